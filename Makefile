@@ -1,0 +1,41 @@
+# Every target sets itself up: a virtual environment in .venv, the install, then the job.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: help update test test-slow bench lint format data clean
+
+help:            ## this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/'
+
+$(READY): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@touch $(READY)
+
+update: $(READY) ## update the bridge column on the bundled data (reduced setting); tables and figures into results/
+	$(BIN)/python tutorials/02_bridge_column.py --preset reduced --out results
+
+test: $(READY)   ## the quick tests
+	$(BIN)/python -m pytest
+
+test-slow: $(READY) ## the slow tests
+	$(BIN)/python -m pytest -m slow
+
+bench: $(READY)  ## speed beside the peers, one table
+	$(BIN)/python -m tests.benchmarks
+
+lint: $(READY)   ## ruff, format and rules
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+format: $(READY) ## let ruff mend what it can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+data: $(READY)   ## make the bundled synthetic data again
+	$(BIN)/python data/make_bridge_column_eq1.py
+
+clean:           ## remove the environment and the results
+	rm -rf $(VENV) results

@@ -1,0 +1,1 @@
+"""Bundled synthetic data sets. See README.md in this folder."""

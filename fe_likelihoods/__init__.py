@@ -1,0 +1,1 @@
+"""Structural finite-element models as black-box log-likelihoods."""

@@ -1,0 +1,1 @@
+"""Structural models: objects with named parameters that turn them into responses."""

@@ -1,0 +1,1 @@
+"""Tempered ensemble samplers behind the interface of emcee."""
