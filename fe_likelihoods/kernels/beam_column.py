@@ -1,0 +1,238 @@
+"""Force-based beam-column element: equilibrium exact along the element, compatibility by iteration.
+
+Basic forces Q = (N, Mi, Mj) give the section forces everywhere without approximation, b(xi) Q with N = Q1 and
+M = (xi - 1) Q2 + xi Q3; the section deformations integrate to the basic deformations,
+
+    v = integral b' e dx,    F = integral b' f b dx,    K = F^-1,
+
+with Gauss-Lobatto points (both ends included). For new deformations v, the element corrects Q by K times the
+compatibility residual until its work is below a tolerance (Neuenhofer & Filippou 1997). Q, K and the section
+states survive from one global iteration to the next.
+
+Softening concrete makes sections locally unstable, and the plain iteration sometimes fails. Then, in this order: the
+initial section flexibilities in every pass; in the first pass only; and a tenth of the increment at a time, up to four
+times over. A failure of all of them is reported, never hidden.
+
+References
+----------
+Spacone, Filippou & Taucer (1996), Earthq. Eng. Struct. Dyn. 25(7); Neuenhofer & Filippou (1997), J. Struct. Eng.
+123(7); specs/bridge_column.md, section 5.
+"""
+
+from __future__ import annotations
+
+import math
+
+from .fiber_section import forces
+from .jit import kernel
+
+__all__ = ["HEAD", "PER_SECTION", "initialise", "advance"]
+
+# State of one element: Q (3), K = K11 K12 K13 K22 K23 K33 (6), v (3), then for each section
+# e0, kappa, flexibility f11 f12 f22, N, M.
+HEAD = 12
+PER_SECTION = 7
+
+MAX_PASSES = 10
+MAX_PASSES_INITIAL = 100
+MAX_SUBDIVISIONS = 4
+MAX_ATTEMPTS = 3000
+
+
+@kernel
+def _invert(f11, f12, f13, f22, f23, f33):
+    """Inverse of a symmetric 3 x 3 matrix, upper half in, upper half out."""
+    c11 = f22 * f33 - f23 * f23
+    c12 = f13 * f23 - f12 * f33
+    c13 = f12 * f23 - f13 * f22
+    d = f11 * c11 + f12 * c12 + f13 * c13
+    return (
+        c11 / d,
+        c12 / d,
+        c13 / d,
+        (f11 * f33 - f13 * f13) / d,
+        (f12 * f13 - f11 * f23) / d,
+        (f11 * f22 - f12 * f12) / d,
+    )
+
+
+@kernel
+def initialise(state, points, weights, length, initial_flexibility):
+    """Unloaded elastic state of one element into `state` (HEAD + PER_SECTION n_points,).
+
+    points, weights : (n_points,) Gauss-Lobatto rule on [0, 1]. initial_flexibility : (3,) f11, f12, f22.
+    """
+    state[:] = 0.0
+    a, b, c = initial_flexibility
+    f11 = f12 = f13 = f22 = f23 = f33 = 0.0
+    for m in range(points.shape[0]):
+        xi, w = points[m], weights[m] * length
+        k = HEAD + PER_SECTION * m
+        state[k + 2], state[k + 3], state[k + 4] = a, b, c
+        f11 += a * w
+        f12 += b * (xi - 1.0) * w
+        f13 += b * xi * w
+        f22 += c * (xi - 1.0) * (xi - 1.0) * w
+        f23 += c * (xi - 1.0) * xi * w
+        f33 += c * xi * xi * w
+    state[3], state[4], state[5], state[6], state[7], state[8] = _invert(f11, f12, f13, f22, f23, f33)
+
+
+@kernel(inline=True)
+def advance(
+    v1,
+    v2,
+    v3,
+    element,
+    state,
+    work,
+    points,
+    weights,
+    length,
+    initial_flexibility,
+    tolerance,
+    core_count,
+    y,
+    area,
+    concrete,
+    concrete_memory,
+    bar_y,
+    bar_area,
+    steel,
+    steel_memory,
+    virgin,
+    trial,
+):
+    """Bring row `element` of `state` to the basic deformations (v1, v2, v3), in place; True when it converged.
+
+    tolerance bounds the work of the last correction [force x length]. work : scratch of the size of one row. The
+    other arguments are those of `fiber_section.forces`. On failure the row is left as it was.
+    """
+    n_points = points.shape[0]
+    n_state = HEAD + PER_SECTION * n_points
+    rest1 = v1 - state[element, 9]
+    rest2 = v2 - state[element, 10]
+    rest3 = v3 - state[element, 11]
+    if math.sqrt(rest1 * rest1 + rest2 * rest2 + rest3 * rest3) <= 2.2e-16:
+        return True
+    i11, i12, i22 = initial_flexibility[0], initial_flexibility[1], initial_flexibility[2]
+    for k in range(n_state):
+        work[0, k] = state[element, k]  # the last state reached
+    part1, part2, part3 = rest1, rest2, rest3
+    scheme = 0
+    subdivision = 0
+    passes = 0
+    # One turn of this loop is one pass over the sections; schemes and subdivisions share it so that the
+    # section is merged into the machine code once.
+    for k in range(n_state):
+        work[1, k] = work[0, k]
+    target1, target2, target3 = v1, v2, v3
+    work[1, 0] += work[1, 3] * part1 + work[1, 4] * part2 + work[1, 5] * part3
+    work[1, 1] += work[1, 4] * part1 + work[1, 6] * part2 + work[1, 7] * part3
+    work[1, 2] += work[1, 5] * part1 + work[1, 7] * part2 + work[1, 8] * part3
+    for _ in range(MAX_ATTEMPTS):
+        use_initial = scheme == 1 or (scheme == 2 and passes == 0)
+        q1, q2, q3 = work[1, 0], work[1, 1], work[1, 2]
+        f11 = f12 = f13 = f22 = f23 = f33 = 0.0
+        r1, r2, r3 = target1, target2, target3
+        for m in range(n_points):
+            xi, w = points[m], weights[m] * length
+            k = HEAD + PER_SECTION * m
+            a, b, c = work[1, k + 2], work[1, k + 3], work[1, k + 4]
+            if use_initial:
+                a, b, c = i11, i12, i22
+            section_n = q1
+            section_m = (xi - 1.0) * q2 + xi * q3
+            dn = section_n - work[1, k + 5]
+            dm = section_m - work[1, k + 6]
+            e0 = work[1, k] + a * dn + b * dm
+            kappa = work[1, k + 1] + b * dn + c * dm
+            n, moment, k_axial, k_coupling, k_bending = forces(
+                e0,
+                kappa,
+                element * n_points + m,
+                core_count,
+                y,
+                area,
+                concrete,
+                concrete_memory,
+                bar_y,
+                bar_area,
+                steel,
+                steel_memory,
+                virgin,
+                trial,
+            )
+            if use_initial:
+                a, b, c = i11, i12, i22
+            else:
+                d = k_axial * k_bending - k_coupling * k_coupling
+                a, b, c = k_bending / d, -k_coupling / d, k_axial / d
+            work[1, k] = e0
+            work[1, k + 1] = kappa
+            work[1, k + 2] = a
+            work[1, k + 3] = b
+            work[1, k + 4] = c
+            work[1, k + 5] = n
+            work[1, k + 6] = moment
+            dn = section_n - n
+            dm = section_m - moment
+            g0 = (e0 + a * dn + b * dm) * w
+            g1 = (kappa + b * dn + c * dm) * w
+            r1 -= g0
+            r2 -= (xi - 1.0) * g1
+            r3 -= xi * g1
+            f11 += a * w
+            f12 += b * (xi - 1.0) * w
+            f13 += b * xi * w
+            f22 += c * (xi - 1.0) * (xi - 1.0) * w
+            f23 += c * (xi - 1.0) * xi * w
+            f33 += c * xi * xi * w
+        k11, k12, k13, k22, k23, k33 = _invert(f11, f12, f13, f22, f23, f33)
+        d1 = k11 * r1 + k12 * r2 + k13 * r3
+        d2 = k12 * r1 + k22 * r2 + k23 * r3
+        d3 = k13 * r1 + k23 * r2 + k33 * r3
+        work[1, 0] = q1 + d1
+        work[1, 1] = q2 + d2
+        work[1, 2] = q3 + d3
+        error = abs(r1 * d1 + r2 * d2 + r3 * d3)
+        passes += 1
+        if error < tolerance:
+            work[1, 3], work[1, 4], work[1, 5] = k11, k12, k13
+            work[1, 6], work[1, 7], work[1, 8] = k22, k23, k33
+            work[1, 9], work[1, 10], work[1, 11] = target1, target2, target3
+            rest1 -= part1
+            rest2 -= part2
+            rest3 -= part3
+            if subdivision == 0:  # the part was the whole rest
+                for k in range(n_state):
+                    state[element, k] = work[1, k]
+                return True
+            for k in range(n_state):
+                work[0, k] = work[1, k]
+            part1, part2, part3 = rest1, rest2, rest3
+            scheme, passes, subdivision = 0, 0, 0
+        else:
+            limit = MAX_PASSES_INITIAL if scheme == 1 else MAX_PASSES
+            if passes < limit and math.isfinite(error):
+                continue
+            passes = 0
+            if scheme < 2:
+                scheme += 1
+            else:
+                if subdivision == MAX_SUBDIVISIONS:
+                    return False
+                subdivision += 1
+                scheme = 0
+                part1, part2, part3 = 0.1 * part1, 0.1 * part2, 0.1 * part3
+        # The next attempt starts from the last state reached.
+        for k in range(n_state):
+            work[1, k] = work[0, k]
+        if subdivision == 0:
+            target1, target2, target3 = v1, v2, v3
+        else:
+            target1, target2, target3 = work[0, 9] + part1, work[0, 10] + part2, work[0, 11] + part3
+        work[1, 0] += work[1, 3] * part1 + work[1, 4] * part2 + work[1, 5] * part3
+        work[1, 1] += work[1, 4] * part1 + work[1, 6] * part2 + work[1, 7] * part3
+        work[1, 2] += work[1, 5] * part1 + work[1, 7] * part2 + work[1, 8] * part3
+    return False

@@ -1,0 +1,43 @@
+"""Solution of the small banded symmetric systems of a column: A x = b by L D L', no pivoting.
+
+A column of n elements has 3 n degrees of freedom numbered from the base up, so that the half bandwidth is 5. The
+tangent may be indefinite beyond a peak of the response; L D L' needs only non-zero pivots.
+"""
+
+from __future__ import annotations
+
+from .jit import kernel
+
+__all__ = ["solve_banded"]
+
+HALF_BANDWIDTH = 5
+
+
+@kernel
+def solve_banded(a, b):
+    """Overwrite `b` (n,) with the solution of a x = b; `a` (n, n) symmetric, its lower half is overwritten."""
+    n = b.shape[0]
+    for j in range(n):
+        low = max(0, j - HALF_BANDWIDTH)
+        d = a[j, j]
+        for k in range(low, j):
+            d -= a[j, k] * a[j, k] * a[k, k]
+        a[j, j] = d
+        high = min(n, j + HALF_BANDWIDTH + 1)
+        for i in range(j + 1, high):
+            v = a[i, j]
+            for k in range(max(0, i - HALF_BANDWIDTH), j):
+                v -= a[i, k] * a[j, k] * a[k, k]
+            a[i, j] = v / d
+    for i in range(n):
+        v = b[i]
+        for k in range(max(0, i - HALF_BANDWIDTH), i):
+            v -= a[i, k] * b[k]
+        b[i] = v
+    for i in range(n):
+        b[i] /= a[i, i]
+    for i in range(n - 1, -1, -1):
+        v = b[i]
+        for k in range(i + 1, min(n, i + HALF_BANDWIDTH + 1)):
+            v -= a[k, i] * b[k]
+        b[i] = v

@@ -1,0 +1,431 @@
+"""Reinforcing steel with a yield plateau, strain hardening and Menegotto-Pinto reversals (OpenSees ``ReinforcingSteel``).
+
+The law works in natural coordinates, x = ln(1 + eps), and is returned in engineering ones::
+
+    sigma = s/(1 + eps),   d sigma/d eps = (E - s)/(1 + eps)^2
+
+Backbone s_b(x), odd in x (specs/bridge_column.md, 3.2): a smooth knee s = z [(E0-Ep)/(1+q^10)^.1 + Ep],
+q = (E0-Ep) z/f0, up to the plateau; a parabola over the transition; strain hardening
+s = fsh + (z-shp) Eu + (fsu-fsh)(1-w^p), w = (up-z)/(up-shp), up to the ultimate strain.
+
+Between reversals the path is a curve of Menegotto and Pinto from (xa, sa, Ea) to (xb, sb, Eb) (3.3)::
+
+    s = sa + Ea (x-xa) [Q - (Q-1)/(1+t^R)^(1/R)],   t = |Ea (x-xa)/(s_ch-sa)|
+
+Which curve is followed is told by a branch number: 1 and 2 are the backbones in tension and compression, 3, 5, 7 ...
+the curves of ever deeper nested reversals that start downwards from tension, 4, 6, 8 ... their mirror images (3.4).
+A branch b > 2 keeps its curve in the slot of level (b+1)//2. Only the rules of the odd branches are written; an even
+branch is run through them with all strains and stresses mirrored.
+
+Buckling, fatigue and isotropic hardening are off, as by default in OpenSees.
+
+References
+----------
+Chang & Mander (1994), NCEER-94-0006; Dodd & Restrepo-Posada (1995), J. Struct. Eng. 121(3);
+Menegotto & Pinto (1973), IABSE; Kunnath, Heo & Mohle (2009), J. Struct. Eng. 135(4).
+"""
+
+from __future__ import annotations
+
+import math
+
+from .jit import SUM_REORDERING, kernel
+
+__all__ = [
+    "N_CONSTANTS",
+    "N_STATE",
+    "constants",
+    "backbone",
+    "virgin_stress_tangent",
+    "monotonic_stress_tangent",
+    "stress_tangent",
+    "update",
+]
+
+# Layout of the constants of one steel.
+E0, FYP, YP, SHP, FSH, UP, EU, FSU, EH, EP, F0, P, FT, EHT, A_SHIFT, VIRGIN_LIMIT, YIELD_STRAIN = range(17)
+N_CONSTANTS = 17
+
+# Layout of the memory of one fiber: scalars, then nine numbers for the curve of each level 2..10.
+BRANCH, OP, ON, XMAX, XMIN, XXMAX, XXMIN, RE, XC, SC, CURVES = range(11)
+XA, SA, EA, XB, SB, EB, RR, QQ, SCH = range(9)
+N_STATE = 10 + 9 * 9
+
+TRANSITION = 0.0002  # strain over which the plateau turns into hardening
+TIE = 1e-14  # strains closer than this are equal
+VIRGIN_Q = 0.6  # the series of virgin_stress_tangent are exact to round-off up to here
+
+
+@kernel
+def constants(fy, fu, es, esh, eps_sh, eps_u, out):
+    """Fill `out` (N_CONSTANTS,) from the six material constants in engineering coordinates (any consistent units)."""
+    out[YP] = math.log(1.0 + fy / es)
+    out[FYP] = fy * (1.0 + fy / es)
+    out[E0] = out[FYP] / out[YP]
+    out[SHP] = math.log(1.0 + eps_sh)
+    out[FSH] = fy * (1.0 + eps_sh)
+    out[UP] = math.log(1.0 + eps_u)
+    out[EU] = fu * (1.0 + eps_u)
+    out[FSU] = out[EU] - (out[UP] - out[SHP]) * out[EU]
+    out[EH] = esh * (1.0 + eps_sh) ** 2 + out[FSH] - out[EU]
+    out[EP] = (out[FSH] - out[FYP]) / (out[SHP] - out[YP])
+    out[F0] = out[FYP] - out[EP] * out[YP]
+    out[P] = out[EH] * (out[UP] - out[SHP]) / (out[FSU] - out[FSH])
+    w = (out[UP] - out[SHP] - TRANSITION) / (out[UP] - out[SHP])
+    out[FT] = out[FSH] + TRANSITION * out[EU] + (out[FSU] - out[FSH]) * (1.0 - w ** out[P])
+    out[EHT] = out[EH] * ((out[FSU] - out[FT]) / (out[FSU] - out[FSH])) ** (1.0 - 1.0 / out[P])
+    out[A_SHIFT] = out[SHP] + TRANSITION - 2.0 * (out[FT] - out[FSH]) / out[EHT]
+    # Smallest strain of either sign beyond which a reversal leaves a trace, |ln(1+eps)| < yp.
+    out[YIELD_STRAIN] = 1.0 - math.exp(-out[YP])
+    # Strain up to which the series below hold: q < .6 and eps < .01.
+    out[VIRGIN_LIMIT] = min(VIRGIN_Q * out[F0] / (out[E0] - out[EP]), 0.01)
+
+
+@kernel
+def backbone(x, c):
+    """Natural stress and modulus of the monotonic curve at natural strain `x`."""
+    z = abs(x)
+    if z <= c[A_SHIFT]:
+        q = (c[E0] - c[EP]) * z / c[F0]
+        u = 1.0 + q**10
+        root = u**-0.1
+        s = z * ((c[E0] - c[EP]) * root + c[EP])
+        e = (c[E0] - c[EP]) * root / u + c[EP]
+    elif z < c[SHP] + TRANSITION:
+        curvature = (c[EHT] - c[EP]) / (c[SHP] + TRANSITION - c[A_SHIFT])
+        d = z - c[A_SHIFT]
+        s = 0.5 * curvature * d * d + c[EP] * z + c[F0]
+        e = curvature * d + c[EP]
+    elif z <= c[UP]:
+        w = (c[UP] - z) / (c[UP] - c[SHP])
+        wp = w ** c[P]
+        s = c[FSH] + (z - c[SHP]) * c[EU] + (c[FSU] - c[FSH]) * (1.0 - wp)
+        e = c[EH] * wp ** (1.0 - 1.0 / c[P]) + c[EU]
+    else:
+        s = c[FSU] + (z - c[SHP]) * c[EU]
+        e = c[EU]
+    return math.copysign(s, x), e
+
+
+@kernel(inline=True, fastmath=SUM_REORDERING)
+def virgin_stress_tangent(eps, e0, ep, f0):
+    """Engineering stress and tangent well below yield, where no reversal has left a trace: the backbone as series.
+
+    For |eps| < VIRGIN_LIMIT the truncated series of ln(1+eps) and (1+q^10)^-.1 are exact to round-off; they need
+    neither a logarithm nor a power, so that a section evaluates its bars side by side.
+    """
+    x = -0.125
+    x = eps * x + 1.0 / 7.0
+    x = eps * x - 1.0 / 6.0
+    x = eps * x + 0.2
+    x = eps * x - 0.25
+    x = eps * x + 1.0 / 3.0
+    x = eps * x - 0.5
+    x = eps * (eps * x + 1.0)
+    q = (e0 - ep) * x / f0
+    q2 = q * q
+    q4 = q2 * q2
+    u = q4 * q4 * q2
+    root = 0.0207967375
+    root = root * u - 0.02446675
+    root = root * u + 0.0298375
+    root = root * u - 0.0385
+    root = root * u + 0.055
+    root = root * u - 0.1
+    root = (root * u + 1.0) * (e0 - ep)
+    natural_stress = x * (root + ep)
+    natural_modulus = root / (1.0 + u) + ep
+    inverse = 1.0 / (1.0 + eps)
+    return natural_stress * inverse, (natural_modulus - natural_stress) * inverse * inverse
+
+
+@kernel
+def _fit_residual(a, r, ea, eb, es):
+    """g(A) of the Menegotto-Pinto fit: zero where the curve ends at (xb, sb) with slope Eb."""
+    return eb - es * (1.0 - a ** (r + 1.0)) / (1.0 - a) + ea * a * (1.0 - a**r) / (1.0 - a)
+
+
+@kernel
+def _fit_root(r, ea, eb, es, r_min):
+    """Root A in (0, 1) of `_fit_residual`, by the search whose stopping rule the reference results carry.
+
+    A stops within 1e-4, so the search itself, not only the equation, fixes the last digits of the stress.
+    """
+    alpha = 0.01
+    for _ in range(60):
+        if _fit_residual(alpha, r, ea, eb, es) * _fit_residual(1.0 - alpha, r, ea, eb, es) <= 0.0:
+            break
+        alpha *= 0.5
+    upper = _fit_residual(1.0 - alpha, r, ea, eb, es)
+    a = min(r_min / r, 0.999999)
+    for _ in range(200):
+        if _fit_residual(a, r, ea, eb, es) * upper < 0.0 and a > 0.0:
+            a = math.sqrt(a)
+        else:
+            break
+    for _ in range(100):
+        step = min(0.49 * (1.0 - a), a / 10.0)
+        if a + step >= 1.0:
+            step = (1.0 - a) / 10.0
+        residual = _fit_residual(a, r, ea, eb, es)
+        if residual == 0.0:
+            return a
+        slope = (_fit_residual(a + step, r, ea, eb, es) - _fit_residual(a - step, r, ea, eb, es)) / (2.0 * step)
+        new = a - residual / slope
+        new = min(new, 0.99999999)
+        if abs(new - a) < 1e-4:
+            return abs(new)
+        if new <= 0.0:
+            new = 0.5 * a
+        a = new
+    return a
+
+
+@kernel
+def _fit(xa, sa, ea, xb, sb, eb, clip, c, curve):
+    """Curve from (xa, sa, ea) to (xb, sb, eb) into `curve` (9,); `clip` keeps the slopes on either side of the chord."""
+    es = (sb - sa) / (xb - xa) if xb != xa else ea
+    if clip:
+        if es < eb:
+            eb = 0.999 * es
+        if es > ea:
+            ea = 1.001 * es
+    r = 18.0 * (c[FYP] / c[E0]) ** (1.0 / 3.0) * (1.0 - 4.0 * abs(xb - xa))
+    q, sch = 1.0, sb
+    if eb != es and abs(xb - xa) >= 1e-7:
+        if es == ea:
+            r_min, a = 0.0, 0.99999999
+        else:
+            r_min = max(0.0, (eb - es) / (es - ea))
+            if r <= r_min:
+                r = r_min + 0.01
+            a = _fit_root(r, ea, eb, es, r_min)
+        q = (es / ea - a) / (1.0 - a)
+        sch = sa + ea * (xb - xa) * a / (1.0 - a**r) ** (1.0 / r)
+    curve[XA], curve[SA], curve[EA] = xa, sa, ea
+    curve[XB], curve[SB], curve[EB] = xb, sb, eb
+    curve[RR], curve[QQ], curve[SCH] = r, q, sch
+
+
+@kernel
+def _on_curve(x, curve):
+    """Natural stress and modulus of a Menegotto-Pinto curve at `x`."""
+    ea, q, r = curve[EA], curve[QQ], curve[RR]
+    dx = x - curve[XA]
+    if dx == 0.0:
+        return curve[SA], ea
+    t = abs(ea * dx / (curve[SCH] - curve[SA]))
+    # (1 + t^R)^(1/R) and t^R/(1 + t^R). R up to 1e13 occurs where the clip makes Ea = Es = Eb: no overflow to nan.
+    power = t**r
+    if power < 1e100:
+        root = (1.0 + power) ** (1.0 / r)
+        weight = power / (1.0 + power)
+    else:
+        root, weight = t, 1.0
+    s = curve[SA] + ea * dx * (q - (q - 1.0) / root)
+    chord = (s - curve[SA]) / dx
+    if r > 100.0:
+        return s, ea
+    return s, chord - (chord - q * ea) * weight
+
+
+@kernel
+def _mirror_branch(b):
+    """1 <-> 2, 3 <-> 4, ..."""
+    return b + 1 if b % 2 == 1 else b - 1
+
+
+@kernel
+def _mirror(state):
+    """Change the sign of every strain and stress of the memory, in place: tension becomes compression."""
+    state[BRANCH] = _mirror_branch(int(state[BRANCH]))
+    state[OP], state[ON] = -state[ON], -state[OP]
+    state[XMAX], state[XMIN] = -state[XMIN], -state[XMAX]
+    state[XXMAX], state[XXMIN] = -state[XXMIN], -state[XXMAX]
+    state[RE] = -state[RE]
+    state[XC] = -state[XC]
+    state[SC] = -state[SC]
+    for level in range(9):
+        k = CURVES + 9 * level
+        state[k + XA] = -state[k + XA]
+        state[k + SA] = -state[k + SA]
+        state[k + XB] = -state[k + XB]
+        state[k + SB] = -state[k + SB]
+        state[k + SCH] = -state[k + SCH]
+
+
+@kernel
+def _slot(state, branch):
+    """The stored curve of a branch > 2."""
+    k = CURVES + 9 * ((branch + 1) // 2 - 2)
+    return state[k : k + 9]
+
+
+@kernel
+def _returning_curve(xc, state, c, curve):
+    """Auxiliary curve of branches 5 and 7: where a path that reversed at `xc` on branch 5 would rejoin branch 3."""
+    two, three = _slot(state, 3), _slot(state, 5)
+    xa2, xb2, ea2 = two[XA], two[XB], two[EA]
+    xa3, xb3 = three[XA], three[XB]
+    start = xb3 * (xc - xa3) / (xb3 - xa3) + xa2 * (xb3 - xc) / (xb3 - xa3)
+    s_start, _ = backbone(start - state[OP], c)
+    s_end, e_end = backbone(xb2 - state[ON], c)
+    _fit(start, s_start, ea2, xb2, s_end, e_end, False, c, curve)
+
+
+@kernel
+def _step(x, tension, state, c):
+    """One transition of an odd branch at trial strain `x`; True, stress, modulus when no further one is due.
+
+    `tension` tells a branch from the mirror image of its even twin: one rule holds on the tension side only.
+    """
+    b = int(state[BRANCH])
+    xc, sc = state[XC], state[SC]
+    if b == 1:
+        e = x - state[OP]
+        if x >= xc or 0.0 < e < c[YP]:
+            s, modulus = backbone(e, c)
+            return True, s, modulus
+        if e <= 0.0:
+            state[BRANCH] = 2
+            return False, 0.0, 0.0
+        state[XMAX] = xc - state[OP]
+        state[XXMAX] = max(state[XXMAX], xc)
+        er = c[E0] * (0.82 + 1.0 / (5.55 + 1000.0 * max(state[XXMAX], -state[XXMIN])))
+        curve = _slot(state, 3)
+        if e >= c[SHP]:
+            m = min(state[XMIN], -c[SHP] - TIE)
+            ea = state[OP] + c[SHP] - c[FSH] / c[E0]
+            eb = state[OP] + state[XMAX] - sc / c[E0]
+            k = math.exp(-state[XMAX] / (5000.0 * c[YP] * c[YP]))
+            o = ea * k + eb * (1.0 - k)
+            if o > state[ON]:
+                m -= o - state[ON]
+                state[ON] = o
+            s_target, e_target = backbone(m, c)
+            x_target = state[ON] + m
+            if tension and (s_target - sc) / (x_target - xc) < e_target:
+                state[ON] = (s_target - sc) / e_target + xc - m
+                x_target = state[ON] + m
+            _fit(xc, sc, er, x_target, s_target, e_target, False, c, curve)
+        else:
+            r = (state[XMAX] - c[YP]) / (c[SHP] - c[YP])
+            m = r * (c[YP] - c[SHP]) - c[YP]
+            state[ON] = xc - sc / c[E0]
+            s_target, _ = backbone(m, c)
+            e_target = 1.0 / (1.0 / c[E0] + r * (1.0 / c[EH] - 1.0 / c[E0]))
+            _fit(xc, sc, er, state[ON] + m, s_target, e_target, True, c, curve)
+        state[BRANCH] = 3
+        return False, 0.0, 0.0
+
+    curve = _slot(state, b)
+    up = b % 4 == 1
+    reached = x >= curve[XB] - TIE if up else x <= curve[XB] + TIE
+    reversal = x < xc - TIE if up else x > xc + TIE
+    if not reached and not reversal:
+        s, modulus = _on_curve(x, curve)
+        return True, s, modulus
+    if reached:
+        if b == 3:
+            state[BRANCH] = 2
+        elif b == 5:
+            state[BRANCH] = 1
+        elif b == 7:
+            _returning_curve(curve[XA], state, c, _slot(state, 3))
+            state[BRANCH] = 3
+        else:
+            state[BRANCH] = b - 4
+        return False, 0.0, 0.0
+
+    er = c[E0] * (0.82 + 1.0 / (5.55 + 1000.0 * max(state[XXMAX], -state[XXMIN])))
+    if b == 3:
+        state[XMIN] = min(state[XMIN], xc - state[ON])
+        d = min(max(curve[XA] - xc - c[FYP] / (1.2 * c[E0]), 0.0), c[FYP] / (3.0 * c[E0]))
+        s_target, e_target = backbone(state[XMAX] + d, c)
+        x_target = state[OP] + state[XMAX] + d
+        new = 5
+    elif b == 5:
+        aside = _slot(state, 7)
+        _returning_curve(xc, state, c, aside)
+        x_target = curve[XA]
+        s_target, e_target = _on_curve(x_target, aside)
+        new = 7
+    elif b == 7:
+        x_target = curve[XA]
+        s_target, e_target = _on_curve(x_target, _slot(state, 5))
+        state[RE] = xc
+        new = 9
+    elif up:
+        if b + 4 <= 20:
+            state[RE] = curve[XA]
+        x_target = state[RE]
+        s_target, e_target = _on_curve(x_target, _slot(state, b - 2))
+        new = b + 2
+    elif b + 2 <= 20:
+        x_target = curve[XA]
+        s_target, e_target = _on_curve(x_target, _slot(state, b - 2))
+        new = b + 2
+    else:
+        x_target = _slot(state, b - 4)[XA]
+        s_target, e_target = _on_curve(x_target, _slot(state, b - 6))
+        new = b - 2
+    _fit(xc, sc, er, x_target, s_target, e_target, True, c, _slot(state, new))
+    state[BRANCH] = new
+    return False, 0.0, 0.0
+
+
+@kernel
+def update(eps, state, c):
+    """Advance the memory of one fiber to the strain `eps`, in place; returns engineering stress and tangent.
+
+    A trial works on a copy of the committed memory; to commit is to work on the memory itself.
+    """
+    x = math.log(1.0 + eps) if eps > -0.95 else math.nan
+    if state[BRANCH] == 0.0:
+        if x == 0.0:
+            return 0.0, c[E0]
+        state[BRANCH] = 1.0 if x > 0.0 else 2.0
+    s, modulus = math.nan, math.nan
+    for _ in range(40):
+        tension = int(state[BRANCH]) % 2 == 1
+        if tension:
+            done, s, modulus = _step(x, True, state, c)
+        else:
+            _mirror(state)
+            done, s, modulus = _step(-x, False, state, c)
+            _mirror(state)
+            s = -s
+        if done:
+            break
+    state[XC] = x
+    state[SC] = s
+    return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
+
+
+@kernel
+def monotonic_stress_tangent(eps, c):
+    """Engineering stress and tangent on the backbone: all there is as long as no strain beyond yield was committed."""
+    s, modulus = backbone(math.log(1.0 + eps) if eps > -0.95 else math.nan, c)
+    return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
+
+
+@kernel
+def stress_tangent(eps, state, c, trial):
+    """Stress and tangent at a trial strain, `state` untouched; `trial` (N_STATE,) is scratch.
+
+    A trial that goes on along its branch needs no copy of the memory.
+    """
+    x = math.log(1.0 + eps) if eps > -0.95 else math.nan
+    b = int(state[BRANCH])
+    if b > 2:
+        curve = state[CURVES + 9 * ((b + 1) // 2 - 2) :]
+        up = b % 4 <= 1
+        if (state[XC] <= x < curve[XB] - TIE) if up else (curve[XB] + TIE < x <= state[XC]):
+            s, modulus = _on_curve(x, curve)
+            return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
+    elif (b == 1 and x >= state[XC]) or (b == 2 and x <= state[XC]):
+        s, modulus = backbone(x - (state[OP] if b == 1 else state[ON]), c)
+        return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
+    for i in range(N_STATE):
+        trial[i] = state[i]
+    return update(eps, trial, c)

@@ -1,0 +1,238 @@
+"""The log-likelihood of a model's parameters and of the noise, given measurements.
+
+Parameters go to the model, its response to sums of squared residuals J, J and the noise's parameters to a number. The
+middle of this chain, `FELikelihood.misfit`, is the only place where simulations are asked for: it decides which rows
+are run, counts them, and records those that fail.
+"""
+
+import hashlib
+import logging
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .channels import Measurements
+from .models.base import Model, misfit_batch
+from .noise import GaussianNoise
+
+__all__ = ["FELikelihood", "as_points"]
+
+logger = logging.getLogger(__name__)
+
+_RECORDED_FAILURES = 1000
+_RECORDED_REASONS = 100
+_OTHER_REASONS = "other reasons"
+
+
+def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
+    """One point or many, as an array.
+
+    Parameters
+    ----------
+    x : array_like (ndim,) or (n, ndim), or a mapping of every name to its value or its (n,) values
+        Mappings are what emcee passes with ``parameter_names=``, and nautilus with its own prior.
+    names : sequence of str
+        Names of the ndim parameters, in order.
+
+    Returns
+    -------
+    ndarray[ndim] or ndarray[n, ndim]
+
+    Raises
+    ------
+    ValueError
+        If the length or the names do not fit.
+    """
+    if isinstance(x, Mapping):
+        if set(x) != set(names):
+            raise ValueError(f"expected a value for each of {', '.join(names)}; got the names {', '.join(map(str, x))}")
+        x = np.stack([np.asarray(x[name], dtype=float) for name in names], axis=-1)
+    points = np.asarray(x, dtype=float)
+    if points.ndim not in (1, 2) or points.shape[-1] != len(names):
+        raise ValueError(
+            f"expected one value for each of the {len(names)} parameters {', '.join(names)}, in an array of shape "
+            f"({len(names)},) or (n, {len(names)}); got shape {points.shape}"
+        )
+    return points
+
+
+class FELikelihood:
+    """Log-likelihood of structural parameters and noise, given measurements.
+
+    Parameters
+    ----------
+    model : Model
+        Turns structural parameters into the response (see `fe_likelihoods.models.base`).
+    measurements : Measurements
+        The model's channels (matched by name, in any order) at the model's step and length.
+    noise : optional
+        Anything with ``parameter_names`` and ``log_likelihood(misfit, n_steps, parameters)``; by default
+        `GaussianNoise` of the model's channels.
+    pool : object with ``map(function, items)``, optional
+        Runs the simulations of a model without batch methods, as many at once as it has workers. It does not travel
+        when the likelihood is pickled.
+
+    Attributes
+    ----------
+    parameter_names : tuple of str
+        The model's, then the noise's.
+    simulation_free : tuple of int
+        Indices of the parameters whose change costs no simulation: the noise's.
+    simulations : int
+        Simulations run by this object in this process.
+    failure_count : int
+        How many of them failed.
+    failures : list of dict
+        ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures.
+    failure_reasons : dict of str to int
+        How often each reason occurred.
+    seconds : float
+        Wall time spent in simulations [s].
+
+    Raises
+    ------
+    ValueError
+        If channels, step or length of model and measurements differ, or parameter names repeat.
+    """
+
+    def __init__(self, model: Model, measurements: Measurements, noise: Any = None, pool: Any = None) -> None:
+        if pool is not None and not hasattr(pool, "map"):
+            raise ValueError(f"FELikelihood: pool must have a method map(function, items); got {pool!r}")
+        self.model = model
+        self.measurements = _matched(model, measurements)
+        self.noise = GaussianNoise(model.channels) if noise is None else noise
+        self.pool = pool
+        self.parameter_names = tuple(model.parameter_names) + tuple(self.noise.parameter_names)
+        if len(set(self.parameter_names)) != len(self.parameter_names):
+            raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
+        self._n_structural = len(model.parameter_names)
+        self.simulation_free = tuple(range(self._n_structural, len(self.parameter_names)))
+        self.simulations = 0
+        self.failure_count = 0
+        self.failures: list[dict] = []
+        self.failure_reasons: Counter[str] = Counter()
+        self.seconds = 0.0
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"pool": None}
+
+    @property
+    def ndim(self) -> int:
+        """Number of parameters."""
+        return len(self.parameter_names)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the model's and the measurements' fingerprints: what the misfit depends on."""
+        text = f"{self.model.fingerprint} {self.measurements.fingerprint}"
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+    def misfit(self, thetas: np.ndarray) -> np.ndarray:
+        """Sums of squared residuals. Equal rows are simulated once; rows that are not finite are not simulated.
+
+        Parameters
+        ----------
+        thetas : (n, n_structural) float
+            Structural parameters only.
+
+        Returns
+        -------
+        (n, n_channels) float : [SI unit of the channel, squared]; NaN where there is no usable simulation.
+        """
+        thetas = np.atleast_2d(as_points(thetas, self.model.parameter_names))
+        result = np.full((len(thetas), self.measurements.n_channels), np.nan)
+        finite = np.isfinite(thetas).all(axis=1)
+        if not finite.any():
+            return result
+        first: dict[bytes, int] = {}  # in order of appearance; adding zero makes -0.0 and 0.0 one key
+        distinct = [first.setdefault(row.tobytes(), len(first)) for row in thetas[finite] + 0.0]
+        rows = np.frombuffer(b"".join(first), dtype=float).reshape(len(first), -1).copy()
+        result[finite] = self._simulate(rows)[distinct]
+        return result
+
+    def log_likelihood(self, x: Any) -> np.ndarray | float:
+        """Log-likelihood of structural parameters followed by the noise's.
+
+        Parameters
+        ----------
+        x : array_like (ndim,) or (n, ndim), or named values (see `as_points`)
+
+        Returns
+        -------
+        float or (n,) float : -inf where a simulation fails, where the noise's parameters are impossible (nothing is
+        simulated there) and where x is not finite; never NaN.
+        """
+        points = as_points(x, self.parameter_names)
+        rows = np.atleast_2d(points)
+        thetas, noise = np.split(rows, [self._n_structural], axis=1)
+        # a perfect fit tells which noise parameters are possible at all, before anything is simulated
+        perfect = np.zeros((len(rows), self.measurements.n_channels))
+        n_steps = self.measurements.n_steps
+        impossible = np.isneginf(self.noise.log_likelihood(perfect, n_steps, noise))
+        possible = np.isfinite(rows).all(axis=1) & ~impossible
+        result = np.full(len(rows), -np.inf)
+        if possible.any():
+            misfit = self.misfit(thetas[possible])
+            values = self.noise.log_likelihood(misfit, n_steps, noise[possible])
+            usable = values < np.inf  # neither NaN nor infinite
+            simulated = np.isfinite(misfit).all(axis=1)
+            for row in np.flatnonzero(simulated & ~usable):
+                self._record(thetas[possible][row], f"the log-likelihood of the noise is {values[row]}")
+            result[possible] = np.where(simulated & usable, values, -np.inf)
+        return result if points.ndim == 2 else float(result[0])
+
+    def _simulate(self, thetas: np.ndarray) -> np.ndarray:
+        start = time.perf_counter()
+        misfit, reasons = misfit_batch(self.model, thetas, self.measurements.values, self.pool)
+        self.seconds += time.perf_counter() - start
+        self.simulations += len(thetas)
+        for theta, reason in zip(thetas, reasons, strict=True):
+            if reason:
+                self._record(theta, reason)
+        return misfit
+
+    def _record(self, theta: np.ndarray, reason: str) -> None:
+        parameters = dict(zip(self.model.parameter_names, theta.tolist(), strict=True))
+        if not self.failure_count:
+            logger.warning(
+                "a simulation failed and counts as impossible: %s at %s; further ones are only counted, see report()",
+                reason,
+                parameters,
+            )
+        self.failure_count += 1
+        if len(self.failures) < _RECORDED_FAILURES:
+            self.failures.append({"parameters": parameters, "reason": reason})
+        known = reason in self.failure_reasons or len(self.failure_reasons) < _RECORDED_REASONS
+        self.failure_reasons[reason if known else _OTHER_REASONS] += 1
+
+
+def _matched(model: Model, measurements: Measurements) -> Measurements:
+    """The measurements in the order of the model's channels, or ValueError with advice where the two do not fit."""
+    expected = [channel.name for channel in model.channels]
+    got = [channel.name for channel in measurements.channels]
+    if sorted(expected) != sorted(got):
+        raise ValueError(
+            f"the model's channels are {', '.join(expected)}, the measurements' are {', '.join(got)}; "
+            "choose the common ones with Measurements.select(names) and in the model"
+        )
+    matched = measurements if expected == got else measurements.select(expected)
+    for ours, theirs in zip(model.channels, matched.channels, strict=True):
+        words = [channel.quantity.split()[:-1] for channel in (ours, theirs)]
+        if ours.dimension != theirs.dimension or (all(words) and words[0] != words[1]):
+            raise ValueError(
+                f"channel {ours.name!r} is {ours.quantity!r} in the model and {theirs.quantity!r} in the measurements"
+            )
+    if abs(matched.dt - model.dt) > 1e-9 * model.dt:
+        raise ValueError(
+            f"the model's response has a step of {model.dt} s, the measurements have {matched.dt} s; make them equal "
+            "with Record.resample(dt) on the excitation or Measurements.decimate(factor)"
+        )
+    if matched.n_steps != model.n_steps:
+        raise ValueError(
+            f"the model's response has {model.n_steps} samples, the measurements have {matched.n_steps}; make them "
+            "equal with Record.trim(start, stop) and Measurements.trim(start, stop)"
+        )
+    return matched

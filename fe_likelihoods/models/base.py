@@ -1,0 +1,227 @@
+"""What a structural model is, and how a batch of its simulations is run.
+
+A model is any object with named parameters, named channels and a method `simulate` that turns one set of parameters
+into one response. It says that a simulation cannot be done by raising `SimulationFailed`. Nothing has to be inherited.
+
+Samplers ask for many parameter sets at once. `simulate_batch` and `misfit_batch` answer with the model's own batch
+methods where it has them (compiled kernels that share work or threads), else set by set, through a pool if there is
+one. They never raise for a simulation that goes wrong: whatever happens to one set of parameters (an exception, a
+response that is not finite or has a wrong shape) becomes a reason in words beside a row of NaN, and leaves the other
+rows alone.
+"""
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ..channels import Channel
+
+__all__ = ["MisfitBatch", "Model", "SimulationBatch", "SimulationFailed", "misfit_batch", "simulate_batch"]
+
+logger = logging.getLogger(__name__)
+
+_RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is wanted: 64 MiB
+
+
+class SimulationFailed(RuntimeError):
+    """A simulation that could not be done, for a reason in words (attribute `reason`)."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = str(reason) or "no reason given"
+
+
+class SimulationBatch(NamedTuple):
+    """Responses of a batch of parameter sets.
+
+    response : (n, n_channels, n_steps) float, SI; rows of failures are NaN
+    reasons : n strings, empty where the simulation succeeded
+    """
+
+    response: np.ndarray
+    reasons: list[str]
+
+
+class MisfitBatch(NamedTuple):
+    """Misfits of a batch of parameter sets.
+
+    misfit : (n, n_channels) float, sums of squared residuals [SI unit of the channel, squared]; rows of failures NaN
+    reasons : n strings, empty where the simulation succeeded
+    """
+
+    misfit: np.ndarray
+    reasons: list[str]
+
+
+class Model(Protocol):
+    """What a likelihood needs of a model.
+
+    It may also have ``simulate_batch(thetas) -> SimulationBatch`` and
+    ``misfit_batch(thetas, measured) -> MisfitBatch``, which must give for each row what `simulate` gives.
+    """
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the structural parameters: multiples of nominal values, or SI."""
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What the rows of the response are."""
+
+    @property
+    def dt(self) -> float:
+        """Time step of the response [s]."""
+
+    @property
+    def n_steps(self) -> int:
+        """Number of samples of the response."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Text that changes with anything that changes a response."""
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        """Response (n_channels, n_steps) [SI] at the parameters (n_parameters,); raises `SimulationFailed`."""
+
+
+def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
+    """Responses at many parameter sets.
+
+    Parameters
+    ----------
+    model : Model
+    thetas : (n, n_parameters) float
+    pool : object with ``map(function, items)``, optional
+        Runs the simulations of a model that has no batch method; the results do not depend on it.
+
+    Returns
+    -------
+    SimulationBatch
+    """
+    shape = (len(model.channels), model.n_steps)
+    whole = getattr(model, "simulate_batch", None)
+    if whole is not None:
+        batch = _run_whole(model, partial(whole, thetas), (len(thetas), *shape))
+        if batch is not None:
+            return SimulationBatch(*batch)
+    return SimulationBatch(*_run_each(_response, model, thetas, shape, pool))
+
+
+def misfit_batch(model: Model, thetas: np.ndarray, measured: np.ndarray, pool: Any = None) -> MisfitBatch:
+    """Sums of squared residuals at many parameter sets; no response is kept.
+
+    Parameters
+    ----------
+    model : Model
+    thetas : (n, n_parameters) float
+    measured : (n_channels, n_steps) float
+        Measured response [SI].
+    pool : object with ``map(function, items)``, optional
+        Runs the simulations of a model that has no batch method; the results do not depend on it.
+
+    Returns
+    -------
+    MisfitBatch
+    """
+    shape = (len(model.channels),)
+    whole = getattr(model, "misfit_batch", None)
+    if whole is None and hasattr(model, "simulate_batch"):
+        whole = partial(_misfit_from_responses, model)
+    if whole is not None:
+        batch = _run_whole(model, partial(whole, thetas, measured), (len(thetas), *shape))
+        if batch is not None:
+            return MisfitBatch(*batch)
+    return MisfitBatch(*_run_each(partial(_misfit, measured), model, thetas, shape, pool))
+
+
+def _squared_residuals(response: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    # contiguous rows: the order of summation, hence the last bit, must not depend on who made the array
+    residuals = np.ascontiguousarray(response - measured)
+    with np.errstate(over="ignore"):
+        return np.square(residuals).sum(axis=-1)
+
+
+def _misfit_from_responses(model: Model, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
+    misfits, reasons = [], []
+    rows = max(1, _RESPONSE_VALUES // measured.size)
+    for start in range(0, len(thetas), rows):
+        batch = simulate_batch(model, thetas[start : start + rows])
+        misfits += [_squared_residuals(response, measured) for response in batch.response]
+        reasons += batch.reasons
+    return MisfitBatch(np.reshape(misfits, (len(thetas), len(measured))), reasons)
+
+
+def _response(model: Model, theta: np.ndarray) -> np.ndarray:
+    response = np.asarray(model.simulate(theta.copy()), dtype=float)
+    expected = (len(model.channels), model.n_steps)
+    if response.shape != expected:
+        raise SimulationFailed(f"the response has shape {response.shape}, expected (n_channels, n_steps) = {expected}")
+    return response
+
+
+def _misfit(measured: np.ndarray, model: Model, theta: np.ndarray) -> np.ndarray:
+    return _squared_residuals(_response(model, theta), measured)
+
+
+def _not_finite(model: Model, values: np.ndarray) -> str:
+    """Reason why one row of responses or misfits is not usable, or an empty string."""
+    for channel, value in zip(model.channels, values, strict=True):
+        if not np.isfinite(value).all():
+            what = "response" if value.ndim else "misfit"
+            return f"the {what} of channel {channel.name!r} is not finite"
+    return ""
+
+
+def _attempt(
+    run: Callable[[Model, np.ndarray], np.ndarray], model: Model, theta: np.ndarray
+) -> tuple[np.ndarray | None, str]:
+    """One simulation: its result and an empty reason, or None and the reason. Runs in the worker."""
+    try:
+        result = run(model, theta)
+    except SimulationFailed as error:
+        return None, error.reason
+    except Exception as error:  # a black box may raise anything; KeyboardInterrupt is no Exception and passes
+        return None, f"{type(error).__name__}: {error}"
+    reason = _not_finite(model, result)
+    return (None, reason) if reason else (result, "")
+
+
+def _run_each(
+    run: Callable[[Model, np.ndarray], np.ndarray], model: Model, thetas: np.ndarray, shape: tuple[int, ...], pool: Any
+) -> tuple[np.ndarray, list[str]]:
+    """Simulate set by set, in this process or in the pool's workers."""
+    attempt = partial(_attempt, run, model)
+    outcomes = list(map(attempt, thetas) if pool is None else pool.map(attempt, list(thetas)))
+    values = np.full((len(thetas), *shape), np.nan)
+    for row, (result, _) in zip(values, outcomes, strict=True):
+        if result is not None:
+            row[...] = result
+    return values, [reason for _, reason in outcomes]
+
+
+def _run_whole(
+    model: Model, method: Callable[[], tuple], shape: tuple[int, ...]
+) -> tuple[np.ndarray, list[str]] | None:
+    """Results of a model's own batch method, or None if it broke as a whole and the sets must be run one by one."""
+    try:
+        values, reasons = method()
+        values, reasons = np.array(values, dtype=float), [str(reason) for reason in reasons]
+        if values.shape != shape or len(reasons) != shape[0]:
+            raise ValueError(
+                f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"
+            )
+    except Exception as error:  # one bad set must not take the others with it
+        logger.warning(
+            "a batch method of %s broke, its sets are run one by one: %s: %s",
+            type(model).__name__,
+            type(error).__name__,
+            error,
+        )
+        return None
+    for row in np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))):
+        reasons[row] = reasons[row] or _not_finite(model, values[row])
+    values[[bool(reason) for reason in reasons]] = np.nan
+    return values, reasons

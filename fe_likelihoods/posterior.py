@@ -1,0 +1,130 @@
+"""The posterior: prior times likelihood, as one object that any Bayesian client can call.
+
+There is no common interface among samplers, but one object answers them all: a density of an array (one point or
+many), its two factors apart, a map from the unit cube, draws of the prior, and the names of the parameters. Two
+promises make it safe to hand to them: a value is a finite number or -inf, whatever happens in a simulation, and
+nothing is simulated where the prior is zero.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from .likelihood import FELikelihood, as_points
+from .priors import Distribution, Prior, RandomState
+
+__all__ = ["Posterior"]
+
+
+class Posterior:
+    """Posterior density of structural parameters and noise.
+
+    Every density takes a point (ndim,) and returns a float, or n points (n, ndim) and returns (n,). Named values are
+    understood as well (see `fe_likelihoods.likelihood.as_points`). Calling the object is `log_prob`.
+
+    Parameters
+    ----------
+    likelihood : FELikelihood
+    prior : Prior, or a mapping of names to distributions
+        Of exactly the likelihood's parameters, in any order.
+    coarse : Posterior, optional
+        A cheaper posterior of the same parameters (a larger step, fewer fibres), for samplers that climb on it first.
+
+    Raises
+    ------
+    ValueError
+        If the names of prior and likelihood, or of the coarse posterior, differ; the message lists both.
+
+    Examples
+    --------
+    >>> posterior = Posterior(FELikelihood(model, measurements), prior)
+    >>> sampler = emcee.EnsembleSampler(32, posterior.ndim, posterior, vectorize=True)
+    >>> sampler.run_mcmc(posterior.sample_prior(32), 1000)
+    """
+
+    def __init__(
+        self,
+        likelihood: FELikelihood,
+        prior: Prior | Mapping[str, Distribution],
+        coarse: "Posterior | None" = None,
+    ) -> None:
+        self.likelihood = likelihood
+        prior = prior if isinstance(prior, Prior) else Prior(prior)
+        self.prior = prior.reorder(likelihood.parameter_names)
+        if coarse is not None and tuple(coarse.parameter_names) != self.prior.names:
+            raise ValueError(
+                f"the coarse posterior must have the parameters {', '.join(self.prior.names)}, in this order; "
+                f"it has {', '.join(coarse.parameter_names)}"
+            )
+        self.coarse = coarse
+
+    @property
+    def ndim(self) -> int:
+        """Number of parameters."""
+        return self.prior.dim
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """Structural parameters first, then the noise's: a list, as emcee, arviz and corner want it."""
+        return list(self.prior.names)
+
+    @property
+    def simulation_free(self) -> tuple[int, ...]:
+        """Indices of the parameters whose change costs no simulation."""
+        return self.likelihood.simulation_free
+
+    def __call__(self, x: Any) -> np.ndarray | float:
+        """Same as `log_prob`."""
+        return self.log_prob(x)
+
+    def log_prob(self, x: Any) -> np.ndarray | float:
+        """Log-prior plus log-likelihood: the posterior density up to the evidence."""
+        points, log_prior, log_likelihood = self._evaluate(x)
+        total = log_prior + log_likelihood
+        return total if points.ndim == 2 else float(total[0])
+
+    def log_prior(self, x: Any) -> np.ndarray | float:
+        """Normalised log-density of the prior: -inf outside its support and where x is NaN."""
+        return self.prior.logpdf(as_points(x, self.prior.names))
+
+    def log_likelihood(self, x: Any) -> np.ndarray | float:
+        """Log-likelihood: -inf also outside the prior's support, where nothing is simulated."""
+        points, _, log_likelihood = self._evaluate(x)
+        return log_likelihood if points.ndim == 2 else float(log_likelihood[0])
+
+    def prior_transform(self, u: np.ndarray) -> np.ndarray:
+        """From the unit cube to the parameters, (ndim,) or (n, ndim), as nested samplers ask."""
+        return self.prior.transform(u)
+
+    def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
+        """Draws of the prior, (n, ndim); `rng` is a seed, a generator, or None for NumPy's global stream."""
+        return self.prior.rvs(n, rng)
+
+    def report(self) -> dict:
+        """What was simulated so far, by this object in this process.
+
+        Returns
+        -------
+        dict
+            ``simulations``, ``cache_hits``, ``failures`` (list of ``{"parameters", "reason"}``, the first thousand),
+            ``failure_count``, ``failure_reasons`` (count of each), ``seconds`` (wall time in simulations).
+        """
+        return {
+            "simulations": self.likelihood.simulations,
+            "cache_hits": 0,
+            "failures": list(self.likelihood.failures),
+            "failure_count": self.likelihood.failure_count,
+            "failure_reasons": dict(self.likelihood.failure_reasons),
+            "seconds": self.likelihood.seconds,
+        }
+
+    def _evaluate(self, x: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points as given, and the log-prior (n,) and log-likelihood (n,) of their rows."""
+        points = as_points(x, self.prior.names)
+        log_prior = np.atleast_1d(self.prior.logpdf(points))
+        log_likelihood = np.full(len(log_prior), -np.inf)
+        inside = log_prior > -np.inf
+        if inside.any():
+            log_likelihood[inside] = self.likelihood.log_likelihood(np.atleast_2d(points)[inside])
+        return points, log_prior, log_likelihood

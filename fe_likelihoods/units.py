@@ -1,0 +1,148 @@
+"""Units: one table from the name of a unit to its SI factor and its dimension.
+
+Inside the library every number is SI. Conversion happens at two places only: where files are read (`to_si`) and where
+labels and plots are made (`from_si`). A unit that is not in the table, or that measures something else than what was
+asked for, is refused: a wrong unit is a wrong answer that looks like a right one.
+
+The factors are exact by definition: 1 in = 25.4 mm, 1 lb = 0.45359237 kg, standard gravity 9.80665 m/s².
+"""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["DIMENSIONS", "G0", "UNITS", "Unit", "find_unit", "from_si", "to_si"]
+
+G0 = 9.80665
+"""Standard acceleration of gravity [m/s²] (3rd General Conference on Weights and Measures, 1901)."""
+
+INCH = 0.0254
+FOOT = 12 * INCH
+POUND_FORCE = 0.45359237 * G0
+
+
+class Unit(NamedTuple):
+    """A unit of measurement: its canonical `name`, the `factor` that brings it to SI, and its `dimension`."""
+
+    name: str
+    factor: float
+    dimension: str
+
+
+_FACTORS = {
+    "acceleration": {
+        "m/s2": 1.0,
+        "cm/s2": 1e-2,
+        "mm/s2": 1e-3,
+        "in/s2": INCH,
+        "ft/s2": FOOT,
+        "gal": 1e-2,
+        "g": G0,
+    },
+    "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "in/s": INCH, "ft/s": FOOT},
+    "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": INCH, "ft": FOOT},
+    "force": {"N": 1.0, "kN": 1e3, "MN": 1e6, "lbf": POUND_FORCE, "kip": 1e3 * POUND_FORCE},
+    "stress": {
+        "Pa": 1.0,
+        "kPa": 1e3,
+        "MPa": 1e6,
+        "GPa": 1e9,
+        "psi": POUND_FORCE / INCH**2,
+        "ksi": 1e3 * POUND_FORCE / INCH**2,
+    },
+    "strain": {"1": 1.0, "%": 1e-2},
+    "rotation": {"rad": 1.0, "deg": np.pi / 180},
+    "time": {"s": 1.0, "ms": 1e-3},
+}
+
+UNITS: dict[str, Unit] = {
+    name: Unit(name, factor, dimension) for dimension, table in _FACTORS.items() for name, factor in table.items()
+}
+"""Every unit that is known, by its canonical name."""
+
+DIMENSIONS: dict[str, str] = {
+    dimension: next(name for name, factor in table.items() if factor == 1.0) for dimension, table in _FACTORS.items()
+}
+"""The SI unit of each dimension."""
+
+_BY_LOWER_CASE = {name.lower(): unit for name, unit in UNITS.items()}
+
+
+def find_unit(name: str, dimension: str | None = None) -> Unit:
+    """Unit of the table with this name.
+
+    The spellings of the usual file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2``, ``cm_s2`` are all
+    ``cm/s2``. Letter case is ignored (file headers are often in capitals), except for the prefix of ``MN`` and
+    ``MPa``, because ``mN`` means something a thousand million times smaller.
+
+    Parameters
+    ----------
+    name : str
+        Name of the unit.
+    dimension : str, optional
+        What the unit must measure, one of `DIMENSIONS`.
+
+    Raises
+    ------
+    ValueError
+        If the unit is not in the table or measures another dimension; the message lists what is known.
+    """
+    if dimension is not None and dimension not in DIMENSIONS:
+        raise ValueError(f"unknown dimension {dimension!r}; known dimensions: {', '.join(DIMENSIONS)}")
+    unit = _lookup(name) if isinstance(name, str) else None
+    if unit is None:
+        raise ValueError(f"unknown unit {name!r}; known units: {_known(dimension)}")
+    if dimension is not None and unit.dimension != dimension:
+        raise ValueError(
+            f"expected a unit of {dimension}, got {name!r}, a unit of {unit.dimension}; {_known(dimension)}"
+        )
+    return unit
+
+
+def to_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArray[np.float64]:
+    """Values in SI from values in `unit`.
+
+    Parameters
+    ----------
+    values : array_like
+        Numbers in `unit`.
+    unit : str
+        A unit of `UNITS` (see `find_unit` for the spellings).
+    dimension : str, optional
+        What the unit must measure, one of `DIMENSIONS`.
+
+    Returns
+    -------
+    ndarray
+        The numbers in SI, same shape, float64 (a scalar for a scalar).
+
+    Raises
+    ------
+    ValueError
+        If the unit is unknown or of another dimension.
+    """
+    return np.asarray(values, dtype=np.float64) * find_unit(unit, dimension).factor
+
+
+def from_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArray[np.float64]:
+    """Values in `unit` from values in SI: the inverse of `to_si`, with the same arguments and errors."""
+    return np.asarray(values, dtype=np.float64) / find_unit(unit, dimension).factor
+
+
+def _lookup(name: str) -> Unit | None:
+    text = re.sub(r"\s+", "", name)
+    if text in UNITS:
+        return UNITS[text]
+    text = re.sub("sec", "s", text, flags=re.IGNORECASE).replace("**", "").replace("^", "").replace("²", "2")
+    text = re.sub(r"/s/s$", "/s2", text.replace("_", "/"), flags=re.IGNORECASE)
+    unit = _BY_LOWER_CASE.get(text.lower())
+    if unit is not None and unit.name.startswith("M") and not text.startswith("M"):
+        return None
+    return unit
+
+
+def _known(dimension: str | None) -> str:
+    dimensions = DIMENSIONS if dimension is None else (dimension,)
+    return "; ".join(f"{each}: {', '.join(_FACTORS[each])}" for each in dimensions)

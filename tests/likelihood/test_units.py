@@ -1,0 +1,72 @@
+"""Units: factors against their definitions, spellings of file headers, and what is refused."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.units import DIMENSIONS, G0, UNITS, find_unit, from_si, to_si
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "expected"),
+    [
+        (1, "g", 9.80665),
+        (980.665, "gal", 9.80665),
+        (980.665, "cm/s2", 9.80665),
+        (1, "in/s2", 0.0254),
+        (1, "ft/s2", 0.3048),
+        (12, "in", 0.3048),
+        (1, "kip", 4448.2216152605),  # NIST SP 811
+        (1, "lbf", 4.4482216152605),
+        (1, "ksi", 6.894757293168361e6),
+        (1, "psi", 6894.757293168361),
+        (1, "MN", 1e6),
+        (1, "GPa", 1e9),
+        (20, "ms", 0.02),
+        (180, "deg", np.pi),
+    ],
+)
+def test_factors_agree_with_their_definitions(value, unit, expected):
+    assert to_si(value, unit) == pytest.approx(expected, rel=1e-14)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_from_si_is_the_inverse_of_to_si(unit, rng):
+    values = rng.normal(size=(3, 4))
+    there_and_back = from_si(to_si(values, unit), unit, UNITS[unit].dimension)
+    np.testing.assert_allclose(there_and_back, values, rtol=4e-16)
+
+
+def test_every_dimension_has_an_si_unit_of_factor_one():
+    assert all(UNITS[unit].factor == 1 and UNITS[unit].dimension == name for name, unit in DIMENSIONS.items())
+
+
+@pytest.mark.parametrize(
+    "spelling", ["cm/s2", "CM/SEC/SEC", "cm/sec2", "cm/s/s", "cm/s^2", "cm/s**2", "cm_s2", "cm/s²"]
+)
+def test_spellings_of_file_headers(spelling):
+    assert find_unit(spelling, "acceleration").name == "cm/s2"
+
+
+@pytest.mark.parametrize("spelling", ["mN", "mPa", "mpa", "mn"])
+def test_milli_is_never_read_as_mega(spelling):
+    with pytest.raises(ValueError, match="unknown unit"):
+        find_unit(spelling)
+    assert find_unit("MPA").factor == 1e6
+
+
+def test_unknown_unit_lists_what_is_known():
+    with pytest.raises(ValueError, match="'furlong'.*in/s2.*kip.*ksi"):
+        to_si(1.0, "furlong")
+    with pytest.raises(ValueError, match="unknown unit None"):
+        to_si(1.0, None)
+
+
+def test_wrong_dimension_is_refused():
+    with pytest.raises(ValueError, match="expected a unit of acceleration, got 'in', a unit of displacement.*gal"):
+        to_si(1.0, "in", "acceleration")
+    with pytest.raises(ValueError, match="unknown dimension 'length'; known dimensions: acceleration"):
+        from_si(1.0, "in", "length")
+
+
+def test_gravity_is_the_standard_one():
+    assert G0 == 9.80665
