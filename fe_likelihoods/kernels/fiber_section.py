@@ -17,6 +17,9 @@ The memory of all sections of a column is held in three arrays:
 * ``virgin`` (n_sections,): 1 while no bar of the section has been committed beyond yield, else 0; the memory of the
   bars of a virgin section is not kept up.
 
+Fibers may be filled up with empty ones (no area, on the axis) to whole SIMD registers: a remainder of a few fibers
+would cost as much as all others.
+
 References: specs/bridge_column.md, section 4.
 """
 
@@ -58,6 +61,45 @@ def reset(core_count, concrete, concrete_memory, steel_memory, virgin):
             concrete_memory[j, 4, i] = ec
 
 
+@kernel(fastmath=SUM_REORDERING)
+def _concrete_beyond(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
+    """Sums over the concrete fibers beyond their memory only, on the envelope."""
+    n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(y.shape[0]):
+        yi = y[i]
+        eps = e0 - yi * kappa
+        if eps < concrete_memory[j, 0, i] or eps > concrete_memory[j, 1, i]:
+            stress, tangent = envelope(eps, concrete[0 if i < core_count else 1])
+            force = stress * area[i]
+            ea = tangent * area[i]
+            n_force += force
+            moment -= force * yi
+            k_axial += ea
+            k_coupling -= ea * yi
+            k_bending += ea * yi * yi
+    return n_force, moment, k_axial, k_coupling, k_bending
+
+
+@kernel
+def _bars_one_by_one(e0, kappa, j, bar_y, bar_area, steel, steel_memory, virgin, trial):
+    """Sums over the bars where some are near or beyond yield."""
+    n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(steel_memory.shape[1]):
+        yi = bar_y[i]
+        if virgin[j] == 1.0:
+            stress, tangent = monotonic_stress_tangent(e0 - yi * kappa, steel)
+        else:
+            stress, tangent = stress_tangent(e0 - yi * kappa, steel_memory[j, i], steel, trial)
+        force = stress * bar_area[i]
+        ea = tangent * bar_area[i]
+        n_force += force
+        moment -= force * yi
+        k_axial += ea
+        k_coupling -= ea * yi
+        k_bending += ea * yi * yi
+    return n_force, moment, k_axial, k_coupling, k_bending
+
+
 @kernel(inline=True, fastmath=SUM_REORDERING)
 def forces(
     e0,
@@ -78,7 +120,8 @@ def forces(
     """Axial force, moment and the three tangents (axial, coupling, bending) of section `j` at a trial strain.
 
     y, area : (n_concrete,) fibers, the first `core_count` of the core. concrete : (2, concrete04.N_CONSTANTS) core and
-    cover. bar_y, bar_area : (n_bars,). steel : (reinforcing_steel.N_CONSTANTS,). trial : scratch (reinforcing_steel.N_STATE,).
+    cover. bar_y, bar_area : (n_bars or more,), filled up with empty bars. steel : (reinforcing_steel.N_CONSTANTS,).
+    trial : scratch (reinforcing_steel.N_STATE,).
     """
     n_force = 0.0
     moment = 0.0
@@ -110,91 +153,89 @@ def forces(
         k_coupling -= ea * yi
         k_bending += ea * yi * yi
     if beyond > 0.0:
-        for i in range(y.shape[0]):
-            yi = y[i]
-            eps = e0 - yi * kappa
-            if eps < concrete_memory[j, 0, i] or eps > concrete_memory[j, 1, i]:
-                stress, tangent = envelope(eps, concrete[0 if i < core_count else 1])
-                n_force += stress * area[i]
-                moment -= stress * area[i] * yi
-                k_axial += tangent * area[i]
-                k_coupling -= tangent * area[i] * yi
-                k_bending += tangent * area[i] * yi * yi
+        a, b, c, d, e = _concrete_beyond(e0, kappa, j, core_count, y, area, concrete, concrete_memory)
+        n_force += a
+        moment += b
+        k_axial += c
+        k_coupling += d
+        k_bending += e
 
-    bars_n = 0.0
-    bars_m = 0.0
-    bars_axial = 0.0
-    bars_coupling = 0.0
-    bars_bending = 0.0
-    outside = 1
     if virgin[j] == 1.0:
-        outside = 0
-        limit = steel[VIRGIN_LIMIT]
-        s_e0, s_ep, s_f0 = steel[STEEL_E0], steel[STEEL_EP], steel[STEEL_F0]
-        for i in range(bar_y.shape[0]):
-            yi = bar_y[i]
-            eps = e0 - yi * kappa
-            outside += 1 if abs(eps) > limit else 0
-            stress, tangent = virgin_stress_tangent(eps, s_e0, s_ep, s_f0)
-            ea = tangent * bar_area[i]
-            force = stress * bar_area[i]
-            bars_n += force
-            bars_m -= force * yi
-            bars_axial += ea
-            bars_coupling -= ea * yi
-            bars_bending += ea * yi * yi
-    if outside > 0:
         bars_n = 0.0
         bars_m = 0.0
         bars_axial = 0.0
         bars_coupling = 0.0
         bars_bending = 0.0
+        limit = steel[VIRGIN_LIMIT]
+        s_e0, s_ep, s_f0 = steel[STEEL_E0], steel[STEEL_EP], steel[STEEL_F0]
+        beyond = 0.0
         for i in range(bar_y.shape[0]):
             yi = bar_y[i]
-            if virgin[j] == 1.0:
-                stress, tangent = monotonic_stress_tangent(e0 - yi * kappa, steel)
-            else:
-                stress, tangent = stress_tangent(e0 - yi * kappa, steel_memory[j, i], steel, trial)
-            bars_n += stress * bar_area[i]
-            bars_m -= stress * bar_area[i] * yi
-            bars_axial += tangent * bar_area[i]
-            bars_coupling -= tangent * bar_area[i] * yi
-            bars_bending += tangent * bar_area[i] * yi * yi
-    return (
-        n_force + bars_n,
-        moment + bars_m,
-        k_axial + bars_axial,
-        k_coupling + bars_coupling,
-        k_bending + bars_bending,
-    )
+            bar = bar_area[i]
+            eps = e0 - yi * kappa
+            beyond += 1.0 if abs(eps) > limit else 0.0
+            stress, tangent = virgin_stress_tangent(eps, s_e0, s_ep, s_f0)
+            ea = tangent * bar
+            force = stress * bar
+            bars_n += force
+            bars_m -= force * yi
+            bars_axial += ea
+            bars_coupling -= ea * yi
+            bars_bending += ea * yi * yi
+        if beyond == 0.0:
+            return (
+                n_force + bars_n,
+                moment + bars_m,
+                k_axial + bars_axial,
+                k_coupling + bars_coupling,
+                k_bending + bars_bending,
+            )
+    a, b, c, d, e = _bars_one_by_one(e0, kappa, j, bar_y, bar_area, steel, steel_memory, virgin, trial)
+    return n_force + a, moment + b, k_axial + c, k_coupling + d, k_bending + e
 
 
-@kernel(inline=True)
-def commit(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel, steel_memory, virgin):
-    """Advance the memory of section `j` to the strains of (e0, kappa), in place."""
-    outside = 0
+@kernel
+def _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory):
+    """Advance the memory of the concrete fibers beyond it."""
     for i in range(y.shape[0]):
         eps = e0 - y[i] * kappa
-        outside += 1 if (eps < concrete_memory[j, 0, i]) | (eps > concrete_memory[j, 1, i]) else 0
-    if outside > 0:
-        for i in range(y.shape[0]):
-            eps = e0 - y[i] * kappa
-            if eps < concrete_memory[j, 0, i] or eps > concrete_memory[j, 1, i]:
-                eps_min, eps_max = concrete04.commit(eps, concrete_memory[j, 0, i], concrete_memory[j, 1, i])
-                eps_end, slope, tension_slope = unloading(eps_min, eps_max, concrete[0 if i < core_count else 1])
-                concrete_memory[j, 0, i] = eps_min
-                concrete_memory[j, 1, i] = eps_max
-                concrete_memory[j, 2, i] = eps_end
-                concrete_memory[j, 3, i] = slope
-                concrete_memory[j, 4, i] = tension_slope
+        if eps < concrete_memory[j, 0, i] or eps > concrete_memory[j, 1, i]:
+            eps_min, eps_max = concrete04.commit(eps, concrete_memory[j, 0, i], concrete_memory[j, 1, i])
+            eps_end, slope, tension_slope = unloading(eps_min, eps_max, concrete[0 if i < core_count else 1])
+            concrete_memory[j, 0, i] = eps_min
+            concrete_memory[j, 1, i] = eps_max
+            concrete_memory[j, 2, i] = eps_end
+            concrete_memory[j, 3, i] = slope
+            concrete_memory[j, 4, i] = tension_slope
 
+
+@kernel
+def _commit_bars(e0, kappa, j, bar_y, steel, steel_memory, virgin):
+    """Advance the memory of the bars of a section that is committed beyond yield, or has been before."""
     if virgin[j] == 1.0:
-        outside = 0
-        for i in range(bar_y.shape[0]):
-            outside += 1 if abs(e0 - bar_y[i] * kappa) >= steel[YIELD_STRAIN] else 0
-        if outside == 0:
-            return
         virgin[j] = 0.0
         steel_memory[j] = 0.0
-    for i in range(bar_y.shape[0]):
+    for i in range(steel_memory.shape[1]):
         update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel)
+
+
+@kernel(inline=True, fastmath=SUM_REORDERING)
+def commit(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel, steel_memory, virgin):
+    """Advance the memory of section `j` to the strains of (e0, kappa), in place."""
+    beyond = 0.0
+    for i in range(y.shape[0]):
+        eps = e0 - y[i] * kappa
+        eps_min = concrete_memory[j, 0, i]
+        eps_max = concrete_memory[j, 1, i]
+        is_beyond = 1.0 if eps < eps_min else 0.0
+        beyond += 1.0 if eps > eps_max else is_beyond
+    if beyond > 0.0:
+        _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory)
+    beyond = 1.0
+    if virgin[j] == 1.0:
+        beyond = 0.0
+        limit = steel[YIELD_STRAIN]
+        for i in range(bar_y.shape[0]):
+            beyond += 1.0 if abs(e0 - bar_y[i] * kappa) >= limit else 0.0
+    if beyond > 0.0:
+        _commit_bars(e0, kappa, j, bar_y, steel, steel_memory, virgin)

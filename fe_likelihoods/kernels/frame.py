@@ -17,6 +17,9 @@ from .jit import kernel
 
 __all__ = ["Column", "allocate", "initialise_column", "assemble", "commit_sections"]
 
+N_VECTORS = 16
+N_MATRICES = 5
+
 
 class Column(NamedTuple):
     """Constants and memory of one column, in any consistent units; the arrays are shared with the kernels."""
@@ -27,9 +30,9 @@ class Column(NamedTuple):
     points: np.ndarray  # (n_points,) Gauss-Lobatto points on [0, 1]
     weights: np.ndarray  # (n_points,)
     core_count: int  # the first fibers are of the core
-    y: np.ndarray  # (n_concrete,)
+    y: np.ndarray  # (n_concrete,), filled up with empty fibers
     area: np.ndarray  # (n_concrete,)
-    bar_y: np.ndarray  # (n_bars,)
+    bar_y: np.ndarray  # (n_bars,), filled up with empty bars
     bar_area: np.ndarray  # (n_bars,)
     concrete: np.ndarray  # (2, concrete04.N_CONSTANTS): core, cover
     steel: np.ndarray  # (reinforcing_steel.N_CONSTANTS,)
@@ -40,6 +43,9 @@ class Column(NamedTuple):
     initial_flexibility: np.ndarray  # (3,)
     trial: np.ndarray  # scratch of one bar
     work: np.ndarray  # scratch of one element
+    vectors: np.ndarray  # (N_VECTORS, n_dof) scratch of the structure
+    matrices: np.ndarray  # (N_MATRICES, n_dof, n_dof)
+    element_state_before: np.ndarray  # as element_state
 
 
 def allocate(
@@ -58,7 +64,8 @@ def allocate(
 
     core, cover, bars : (n, 2) position y and area of the fibers. Other arguments as in `Column`.
     """
-    concrete = np.concatenate([core, cover])
+    concrete = _fill_up(np.concatenate([core, cover]), 16)
+    padded_bars = _fill_up(bars, 8)
     n_sections = n_elements * len(points)
     n_state = HEAD + PER_SECTION * len(points)
     return Column(
@@ -70,8 +77,8 @@ def allocate(
         core_count=len(core),
         y=np.ascontiguousarray(concrete[:, 0], dtype=float),
         area=np.ascontiguousarray(concrete[:, 1], dtype=float),
-        bar_y=np.ascontiguousarray(bars[:, 0], dtype=float),
-        bar_area=np.ascontiguousarray(bars[:, 1], dtype=float),
+        bar_y=np.ascontiguousarray(padded_bars[:, 0], dtype=float),
+        bar_area=np.ascontiguousarray(padded_bars[:, 1], dtype=float),
         concrete=np.zeros((2, concrete04.N_CONSTANTS)),
         steel=np.zeros(reinforcing_steel.N_CONSTANTS),
         concrete_memory=np.zeros((n_sections, 5, len(concrete))),
@@ -81,7 +88,15 @@ def allocate(
         initial_flexibility=np.zeros(3),
         trial=np.zeros(reinforcing_steel.N_STATE),
         work=np.zeros((2, n_state)),
+        vectors=np.zeros((N_VECTORS, 3 * n_elements)),
+        matrices=np.zeros((N_MATRICES, 3 * n_elements, 3 * n_elements)),
+        element_state_before=np.zeros((n_elements, n_state)),
     )
+
+
+def _fill_up(fibers: np.ndarray, multiple: int) -> np.ndarray:
+    """`fibers` (n, 2) with empty ones appended, to a multiple that fills SIMD registers."""
+    return np.concatenate([fibers, np.zeros((-len(fibers) % multiple, 2))])
 
 
 @kernel

@@ -61,7 +61,10 @@ _CACHE_FOLDER = _cache_folder()
 def kernel(
     function: Callable | None = None, *, inline: bool = False, fastmath: set[str] | bool = False, cache: bool = True
 ) -> Callable:
-    """Compile a kernel: no Python objects, no GIL, IEEE division, cached on disk.
+    """Compile a kernel: no Python objects, no GIL, IEEE division, no allocation, cached on disk.
+
+    Kernels are compiled without numba's reference counting: every array comes from the caller, and an allocation is a
+    compile error. Counting the references of the arrays of a section cost more than its fibers (110 of 180 ns).
 
     Parameters
     ----------
@@ -81,7 +84,12 @@ def kernel(
     numba.config.CACHE_DIR = _CACHE_FOLDER  # read by numba at decoration; other users' setting is put back
     try:
         return numba.njit(
-            nogil=True, error_model="numpy", cache=cache and not inline, forceinline=inline, fastmath=fastmath
+            nogil=True,
+            error_model="numpy",
+            cache=cache and not inline,
+            forceinline=inline,
+            fastmath=fastmath,
+            _nrt=False,
         )(function)
     finally:
         numba.config.CACHE_DIR = before

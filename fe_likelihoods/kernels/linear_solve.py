@@ -8,9 +8,24 @@ from __future__ import annotations
 
 from .jit import kernel
 
-__all__ = ["solve_banded"]
+__all__ = ["copy_vector", "copy_matrix", "solve_banded"]
 
 HALF_BANDWIDTH = 5
+
+
+@kernel(inline=True)
+def copy_vector(a, b):
+    """b <- a, element by element."""
+    for i in range(a.shape[0]):
+        b[i] = a[i]
+
+
+@kernel(inline=True)
+def copy_matrix(a, b):
+    """b <- a, element by element."""
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            b[i, k] = a[i, k]
 
 
 @kernel

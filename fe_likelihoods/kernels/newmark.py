@@ -22,11 +22,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from .frame import assemble, commit_sections
 from .jit import kernel
-from .linear_solve import solve_banded
+from .linear_solve import copy_matrix, solve_banded
 from .static import LOOSER, apply_gravity
 
 __all__ = ["HISTORY_ROWS", "newmark"]
@@ -53,32 +51,24 @@ def newmark(
     Returns (status, retries, iterations): status 0 when all went well, -1 when gravity failed, k > 0 when step k failed.
     """
     n = gravity.shape[0]
-    u = np.zeros(n)
-    v = np.zeros(n)
-    a = np.zeros(n)
-    force = np.zeros(n)
-    stiffness = np.zeros((n, n))
+    rows = column.vectors
+    u, v, a, force, damping, du = rows[4], rows[5], rows[6], rows[7], rows[8], rows[9]
+    u_old, v_old, a_old, force_old, damping_old = rows[10], rows[11], rows[12], rows[13], rows[14]
+    # matrices[1] and vectors[:4] are scratch of the static steps of gravity
+    matrix, stiffness, committed, base = column.matrices[0], column.matrices[2], column.matrices[3], column.matrices[4]
     retries = apply_gravity(column, u, gravity, force, stiffness, tolerance, max_iterations, halvings)
     if retries < 0:
         return -1, 0, 0
     top = n - 3
-    v[top] = initial_velocity
-    committed = stiffness.copy()  # Kc
-    damping = np.zeros(n)  # C V at the last committed instant
     for i in range(n):
+        v[i] = 0.0
+        a[i] = 0.0
+    v[top] = initial_velocity
+    copy_matrix(stiffness, committed)  # Kc
+    for i in range(n):  # C V at the last committed instant
         damping[i] = a0 * mass[i] * v[i]
         for k in range(n):
             damping[i] += a1 * committed[i, k] * v[k]
-    base = np.empty((n, n))
-    matrix = np.empty((n, n))
-    du = np.empty(n)
-    u_old = np.empty(n)
-    v_old = np.empty(n)
-    a_old = np.empty(n)
-    force_old = np.empty(n)
-    damping_old = np.empty(n)
-    n_elements, n_state = column.element_state.shape
-    state_old = np.empty((n_elements, n_state))
     smallest = 0.5**halvings
     total_iterations = 0
     damped = 0.0
@@ -112,9 +102,7 @@ def newmark(
                 for k in range(n):
                     base[i, k] = 2.0 / h * a1 * committed[i, k]
                 base[i, i] += (2.0 / h * a0 + 4.0 / (h * h)) * mass[i]
-            for e in range(n_elements):
-                for k in range(n_state):
-                    state_old[e, k] = column.element_state[e, k]
+            copy_matrix(column.element_state, column.element_state_before)
 
             converged = False
             for _ in range(max_iterations):
@@ -149,11 +137,8 @@ def newmark(
                     v[i] = v_old[i]
                     a[i] = a_old[i]
                     force[i] = force_old[i]
-                    for k in range(n):
-                        stiffness[i, k] = committed[i, k]
-                for e in range(n_elements):
-                    for k in range(n_state):
-                        column.element_state[e, k] = state_old[e, k]
+                copy_matrix(committed, stiffness)
+                copy_matrix(column.element_state_before, column.element_state)
                 if not loose:
                     loose = True
                     continue
@@ -175,9 +160,7 @@ def newmark(
                 if i % 3 == 0:
                     supplied -= 0.5 * mass[i] * (at_start + at_end) * moved
             commit_sections(column)
-            for i in range(n):
-                for k in range(n):
-                    committed[i, k] = stiffness[i, k]
+            copy_matrix(stiffness, committed)
             done += part
             loose = False
         if step % every == 0:

@@ -255,16 +255,15 @@ def _mirror(state):
 
 
 @kernel
-def _slot(state, branch):
-    """The stored curve of a branch > 2."""
-    k = CURVES + 9 * ((branch + 1) // 2 - 2)
-    return state[k : k + 9]
+def _slot(branch):
+    """Where the memory keeps the curve of a branch > 2."""
+    return CURVES + 9 * ((branch + 1) // 2 - 2)
 
 
 @kernel
 def _returning_curve(xc, state, c, curve):
     """Auxiliary curve of branches 5 and 7: where a path that reversed at `xc` on branch 5 would rejoin branch 3."""
-    two, three = _slot(state, 3), _slot(state, 5)
+    two, three = state[_slot(3) :], state[_slot(5) :]
     xa2, xb2, ea2 = two[XA], two[XB], two[EA]
     xa3, xb3 = three[XA], three[XB]
     start = xb3 * (xc - xa3) / (xb3 - xa3) + xa2 * (xb3 - xc) / (xb3 - xa3)
@@ -292,7 +291,7 @@ def _step(x, tension, state, c):
         state[XMAX] = xc - state[OP]
         state[XXMAX] = max(state[XXMAX], xc)
         er = c[E0] * (0.82 + 1.0 / (5.55 + 1000.0 * max(state[XXMAX], -state[XXMIN])))
-        curve = _slot(state, 3)
+        curve = state[_slot(3) :]
         if e >= c[SHP]:
             m = min(state[XMIN], -c[SHP] - TIE)
             ea = state[OP] + c[SHP] - c[FSH] / c[E0]
@@ -318,7 +317,7 @@ def _step(x, tension, state, c):
         state[BRANCH] = 3
         return False, 0.0, 0.0
 
-    curve = _slot(state, b)
+    curve = state[_slot(b) :]
     up = b % 4 == 1
     reached = x >= curve[XB] - TIE if up else x <= curve[XB] + TIE
     reversal = x < xc - TIE if up else x > xc + TIE
@@ -331,7 +330,7 @@ def _step(x, tension, state, c):
         elif b == 5:
             state[BRANCH] = 1
         elif b == 7:
-            _returning_curve(curve[XA], state, c, _slot(state, 3))
+            _returning_curve(curve[XA], state, c, state[_slot(3) :])
             state[BRANCH] = 3
         else:
             state[BRANCH] = b - 4
@@ -345,31 +344,31 @@ def _step(x, tension, state, c):
         x_target = state[OP] + state[XMAX] + d
         new = 5
     elif b == 5:
-        aside = _slot(state, 7)
+        aside = state[_slot(7) :]
         _returning_curve(xc, state, c, aside)
         x_target = curve[XA]
         s_target, e_target = _on_curve(x_target, aside)
         new = 7
     elif b == 7:
         x_target = curve[XA]
-        s_target, e_target = _on_curve(x_target, _slot(state, 5))
+        s_target, e_target = _on_curve(x_target, state[_slot(5) :])
         state[RE] = xc
         new = 9
     elif up:
         if b + 4 <= 20:
             state[RE] = curve[XA]
         x_target = state[RE]
-        s_target, e_target = _on_curve(x_target, _slot(state, b - 2))
+        s_target, e_target = _on_curve(x_target, state[_slot(b - 2) :])
         new = b + 2
     elif b + 2 <= 20:
         x_target = curve[XA]
-        s_target, e_target = _on_curve(x_target, _slot(state, b - 2))
+        s_target, e_target = _on_curve(x_target, state[_slot(b - 2) :])
         new = b + 2
     else:
-        x_target = _slot(state, b - 4)[XA]
-        s_target, e_target = _on_curve(x_target, _slot(state, b - 6))
+        x_target = state[_slot(b - 4) :][XA]
+        s_target, e_target = _on_curve(x_target, state[_slot(b - 6) :])
         new = b - 2
-    _fit(xc, sc, er, x_target, s_target, e_target, True, c, _slot(state, new))
+    _fit(xc, sc, er, x_target, s_target, e_target, True, c, state[_slot(new) :])
     state[BRANCH] = new
     return False, 0.0, 0.0
 
@@ -418,14 +417,24 @@ def stress_tangent(eps, state, c, trial):
     x = math.log(1.0 + eps) if eps > -0.95 else math.nan
     b = int(state[BRANCH])
     if b > 2:
-        curve = state[CURVES + 9 * ((b + 1) // 2 - 2) :]
+        curve = state[_slot(b) :]
         up = b % 4 <= 1
         if (state[XC] <= x < curve[XB] - TIE) if up else (curve[XB] + TIE < x <= state[XC]):
             s, modulus = _on_curve(x, curve)
             return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
-    elif (b == 1 and x >= state[XC]) or (b == 2 and x <= state[XC]):
-        s, modulus = backbone(x - (state[OP] if b == 1 else state[ON]), c)
-        return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
+    elif b > 0:
+        # On the backbone: going on, or where a reversal leaves no trace, or beyond zero on the other one.
+        sign = 1.0 if b == 1 else -1.0
+        origin, other = (state[OP], state[ON]) if b == 1 else (state[ON], state[OP])
+        onwards = sign * (x - state[XC]) >= 0.0
+        e = sign * (x - origin)
+        if onwards or e < c[YP]:
+            if e <= 0.0 and not onwards:
+                origin = other
+            if origin == 0.0 and abs(eps) < c[VIRGIN_LIMIT]:
+                return virgin_stress_tangent(eps, c[E0], c[EP], c[F0])
+            s, modulus = backbone(x - origin, c)
+            return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
     for i in range(N_STATE):
         trial[i] = state[i]
     return update(eps, trial, c)

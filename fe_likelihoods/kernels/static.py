@@ -11,12 +11,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from .frame import assemble, commit_sections, initialise_column
 from .beam_column import HEAD
+from .frame import assemble, commit_sections, initialise_column
 from .jit import kernel
-from .linear_solve import solve_banded
+from .linear_solve import copy_matrix, copy_vector, solve_banded
 
 __all__ = ["GRAVITY_STEPS", "LOOSER", "equilibrate", "apply_gravity", "impose_displacement"]
 
@@ -32,12 +30,12 @@ def equilibrate(column, u, load, imposed, increment, force, stiffness, tolerance
     `stiffness` belong to `u`; on success they belong to the new `u` and the fibers are committed.
     """
     n = u.shape[0]
-    u_before = u.copy()
-    state_before = column.element_state.copy()
-    force_before = force.copy()
-    stiffness_before = stiffness.copy()
-    matrix = np.empty((n, n))
-    du = np.empty(n)
+    du, u_before, force_before = column.vectors[0], column.vectors[1], column.vectors[2]
+    matrix, stiffness_before = column.matrices[0], column.matrices[1]
+    copy_vector(u, u_before)
+    copy_vector(force, force_before)
+    copy_matrix(stiffness, stiffness_before)
+    copy_matrix(column.element_state, column.element_state_before)
     step = increment
     for _ in range(max_iterations):
         for i in range(n):
@@ -62,30 +60,41 @@ def equilibrate(column, u, load, imposed, increment, force, stiffness, tolerance
         if math.sqrt(norm) < tolerance:
             commit_sections(column)
             return True
-    u[:] = u_before
-    column.element_state[:] = state_before
-    force[:] = force_before
-    stiffness[:] = stiffness_before
+    copy_vector(u_before, u)
+    copy_vector(force_before, force)
+    copy_matrix(stiffness_before, stiffness)
+    copy_matrix(column.element_state_before, column.element_state)
     return False
 
 
 @kernel
-def _advance_to(column, u, load, load_step, imposed, increment, force, stiffness, tolerance, max_iterations, halvings):
-    """One step of load and of imposed displacement, halved where it does not converge; number of retries, -1 failed."""
+def _advance_to(
+    column, u, load, total, share, imposed, increment, force, stiffness, tolerance, max_iterations, halvings
+):
+    """Add `share` of the load `total` and an imposed displacement, halved where it does not converge.
+
+    Returns the number of retries, or -1 when it failed.
+    """
     done, part, retries = 0.0, 1.0, 0
-    start = load.copy()
     smallest = 0.5**halvings
     while done < 1.0:
-        load[:] = start + (done + part) * load_step
+        for i in range(u.shape[0]):
+            load[i] += part * share * total[i]
         move = part * increment
-        if not equilibrate(column, u, load, imposed, move, force, stiffness, tolerance, max_iterations):
+        converged = equilibrate(column, u, load, imposed, move, force, stiffness, tolerance, max_iterations)
+        if not converged:
             retries += 1
-            if not equilibrate(column, u, load, imposed, move, force, stiffness, LOOSER * tolerance, max_iterations):
-                part *= 0.5
-                if part < smallest:
-                    return -1
-                continue
-        done += part
+            converged = equilibrate(
+                column, u, load, imposed, move, force, stiffness, LOOSER * tolerance, max_iterations
+            )
+        if converged:
+            done += part
+            continue
+        for i in range(u.shape[0]):
+            load[i] -= part * share * total[i]
+        part *= 0.5
+        if part < smallest:
+            return -1
     return retries
 
 
@@ -93,13 +102,26 @@ def _advance_to(column, u, load, load_step, imposed, increment, force, stiffness
 def apply_gravity(column, u, gravity, force, stiffness, tolerance, max_iterations, halvings):
     """Virgin column under `gravity` (n,) in ten equal steps; number of retries, or -1 when it failed."""
     initialise_column(column)
-    u[:] = 0.0
+    load = column.vectors[3]
+    for i in range(u.shape[0]):
+        u[i] = 0.0
+        load[i] = 0.0
     assemble(u, column, force, stiffness)
-    load = np.zeros_like(gravity)
     total = 0
     for _ in range(GRAVITY_STEPS):
         retries = _advance_to(
-            column, u, load, gravity / GRAVITY_STEPS, -1, 0.0, force, stiffness, tolerance, max_iterations, halvings
+            column,
+            u,
+            load,
+            gravity,
+            1.0 / GRAVITY_STEPS,
+            -1,
+            0.0,
+            force,
+            stiffness,
+            tolerance,
+            max_iterations,
+            halvings,
         )
         if retries < 0:
             return -1
@@ -114,21 +136,28 @@ def impose_displacement(column, gravity, targets, tolerance, max_iterations, hal
     history : (8, n_steps) out: ux, uy, theta of the top, lateral force, and e0, kappa, N, M of the base section.
     Returns (status, retries): status 0 when all went well, -1 when gravity failed, k > 0 when step k failed.
     """
-    n = gravity.shape[0]
-    u = np.zeros(n)
-    force = np.zeros(n)
-    stiffness = np.zeros((n, n))
+    u, force, load = column.vectors[4], column.vectors[5], column.vectors[3]
+    stiffness = column.matrices[2]
     retries = apply_gravity(column, u, gravity, force, stiffness, tolerance, max_iterations, halvings)
     if retries < 0:
         return -1, 0
-    top = n - 3
-    load = gravity.copy()
-    none = np.zeros(n)
+    top = gravity.shape[0] - 3
     for step in range(targets.shape[0]):
         increment = targets[step] - u[top]
         if increment != 0.0:
             more = _advance_to(
-                column, u, load, none, top, increment, force, stiffness, tolerance, max_iterations, halvings
+                column,
+                u,
+                load,
+                gravity,
+                0.0,
+                top,
+                increment,
+                force,
+                stiffness,
+                tolerance,
+                max_iterations,
+                halvings,
             )
             if more < 0:
                 return step + 1, retries

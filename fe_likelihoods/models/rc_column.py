@@ -588,7 +588,9 @@ def _check(m: RCColumn) -> None:
         refuse("fy/es < hardening_strain < ultimate_strain and fy < fu", m.steel, "check the units of the steel")
     unknown = [p for p in m.parameters if p not in PARAMETERS]
     if unknown or len(set(m.parameters)) != len(m.parameters) or not m.parameters:
-        refuse(f"parameters out of {tuple(PARAMETERS)}, each once", m.parameters, "see RCColumn.nominal for their values")
+        refuse(
+            f"parameters out of {tuple(PARAMETERS)}, each once", m.parameters, "see RCColumn.nominal for their values"
+        )
     zero = [p for p in m.parameters if m.nominal[p] == 0.0]
     if zero:
         refuse("non-zero nominal values to take multiples of", zero, "give them, or leave them out of parameters")

@@ -1,0 +1,30 @@
+"""Settings of published runs, by name: ``SMCSampler(1000, ndim, log_prob_fn, **RAMANCHA_2022_LITERAL)``.
+
+Ramancha, Astroza, Conte, Restrepo & Todd (2022) update a bridge column with 1000 particles, multinomial resampling and
+10 Metropolis steps a stage, and choose beta so that "ESS_j = 0.95 ESS_{j-1}" (their Table 1). Two readings:
+
+constant
+    After resampling all weights are equal, so ESS_{j-1} is the number of particles, and every stage keeps 95 % of it.
+literal
+    The target itself shrinks by 5 % a stage, 950, 902, 857, ..., with a floor of 50.
+
+The scale of their random walk is not given; 2.38 / sqrt(ndim) is taken.
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from .moves import RandomWalkMove
+
+__all__ = ["RAMANCHA_2022_CONSTANT", "RAMANCHA_2022_LITERAL"]
+
+_COMMON = {
+    "moves": RandomWalkMove(),  # a sampler copies its moves, so runs do not share it
+    "ess_ratio": 0.95,
+    "resampling": "multinomial",
+    "min_moves": 10,
+    "max_moves": 10,
+}
+RAMANCHA_2022_CONSTANT: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "constant"})
+RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "declining", "ess_floor": 50.0})

@@ -1,0 +1,57 @@
+"""How a ladder is climbed: the settings shared by the tempered samplers, checked when they are made."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from .resampling import RESAMPLING
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the ladder is climbed.
+
+    Attributes
+    ----------
+    ess_ratio : float — the effective sample size wanted of each stage, as a share: of the number of walkers
+        (`ess_rule` "constant") or of the last stage's target ("declining"), 0 < ess_ratio < 1.
+    ess_rule : "constant" or "declining".
+    ess_floor : float — the declining target stops there.
+    resampling : name of a scheme in `samplers.resampling`, or a function of (weights, random) that returns indices.
+    min_moves, max_moves : int — sweeps of the ensemble a stage; equal for a fixed number.
+    max_correlation : float — between the two, moving stops once the correlation of every parameter and of the
+        log-likelihood with the resampled start is below this, or falls no further.
+    """
+
+    ess_ratio: float = 0.5
+    ess_rule: str = "constant"
+    ess_floor: float = 0.0
+    resampling: str | Callable = "systematic"
+    min_moves: int = 2
+    max_moves: int = 20
+    max_correlation: float = 0.15
+
+    def __post_init__(self):
+        if not 0.0 < self.ess_ratio < 1.0:
+            raise ValueError(f"ess_ratio must lie between 0 and 1 (both excluded); got {self.ess_ratio}")
+        if self.ess_rule not in ("constant", "declining"):
+            raise ValueError(f'ess_rule must be "constant" or "declining"; got {self.ess_rule!r}')
+        if not self.ess_floor >= 0.0:
+            raise ValueError(f"ess_floor must not be negative; got {self.ess_floor}")
+        if not callable(self.resampling) and self.resampling not in RESAMPLING:
+            raise ValueError(f"resampling must be a function or one of {sorted(RESAMPLING)}; got {self.resampling!r}")
+        if not 1 <= self.min_moves <= self.max_moves:
+            raise ValueError(f"1 <= min_moves <= max_moves is needed; got {self.min_moves} and {self.max_moves}")
+        if not 0.0 < self.max_correlation <= 1.0:
+            raise ValueError(f"max_correlation must lie in (0, 1]; got {self.max_correlation}")
+
+    @property
+    def resample(self) -> Callable:
+        """The resampling scheme itself."""
+        return self.resampling if callable(self.resampling) else RESAMPLING[self.resampling]
+
+    def target(self, last_target: float, n_walkers: int) -> float:
+        """Effective sample size wanted of a stage, from that of the stage before (n_walkers before the first)."""
+        base = n_walkers if self.ess_rule == "constant" else last_target
+        return max(self.ess_ratio * base, self.ess_floor)

@@ -1,0 +1,82 @@
+"""Sequential Monte Carlo behind emcee's interface.
+
+Del Moral, Doucet & Jasra (2006), doi:10.1111/j.1467-9868.2006.00553.x, with the adaptation usual since: the next
+exponent by the effective sample size, resampling at every stage, proposals fitted to the weighted population, and as
+many moves as it takes to forget the resampled start. The settings of papers are in `samplers.presets`.
+"""
+
+from collections.abc import Callable
+
+from .moves import AlternatingMove, RandomWalkMove, StudentTMove
+from .settings import Settings
+from .tempered import TemperedSampler
+
+__all__ = ["SMCSampler"]
+
+
+class SMCSampler(TemperedSampler):
+    """Sequential Monte Carlo sampler.
+
+    >>> sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True)
+    >>> sampler.run_mcmc(None, 10)
+    >>> sampler.get_chain(flat=True), sampler.log_evidence, sampler.log_evidence_error
+
+    Parameters
+    ----------
+    nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, independent draws from
+        a Student t fitted to the stage alternate with a random walk, and rule alone where more than half are accepted.
+    log_prior_fn, seed : as in `TemperedSampler`.
+    ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation : as in
+        `samplers.settings.Settings`.
+    """
+
+    def __init__(
+        self,
+        nwalkers,
+        ndim,
+        log_prob_fn,
+        pool=None,
+        moves=None,
+        args=None,
+        kwargs=None,
+        backend=None,
+        vectorize=False,
+        blobs_dtype=None,
+        parameter_names=None,
+        *,
+        log_prior_fn: Callable | None = None,
+        seed: int | None = None,
+        ess_ratio: float = 0.5,
+        ess_rule: str = "constant",
+        ess_floor: float = 0.0,
+        resampling: str | Callable = "systematic",
+        min_moves: int = 2,
+        max_moves: int = 20,
+        max_correlation: float = 0.15,
+    ):
+        if moves is None:
+            moves = AlternatingMove([StudentTMove(), RandomWalkMove(adapt=True)])
+        super().__init__(
+            nwalkers,
+            ndim,
+            log_prob_fn,
+            pool=pool,
+            moves=moves,
+            args=args,
+            kwargs=kwargs,
+            backend=backend,
+            vectorize=vectorize,
+            blobs_dtype=blobs_dtype,
+            parameter_names=parameter_names,
+            log_prior_fn=log_prior_fn,
+            seed=seed,
+            settings=Settings(
+                ess_ratio=ess_ratio,
+                ess_rule=ess_rule,
+                ess_floor=ess_floor,
+                resampling=resampling,
+                min_moves=min_moves,
+                max_moves=max_moves,
+                max_correlation=max_correlation,
+            ),
+        )

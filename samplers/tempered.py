@@ -1,0 +1,413 @@
+"""An emcee sampler that climbs from the prior to the posterior before it samples.
+
+`TemperedSampler` is an `emcee.EnsembleSampler` whose ``sample`` first carries a population of draws of the prior up the
+tempering ladder (see `samplers.ladder`): choose the next beta, weigh, resample, move. Then emcee's own loop goes on at
+beta = 1, so that the chain holds states of the posterior only, and everything emcee does with a chain works unchanged.
+
+Each walker carries (log_prob, log_prior, blobs) as the blobs of an emcee State, whose log_prob is the tempered density:
+any emcee move can work below beta = 1, and a change of beta costs no evaluation.
+
+emcee's private names are touched in this module only.
+"""
+
+import copy
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from emcee import EnsembleSampler, State
+from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
+from emcee.model import Model
+from emcee.pbar import get_progress_bar
+
+from .alarms import check_ladder, sound
+from .backends import read_ladder, write_stage
+from .evaluation import Records, log_probabilities
+from .ladder import (
+    EvidenceError,
+    Stage,
+    coarse_weights,
+    effective_sample_size,
+    log_mean_weight,
+    next_beta,
+    normalised_weights,
+)
+from .moves import RandomWalkMove
+from .mutation import Memory, tempered_log_prob
+from .settings import Settings
+
+__all__ = ["TemperedSampler"]
+
+
+class TemperedSampler(EnsembleSampler):
+    """emcee's ensemble sampler with a ladder from the prior to the posterior.
+
+    Parameters
+    ----------
+    nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names :
+        as in `emcee.EnsembleSampler`, in its order. `moves` are the mutation kernels, copied; by default a random walk.
+        NaN from `log_prob_fn` counts as -inf; it is not called outside the support of the prior.
+    log_prior_fn : callable, optional
+        Log density of the normalised prior, of the same kind of argument as `log_prob_fn` (a point; a batch with
+        `vectorize`; a dict with `parameter_names`) but without `args` and `kwargs`. By default
+        ``log_prob_fn.log_prior``. Always called in this process.
+    seed : int or array of int, optional
+        Seed of the run. By default one drawn from NumPy's global generator, so that ``np.random.seed`` governs and two
+        samplers never share a stream. A backend with a chain brings its own random state, which goes before.
+    settings : Settings
+
+    Raises
+    ------
+    ValueError
+        For settings that cannot work, fewer than 2 ndim walkers, or no log-prior.
+    """
+
+    def __init__(
+        self,
+        nwalkers,
+        ndim,
+        log_prob_fn,
+        pool=None,
+        moves=None,
+        args=None,
+        kwargs=None,
+        backend=None,
+        vectorize=False,
+        blobs_dtype=None,
+        parameter_names=None,
+        *,
+        log_prior_fn: Callable | None = None,
+        seed: int | None = None,
+        settings: Settings = Settings(),
+    ):
+        if not callable(log_prob_fn):
+            raise ValueError(f"log_prob_fn must be callable; got {log_prob_fn!r}")
+        if log_prior_fn is None:
+            log_prior_fn = getattr(log_prob_fn, "log_prior", None)
+        if not callable(log_prior_fn):
+            raise ValueError(
+                "tempering starts at the prior: pass log_prior_fn, or a log_prob_fn with a method log_prior"
+                f" (a posterior object itself, not its bound method); got {log_prior_fn!r}"
+            )
+        if ndim < 1 or nwalkers < 2 * ndim:
+            raise ValueError(
+                f"a population must span the parameters: at least 2 ndim walkers and one parameter are needed, some "
+                f"hundreds are usual; got nwalkers={nwalkers} for ndim={ndim}"
+            )
+        if settings.ess_floor >= nwalkers:
+            raise ValueError(f"ess_floor={settings.ess_floor} must be below nwalkers={nwalkers}")
+
+        self.log_prior_fn = log_prior_fn
+        self.settings = settings
+        self._records = Records(blobs_dtype)
+        self._ladder: list[Stage] = []
+        self._previous_state = None
+        self._summit = None
+        super().__init__(
+            nwalkers,
+            ndim,
+            log_prob_fn,
+            pool=pool,
+            moves=copy.deepcopy(RandomWalkMove() if moves is None else moves),
+            args=args,
+            kwargs=kwargs,
+            backend=backend,
+            vectorize=vectorize,
+            blobs_dtype=blobs_dtype,
+            parameter_names=parameter_names,
+        )
+        self._ladder = list(read_ladder(self.backend))
+        if self.backend.random_state is None:
+            self._random.seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
+
+    def __getstate__(self):
+        # emcee drops the pool of the living sampler here; drop it from the copy only
+        return {**self.__dict__, "pool": None}
+
+    # ------------------------------------------------------------------ results
+
+    @property
+    def evaluations(self) -> int:
+        """Points handed to `log_prob_fn` by this object."""
+        return self._records.evaluations
+
+    @property
+    def nan_count(self) -> int:
+        """How many of their values were NaN, and counted as -inf."""
+        return self._records.nan_count
+
+    @property
+    def ladder(self) -> tuple[Stage, ...]:
+        """Stages of the last climb, in order; empty before it."""
+        return tuple(self._ladder)
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the evidence: the sum of the increments of the ladder."""
+        return float(sum(stage.log_evidence_increment for stage in self._finished_ladder()))
+
+    @property
+    def log_evidence_error(self) -> float:
+        """Standard error of `log_evidence`, from this run alone (see `samplers.ladder.EvidenceError`)."""
+        return self._finished_ladder()[-1].log_evidence_error
+
+    def _finished_ladder(self) -> list[Stage]:
+        if not self._on_top():
+            reached = f"the ladder ends at beta = {self._ladder[-1].beta:.3g}" if self._ladder else "there is no ladder"
+            raise ValueError(f"the evidence is known at beta = 1 and {reached}: call run_mcmc first")
+        return self._ladder
+
+    def _on_top(self) -> bool:
+        return bool(self._ladder) and self._ladder[-1].beta == 1.0
+
+    def reset(self):
+        """Clear the chain, as in emcee. The ladder and the place at beta = 1 are kept: burn in, reset, go on."""
+        super().reset()
+        for index, stage in enumerate(self._ladder):
+            write_stage(self.backend, index, stage)
+
+    # ------------------------------------------------------------------ running
+
+    def run_mcmc(self, initial_state, nsteps, **kwargs):
+        """Climb the ladder if that has not been done, then make `nsteps` sweeps at beta = 1.
+
+        Parameters
+        ----------
+        initial_state : (nwalkers, ndim) draws of the prior, or None: go on from the last state if there is one, else
+            draw ``log_prob_fn.sample_prior(nwalkers, random)``. After a climb, a State of this sampler (or the
+            coordinates of its last one) goes on from there; any other coordinates start a new climb.
+        nsteps : int — sweeps stored in the chain; 0 climbs only.
+        **kwargs : of `sample`.
+
+        Returns
+        -------
+        emcee.State — the last one.
+        """
+        if initial_state is None and self._previous_state is None:
+            initial_state = self._last_or_prior()
+        result = super().run_mcmc(initial_state, nsteps, **kwargs)
+        if result is None:
+            result = self._previous_state = self._summit
+        return result
+
+    def sample(
+        self,
+        initial_state,
+        log_prob0=None,
+        rstate0=None,
+        blobs0=None,
+        iterations=1,
+        tune=False,
+        skip_initial_state_check=False,
+        thin_by=1,
+        thin=None,
+        store=True,
+        progress=False,
+        progress_kwargs=None,
+    ) -> Iterator[State]:
+        """Advance the chain as a generator: emcee's ``sample``, preceded by the climb where one is due.
+
+        The arguments are emcee's; `initial_state` is understood as in `run_mcmc`.
+        """
+        if iterations is None and store:
+            raise ValueError("'store' must be False when 'iterations' is None")
+        if int(thin_by if thin is None else thin) <= 0:
+            raise ValueError("Invalid thinning argument")
+        state = State(self._last_or_prior() if initial_state is None else initial_state, copy=True)
+        for name, value in (("log_prob", log_prob0), ("random_state", rstate0), ("blobs", blobs0)):
+            if value is not None:
+                setattr(state, name, value)
+
+        last = self._previous_state
+        if state.log_prob is None and last is not None and np.array_equal(state.coords, last.coords):
+            state.log_prob, state.blobs = copy.deepcopy((last.log_prob, last.blobs))
+
+        nan_count = self.nan_count
+        try:
+            if self._climb_is_due(state):
+                state = self._climb(state, skip_initial_state_check, progress, progress_kwargs or {})
+                skip_initial_state_check = True
+            self._summit = state
+            yield from super().sample(
+                state,
+                iterations=iterations,
+                tune=tune,
+                skip_initial_state_check=skip_initial_state_check,
+                thin_by=thin_by,
+                thin=thin,
+                store=store,
+                progress=progress,
+                progress_kwargs=progress_kwargs,
+            )
+        finally:
+            if self.nan_count > nan_count:
+                sound(f"log_prob_fn returned NaN for {self.nan_count - nan_count} points, taken as -inf")
+
+    def _last_or_prior(self):
+        """The state to start from when none is given."""
+        if self._previous_state is not None:
+            return self._previous_state
+        if self.backend.iteration > 0:
+            return self.get_last_sample()
+        draw = getattr(self.log_prob_fn.f, "sample_prior", None)
+        if draw is None:
+            raise ValueError(
+                "initial_state is None and log_prob_fn has no method sample_prior(n, random): "
+                f"pass {self.nwalkers} draws of the prior"
+            )
+        return np.asarray(draw(self.nwalkers, self._random), dtype=float)
+
+    def _climb_is_due(self, state: State) -> bool:
+        """Whether a state is one of the prior; an error where that cannot be told."""
+        known = state.log_prob is not None
+        if self._on_top():
+            return not known
+        if known and self.backend.iteration > 0:
+            raise ValueError(
+                "the backend holds a chain without a finished ladder, so its states cannot be taken as draws of the "
+                "prior: give an empty backend, or pass draws of the prior as initial_state"
+            )
+        return True
+
+    # ------------------------------------------------------------------ evaluating
+
+    def compute_log_prob(self, coords):
+        """Log-probability and blobs of points (n, ndim), as in emcee; -inf for NaN and outside the prior's support."""
+        return self._records.unpack(self._evaluate(coords))
+
+    def _evaluate(self, coords: np.ndarray) -> np.ndarray:
+        """Records (log_prob, log_prior[, blobs]) of points (n, ndim)."""
+        if not np.all(np.isfinite(coords)):
+            raise ValueError("At least one parameter value was infinite or NaN")
+        return self._records.evaluate(
+            coords, self._log_prior(coords), lambda points: self._call(self.log_prob_fn, points, self.pool)
+        )
+
+    def _log_prior(self, coords: np.ndarray) -> np.ndarray:
+        """Log-prior of points (n, ndim); -inf for NaN."""
+        log_prior, _ = log_probabilities(self._call(self.log_prior_fn, coords, None), len(coords), "log_prior_fn")
+        return np.where(np.isnan(log_prior), -np.inf, log_prior)
+
+    def _call(self, function: Callable, coords: np.ndarray, pool: Any):
+        """emcee's way to call a function of points: batch, pool or map; dictionaries for named parameters."""
+        points = ndarray_to_list_of_dicts(coords, self.parameter_names) if self.params_are_named else coords
+        if self.vectorize:
+            return function(points)
+        return list((map if pool is None else pool.map)(function, points))
+
+    # ------------------------------------------------------------------ climbing
+
+    def _climb(self, state: State, skip_check: bool, progress: bool | str, progress_kwargs: dict) -> State:
+        """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
+        started, evaluations = time.perf_counter(), self.evaluations
+        packed = self._enter(state, skip_check)
+        coords, beta, target = state.coords, 0.0, float(self.nwalkers)
+        error = EvidenceError(self.nwalkers)
+        self._ladder = []
+
+        with get_progress_bar(progress, None, **{"desc": "ladder", "unit": " sweeps", **progress_kwargs}) as bar:
+            while beta < 1.0:
+                log_likelihood = packed["log_prob"] - packed["log_prior"]
+                target = self.settings.target(target, self.nwalkers)
+                last_beta, beta = beta, next_beta(log_likelihood, beta, target)
+                log_weights = (beta - last_beta) * log_likelihood
+                weights = normalised_weights(log_weights)
+                standard_error = error.weigh(weights)
+                self._calibrate(coords, coarse_weights(log_weights))
+
+                ancestors = self.settings.resample(weights, self._random)
+                error.resample(ancestors)
+                coords, packed = coords[ancestors], packed[ancestors]
+                distinct = len(np.unique(coords, axis=0))
+                ess = effective_sample_size(log_weights)
+                coords, packed, acceptance, moves = self._mutate(
+                    coords, packed, beta, lambda share, b=beta, e=ess: self._show(bar, b, e, share)
+                )
+
+                stage = Stage(
+                    beta=beta,
+                    effective_sample_size=ess,
+                    acceptance=acceptance,
+                    moves=moves,
+                    distinct_ancestors=distinct,
+                    log_evidence_increment=log_mean_weight(log_weights),
+                    log_evidence_error=standard_error,
+                    evaluations=self.evaluations - evaluations,
+                    seconds=time.perf_counter() - started,
+                )
+                started, evaluations = time.perf_counter(), self.evaluations
+                self._ladder.append(stage)
+                write_stage(self.backend, len(self._ladder) - 1, stage)
+                check_ladder(self._ladder, self.nwalkers, self.ndim)
+
+        log_prob, blobs = self._records.unpack(packed)
+        return State(coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
+
+    def _enter(self, state: State, skip_check: bool) -> np.ndarray:
+        """Check draws of the prior and evaluate them: records of all walkers."""
+        if state.coords.shape != (self.nwalkers, self.ndim):
+            raise ValueError(
+                f"incompatible input dimensions: initial_state must be ({self.nwalkers}, {self.ndim}) draws of the "
+                f"prior; got {state.coords.shape}"
+            )
+        if not skip_check and not walkers_independent(state.coords):
+            raise ValueError(
+                "Initial state has a large condition number: the walkers must be finite and linearly independent, as "
+                "draws of the prior are"
+            )
+        self.random_state = state.random_state
+        state.coords = np.asarray(state.coords, dtype=float)
+        log_prior = self._log_prior(state.coords)
+        outside = np.flatnonzero(log_prior == -np.inf)
+        if len(outside) > 0:
+            raise ValueError(
+                f"{len(outside)} of {self.nwalkers} initial points lie outside the prior's support (log_prior -inf or "
+                f"NaN), the first of them {state.coords[outside[0]]}: pass draws of the prior"
+            )
+        if state.log_prob is None:
+            return self._evaluate(state.coords)
+        log_prob, _ = log_probabilities(np.asarray(state.log_prob), self.nwalkers, "the initial state's log_prob")
+        return self._records.pack(log_prob, log_prior, state.blobs)
+
+    def _calibrate(self, coords: np.ndarray, weights: np.ndarray) -> None:
+        for move in self._moves:
+            if hasattr(move, "calibrate"):
+                move.calibrate(coords, weights)
+
+    def _mutate(
+        self, coords: np.ndarray, packed: np.ndarray, beta: float, show: Callable[[float], None]
+    ) -> tuple[np.ndarray, np.ndarray, float, int]:
+        """Move equally weighted points at beta until they have forgotten where they started, as the settings say.
+
+        Returns coordinates, records, acceptance and number of sweeps.
+        """
+
+        def compute(points):
+            records = self._evaluate(points)
+            return tempered_log_prob(records, beta), records
+
+        model = Model(self.log_prob_fn, compute, map if self.pool is None else self.pool.map, self._random)
+        memory = Memory(coords, packed)
+        state = State(coords, log_prob=tempered_log_prob(packed, beta), blobs=packed)
+        acceptance = []
+        while not memory.enough(self.settings):
+            move = self._random.choice(self._moves, p=self._weights)
+            state, accepted = move.propose(model, state)
+            move.tune(state, accepted)
+            memory.update(state.coords, state.blobs)
+            acceptance.append(float(np.mean(accepted)))
+            show(acceptance[-1])
+        return state.coords, state.blobs, float(np.mean(acceptance)), len(acceptance)
+
+    def _show(self, bar: Any, beta: float, ess: float, acceptance: float) -> None:
+        """One sweep further on the progress bar."""
+        if hasattr(bar, "set_postfix"):  # emcee's silent bar has only update
+            figures = {"beta": f"{beta:.3g}", "ESS": f"{ess:.0f}", "acceptance": f"{acceptance:.2f}"}
+            figures["evaluations"] = str(self.evaluations)
+            if hasattr(self.log_prob_fn.f, "report"):
+                simulations = self.log_prob_fn.f.report().get("simulations")
+                if simulations is not None:
+                    figures["simulations"] = str(simulations)
+            bar.set_postfix(figures, refresh=False)
+        bar.update(1)

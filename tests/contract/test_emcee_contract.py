@@ -1,0 +1,318 @@
+"""What emcee promises of a sampler holds for ours, in memory and in HDF5: the same tests for each."""
+
+import inspect
+import pickle
+from multiprocessing.pool import ThreadPool
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SMCSampler, TemperedSampler
+from tests.contract.targets import Gaussian, WithBlobs
+
+N, STEPS = 24, 8
+SAMPLERS = [emcee.EnsembleSampler, SMCSampler]
+both = pytest.mark.parametrize("Sampler", SAMPLERS, ids=lambda s: s.__name__)
+
+
+@pytest.fixture(params=["memory", "hdf5"])
+def make_backend(request, tmp_path):
+    """A function that opens the backend, the same one each time it is called in a test."""
+    memory = emcee.backends.Backend()
+
+    def make():
+        return memory if request.param == "memory" else emcee.backends.HDFBackend(str(tmp_path / "chain.h5"))
+
+    return make
+
+
+def start(posterior, seed=1):
+    return posterior.sample_prior(N, np.random.default_rng(seed))
+
+
+def run(Sampler, backend=None, posterior=None, **kwargs):
+    posterior = posterior or Gaussian()
+    np.random.seed(7)  # noqa: NPY002  emcee takes its state from the global generator
+    sampler = Sampler(N, posterior.ndim, posterior, backend=backend, **kwargs)
+    sampler.run_mcmc(start(posterior), STEPS)
+    return sampler
+
+
+def parameters(function, keep):
+    return [
+        (p.name, p.default, p.kind)
+        for p in inspect.signature(function).parameters.values()
+        if p.kind is not p.KEYWORD_ONLY and p.name in keep
+    ]
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TemperedSampler])
+def test_signatures_are_emcees(Sampler):
+    deprecated = {"a", "postargs", "threads", "live_dangerously", "runtime_sortingfn"}
+    theirs = inspect.signature(emcee.EnsembleSampler).parameters
+    keep = set(theirs) - deprecated
+    assert parameters(Sampler, keep) == parameters(emcee.EnsembleSampler, keep)
+    ours = inspect.signature(Sampler).parameters
+    assert [p.name for p in ours.values() if p.kind is not p.KEYWORD_ONLY] == [n for n in theirs if n in keep]
+    for name in ("sample", "run_mcmc", "reset", "compute_log_prob", "get_chain", "get_last_sample"):
+        mine, yours = getattr(Sampler, name), getattr(emcee.EnsembleSampler, name)
+        assert [(p.name, p.default) for p in inspect.signature(mine).parameters.values()] == [
+            (p.name, p.default) for p in inspect.signature(yours).parameters.values()
+        ], name
+
+
+def test_only_what_must_be_is_overridden():
+    shared = {n for n in vars(TemperedSampler) if n in vars(emcee.EnsembleSampler)}
+    own = {"__module__", "__doc__", "__init__", "__getstate__", "__firstlineno__", "__static_attributes__"}
+    assert shared - own == {"sample", "run_mcmc", "reset", "compute_log_prob"}
+
+
+def test_emcees_private_names_exist():
+    """The names that tempered.py relies on; if emcee renames one, this says so."""
+    sampler = emcee.EnsembleSampler(8, 2, Gaussian(2))
+    for name in ("_random", "_moves", "_weights"):
+        assert hasattr(sampler, name), name
+    sampler.run_mcmc(start(Gaussian(2))[:8], 1)
+    assert isinstance(sampler._previous_state, emcee.State)
+    assert isinstance(sampler._random, np.random.RandomState)
+    assert sampler.log_prob_fn.f.ndim == 2
+
+
+@both
+def test_shapes(Sampler, make_backend):
+    sampler = run(Sampler, make_backend())
+    assert sampler.get_chain().shape == (STEPS, N, 3)
+    assert sampler.get_log_prob().shape == (STEPS, N)
+    assert sampler.get_chain(flat=True).shape == (STEPS * N, 3)
+    assert sampler.get_chain(discard=3).shape == (STEPS - 3, N, 3)
+    assert sampler.get_chain(discard=2, thin=2, flat=True).shape == (3 * N, 3)
+    assert sampler.get_blobs() is None
+    assert sampler.iteration == STEPS
+    assert sampler.acceptance_fraction.shape == (N,)
+    assert np.all((sampler.acceptance_fraction >= 0) & (sampler.acceptance_fraction <= 1))
+    assert sampler.get_autocorr_time(quiet=True).shape == (3,)
+    state = sampler.get_last_sample()
+    assert np.array_equal(state.coords, sampler.get_chain()[-1])
+    assert np.array_equal(state.log_prob, sampler.get_log_prob()[-1])
+
+
+@both
+def test_stored_log_prob_is_that_of_the_posterior(Sampler, make_backend):
+    sampler, posterior = run(Sampler, make_backend()), Gaussian()
+    chain = sampler.get_chain(flat=True)
+    assert np.allclose(sampler.get_log_prob(flat=True), posterior(chain), rtol=1e-13)
+
+
+@both
+def test_thin_by_and_store(Sampler, make_backend):
+    posterior = Gaussian()
+    sampler = Sampler(N, 3, posterior, backend=make_backend())
+    sampler.run_mcmc(start(posterior), 4, thin_by=3)
+    assert sampler.get_chain().shape == (4, N, 3)
+    unstored = Sampler(N, 3, posterior)
+    assert isinstance(unstored.run_mcmc(start(posterior), 3, store=False), emcee.State)
+    with pytest.raises(AttributeError):
+        unstored.get_chain()
+
+
+@both
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_blobs(Sampler, make_backend, vectorize):
+    sampler = run(Sampler, make_backend(), WithBlobs(), vectorize=vectorize)
+    chain, blobs = sampler.get_chain(), sampler.get_blobs()
+    assert blobs.shape == (STEPS, N, 2)
+    assert np.allclose(blobs[..., 0], np.sum(chain**2, axis=-1), rtol=1e-13)
+    assert np.array_equal(blobs[..., 1], chain[..., 0])
+    assert sampler.get_blobs(flat=True).shape == (STEPS * N, 2)
+
+
+def labelled(x, posterior):
+    return posterior(x), float(x[0]), f"x0={x[0]:.17g}"
+
+
+def single(x, posterior):
+    return posterior(x), float(x[1])
+
+
+@both
+def test_named_text_and_single_blobs(Sampler, make_backend):
+    posterior = Gaussian()
+    extra = {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": posterior.log_prior}
+    dtype = [("first", float), ("text", object)]
+    sampler = Sampler(N, 3, labelled, args=[posterior], blobs_dtype=dtype, **extra)
+    sampler.run_mcmc(start(posterior), STEPS)
+    chain, blobs = sampler.get_chain(), sampler.get_blobs()
+    assert np.array_equal(blobs["first"], chain[..., 0])
+    assert blobs["text"][-1, 3] == f"x0={chain[-1, 3, 0]:.17g}"
+
+    sampler = Sampler(N, 3, single, backend=make_backend(), kwargs={"posterior": posterior}, **extra)
+    sampler.run_mcmc(start(posterior), STEPS)
+    assert np.array_equal(sampler.get_blobs(), sampler.get_chain()[..., 1])
+
+
+def shifted(x, posterior, shift, scale=1.0):
+    return posterior((x - shift) / scale)
+
+
+@both
+def test_args_and_kwargs(Sampler):
+    posterior = Gaussian()
+    extra = {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": posterior.log_prior}
+    sampler = Sampler(N, 3, shifted, args=[posterior, 0.0], kwargs={"scale": 1.0}, **extra)
+    sampler.run_mcmc(start(posterior), STEPS)
+    chain = sampler.get_chain(flat=True)
+    assert np.allclose(sampler.get_log_prob(flat=True), posterior(chain))
+    assert sampler.log_prob_fn.args == [posterior, 0.0]
+    assert not hasattr(sampler, "args")  # arviz would take it for the data
+
+
+def of_names(x):
+    return Gaussian(3)(np.array([x["x0"], *x["rest"]]))
+
+
+def prior_of_names(x):
+    return Gaussian(3).log_prior(np.array([x["x0"], *x["rest"]]))
+
+
+@both
+def test_parameter_names(Sampler):
+    extra = {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": prior_of_names}
+    sampler = Sampler(N, 3, of_names, parameter_names={"x0": 0, "rest": [1, 2]}, **extra)
+    sampler.run_mcmc(start(Gaussian()), STEPS)
+    assert np.allclose(sampler.get_log_prob(flat=True), Gaussian()(sampler.get_chain(flat=True)))
+
+
+@both
+def test_seed_pool_and_vectorize_give_the_same_chain(Sampler):
+    chain = run(Sampler).get_chain()
+    assert np.array_equal(run(Sampler).get_chain(), chain)
+    assert np.array_equal(run(Sampler, vectorize=True).get_chain(), chain)
+    for workers in (1, 3):
+        with ThreadPool(workers) as pool:
+            assert np.array_equal(run(Sampler, pool=pool).get_chain(), chain)
+
+
+@both
+def test_pickle(Sampler, make_backend):
+    with ThreadPool(1) as pool:
+        sampler = run(Sampler, make_backend(), pool=pool)
+        if Sampler is SMCSampler:  # emcee's own pickling takes the pool from the living sampler
+            pickle.dumps(sampler)
+            assert sampler.pool is pool
+        sampler.pool = None
+        copy = pickle.loads(pickle.dumps(sampler))
+        assert copy.pool is None
+        assert np.array_equal(copy.get_chain(), sampler.get_chain())
+        if isinstance(sampler.backend, emcee.backends.HDFBackend):
+            return  # both would write to one file
+        first, second = sampler.run_mcmc(None, 3), copy.run_mcmc(None, 3)
+        assert np.array_equal(first.coords, second.coords)
+        if Sampler is SMCSampler:
+            assert copy.ladder == sampler.ladder
+
+
+@both
+def test_reset_and_go_on(Sampler, make_backend):
+    posterior = Gaussian()
+    sampler = Sampler(N, 3, posterior, backend=make_backend())
+    state = sampler.run_mcmc(start(posterior), STEPS)
+    sampler.reset()
+    assert sampler.iteration == 0
+    sampler.run_mcmc(state, 2)
+    sampler.run_mcmc(None, 3)
+    assert sampler.get_chain().shape == (5, N, 3)
+
+
+@both
+def test_random_state(Sampler, make_backend):
+    sampler = run(Sampler, make_backend())
+    kept = sampler.random_state
+    state = sampler.get_last_sample()
+    for ours, stored in zip(kept, state.random_state, strict=True):
+        assert np.all(ours == stored)
+    first = sampler.run_mcmc(state, 2, store=False).coords
+    sampler.random_state = kept
+    assert np.array_equal(sampler.run_mcmc(state, 2, store=False).coords, first)
+
+
+@both
+def test_reopened_backend_goes_on_bit_by_bit(Sampler, make_backend):
+    posterior, whole = Gaussian(), None
+    for pieces in ([6], [3, 3]):
+        backend = make_backend()
+        backend.reset(N, 3)
+        if hasattr(backend, "ladder"):
+            del backend.ladder
+        for number, steps in enumerate(pieces):
+            np.random.seed(7)  # noqa: NPY002
+            sampler = Sampler(N, 3, posterior, backend=make_backend(), moves=emcee.moves.StretchMove())
+            sampler.run_mcmc(start(posterior) if number == 0 else None, steps)
+        chain = sampler.get_chain()
+        whole = chain if whole is None else whole
+        assert np.array_equal(chain, whole)
+
+
+@both
+def test_sample_is_a_generator_that_stores_as_it_goes(Sampler, make_backend):
+    posterior = Gaussian()
+    sampler = Sampler(N, 3, posterior, backend=make_backend())
+    for count, state in enumerate(sampler.sample(start(posterior), iterations=4), start=1):
+        assert sampler.iteration == count
+        assert np.array_equal(sampler.get_chain()[-1], state.coords)
+    unending = Sampler(N, 3, posterior).sample(start(posterior), iterations=None, store=False)
+    assert len({float(next(unending).coords[0, 0]) for _ in range(20)}) > 1
+
+
+@both
+def test_arviz_from_emcee(Sampler):
+    import arviz
+
+    sampler = run(Sampler)
+    data = arviz.from_emcee(sampler, var_names=sampler.log_prob_fn.f.parameter_names)
+    assert data.posterior["x1"].shape == (N, STEPS)
+
+
+@both
+@pytest.mark.parametrize(
+    "moves",
+    [
+        emcee.moves.StretchMove(),
+        emcee.moves.DEMove(),
+        [emcee.moves.DEMove(), emcee.moves.WalkMove()],
+        [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)],
+        emcee.moves.GaussianMove(0.01),
+        emcee.moves.KDEMove(),
+    ],
+    ids=["stretch", "de", "list", "weighted", "gaussian", "kde"],
+)
+def test_emcees_moves_are_kernels(Sampler, moves):
+    sampler = run(Sampler, moves=moves)
+    assert sampler.get_chain().shape == (STEPS, N, 3)
+    assert 0 < sampler.acceptance_fraction.mean() <= 1
+
+
+def test_our_moves_are_emcees():
+    """Inside a plain EnsembleSampler nobody calibrates; the moves fit themselves to the first ensemble."""
+    from samplers.moves import AlternatingMove, RandomWalkMove, StudentTMove
+
+    posterior = Gaussian()
+    for move in (RandomWalkMove(), StudentTMove(), AlternatingMove([StudentTMove(), RandomWalkMove(adapt=True)])):
+        sampler = emcee.EnsembleSampler(N, 3, posterior, moves=move)
+        sampler.run_mcmc(posterior.mean + posterior.sd * start(posterior), 20, tune=True)
+        assert sampler.acceptance_fraction.mean() > 0.1
+
+
+@both
+def test_progress_bar(Sampler, capfd):
+    pytest.importorskip("tqdm")
+    posterior = Gaussian()
+    posterior.report = lambda: {"simulations": 123456}
+    Sampler(N, 3, posterior).run_mcmc(start(posterior), 3, progress=True)
+    shown = capfd.readouterr().err
+    assert "3/3" in shown
+    if Sampler is SMCSampler:
+        for word in ("beta=1", "ESS=", "acceptance=", "evaluations=", "simulations=123456"):
+            assert word in shown, word
+    Sampler(N, 3, posterior).run_mcmc(start(posterior), 3)
+    assert capfd.readouterr().err == ""

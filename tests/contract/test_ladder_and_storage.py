@@ -1,0 +1,408 @@
+"""What our samplers add to emcee's contract: the ladder, the evidence, where they are kept, and when they refuse."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import (
+    RAMANCHA_2022_CONSTANT,
+    RAMANCHA_2022_LITERAL,
+    SamplingWarning,
+    SMCSampler,
+    TemperedSampler,
+    read_ladder,
+)
+from samplers.report import ladder_plot, ladder_table, pair_plot, summary, to_arviz
+from samplers.resampling import stratified
+from tests.contract.targets import Box, Gaussian
+
+N = 40
+
+
+def climbed(posterior=None, nsteps=3, **kwargs):
+    posterior = posterior or Gaussian()
+    sampler = SMCSampler(N, posterior.ndim, posterior, vectorize=True, **{"seed": 3, **kwargs})
+    sampler.run_mcmc(None, nsteps)
+    return sampler
+
+
+# ---------------------------------------------------------------- the ladder
+
+
+def test_stages_account_for_everything():
+    posterior = Gaussian()
+    sampler = climbed(posterior, nsteps=0)
+    betas = [s.beta for s in sampler.ladder]
+    assert betas == sorted(set(betas)) and betas[-1] == 1.0
+    assert sum(s.evaluations for s in sampler.ladder) == sampler.evaluations == posterior.calls
+    assert all(s.evaluations == N * s.moves for s in sampler.ladder[1:])  # a prior without edges rejects nothing unseen
+    assert all(2 <= s.moves <= 20 and 0 < s.acceptance <= 1 for s in sampler.ladder)
+    assert all(abs(s.effective_sample_size / (0.5 * N) - 1) < 1e-4 for s in sampler.ladder[:-1])
+    assert sampler.ladder[-1].effective_sample_size >= 0.5 * N
+    assert sampler.log_evidence == sum(s.log_evidence_increment for s in sampler.ladder)
+    assert sampler.log_evidence_error == sampler.ladder[-1].log_evidence_error > 0
+    assert all(s.seconds > 0 for s in sampler.ladder)
+
+
+def test_presets_targets_and_moves():
+    for preset, rule in ((RAMANCHA_2022_CONSTANT, lambda j: 0.95 * 200), (RAMANCHA_2022_LITERAL, None)):
+        posterior = Gaussian(2)
+        sampler = SMCSampler(200, 2, posterior, vectorize=True, seed=1, **preset)
+        sampler.run_mcmc(None, 0)
+        for j, s in enumerate(sampler.ladder[:-1], start=1):
+            wanted = rule(j) if rule else max(50.0, 200 * 0.95**j)
+            assert s.effective_sample_size == pytest.approx(wanted, rel=1e-4)
+            assert s.moves == 10
+    assert RAMANCHA_2022_LITERAL["moves"]._root is None  # the sampler works on copies
+
+
+@pytest.mark.parametrize("resampling", ["multinomial", "residual", "stratified", "systematic", stratified])
+def test_resampling_by_name_or_function(resampling):
+    assert climbed(resampling=resampling).ladder[-1].beta == 1.0
+
+
+def test_climb_once_then_go_on():
+    posterior = Gaussian()
+    sampler = climbed(posterior, nsteps=2)
+    ladder = sampler.ladder
+    state = sampler.run_mcmc(None, 2)
+    sampler.run_mcmc(state, 2)
+    sampler.run_mcmc(state.coords, 0)  # other coordinates than the last: draws of the prior, a new climb
+    assert sampler.ladder != ladder
+    sampler = climbed(posterior := Gaussian(), nsteps=2)
+    last, ladder, calls = sampler.get_last_sample(), sampler.ladder, posterior.calls
+    sampler.run_mcmc(last.coords, 2)  # emcee's old habit: burn in, then start from the positions
+    assert sampler.ladder == ladder
+    assert posterior.calls == calls + 2 * N
+    sampler.reset()
+    assert sampler.ladder == ladder == read_ladder(sampler.backend)
+
+
+def test_climb_without_steps_then_steps():
+    sampler = climbed(nsteps=0)
+    ladder = sampler.ladder
+    assert isinstance(sampler.run_mcmc(None, 2), emcee.State)
+    assert sampler.ladder == ladder
+    assert sampler.iteration == 2
+
+
+def test_a_state_that_knows_its_log_prob_saves_evaluations():
+    posterior = Gaussian()
+    draws = posterior.sample_prior(N, np.random.default_rng(0))
+    plain = SMCSampler(N, 3, posterior, vectorize=True, seed=1)
+    plain.run_mcmc(draws, 1)
+    spared = SMCSampler(N, 3, posterior, vectorize=True, seed=1)
+    spared.run_mcmc(emcee.State(draws, log_prob=posterior(draws)), 1)
+    assert np.array_equal(plain.get_chain(), spared.get_chain())
+    assert spared.evaluations == plain.evaluations - N
+
+
+def test_samplers_without_a_seed_do_not_share_a_stream():
+    np.random.seed(5)  # noqa: NPY002
+    first, second = climbed(seed=None).get_chain(), climbed(seed=None).get_chain()
+    assert not np.array_equal(first, second)
+    np.random.seed(5)  # noqa: NPY002
+    assert np.array_equal(climbed(seed=None).get_chain(), first)
+
+
+def test_a_finished_run_is_not_seeded_again(tmp_path):
+    backend = emcee.backends.HDFBackend(str(tmp_path / "a.h5"))
+    sampler = climbed(backend=backend)
+    again = SMCSampler(N, 3, Gaussian(), backend=backend, vectorize=True, seed=3)
+    for ours, theirs in zip(again.random_state, sampler.random_state, strict=True):
+        assert np.all(ours == theirs)
+
+
+# ---------------------------------------------------------------- storage
+
+
+def test_ladder_beside_the_chain(tmp_path):
+    import h5py
+
+    path = str(tmp_path / "run.h5")
+    sampler = climbed(backend=emcee.backends.HDFBackend(path, name="column"))
+    assert read_ladder(emcee.backends.HDFBackend(path, name="column", read_only=True)) == sampler.ladder
+    assert read_ladder(emcee.backends.HDFBackend(path, name="nothing")) == ()
+    with h5py.File(path) as file:
+        assert file["column/ladder"].dtype["beta"] == np.float64
+        assert file["column/chain"].shape == (3, N, 3)
+    again = SMCSampler(N, 3, Gaussian(), backend=emcee.backends.HDFBackend(path, name="column"), vectorize=True)
+    assert again.ladder == sampler.ladder
+    assert (again.log_evidence, again.log_evidence_error) == (sampler.log_evidence, sampler.log_evidence_error)
+    again.run_mcmc(None, 2)
+    assert again.iteration == 5 and again.ladder == sampler.ladder
+
+
+def test_a_new_climb_replaces_the_ladder(tmp_path):
+    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+    sampler = climbed(Gaussian(sd=0.01), backend=backend)
+    long = len(sampler.ladder)
+    sampler.reset()
+    sampler = SMCSampler(N, 3, Gaussian(sd=0.5), backend=backend, vectorize=True)
+    sampler.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 1)
+    assert read_ladder(backend) == sampler.ladder
+    assert len(sampler.ladder) < long
+
+
+class Interrupted(Gaussian):
+    """Raises after some calls."""
+
+    def __init__(self, error, after, **kwargs):
+        super().__init__(**kwargs)
+        self.error, self.after = error, after
+
+    def __call__(self, x):
+        if self.calls > self.after:
+            raise self.error
+        return super().__call__(x)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("solver died")])
+def test_an_exception_leaves_what_was_done(tmp_path, error):
+    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+    posterior = Interrupted(error, after=8 * N, sd=0.01)
+    sampler = SMCSampler(N, 3, posterior, backend=backend, vectorize=True, seed=2)
+    with pytest.raises(type(error)):
+        sampler.run_mcmc(None, 5)
+    assert 0 < len(sampler.ladder) and sampler.ladder[-1].beta < 1
+    assert read_ladder(backend) == sampler.ladder
+    with pytest.raises(ValueError, match="the ladder ends at beta"):
+        _ = sampler.log_evidence
+    posterior.after = np.inf
+    sampler.run_mcmc(None, 1)
+    assert sampler.ladder[-1].beta == 1 and sampler.iteration == 1
+
+
+def test_a_killed_run_leaves_a_readable_file(tmp_path):
+    path = tmp_path / "run.h5"
+    code = f"""
+import time, emcee
+from samplers import SMCSampler
+from tests.contract.targets import Gaussian
+class Slow(Gaussian):
+    def __call__(self, x):
+        time.sleep(0.005)
+        if self.calls == 20 * {N}:
+            print("under way", flush=True)
+        return super().__call__(x)
+SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, backend=emcee.backends.HDFBackend({str(path)!r})).run_mcmc(None, 999)
+"""
+    root = Path(__file__).parents[2]
+    with subprocess.Popen([sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "under way\n"
+        process.kill()
+    ladder = read_ladder(emcee.backends.HDFBackend(str(path), read_only=True))
+    assert len(ladder) >= 1
+    assert ladder[-1].beta < 1
+    assert all(s.moves <= 20 and s.evaluations >= 2 * N for s in ladder)
+
+
+# ---------------------------------------------------------------- refusals, alarms
+
+
+def test_no_evidence_before_a_run():
+    sampler = SMCSampler(N, 3, Gaussian())
+    assert sampler.ladder == ()
+    for name in ("log_evidence", "log_evidence_error"):
+        with pytest.raises(ValueError, match="call run_mcmc first"):
+            getattr(sampler, name)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"ess_ratio": 0.0},
+        {"ess_ratio": 1.0},
+        {"ess_ratio": np.nan},
+        {"ess_rule": "sometimes"},
+        {"ess_floor": N},
+        {"ess_floor": -1.0},
+        {"resampling": "wheel"},
+        {"min_moves": 0},
+        {"min_moves": 5, "max_moves": 4},
+        {"max_correlation": 0.0},
+    ],
+    ids=str,
+)
+def test_impossible_settings(settings):
+    with pytest.raises(ValueError, match=next(iter(settings)).replace("min_moves", "moves")):
+        SMCSampler(N, 3, Gaussian(), **settings)
+
+
+def test_impossible_problems():
+    posterior = Gaussian()
+    with pytest.raises(ValueError, match="at least 2 ndim walkers"):
+        SMCSampler(5, 3, posterior)
+    with pytest.raises(ValueError, match="log_prior_fn"):
+        SMCSampler(N, 3, lambda x: 0.0)
+    with pytest.raises(ValueError, match="callable"):
+        SMCSampler(N, 3, None, log_prior_fn=posterior.log_prior)
+    unsampled = SMCSampler(N, 3, posterior.__call__, log_prior_fn=posterior.log_prior)
+    with pytest.raises(ValueError, match="sample_prior"):
+        unsampled.run_mcmc(None, 1)
+    assert posterior.calls == 0
+
+
+def test_impossible_starts():
+    box = Box([0, 0], [1, 1], lambda x: 0.0 * x[..., 0])
+    inside = box.sample_prior(N, np.random.default_rng(0))
+    outside = inside.copy()
+    outside[7] = 2.0
+    nan = inside.copy()
+    nan[3, 0] = np.nan
+    for start, message in (
+        (outside, r"1 of 40 initial points lie outside the prior's support"),
+        (inside[:-1], "incompatible input dimensions"),
+        (np.ones((N, 2)), "condition number"),
+        (nan, "condition number"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            SMCSampler(N, 2, box).run_mcmc(start, 1)
+    with pytest.raises(ValueError, match="no point of the population has a finite log-likelihood"):
+        SMCSampler(N, 2, Box([0, 0], [1, 1], lambda x: -np.inf)).run_mcmc(inside, 1)
+    with pytest.raises(ValueError, match="iterations"):
+        next(SMCSampler(N, 2, box).sample(inside, iterations=None))
+    with pytest.raises(ValueError, match="thinning"):
+        SMCSampler(N, 2, box).run_mcmc(inside, 1, thin_by=0)
+
+
+def test_a_chain_of_another_sampler_is_no_start():
+    posterior, backend = Gaussian(), emcee.backends.Backend()
+    emcee.EnsembleSampler(N, 3, posterior, backend=backend).run_mcmc(
+        posterior.sample_prior(N, np.random.default_rng(0)), 3
+    )
+    with pytest.raises(ValueError, match="without a finished ladder"):
+        SMCSampler(N, 3, posterior, backend=backend).run_mcmc(None, 1)
+
+
+@pytest.mark.parametrize(
+    "vectorize, answer, message",
+    [
+        (False, None, "must return a number"),
+        (False, "-3.5", "must return a number"),
+        (False, np.zeros(0), "one number a point"),
+        (False, 1j, "one number a point"),
+        (False, np.inf, r"\+inf"),
+        (True, None, "NoneType"),
+        (True, 0.0, "vectorize=False"),
+        (True, "text", "str"),
+        (True, np.zeros(7), "40 numbers for 40 points; got 7"),
+        (True, np.full(N, "a"), "must return a number"),
+    ],
+)
+def test_wrong_answers_of_log_prob_fn(vectorize, answer, message):
+    posterior = Gaussian()
+    if vectorize is False and isinstance(answer, np.ndarray):
+        answer = [answer]
+    sampler = SMCSampler(N, 3, lambda x: answer, vectorize=vectorize, log_prior_fn=posterior.log_prior)
+    with pytest.raises(ValueError, match=message):
+        sampler.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 1)
+
+
+def test_nan_counts_as_impossible_and_is_reported():
+    def log_likelihood(x):
+        return np.where(x[..., 0] < 0.25, np.nan, -x[..., 1])
+
+    posterior = Box([0, 0], [1, 1], log_likelihood)
+    sampler = SMCSampler(N, 2, posterior, vectorize=True, seed=1)
+    with pytest.warns(SamplingWarning, match="log_prob_fn returned NaN for") as caught:
+        sampler.run_mcmc(None, 5)
+    assert sampler.nan_count > 0
+    assert f"for {sampler.nan_count} points" in str(caught[0].message)
+    chain = sampler.get_chain(flat=True)
+    assert chain[:, 0].min() >= 0.25
+    assert np.all(np.isfinite(sampler.get_log_prob()))
+
+
+def test_nothing_is_evaluated_outside_the_prior():
+    seen = []
+
+    def log_likelihood(x):
+        seen.append(np.array(x))
+        return -50.0 * np.sum(x, axis=-1)  # piles up at the corner
+
+    climbed(Box([0, 0], [1, 1], log_likelihood))
+    seen = np.concatenate(seen)
+    assert seen.min() >= 0 and seen.max() <= 1
+
+
+def test_collapse_is_loud():
+    with pytest.warns(SamplingWarning) as caught:
+        posterior = Gaussian()
+        SMCSampler(N, 3, posterior, vectorize=True, seed=1, moves=emcee.moves.GaussianMove(1e6)).run_mcmc(None, 1)
+    messages = [str(w.message) for w in caught]
+    assert len(messages) == 2  # each reason once, however many stages
+    assert "were accepted, so the points did not move" in messages[0]
+    assert "survived the resampling" in messages[1]
+    with pytest.warns(SamplingWarning, match="distinct points of 40 survived"):
+        posterior = Gaussian(sd=1e-3)
+        SMCSampler(N, 3, posterior, vectorize=True, seed=1, ess_ratio=0.03).run_mcmc(None, 1)
+
+
+# ---------------------------------------------------------------- reports
+
+
+def test_to_arviz_writes_netcdf(tmp_path):
+    import json
+
+    import arviz
+
+    runs = [climbed(seed=s) for s in (1, 2)]
+    data = to_arviz(runs)
+    assert data["posterior"]["x2"].shape == (2, 3 * N)
+    assert np.array_equal(data["posterior"]["x2"][1], runs[1].get_chain(flat=True)[:, 2])
+    data.to_netcdf(str(tmp_path / "run.nc"))
+    stored = arviz.from_netcdf(str(tmp_path / "run.nc"))["sample_stats"]
+    assert np.array_equal(stored["lp"][0], runs[0].get_log_prob(flat=True))
+    assert np.allclose(stored.attrs["log_evidence"], [run.log_evidence for run in runs])
+    assert [row["beta"] for row in json.loads(stored.attrs["ladder"])[0]] == [s.beta for s in runs[0].ladder]
+    plain = emcee.EnsembleSampler(N, 3, Gaussian())
+    plain.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 2)
+    assert to_arviz(plain, ["a", "b", "c"])["posterior"]["a"].shape == (1, 2 * N)
+    with pytest.raises(ValueError, match="one name a parameter"):
+        to_arviz(plain, ["a"])
+
+
+def test_table_and_figures():
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    sampler = climbed()
+    table = ladder_table(sampler).splitlines()
+    assert len(table) == len(sampler.ladder) + 2
+    assert f"{sampler.log_evidence:.3f}" in table[-1]
+    figure = ladder_plot(sampler)
+    assert len(figure.axes[0].lines[0].get_xdata()) == len(sampler.ladder)
+    samples = sampler.get_chain(flat=True)
+    figure = pair_plot(samples, ["a", "b", "c"], truth=[0.7, 0.7, 0.7])
+    titles = [figure.axes[4 * i].get_title() for i in range(3)]
+    assert titles == [f"CV = {cv:.2e}" for cv in summary(samples).cv]
+    assert figure.axes[3].texts[0].get_text() == f"r = {np.corrcoef(samples[:, 0], samples[:, 1])[0, 1]:.2f}"
+    pair_plot(np.column_stack([samples[:, 0], np.ones(len(samples))]))  # a parameter without spread
+    plt.close("all")
+    with pytest.raises(ValueError, match="call run_mcmc first"):
+        ladder_plot(SMCSampler(N, 3, Gaussian()))
+
+
+def test_summary_with_weights():
+    values = np.array([[0.0, 1.0], [2.0, 1.0], [9.0, 1.0]])
+    result = summary(values, ["a", "b"], weights=[1, 1, 0])
+    assert np.array_equal(result.mean, [1, 1]) and np.array_equal(result.sd, [1, 0])
+    assert np.array_equal(result.cv, [1, 0])
+    assert "a" in str(result)
+    for weights in ([1, 1], [0, 0, 0], [1, -1, 1]):
+        with pytest.raises(ValueError, match="weights"):
+            summary(values, weights=weights)
+
+
+def test_tempered_sampler_works_alone():
+    posterior = Gaussian()
+    sampler = TemperedSampler(N, 3, posterior, vectorize=True, seed=1)
+    sampler.run_mcmc(None, 2)
+    assert sampler.ladder[-1].beta == 1

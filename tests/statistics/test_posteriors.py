@@ -1,0 +1,212 @@
+"""Posteriors whose answer is known: the samplers must give it within four standard errors over seeds."""
+
+import emcee
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers import RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler
+from samplers.moves import AlternatingMove, RandomWalkMove, StudentTMove
+from tests.contract.targets import Box, Gaussian
+
+MODES = {"default": {}, "constant": RAMANCHA_2022_CONSTANT, "literal": RAMANCHA_2022_LITERAL}
+
+
+def runs(posterior, seed, count=8, nwalkers=200, nsteps=4, **kwargs):
+    """Independent runs of one posterior."""
+    samplers = []
+    for k in range(count):
+        sampler = SMCSampler(nwalkers, posterior.ndim, posterior, vectorize=True, seed=[seed, k], **kwargs)
+        sampler.run_mcmc(None, nsteps)
+        samplers.append(sampler)
+    return samplers
+
+
+def deviations(samplers, truth, function=lambda x: x):
+    """(mean over runs - truth) in standard errors, the error from the scatter of the runs."""
+    means = np.array([np.mean(function(s.get_chain(flat=True)), axis=0) for s in samplers])
+    return (means.mean(axis=0) - truth) / (means.std(axis=0, ddof=1) / np.sqrt(len(samplers)))
+
+
+def within(deviation, samplers, sigmas=4.0):
+    """Four standard errors of a normal, widened to the same probability of Student's t for so few runs."""
+    bound = stats.t(len(samplers) - 1).isf(stats.norm.sf(sigmas))
+    return bool(np.all(np.abs(deviation) < bound))
+
+
+def evidence_deviation(samplers, truth):
+    values = np.array([s.log_evidence for s in samplers])
+    return (values.mean() - truth) / (values.std(ddof=1) / np.sqrt(len(values)))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_conjugate_gaussian(mode, seed):
+    posterior = Gaussian(3, sd=0.1)
+    samplers = runs(posterior, seed, **MODES[mode])
+    assert within(deviations(samplers, posterior.mean), samplers)
+    spread = deviations(samplers, posterior.sd**2, lambda x: (x - posterior.mean) ** 2)
+    assert within(spread, samplers)
+    assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
+
+
+@pytest.mark.parametrize(
+    "moves",
+    [
+        RandomWalkMove(),
+        RandomWalkMove(adapt=True, scale=5.0),
+        StudentTMove(),
+        [(StudentTMove(dof=5.0), 0.5), (RandomWalkMove(), 0.5)],
+        emcee.moves.StretchMove(),
+    ],
+    ids=["walk", "adaptive walk", "t", "weighted", "stretch"],
+)
+def test_every_kernel(moves, seed):
+    posterior = Gaussian(2, sd=0.2)
+    samplers = runs(posterior, seed, moves=moves, min_moves=8)
+    assert within(deviations(samplers, posterior.mean), samplers)
+    assert within(deviations(samplers, posterior.sd**2, lambda x: (x - posterior.mean) ** 2), samplers)
+    assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
+
+
+class WrongMove(StudentTMove):
+    """The independence proposal without its Hastings ratio: draws too wide a posterior."""
+
+    def _draw(self, coords, random):
+        proposed, factors = super()._draw(coords, random)
+        return proposed, 0.0 * factors
+
+
+def test_a_wrong_kernel_is_caught(seed):
+    """Negative control: the criterion of these tests can fail."""
+    posterior = Gaussian(3, sd=0.1)
+    samplers = runs(posterior, seed, moves=WrongMove())
+    spread = deviations(samplers, posterior.sd**2, lambda x: (x - posterior.mean) ** 2)
+    assert not within(spread, samplers)
+
+
+def test_two_modes(seed):
+    """Weights 1:2, ten standard deviations apart."""
+    centres, sd, weights = np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.5]]), 0.1, np.array([1.0, 2.0]) / 3
+
+    def log_likelihood(x):
+        parts = [
+            np.log(w) + np.sum(stats.norm.logpdf(x, c, sd), axis=-1) for w, c in zip(weights, centres, strict=True)
+        ]
+        return np.logaddexp(*parts)
+
+    samplers = runs(Box([0, 0, 0], [3, 3, 3], log_likelihood), seed, nwalkers=300, nsteps=2)
+    assert within(deviations(samplers, 2 / 3, lambda x: x[:, 0] > 1.5), samplers)
+    assert within(evidence_deviation(samplers, -3 * np.log(3)), samplers)
+
+
+def test_edges_of_a_truncated_prior(seed):
+    """The posterior is a half-normal with its mode on the edge, times an exponential that piles up at another."""
+
+    def log_likelihood(x):
+        return -0.5 * (x[..., 0] / 0.05) ** 2 - 20.0 * x[..., 1]
+
+    samplers = runs(Box([0, 0], [1, 1], log_likelihood), seed)
+    half_normal, exponential = stats.halfnorm(scale=0.05), stats.truncexpon(b=20, scale=1 / 20)
+    assert within(deviations(samplers, [half_normal.mean(), exponential.mean()]), samplers)
+    assert within(
+        deviations(samplers, 0.1, lambda x: x < np.array([half_normal.ppf(0.1), exponential.ppf(0.1)])), samplers
+    )
+    truth = np.log(0.05 * np.sqrt(np.pi / 2)) + np.log((1 - np.exp(-20.0)) / 20)
+    assert within(evidence_deviation(samplers, truth), samplers)
+
+
+def test_flat_likelihood(seed):
+    """Nothing is learnt: one stage, the prior comes back, the evidence is exact and so says its error."""
+    posterior = Box([0, -2], [1, 5], lambda x: 0.0 * x[..., 0] - 1234.5)
+    samplers = runs(posterior, seed)
+    for sampler in samplers:
+        assert len(sampler.ladder) == 1
+        assert sampler.log_evidence == pytest.approx(-1234.5, abs=1e-9)
+        assert sampler.log_evidence_error == pytest.approx(0, abs=1e-9)
+    assert within(deviations(samplers, [0.5, 1.5]), samplers)
+
+
+def test_very_informative_likelihood(seed):
+    """The posterior is a hundred thousand times narrower than the prior."""
+    posterior = Gaussian(2, sd=1e-5)
+    samplers = runs(posterior, seed, count=6)
+    assert within(deviations(samplers, posterior.mean), samplers)
+    assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
+
+
+def test_dead_regions(seed):
+    """Where the model fails the likelihood is zero: 70 % of the box."""
+    posterior = Box([0, 0], [1, 1], lambda x: np.where(x[..., 0] > 0.3, -np.inf, -10.0 * x[..., 1]))
+    samplers = runs(posterior, seed)
+    assert within(deviations(samplers, [0.15, stats.truncexpon(b=10, scale=0.1).mean()]), samplers)
+    assert within(evidence_deviation(samplers, np.log(0.3 * (1 - np.exp(-10.0)) / 10)), samplers)
+
+
+# ---------------------------------------------------------------- invariances
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("offset", [-5000.0, 5000.0])
+def test_a_constant_changes_no_draw(mode, offset, seed):
+    plain, shifted = (runs(Gaussian(3, offset=c), seed, count=1, **MODES[mode])[0] for c in (0.0, offset))
+    assert np.array_equal(plain.get_chain(), shifted.get_chain())
+    assert [s.beta for s in plain.ladder] == [s.beta for s in shifted.ladder]
+    assert shifted.log_evidence - plain.log_evidence == pytest.approx(offset, abs=1e-8)
+    assert shifted.log_evidence_error == pytest.approx(plain.log_evidence_error, rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("unit", [1e-4, 1e4, 2.0**-14, 2.0**14])
+def test_units_change_no_draw(mode, unit, seed):
+    plain, scaled = (runs(Gaussian(3, unit=u), seed, count=1, **MODES[mode])[0] for u in (1.0, unit))
+    if np.log2(unit).is_integer():  # then scaling itself rounds nothing
+        assert np.array_equal(plain.get_chain() * unit, scaled.get_chain())
+    assert np.allclose(plain.get_chain() * unit, scaled.get_chain(), rtol=1e-8)
+    assert [s.moves for s in plain.ladder] == [s.moves for s in scaled.ladder]
+    assert scaled.log_evidence == pytest.approx(plain.log_evidence, abs=1e-8)
+
+
+def test_one_parameter_in_another_unit(seed):
+    class Mixed(Gaussian):
+        def __init__(self, unit):
+            super().__init__(3)
+            self.unit = np.array([1.0, unit, 1.0])
+
+        def log_prior(self, x):
+            z = x / self.unit
+            return -0.5 * np.sum(z**2, axis=-1) - np.sum(np.log(np.sqrt(2 * np.pi) * self.unit))
+
+    for unit in (1e-4, 1e4):
+        plain, scaled = (runs(Mixed(u), seed, count=1)[0] for u in (1.0, unit))
+        assert np.allclose(plain.get_chain() * np.array([1, unit, 1]), scaled.get_chain(), rtol=1e-8)
+
+
+# ---------------------------------------------------------------- the error of the evidence
+
+
+@pytest.mark.parametrize("mode", ["default", "literal"])
+def test_evidence_error_covers(mode, seed):
+    """Two standard errors cover the truth in nearly 95 % of 40 cheap runs, and are not idly wide."""
+    posterior = Gaussian(3, sd=0.1)
+    samplers = runs(posterior, seed, count=40, nwalkers=150, nsteps=0, **MODES[mode])
+    error = np.array([s.log_evidence - posterior.log_evidence for s in samplers])
+    stated = np.array([s.log_evidence_error for s in samplers])
+    covered = int(np.sum(np.abs(error) < 2 * stated))
+    assert covered >= stats.binom(40, 0.93).ppf(1e-3)
+    assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < 1.6
+
+
+def test_alternation_rests_the_walk_where_independent_draws_do_well(seed):
+    class Counting(RandomWalkMove):
+        proposals = 0
+
+        def propose(self, model, state):
+            type(self).proposals += 1
+            return super().propose(model, state)
+
+    runs(Gaussian(2, sd=0.3), seed, count=1, moves=AlternatingMove([StudentTMove(), Counting()]), min_moves=6)
+    assert Counting.proposals == 0
+    runs(
+        Gaussian(2, sd=0.3), seed, count=1, moves=AlternatingMove([StudentTMove(), Counting()], enough=1.0), min_moves=6
+    )
+    assert Counting.proposals > 6
