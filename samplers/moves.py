@@ -1,14 +1,15 @@
 """Mutation kernels in the form of emcee moves.
 
 A tempered sampler resamples its population and then moves it at the new beta. Any emcee move can do that; the moves of
-this module also learn from the population first: they have ``calibrate(coords, weights)``, called once a stage with the
-points of the last stage and their weights at the new beta, and they move the whole ensemble at once.
+this module also learn from the population first: they have ``calibrate(coords, weights, inside)``, called once a
+stage with the points of the last stage, their weights at the new beta, and a function that tells which points lie in
+the support of the prior; and they move the whole ensemble at once.
 
 Fits are made per unit of the weighted standard deviations, so a parameter of 2e-4 s beside one of 3e10 Pa is no matter.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from emcee import State
@@ -16,40 +17,22 @@ from emcee.model import Model
 from emcee.moves import MHMove, Move
 from scipy.linalg import solve_triangular
 
-__all__ = ["AlternatingMove", "RandomWalkMove", "StudentTMove"]
+from .mixtures import (
+    Mixture,
+    component_log_densities,
+    draw,
+    fit_mixture,
+    location_and_root,
+    log_density,
+)
+from .shears import bend, straighten
 
-FEW_POINTS = 5.0
-SMALLEST_PIVOT = 1e-7
-
-
-def _location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean (ndim,) and a lower-triangular root (ndim, ndim) of the weighted covariance, always regular.
-
-    The root is standard deviations times the root of the correlation matrix. With less than five effective points a
-    dimension the correlations are not known and are shrunk towards zero; where the matrix is singular all the same, its
-    diagonal is raised until it is not.
-    """
-    mean = weights @ coords
-    centred = coords - mean
-    sd = np.sqrt(weights @ centred**2)
-    # a parameter without spread keeps a sliver of it, in its own unit
-    sd = np.maximum(sd, np.maximum(1e-12 * coords.std(axis=0), np.spacing(np.abs(mean))))
-    standard = centred / sd
-    correlation = (standard * weights[:, None]).T @ standard
-
-    ndim = len(mean)
-    shrinkage = max(0.0, 1.0 - 1.0 / (weights @ weights) / (FEW_POINTS * ndim))
-    correlation *= 1.0 - shrinkage
-    np.fill_diagonal(correlation, 1.0)
-    jitter = 0.0
-    while True:
-        try:
-            root = np.linalg.cholesky((correlation + jitter * np.eye(ndim)) / (1.0 + jitter))
-            if root.diagonal().min() > SMALLEST_PIVOT:
-                return mean, sd[:, None] * root
-        except np.linalg.LinAlgError:
-            pass
-        jitter = max(10.0 * jitter, 1e-12)
+__all__ = ["AlternatingMove", "MixtureMove", "RandomWalkMove", "StudentTMove"]
+WHOLE_DIFFERENCES = 0.1
+REDRAWS = 20
+SHARES = (0.5, 0.25, 0.25)
+Inside = Callable[[np.ndarray], np.ndarray]
+CROSSOVERS = (1.0 / 3.0, 2.0 / 3.0, 1.0)
 
 
 class _FittedMove(MHMove):
@@ -60,9 +43,9 @@ class _FittedMove(MHMove):
         self._mean = None
         self._root = None
 
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray) -> None:
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit the proposal to points (n, ndim) with normalised weights (n,)."""
-        self._mean, self._root = _location_and_root(coords, weights)
+        self._mean, self._root = location_and_root(coords, weights)
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """One proposal for every walker: the new state and which proposals (nwalkers,) were accepted."""
@@ -121,9 +104,9 @@ class StudentTMove(_FittedMove):
         self.dof = dof
         self._inverse = None
 
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray) -> None:
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit mean and covariance to points (n, ndim) with normalised weights (n,)."""
-        super().calibrate(coords, weights)
+        super().calibrate(coords, weights, inside)
         self._root = self._root * math.sqrt((self.dof - 2.0) / self.dof)
         self._inverse = solve_triangular(self._root, np.eye(len(self._root)), lower=True)
 
@@ -157,13 +140,13 @@ class AlternatingMove(Move):
         self._last = -1
         self._first_alone = False
 
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray) -> None:
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Calibrate every move that learns, and start the cycle again."""
         self._last = -1
         self._first_alone = False
         for move in self.moves:
             if hasattr(move, "calibrate"):
-                move.calibrate(coords, weights)
+                move.calibrate(coords, weights, inside)
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """One sweep of the move whose turn it is: the new state and which proposals (nwalkers,) were accepted."""
@@ -175,3 +158,107 @@ class AlternatingMove(Move):
         if self._last == 0:
             self._first_alone = float(np.mean(accepted)) > self.enough
         self.moves[self._last].tune(state, accepted)
+
+
+class MixtureMove(MHMove):
+    """Three kernels, drawn sweep by sweep, all from one mixture fitted to the stage (see `samplers.mixtures`).
+
+    independence
+        A draw from the mixture: crosses between modes, and renews most of an ensemble the mixture fits well. The only
+        kernel as long as more than `enough` of its draws are accepted. A draw outside the support of the prior is
+        repeated, at no evaluation: the proposal is the mixture cut off at the edges of the support.
+    local walk
+        A random walk with the covariance of one component, drawn from the responsibilities of the components for the
+        point; the ratio of the responsibilities after and before makes it reversible.
+    differences
+        A step along the difference of two points of the last stage, drawn by their weights; now and then the whole
+        difference, which leads from mode to mode (after ter Braak 2006, doi:10.1007/s11222-006-8769-1). The points are
+        those the stage was calibrated on, so that the steps do not depend on the ensemble being moved.
+
+    The scales of the last two are steered by ``tune`` towards the acceptance `target`.
+
+    Parameters
+    ----------
+    max_components : int — of the mixture.
+    enough : float — acceptance of the independent draws above which the other kernels rest.
+    target : float — acceptance aimed at by the walk and the differences.
+    """
+
+    def __init__(self, max_components: int = 6, enough: float = 0.5, target: float = 0.25):
+        if max_components < 1:
+            raise ValueError(f"max_components must be at least 1; got {max_components}")
+        super().__init__(self._draw)
+        self.max_components = max_components
+        self.enough = enough
+        self.target = target
+        self._mixture: Mixture | None = None
+        self._kernels = (self._independence, self._local_walk, self._differences)
+        self._log_factors = [0.0, 0.0, 0.0]
+        self._turn = -1
+        self._alone = False
+
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
+        """Fit the mixture to weighted points (n, ndim), (n,); the next sweep is an independent one."""
+        self._mixture = fit_mixture(coords, weights, self.max_components)
+        self._inside = inside
+        self._archive = straighten(self._mixture.shears, coords)
+        self._cumulated = np.cumsum(weights)
+        self._turn, self._alone = -1, False
+
+    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
+        """One sweep of one kernel: the new state and which proposals (nwalkers,) were accepted."""
+        if self._mixture is None:  # inside a plain EnsembleSampler nobody calibrates: fit to the ensemble as it stands
+            n = len(state.coords)
+            self.calibrate(state.coords, np.full(n, 1.0 / n))
+        # chance decides, not a counter: a run goes on the same from the same random state
+        self._turn = 0 if self._alone or self._turn < 0 else model.random.choice(len(self._kernels), p=SHARES)
+        return super().propose(model, state)
+
+    def tune(self, state: State, accepted: np.ndarray) -> None:
+        """Steer the scale of the kernel made last, or let the independent draws work alone."""
+        share = float(np.mean(accepted))
+        if self._turn == 0:
+            self._alone = share > self.enough
+        else:
+            self._log_factors[self._turn] += share - self.target
+
+    def _draw(self, coords, random):
+        return self._kernels[self._turn](coords, random)
+
+    def _independence(self, coords, random):
+        proposed = draw(self._mixture, len(coords), random)
+        if self._inside is not None:
+            for _ in range(REDRAWS):
+                outside = np.flatnonzero(~self._inside(proposed))
+                if len(outside) == 0:
+                    break
+                proposed[outside] = draw(self._mixture, len(outside), random)
+        return proposed, log_density(self._mixture, coords) - log_density(self._mixture, proposed)
+
+    def _local_walk(self, coords, random):
+        n, ndim = coords.shape
+        before = component_log_densities(self._mixture, coords)
+        total = np.logaddexp.reduce(before, axis=1)
+        cumulated = np.cumsum(np.exp(before - total[:, None]), axis=1)
+        component = np.sum(cumulated < random.uniform(size=n)[:, None] * cumulated[:, -1:], axis=1)
+        scale = 2.38 / math.sqrt(ndim) * math.exp(self._log_factors[1])
+        steps = np.einsum("nij,nj->ni", self._mixture.roots[component], random.standard_normal((n, ndim)))
+        proposed = bend(self._mixture.shears, straighten(self._mixture.shears, coords) + scale * steps)
+        after = component_log_densities(self._mixture, proposed)
+        rows = np.arange(n)
+        return proposed, (after[rows, component] - np.logaddexp.reduce(after, axis=1)) - (
+            before[rows, component] - total
+        )
+
+    def _differences(self, coords, random):
+        n, ndim = coords.shape
+        first, second = (
+            np.searchsorted(self._cumulated, random.uniform(size=n) * self._cumulated[-1], side="right")
+            for _ in range(2)
+        )
+        crossed = random.uniform(size=(n, ndim)) < random.choice(CROSSOVERS, size=n)[:, None]
+        crossed[np.arange(n), random.randint(ndim, size=n)] = True
+        scale = 2.38 / np.sqrt(2.0 * crossed.sum(axis=1)) * math.exp(self._log_factors[2])
+        scale[random.uniform(size=n) < WHOLE_DIFFERENCES] = 1.0
+        steps = crossed * scale[:, None] * (self._archive[first] - self._archive[second])
+        return bend(self._mixture.shears, straighten(self._mixture.shears, coords) + steps), np.zeros(n)

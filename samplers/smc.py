@@ -7,7 +7,7 @@ many moves as it takes to forget the resampled start. The settings of papers are
 
 from collections.abc import Callable
 
-from .moves import AlternatingMove, RandomWalkMove, StudentTMove
+from .moves import MixtureMove
 from .settings import Settings
 from .tempered import TemperedSampler
 
@@ -23,8 +23,8 @@ class SMCSampler(TemperedSampler):
 
     Parameters
     ----------
-    nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, independent draws from
-        a Student t fitted to the stage alternate with a random walk, and rule alone where more than half are accepted.
+    nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, those of
+        `samplers.moves.MixtureMove`: three kernels from a mixture fitted to every stage.
     log_prior_fn, seed : as in `TemperedSampler`.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation : as in
         `samplers.settings.Settings`.
@@ -51,11 +51,11 @@ class SMCSampler(TemperedSampler):
         ess_floor: float = 0.0,
         resampling: str | Callable = "systematic",
         min_moves: int = 2,
-        max_moves: int = 20,
+        max_moves: int = 7,
         max_correlation: float = 0.15,
     ):
         if moves is None:
-            moves = AlternatingMove([StudentTMove(), RandomWalkMove(adapt=True)])
+            moves = MixtureMove()
         super().__init__(
             nwalkers,
             ndim,

@@ -289,6 +289,10 @@ class TemperedSampler(EnsembleSampler):
         log_prior, _ = log_probabilities(self._call(self.log_prior_fn, coords, None), len(coords), "log_prior_fn")
         return np.where(np.isnan(log_prior), -np.inf, log_prior)
 
+    def _inside(self, coords: np.ndarray) -> np.ndarray:
+        """Which of the points (n, ndim) lie in the support of the prior."""
+        return self._log_prior(coords) > -np.inf
+
     def _call(self, function: Callable, coords: np.ndarray, pool: Any):
         """emcee's way to call a function of points: batch, pool or map; dictionaries for named parameters."""
         points = ndarray_to_list_of_dicts(coords, self.parameter_names) if self.params_are_named else coords
@@ -373,7 +377,7 @@ class TemperedSampler(EnsembleSampler):
     def _calibrate(self, coords: np.ndarray, weights: np.ndarray) -> None:
         for move in self._moves:
             if hasattr(move, "calibrate"):
-                move.calibrate(coords, weights)
+                move.calibrate(coords, weights, self._inside)
 
     def _mutate(
         self, coords: np.ndarray, packed: np.ndarray, beta: float, show: Callable[[float], None]

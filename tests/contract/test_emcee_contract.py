@@ -294,10 +294,11 @@ def test_emcees_moves_are_kernels(Sampler, moves):
 
 def test_our_moves_are_emcees():
     """Inside a plain EnsembleSampler nobody calibrates; the moves fit themselves to the first ensemble."""
-    from samplers.moves import AlternatingMove, RandomWalkMove, StudentTMove
+    from samplers.moves import AlternatingMove, MixtureMove, RandomWalkMove, StudentTMove
 
     posterior = Gaussian()
-    for move in (RandomWalkMove(), StudentTMove(), AlternatingMove([StudentTMove(), RandomWalkMove(adapt=True)])):
+    alternating = AlternatingMove([StudentTMove(), RandomWalkMove(adapt=True)])
+    for move in (RandomWalkMove(), StudentTMove(), MixtureMove(), alternating):
         sampler = emcee.EnsembleSampler(N, 3, posterior, moves=move)
         sampler.run_mcmc(posterior.mean + posterior.sd * start(posterior), 20, tune=True)
         assert sampler.acceptance_fraction.mean() > 0.1

@@ -40,7 +40,7 @@ def test_stages_account_for_everything():
     assert betas == sorted(set(betas)) and betas[-1] == 1.0
     assert sum(s.evaluations for s in sampler.ladder) == sampler.evaluations == posterior.calls
     assert all(s.evaluations == N * s.moves for s in sampler.ladder[1:])  # a prior without edges rejects nothing unseen
-    assert all(2 <= s.moves <= 20 and 0 < s.acceptance <= 1 for s in sampler.ladder)
+    assert all(2 <= s.moves <= 7 and 0 < s.acceptance <= 1 for s in sampler.ladder)
     assert all(abs(s.effective_sample_size / (0.5 * N) - 1) < 1e-4 for s in sampler.ladder[:-1])
     assert sampler.ladder[-1].effective_sample_size >= 0.5 * N
     assert sampler.log_evidence == sum(s.log_evidence_increment for s in sampler.ladder)
@@ -198,7 +198,7 @@ SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, backend=emcee.backends.HDFBack
     ladder = read_ladder(emcee.backends.HDFBackend(str(path), read_only=True))
     assert len(ladder) >= 1
     assert ladder[-1].beta < 1
-    assert all(s.moves <= 20 and s.evaluations >= 2 * N for s in ladder)
+    assert all(s.moves <= 7 and s.evaluations >= 2 * N for s in ladder)
 
 
 # ---------------------------------------------------------------- refusals, alarms

@@ -13,7 +13,8 @@ from samplers.ladder import (
     next_beta,
     normalised_weights,
 )
-from samplers.moves import RandomWalkMove, StudentTMove, _location_and_root
+from samplers.mixtures import location_and_root
+from samplers.moves import RandomWalkMove, StudentTMove
 from samplers.resampling import RESAMPLING
 
 
@@ -118,10 +119,10 @@ def test_roots_are_regular_and_follow_units(rng):
     ndim = 4
     coords = rng.standard_normal((200, ndim)) @ np.tril(rng.standard_normal((ndim, ndim)))
     weights = rng.dirichlet(np.ones(200))
-    mean, root = _location_and_root(coords, weights)
+    mean, root = location_and_root(coords, weights)
     assert np.allclose(root @ root.T, np.cov(coords.T, aweights=weights, ddof=0))
     units = np.array([1e-4, 1.0, 1e4, 1e11])
-    scaled_mean, scaled_root = _location_and_root(coords * units, weights)
+    scaled_mean, scaled_root = location_and_root(coords * units, weights)
     assert np.allclose(scaled_mean, mean * units)
     assert np.allclose(scaled_root, units[:, None] * root)
     for degenerate in (
@@ -129,7 +130,7 @@ def test_roots_are_regular_and_follow_units(rng):
         np.repeat(coords[:2], 100, axis=0),
         np.column_stack([coords[:, 0], coords[:, 0], coords[:, 1], np.full(200, 3e10)]),
     ):
-        _, root = _location_and_root(degenerate, weights)
+        _, root = location_and_root(degenerate, weights)
         assert np.all(np.isfinite(root)) and np.all(root.diagonal() > 0)
 
 

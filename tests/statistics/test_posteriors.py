@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from samplers import RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler
-from samplers.moves import AlternatingMove, RandomWalkMove, StudentTMove
+from samplers.moves import AlternatingMove, MixtureMove, RandomWalkMove, StudentTMove
 from tests.contract.targets import Box, Gaussian
 
 MODES = {"default": {}, "constant": RAMANCHA_2022_CONSTANT, "literal": RAMANCHA_2022_LITERAL}
@@ -57,12 +57,13 @@ def test_conjugate_gaussian(mode, seed):
         StudentTMove(),
         [(StudentTMove(dof=5.0), 0.5), (RandomWalkMove(), 0.5)],
         emcee.moves.StretchMove(),
+        MixtureMove(enough=1.0),
     ],
-    ids=["walk", "adaptive walk", "t", "weighted", "stretch"],
+    ids=["walk", "adaptive walk", "t", "weighted", "stretch", "mixture"],
 )
 def test_every_kernel(moves, seed):
     posterior = Gaussian(2, sd=0.2)
-    samplers = runs(posterior, seed, moves=moves, min_moves=8)
+    samplers = runs(posterior, seed, moves=moves, min_moves=8, max_moves=20)
     assert within(deviations(samplers, posterior.mean), samplers)
     assert within(deviations(samplers, posterior.sd**2, lambda x: (x - posterior.mean) ** 2), samplers)
     assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
