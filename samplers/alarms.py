@@ -3,11 +3,15 @@
 import warnings
 from collections.abc import Sequence
 
+import numpy as np
+
+from .importance import EvidenceCheck
 from .ladder import Stage
 
-__all__ = ["SamplingWarning", "check_ladder", "sound"]
+__all__ = ["SamplingWarning", "check_evidence", "check_ladder", "sound"]
 
 LOW_ACCEPTANCE = 0.01
+LOW_YIELD = 0.05
 
 
 class SamplingWarning(UserWarning):
@@ -38,4 +42,21 @@ def check_ladder(ladder: Sequence[Stage], nwalkers: int, ndim: int) -> None:
         sound(
             f"stuck at stage {number} (beta = {stage.beta:.3g}): {100 * stage.acceptance:.2g} % of the proposals were "
             "accepted, so the points did not move. Use other moves or more of them"
+        )
+
+
+def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> None:
+    """Warn if an independent estimate says nothing, or differs from the ladder's by more than three joint errors."""
+    if not check.reliable and check.effective_sample_size < LOW_YIELD * check.evaluations:
+        sound(
+            f"no mixture follows the final points: {check.evaluations} draws from the best one are worth "
+            f"{check.effective_sample_size:.2g}, so the evidence and the posterior stand on the ladder alone. Use more "
+            "walkers or more moves, and compare two runs"
+        )
+    joint = float(np.hypot(error, check.error))
+    if check.reliable and abs(log_evidence - check.log_evidence) > 3.0 * joint + 1e-6:
+        sound(
+            f"the ladder gives the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling of the final "
+            f"points {check.log_evidence:.2f} +- {check.error:.2f}. The posterior may be right all the same; for the "
+            "evidence use more walkers or more moves"
         )

@@ -1,25 +1,28 @@
 """The ladder beside the chain: in the backend that holds the chain, whichever of emcee's it is.
 
 In an HDF5 file the ladder is the dataset ``ladder`` in the group of the chain, one row a stage, appended as soon as the
-stage is done; the file is closed in between, so that a killed run leaves a readable file. In memory it is an attribute
-of the backend.
+stage is done, and the independent check of the evidence is its attribute ``evidence_check``; the file is closed in
+between, so that a killed run leaves a readable file. In memory both are attributes of the backend.
 """
 
 import numpy as np
 from emcee.backends import Backend, HDFBackend
 
+from .importance import EvidenceCheck
 from .ladder import Stage
 
-__all__ = ["read_ladder", "write_stage"]
+__all__ = ["read_check", "read_ladder", "write_check", "write_stage"]
 
 DATASET = "ladder"
+CHECK = "evidence_check"
 STAGE_DTYPE = np.dtype(
     [(name, np.int64 if kind is int else np.float64) for name, kind in Stage.__annotations__.items()]
 )
 
 
 def write_stage(backend: Backend, index: int, stage: Stage) -> None:
-    """Store a stage at its place in the ladder; what was there from `index` on is dropped.
+    """Store a stage at its place in the ladder; what was there from `index` on is dropped,
+    and the check of the evidence with it.
 
     Parameters
     ----------
@@ -34,10 +37,12 @@ def write_stage(backend: Backend, index: int, stage: Stage) -> None:
             if DATASET not in group:
                 group.create_dataset(DATASET, shape=(0,), maxshape=(None,), chunks=(64,), dtype=STAGE_DTYPE)
             group[DATASET].resize(index + 1, axis=0)
+            group[DATASET].attrs.pop(CHECK, None)
             group[DATASET][index] = row
     else:
         stored = getattr(backend, DATASET, np.empty(0, dtype=STAGE_DTYPE))
         setattr(backend, DATASET, np.append(stored[:index], row))
+        setattr(backend, CHECK, None)
 
 
 def read_ladder(backend: Backend) -> tuple[Stage, ...]:
@@ -57,3 +62,24 @@ def read_ladder(backend: Backend) -> tuple[Stage, ...]:
     else:
         rows = getattr(backend, DATASET, np.empty(0, dtype=STAGE_DTYPE))
     return tuple(Stage(*row.item()) for row in rows)
+
+
+def write_check(backend: Backend, check: EvidenceCheck) -> None:
+    """Store the check of the evidence beside a ladder that is there."""
+    if isinstance(backend, HDFBackend):
+        with backend.open("a") as file:
+            file[backend.name][DATASET].attrs[CHECK] = np.array(check, dtype=float)
+    else:
+        setattr(backend, CHECK, check)
+
+
+def read_check(backend: Backend) -> EvidenceCheck | None:
+    """The stored check of the evidence; None where there is none."""
+    if not isinstance(backend, HDFBackend):
+        return getattr(backend, CHECK, None)
+    if not backend.initialized:
+        return None
+    with backend.open() as file:
+        group = file[backend.name]
+        row = group[DATASET].attrs.get(CHECK) if DATASET in group else None
+    return None if row is None else EvidenceCheck(*row[:4].tolist(), int(row[4]))

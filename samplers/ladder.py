@@ -111,7 +111,7 @@ def log_mean_weight(log_weights: np.ndarray) -> float:
     return top if top == -np.inf else top + float(np.log(weights.mean()))
 
 
-def next_beta(log_likelihood: np.ndarray, beta: float, target: float) -> float:
+def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.ndarray | None = None) -> float:
     """Largest next exponent whose incremental weights keep the effective sample size at `target`.
 
     Points of zero likelihood are lost at any exponent above zero, so the target is meant per point that is left: it is
@@ -124,6 +124,8 @@ def next_beta(log_likelihood: np.ndarray, beta: float, target: float) -> float:
     log_likelihood : (n,) float — at the points of the population; -inf allowed.
     beta : float — exponent of the population, 0 <= beta < 1.
     target : float — wanted effective sample size, 0 < target < n.
+    base : (n,) float, optional — log-weights that the points carry at `beta`; by default all the same. With them the
+        target is taken as it is, and must be met at `beta`.
 
     Returns
     -------
@@ -137,18 +139,26 @@ def next_beta(log_likelihood: np.ndarray, beta: float, target: float) -> float:
     top = np.max(log_likelihood)
     if top == -np.inf:
         raise ValueError("no point of the population has a finite log-likelihood; check the model and the prior")
-    relative = log_likelihood[log_likelihood > -np.inf] - top
-    target = target * len(relative) / len(log_likelihood)
+    alive = log_likelihood > -np.inf
+    relative = log_likelihood[alive] - top
+    if base is None:
+        carried = 0.0
+        target = target * len(relative) / len(log_likelihood)
+    else:
+        carried = base[alive]
+
+    def meets(step: float) -> bool:
+        return effective_sample_size(carried + step * relative) >= target
 
     step = 1.0 - beta
-    if effective_sample_size(step * relative) >= target:
+    if meets(step):
         return 1.0
-    while effective_sample_size(step * relative) < target:
+    while step > 0.0 and not meets(step):
         step *= 0.5
     low, high = step, 2.0 * step
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        if effective_sample_size(middle * relative) >= target:
+        if meets(middle):
             low = middle
         else:
             high = middle

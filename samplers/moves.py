@@ -31,6 +31,7 @@ __all__ = ["AlternatingMove", "MixtureMove", "RandomWalkMove", "StudentTMove"]
 WHOLE_DIFFERENCES = 0.1
 REDRAWS = 20
 SHARES = (0.5, 0.25, 0.25)
+SHARES_DOING_WELL = (0.8, 0.1, 0.1)
 Inside = Callable[[np.ndarray], np.ndarray]
 CROSSOVERS = (1.0 / 3.0, 2.0 / 3.0, 1.0)
 
@@ -164,9 +165,9 @@ class MixtureMove(MHMove):
     """Three kernels, drawn sweep by sweep, all from one mixture fitted to the stage (see `samplers.mixtures`).
 
     independence
-        A draw from the mixture: crosses between modes, and renews most of an ensemble the mixture fits well. The only
-        kernel as long as more than `enough` of its draws are accepted. A draw outside the support of the prior is
-        repeated, at no evaluation: the proposal is the mixture cut off at the edges of the support.
+        A draw from the mixture: crosses between modes, and renews most of an ensemble the mixture fits well. Half of
+        all sweeps, and four in five as long as more than `enough` of its draws are accepted. A draw outside the support
+        of the prior is repeated, at no evaluation: the proposal is the mixture cut off at the edges of the support.
     local walk
         A random walk with the covariance of one component, drawn from the responsibilities of the components for the
         point; the ratio of the responsibilities after and before makes it reversible.
@@ -180,7 +181,7 @@ class MixtureMove(MHMove):
     Parameters
     ----------
     max_components : int — of the mixture.
-    enough : float — acceptance of the independent draws above which the other kernels rest.
+    enough : float — acceptance of the independent draws above which the other kernels mostly rest.
     target : float — acceptance aimed at by the walk and the differences.
     """
 
@@ -195,7 +196,7 @@ class MixtureMove(MHMove):
         self._kernels = (self._independence, self._local_walk, self._differences)
         self._log_factors = [0.0, 0.0, 0.0]
         self._turn = -1
-        self._alone = False
+        self._doing_well = False
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit the mixture to weighted points (n, ndim), (n,); the next sweep is an independent one."""
@@ -203,7 +204,7 @@ class MixtureMove(MHMove):
         self._inside = inside
         self._archive = straighten(self._mixture.shears, coords)
         self._cumulated = np.cumsum(weights)
-        self._turn, self._alone = -1, False
+        self._turn, self._doing_well = -1, False
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """One sweep of one kernel: the new state and which proposals (nwalkers,) were accepted."""
@@ -211,14 +212,15 @@ class MixtureMove(MHMove):
             n = len(state.coords)
             self.calibrate(state.coords, np.full(n, 1.0 / n))
         # chance decides, not a counter: a run goes on the same from the same random state
-        self._turn = 0 if self._alone or self._turn < 0 else model.random.choice(len(self._kernels), p=SHARES)
+        shares = SHARES_DOING_WELL if self._doing_well else SHARES
+        self._turn = 0 if self._turn < 0 else model.random.choice(len(self._kernels), p=shares)
         return super().propose(model, state)
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Steer the scale of the kernel made last, or let the independent draws work alone."""
+        """Steer the scale of the kernel made last, or see whether the independent draws do well."""
         share = float(np.mean(accepted))
         if self._turn == 0:
-            self._alone = share > self.enough
+            self._doing_well = share > self.enough
         else:
             self._log_factors[self._turn] += share - self.target
 

@@ -22,6 +22,10 @@ class Settings:
     min_moves, max_moves : int — sweeps of the ensemble a stage; equal for a fixed number.
     max_correlation : float — between the two, moving stops once the correlation of every parameter and of the
         log-likelihood with the resampled start is below this, or falls no further.
+    recycle : bool — climb by importance sampling over every point evaluated (`samplers.recycling`), and by moves only
+        where that may not be trusted.
+    check_draws : int, optional — evaluations spent at the end on an evidence independent of the ladder; by default as
+        many as there are walkers, none with 0.
     """
 
     ess_ratio: float = 0.5
@@ -29,8 +33,10 @@ class Settings:
     ess_floor: float = 0.0
     resampling: str | Callable = "systematic"
     min_moves: int = 2
-    max_moves: int = 20
+    max_moves: int = 7
     max_correlation: float = 0.15
+    recycle: bool = False
+    check_draws: int | None = None
 
     def __post_init__(self):
         if not 0.0 < self.ess_ratio < 1.0:
@@ -45,6 +51,8 @@ class Settings:
             raise ValueError(f"1 <= min_moves <= max_moves is needed; got {self.min_moves} and {self.max_moves}")
         if not 0.0 < self.max_correlation <= 1.0:
             raise ValueError(f"max_correlation must lie in (0, 1]; got {self.max_correlation}")
+        if self.check_draws is not None and not self.check_draws >= 0:
+            raise ValueError(f"check_draws must not be negative; got {self.check_draws}")
 
     @property
     def resample(self) -> Callable:

@@ -26,8 +26,10 @@ class SMCSampler(TemperedSampler):
     nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, those of
         `samplers.moves.MixtureMove`: three kernels from a mixture fitted to every stage.
     log_prior_fn, seed : as in `TemperedSampler`.
-    ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation : as in
-        `samplers.settings.Settings`.
+    recycle : bool, optional — climb by recycling every evaluated point (`samplers.recycling`), and by moves where that
+        may not be trusted. By default yes if `moves` are not given.
+    ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation, check_draws : as in
+        `samplers.settings.Settings`; all but the last for a climb by moves.
     """
 
     def __init__(
@@ -53,7 +55,11 @@ class SMCSampler(TemperedSampler):
         min_moves: int = 2,
         max_moves: int = 7,
         max_correlation: float = 0.15,
+        recycle: bool | None = None,
+        check_draws: int | None = None,
     ):
+        if recycle is None:
+            recycle = moves is None
         if moves is None:
             moves = MixtureMove()
         super().__init__(
@@ -78,5 +84,7 @@ class SMCSampler(TemperedSampler):
                 min_moves=min_moves,
                 max_moves=max_moves,
                 max_correlation=max_correlation,
+                recycle=recycle,
+                check_draws=check_draws,
             ),
         )

@@ -11,6 +11,7 @@ emcee's private names are touched in this module only.
 """
 
 import copy
+import logging
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,9 +22,10 @@ from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
 from emcee.model import Model
 from emcee.pbar import get_progress_bar
 
-from .alarms import check_ladder, sound
-from .backends import read_ladder, write_stage
+from .alarms import check_evidence, check_ladder, sound
+from .backends import read_check, read_ladder, write_check, write_stage
 from .evaluation import Records, log_probabilities
+from .importance import EvidenceCheck, draw_inside, evidence_from_weights
 from .ladder import (
     EvidenceError,
     Stage,
@@ -33,11 +35,15 @@ from .ladder import (
     next_beta,
     normalised_weights,
 )
+from .mixtures import fit_mixture, log_density
 from .moves import RandomWalkMove
 from .mutation import Memory, tempered_log_prob
+from .recycling import recycle
 from .settings import Settings
 
 __all__ = ["TemperedSampler"]
+
+logger = logging.getLogger(__name__)
 
 
 class TemperedSampler(EnsembleSampler):
@@ -102,6 +108,7 @@ class TemperedSampler(EnsembleSampler):
         self.settings = settings
         self._records = Records(blobs_dtype)
         self._ladder: list[Stage] = []
+        self._check: EvidenceCheck | None = None
         self._previous_state = None
         self._summit = None
         super().__init__(
@@ -118,6 +125,7 @@ class TemperedSampler(EnsembleSampler):
             parameter_names=parameter_names,
         )
         self._ladder = list(read_ladder(self.backend))
+        self._check = read_check(self.backend)
         if self.backend.random_state is None:
             self._random.seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
 
@@ -144,13 +152,37 @@ class TemperedSampler(EnsembleSampler):
 
     @property
     def log_evidence(self) -> float:
-        """Log of the evidence: the sum of the increments of the ladder."""
-        return float(sum(stage.log_evidence_increment for stage in self._finished_ladder()))
+        """Log of the evidence: of `log_evidence_ladder` and `log_evidence_check` the one of the smaller error."""
+        return self._evidence()[0]
 
     @property
     def log_evidence_error(self) -> float:
-        """Standard error of `log_evidence`, from this run alone (see `samplers.ladder.EvidenceError`)."""
-        return self._finished_ladder()[-1].log_evidence_error
+        """Standard error of `log_evidence`, from this run alone.
+
+        At least half the difference of the two estimates if they differ by more than twice their joint error.
+        """
+        return self._evidence()[1]
+
+    @property
+    def log_evidence_ladder(self) -> float:
+        """Log of the evidence by the ladder: the sum of its increments."""
+        return float(sum(stage.log_evidence_increment for stage in self._finished_ladder()))
+
+    @property
+    def log_evidence_check(self) -> EvidenceCheck | None:
+        """The evidence by importance sampling after the climb; None without (``check_draws=0``)."""
+        self._finished_ladder()
+        return self._check
+
+    def _evidence(self) -> tuple[float, float]:
+        value, error = self.log_evidence_ladder, self._ladder[-1].log_evidence_error
+        check = self._check
+        if check is None or not check.reliable:
+            return value, error
+        difference, joint = abs(value - check.log_evidence), np.hypot(error, check.error)
+        if check.error < error:
+            value, error = check.log_evidence, check.error
+        return value, max(error, 0.5 * difference) if difference > 2.0 * joint else error
 
     def _finished_ladder(self) -> list[Stage]:
         if not self._on_top():
@@ -166,6 +198,8 @@ class TemperedSampler(EnsembleSampler):
         super().reset()
         for index, stage in enumerate(self._ladder):
             write_stage(self.backend, index, stage)
+        if self._check is not None:
+            write_check(self.backend, self._check)
 
     # ------------------------------------------------------------------ running
 
@@ -304,49 +338,115 @@ class TemperedSampler(EnsembleSampler):
 
     def _climb(self, state: State, skip_check: bool, progress: bool | str, progress_kwargs: dict) -> State:
         """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
-        started, evaluations = time.perf_counter(), self.evaluations
+        self._mark = time.perf_counter(), self.evaluations
+        self._check = None
         packed = self._enter(state, skip_check)
-        coords, beta, target = state.coords, 0.0, float(self.nwalkers)
-        error = EvidenceError(self.nwalkers)
-        self._ladder = []
-
         with get_progress_bar(progress, None, **{"desc": "ladder", "unit": " sweeps", **progress_kwargs}) as bar:
-            while beta < 1.0:
-                log_likelihood = packed["log_prob"] - packed["log_prior"]
-                target = self.settings.target(target, self.nwalkers)
-                last_beta, beta = beta, next_beta(log_likelihood, beta, target)
-                log_weights = (beta - last_beta) * log_likelihood
-                weights = normalised_weights(log_weights)
-                standard_error = error.weigh(weights)
-                self._calibrate(coords, coarse_weights(log_weights))
-
-                ancestors = self.settings.resample(weights, self._random)
-                error.resample(ancestors)
-                coords, packed = coords[ancestors], packed[ancestors]
-                distinct = len(np.unique(coords, axis=0))
-                ess = effective_sample_size(log_weights)
-                coords, packed, acceptance, moves = self._mutate(
-                    coords, packed, beta, lambda share, b=beta, e=ess: self._show(bar, b, e, share)
-                )
-
-                stage = Stage(
-                    beta=beta,
-                    effective_sample_size=ess,
-                    acceptance=acceptance,
-                    moves=moves,
-                    distinct_ancestors=distinct,
-                    log_evidence_increment=log_mean_weight(log_weights),
-                    log_evidence_error=standard_error,
-                    evaluations=self.evaluations - evaluations,
-                    seconds=time.perf_counter() - started,
-                )
-                started, evaluations = time.perf_counter(), self.evaluations
-                self._ladder.append(stage)
-                write_stage(self.backend, len(self._ladder) - 1, stage)
-                check_ladder(self._ladder, self.nwalkers, self.ndim)
-
+            climbed = self._climb_by_recycling(state.coords, packed, bar) if self.settings.recycle else None
+            coords, packed = climbed or self._climb_by_moves(state.coords, packed, bar)
+        if self._check is None and self.settings.check_draws != 0:
+            self._check = self._check_evidence(coords)
+        if self._check is not None:
+            write_check(self.backend, self._check)
+            last = self._ladder[-1]
+            check_evidence(self.log_evidence_ladder, last.log_evidence_error, self._check)
         log_prob, blobs = self._records.unpack(packed)
         return State(coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
+
+    def _add_stage(self, **fields: float) -> None:
+        """Enter a finished stage, and store it: what it cost is counted since the stage before."""
+        seconds, evaluations = self._mark
+        self._mark = time.perf_counter(), self.evaluations
+        stage = Stage(seconds=self._mark[0] - seconds, evaluations=self._mark[1] - evaluations, **fields)
+        self._ladder.append(stage)
+        write_stage(self.backend, len(self._ladder) - 1, stage)
+
+    def _climb_by_moves(self, coords: np.ndarray, packed: np.ndarray, bar: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Sequential Monte Carlo: weigh, resample, move, from draws of the prior on."""
+        beta, target = 0.0, float(self.nwalkers)
+        error = EvidenceError(self.nwalkers)
+        self._ladder = []
+        while beta < 1.0:
+            log_likelihood = packed["log_prob"] - packed["log_prior"]
+            target = self.settings.target(target, self.nwalkers)
+            last_beta, beta = beta, next_beta(log_likelihood, beta, target)
+            log_weights = (beta - last_beta) * log_likelihood
+            weights = normalised_weights(log_weights)
+            standard_error = error.weigh(weights)
+            self._calibrate(coords, coarse_weights(log_weights))
+
+            ancestors = self.settings.resample(weights, self._random)
+            error.resample(ancestors)
+            coords, packed = coords[ancestors], packed[ancestors]
+            distinct = len(np.unique(coords, axis=0))
+            ess = effective_sample_size(log_weights)
+            coords, packed, acceptance, moves = self._mutate(
+                coords, packed, beta, lambda share, b=beta, e=ess: self._show(bar, b, e, share)
+            )
+            self._add_stage(
+                beta=beta,
+                effective_sample_size=ess,
+                acceptance=acceptance,
+                moves=moves,
+                distinct_ancestors=distinct,
+                log_evidence_increment=log_mean_weight(log_weights),
+                log_evidence_error=standard_error,
+            )
+            check_ladder(self._ladder, self.nwalkers, self.ndim)
+        return coords, packed
+
+    def _climb_by_recycling(
+        self, coords: np.ndarray, packed: np.ndarray, bar: Any
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Adaptive importance sampling over all points; None where its result may not be trusted."""
+        self._ladder = []
+
+        def enter(log_evidence, acceptance, effective_sample_size, **fields):
+            self._add_stage(
+                effective_sample_size=effective_sample_size,
+                acceptance=acceptance,
+                moves=0,
+                distinct_ancestors=int(effective_sample_size),
+                log_evidence_increment=log_evidence - sum(s.log_evidence_increment for s in self._ladder),
+                **fields,
+            )
+            self._show(bar, fields["beta"], effective_sample_size, acceptance)
+
+        found = recycle(coords, packed, self._evaluate, self._inside, self._random, enter)
+        if not found.trusted:
+            logger.info("recycling is not trusted here, because %s: climbing by moves", found.doubt)
+            return None
+        if self.settings.check_draws != 0:
+            self._check = found.check
+            self._mark = self._mark[0], self._mark[1] + found.check.evaluations
+        weights = normalised_weights(found.log_weights)
+        self._calibrate(found.coords, coarse_weights(found.log_weights))
+        # the weights of few thousand points, thinned to as many points as there are walkers
+        ancestors = np.searchsorted(
+            np.cumsum(weights), (np.arange(self.nwalkers) + self._random.uniform()) / self.nwalkers, side="right"
+        )
+        ancestors = np.minimum(ancestors, len(weights) - 1)
+        ess = effective_sample_size(found.log_weights)
+        coords, packed, acceptance, moves = self._mutate(
+            found.coords[ancestors], found.records[ancestors], 1.0, lambda share: self._show(bar, 1.0, ess, share)
+        )
+        self._add_stage(
+            beta=1.0,
+            effective_sample_size=ess,
+            acceptance=acceptance,
+            moves=moves,
+            distinct_ancestors=len(np.unique(ancestors)),
+            log_evidence_increment=found.log_evidence - sum(s.log_evidence_increment for s in self._ladder),
+            log_evidence_error=found.log_evidence_error,
+        )
+        return coords, packed
+
+    def _check_evidence(self, coords: np.ndarray) -> EvidenceCheck:
+        """The evidence from fresh draws of a mixture fitted to the final population."""
+        n = self.nwalkers if self.settings.check_draws is None else self.settings.check_draws
+        mixture = fit_mixture(coords, np.full(len(coords), 1.0 / len(coords)))
+        drawn, made = draw_inside(mixture, n, self._random, self._inside)
+        return evidence_from_weights(self._evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
 
     def _enter(self, state: State, skip_check: bool) -> np.ndarray:
         """Check draws of the prior and evaluate them: records of all walkers."""

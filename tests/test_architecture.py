@@ -18,13 +18,26 @@ SAMPLERS = {
     "resampling": set(),
     "shears": set(),
     "mixtures": {"shears"},
+    "importance": {"ladder", "mixtures"},
+    "recycling": {"importance", "ladder", "mixtures"},
     "evaluation": set(),
     "moves": {"mixtures", "shears"},
-    "backends": {"ladder"},
-    "alarms": {"ladder"},
+    "backends": {"importance", "ladder"},
+    "alarms": {"importance", "ladder"},
     "settings": {"resampling"},
     "mutation": {"settings"},
-    "tempered": {"alarms", "backends", "evaluation", "ladder", "moves", "mutation", "settings"},
+    "tempered": {
+        "alarms",
+        "backends",
+        "evaluation",
+        "importance",
+        "ladder",
+        "mixtures",
+        "moves",
+        "mutation",
+        "recycling",
+        "settings",
+    },
 }
 
 
@@ -124,7 +137,7 @@ def test_samplers_stand_in_storeys():
             continue
         below = {m.split(".")[1] for m, _ in imports(path) if m.split(".")[0] == "samplers"}
         assert below <= SAMPLERS[path.stem], f"{name(path)} imports {below - SAMPLERS[path.stem]}"
-        if path.stem in ("ladder", "resampling", "shears", "mixtures"):
+        if path.stem in ("ladder", "resampling", "shears", "mixtures", "importance", "recycling"):
             outside = {m.split(".")[0] for m, _ in imports(path)} - {"samplers"}
             assert outside <= {"numpy", "scipy", *sys.stdlib_module_names}, name(path)
 

@@ -35,17 +35,68 @@ def climbed(posterior=None, nsteps=3, **kwargs):
 
 def test_stages_account_for_everything():
     posterior = Gaussian()
-    sampler = climbed(posterior, nsteps=0)
+    sampler = climbed(posterior, nsteps=0, recycle=False)
     betas = [s.beta for s in sampler.ladder]
     assert betas == sorted(set(betas)) and betas[-1] == 1.0
-    assert sum(s.evaluations for s in sampler.ladder) == sampler.evaluations == posterior.calls
+    check = sampler.log_evidence_check
+    assert check.evaluations == N
+    assert sum(s.evaluations for s in sampler.ladder) + N == sampler.evaluations == posterior.calls
     assert all(s.evaluations == N * s.moves for s in sampler.ladder[1:])  # a prior without edges rejects nothing unseen
     assert all(2 <= s.moves <= 7 and 0 < s.acceptance <= 1 for s in sampler.ladder)
     assert all(abs(s.effective_sample_size / (0.5 * N) - 1) < 1e-4 for s in sampler.ladder[:-1])
     assert sampler.ladder[-1].effective_sample_size >= 0.5 * N
-    assert sampler.log_evidence == sum(s.log_evidence_increment for s in sampler.ladder)
-    assert sampler.log_evidence_error == sampler.ladder[-1].log_evidence_error > 0
+    assert sampler.log_evidence_ladder == sum(s.log_evidence_increment for s in sampler.ladder)
+    assert sampler.ladder[-1].log_evidence_error > 0
     assert all(s.seconds > 0 for s in sampler.ladder)
+
+
+def test_recycling_accounts_for_everything():
+    posterior = Gaussian(sd=0.02)
+    sampler = climbed(posterior, nsteps=0)
+    betas = [s.beta for s in sampler.ladder]
+    assert betas == sorted(set(betas)) and betas[-1] == 1.0
+    assert [s.moves for s in sampler.ladder[:-1]] == [0] * (len(betas) - 1)
+    assert sampler.ladder[-1].moves >= 2
+    check = sampler.log_evidence_check
+    assert sum(s.evaluations for s in sampler.ladder) + check.evaluations == sampler.evaluations == posterior.calls
+    assert abs(check.log_evidence - posterior.log_evidence) < 4 * check.error
+    assert abs(sampler.log_evidence_ladder - posterior.log_evidence) < 4 * sampler.ladder[-1].log_evidence_error
+    assert sampler.log_evidence in (check.log_evidence, sampler.log_evidence_ladder)
+    moved = climbed(Gaussian(sd=0.02), nsteps=0, recycle=False)
+    assert sampler.evaluations < moved.evaluations
+
+
+@pytest.mark.parametrize("recycle", [False, True])
+def test_without_a_check(recycle):
+    sampler = climbed(check_draws=0, recycle=recycle)
+    assert sampler.log_evidence_check is None
+    assert sampler.log_evidence == sampler.log_evidence_ladder
+    assert sampler.log_evidence_error == sampler.ladder[-1].log_evidence_error
+
+
+def test_two_estimates_that_disagree_widen_the_error():
+    sampler = climbed()
+    check = sampler.log_evidence_check
+    sampler._check = check._replace(log_evidence=check.log_evidence + 10.0, error=0.01, pareto_shape=0.1)
+    assert sampler.log_evidence == sampler._check.log_evidence
+    assert sampler.log_evidence_error == pytest.approx(5.0, abs=1.0)
+    sampler._check = sampler._check._replace(pareto_shape=0.9)  # not to be believed
+    assert sampler.log_evidence == sampler.log_evidence_ladder
+
+
+def test_recycling_that_fails_falls_back_to_moves():
+    """A ring in two dimensions and an exponential corner in six: no mixture proposes well in it."""
+
+    def log_likelihood(x):
+        ring = -0.5 * ((np.hypot(x[..., 0] - 0.5, x[..., 1] - 0.5) - 0.4) / 0.002) ** 2
+        return ring - 400.0 * np.sum(x[..., 2:], axis=-1)
+
+    posterior = Box(np.zeros(8), np.ones(8), log_likelihood)
+    with pytest.warns(SamplingWarning):
+        sampler = climbed(posterior, nsteps=0)
+    assert all(s.moves >= 2 for s in sampler.ladder)
+    check = sampler.log_evidence_check
+    assert sum(s.evaluations for s in sampler.ladder) + check.evaluations == sampler.evaluations
 
 
 def test_presets_targets_and_moves():
@@ -132,6 +183,7 @@ def test_ladder_beside_the_chain(tmp_path):
         assert file["column/chain"].shape == (3, N, 3)
     again = SMCSampler(N, 3, Gaussian(), backend=emcee.backends.HDFBackend(path, name="column"), vectorize=True)
     assert again.ladder == sampler.ladder
+    assert again.log_evidence_check == sampler.log_evidence_check is not None
     assert (again.log_evidence, again.log_evidence_error) == (sampler.log_evidence, sampler.log_evidence_error)
     again.run_mcmc(None, 2)
     assert again.iteration == 5 and again.ladder == sampler.ladder
@@ -189,7 +241,8 @@ class Slow(Gaussian):
         if self.calls == 20 * {N}:
             print("under way", flush=True)
         return super().__call__(x)
-SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, backend=emcee.backends.HDFBackend({str(path)!r})).run_mcmc(None, 999)
+SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, recycle=False,
+    backend=emcee.backends.HDFBackend({str(path)!r})).run_mcmc(None, 999)
 """
     root = Path(__file__).parents[2]
     with subprocess.Popen([sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE, text=True) as process:
@@ -225,6 +278,7 @@ def test_no_evidence_before_a_run():
         {"min_moves": 0},
         {"min_moves": 5, "max_moves": 4},
         {"max_correlation": 0.0},
+        {"check_draws": -1},
     ],
     ids=str,
 )
@@ -340,7 +394,7 @@ def test_collapse_is_loud():
     assert "survived the resampling" in messages[1]
     with pytest.warns(SamplingWarning, match="distinct points of 40 survived"):
         posterior = Gaussian(sd=1e-3)
-        SMCSampler(N, 3, posterior, vectorize=True, seed=1, ess_ratio=0.03).run_mcmc(None, 1)
+        SMCSampler(N, 3, posterior, vectorize=True, seed=1, ess_ratio=0.03, recycle=False).run_mcmc(None, 1)
 
 
 # ---------------------------------------------------------------- reports

@@ -9,7 +9,15 @@ from samplers import RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler
 from samplers.moves import AlternatingMove, MixtureMove, RandomWalkMove, StudentTMove
 from tests.contract.targets import Box, Gaussian
 
-MODES = {"default": {}, "constant": RAMANCHA_2022_CONSTANT, "literal": RAMANCHA_2022_LITERAL}
+MODES = {
+    "default": {},
+    "moves": {"recycle": False},
+    "constant": RAMANCHA_2022_CONSTANT,
+    "literal": RAMANCHA_2022_LITERAL,
+}
+
+
+both_climbs = pytest.mark.parametrize("recycle", [True, False], ids=["recycling", "moves"])
 
 
 def runs(posterior, seed, count=8, nwalkers=200, nsteps=4, **kwargs):
@@ -85,7 +93,8 @@ def test_a_wrong_kernel_is_caught(seed):
     assert not within(spread, samplers)
 
 
-def test_two_modes(seed):
+@both_climbs
+def test_two_modes(recycle, seed):
     """Weights 1:2, ten standard deviations apart."""
     centres, sd, weights = np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.5]]), 0.1, np.array([1.0, 2.0]) / 3
 
@@ -95,18 +104,19 @@ def test_two_modes(seed):
         ]
         return np.logaddexp(*parts)
 
-    samplers = runs(Box([0, 0, 0], [3, 3, 3], log_likelihood), seed, nwalkers=300, nsteps=2)
+    samplers = runs(Box([0, 0, 0], [3, 3, 3], log_likelihood), seed, nwalkers=300, nsteps=2, recycle=recycle)
     assert within(deviations(samplers, 2 / 3, lambda x: x[:, 0] > 1.5), samplers)
     assert within(evidence_deviation(samplers, -3 * np.log(3)), samplers)
 
 
-def test_edges_of_a_truncated_prior(seed):
+@both_climbs
+def test_edges_of_a_truncated_prior(recycle, seed):
     """The posterior is a half-normal with its mode on the edge, times an exponential that piles up at another."""
 
     def log_likelihood(x):
         return -0.5 * (x[..., 0] / 0.05) ** 2 - 20.0 * x[..., 1]
 
-    samplers = runs(Box([0, 0], [1, 1], log_likelihood), seed)
+    samplers = runs(Box([0, 0], [1, 1], log_likelihood), seed, recycle=recycle)
     half_normal, exponential = stats.halfnorm(scale=0.05), stats.truncexpon(b=20, scale=1 / 20)
     assert within(deviations(samplers, [half_normal.mean(), exponential.mean()]), samplers)
     assert within(
@@ -124,21 +134,24 @@ def test_flat_likelihood(seed):
         assert len(sampler.ladder) == 1
         assert sampler.log_evidence == pytest.approx(-1234.5, abs=1e-9)
         assert sampler.log_evidence_error == pytest.approx(0, abs=1e-9)
+        assert abs(sampler.log_evidence_check.log_evidence + 1234.5) < 4 * sampler.log_evidence_check.error
     assert within(deviations(samplers, [0.5, 1.5]), samplers)
 
 
-def test_very_informative_likelihood(seed):
+@both_climbs
+def test_very_informative_likelihood(recycle, seed):
     """The posterior is a hundred thousand times narrower than the prior."""
     posterior = Gaussian(2, sd=1e-5)
-    samplers = runs(posterior, seed, count=6)
+    samplers = runs(posterior, seed, count=6, recycle=recycle)
     assert within(deviations(samplers, posterior.mean), samplers)
     assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
 
 
-def test_dead_regions(seed):
+@both_climbs
+def test_dead_regions(recycle, seed):
     """Where the model fails the likelihood is zero: 70 % of the box."""
     posterior = Box([0, 0], [1, 1], lambda x: np.where(x[..., 0] > 0.3, -np.inf, -10.0 * x[..., 1]))
-    samplers = runs(posterior, seed)
+    samplers = runs(posterior, seed, recycle=recycle)
     assert within(deviations(samplers, [0.15, stats.truncexpon(b=10, scale=0.1).mean()]), samplers)
     assert within(evidence_deviation(samplers, np.log(0.3 * (1 - np.exp(-10.0)) / 10)), samplers)
 
@@ -185,7 +198,7 @@ def test_one_parameter_in_another_unit(seed):
 # ---------------------------------------------------------------- the error of the evidence
 
 
-@pytest.mark.parametrize("mode", ["default", "literal"])
+@pytest.mark.parametrize("mode", ["default", "moves", "literal"])
 def test_evidence_error_covers(mode, seed):
     """Two standard errors cover the truth in nearly 95 % of 40 cheap runs, and are not idly wide."""
     posterior = Gaussian(3, sd=0.1)

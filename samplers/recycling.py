@@ -1,0 +1,180 @@
+"""Recycling: a ladder climbed by importance sampling, on which nothing evaluated is thrown away.
+
+Every point so far, draws of the prior and of all proposals since, is weighted by the target over the mixture of all
+densities it could have come from (deterministic mixture weights). The next beta keeps the effective sample size of
+*all* points at a target; a mixture fitted to them at that beta is the next proposal; and once beta = 1 is reached,
+draws are added until the effective sample size suffices. A posterior that is nearly Gaussian, straightened or split if
+need be, takes a small part of the evaluations of moves this way.
+
+Proposals adapted to their own weights can be confidently wrong. So the last fit is tried on fresh draws that had no
+part in it, and the result is used only if their weights behave and their evidence agrees (`Recycled.trusted`).
+
+References
+----------
+Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x
+Owen & Zhou (2000), JASA 95(449), doi:10.1080/01621459.2000.10473909 (deterministic mixture weights)
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from .importance import EvidenceCheck, draw_inside, evidence_from_weights
+from .ladder import coarse_weights, effective_sample_size, log_mean_weight, next_beta
+from .mixtures import Mixture, fit_mixture, log_density
+
+__all__ = ["Recycled", "recycle"]
+
+TARGET_SHARE = 0.2
+POINTS_PER_DIMENSION = 5
+LOW_YIELD = 0.05
+LEAST_YIELD = 0.2
+HIGH_YIELD = 0.5
+PATIENCE = 6
+MOST_STAGES = 100
+LARGEST_DIFFERENCE = 0.5
+
+
+class Recycled(NamedTuple):
+    """Outcome of a climb by recycling.
+
+    Attributes
+    ----------
+    doubt : str — why the result may not be trusted; empty if it may.
+    coords : (n, ndim) float — every point evaluated.
+    records : (n,) — their records (log_prob, log_prior[, blobs]).
+    log_weights : (n,) float — at beta = 1.
+    log_evidence, log_evidence_error : float — and standard error, without the draws of the check.
+    check : EvidenceCheck, or None if beta = 1 was not reached.
+    """
+
+    doubt: str
+    coords: np.ndarray
+    records: np.ndarray
+    log_weights: np.ndarray
+    log_evidence: float
+    log_evidence_error: float
+    check: EvidenceCheck | None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the weights may be used."""
+        return not self.doubt
+
+
+class _Pool:
+    """All points, their records, and the log of the mixture of all densities they were drawn from."""
+
+    def __init__(self, coords: np.ndarray, records: np.ndarray):
+        self.coords, self.records = coords, records
+        self._proposals: list[tuple[float, Mixture]] = []
+        self._n_prior = len(coords)
+        self._log_mixture = np.log(self._n_prior) + records["log_prior"]
+
+    def add(self, mixture: Mixture, made: int, coords: np.ndarray, records: np.ndarray) -> None:
+        """Enter the draws (n, ndim) that `made` draws of a mixture left inside the support."""
+        log_mixture = np.log(self._n_prior) + records["log_prior"]
+        for log_count, earlier in self._proposals:
+            log_mixture = np.logaddexp(log_mixture, log_count + log_density(earlier, coords))
+        self._proposals.append((np.log(made), mixture))
+        self.coords = np.concatenate([self.coords, coords])
+        self.records = np.concatenate([self.records, records])
+        self._log_mixture = np.logaddexp(
+            np.concatenate([self._log_mixture, log_mixture]), np.log(made) + log_density(mixture, self.coords)
+        )
+
+    @property
+    def log_likelihood(self) -> np.ndarray:
+        return self.records["log_prob"] - self.records["log_prior"]
+
+    def log_weights(self, beta: float) -> np.ndarray:
+        """Log of the tempered target over the mixture, (n,); their sum estimates the evidence at beta."""
+        alive = self.records["log_prob"] > -np.inf
+        log_likelihood = np.where(alive, self.log_likelihood, 0.0)
+        tempered = self.records["log_prior"] + beta * log_likelihood - self._log_mixture
+        return np.where(alive, tempered, -np.inf)
+
+
+def recycle(
+    coords: np.ndarray,
+    records: np.ndarray,
+    evaluate: Callable[[np.ndarray], np.ndarray],
+    inside: Callable[[np.ndarray], np.ndarray],
+    random: np.random.RandomState,
+    enter: Callable[..., None],
+) -> Recycled:
+    """Climb from draws of the prior to beta = 1 by adaptive mixture importance sampling.
+
+    Parameters
+    ----------
+    coords, records : (n, ndim) and (n,) — draws of the prior and their records; n sets the size of everything.
+    evaluate : function of points (m, ndim) that returns their records (m,).
+    inside : function of points (m, ndim) that tells which lie in the support of the prior.
+    random : RandomState
+    enter : called for each beta below 1, before its draws are made, with the keywords of a `Stage` that are known here:
+        beta, effective_sample_size, acceptance (the share of the latest draws that their weights are worth),
+        log_evidence and log_evidence_error (both so far).
+    """
+    n, ndim = coords.shape
+    target = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
+    pool = _Pool(coords, records)
+    beta, yields = 0.0, []
+    alive = effective_sample_size(pool.log_weights(0.0))
+    if alive < target:
+        doubt = f"only {alive:.0f} of {n} draws of the prior have a likelihood above zero"
+        return Recycled(doubt, coords, records, pool.log_weights(1.0), float("-inf"), float("inf"), None)
+    while True:
+        base, last_beta = pool.log_weights(beta), beta
+        if beta < 1.0 and effective_sample_size(base) >= target:
+            beta = next_beta(pool.log_likelihood, beta, target, base)
+        log_weights = pool.log_weights(beta)
+        effective = effective_sample_size(log_weights)
+        log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
+        # proposals were chosen by weights worth `target` points: their luck lives on in all that follows
+        luck = 1.0 / target if yields else 0.0
+        error = float(np.sqrt(max(1.0 / effective - 1.0 / len(log_weights), 0.0) + luck))
+        if last_beta < beta < 1.0:
+            share = yields[-1] if yields else effective / n
+            enter(
+                beta=beta,
+                effective_sample_size=effective,
+                acceptance=share,
+                log_evidence=log_evidence,
+                log_evidence_error=error,
+            )
+        mixture = fit_mixture(pool.coords, coarse_weights(log_weights))
+        finished = beta == 1.0 and effective >= n
+        new, made = draw_inside(mixture, n if finished else int(round(2.0 * target)), random, inside)
+        new_records = evaluate(new)
+        new_weights = _against(mixture, new_records, new, beta)
+        yields.append(effective_sample_size(new_weights) / max(len(new), 1))
+        pool.add(mixture, made, new, new_records)
+        check = evidence_from_weights(new_weights, made) if finished else None
+        doubt = _doubt(check, log_evidence, beta, yields)
+        if finished or doubt:
+            return Recycled(doubt, pool.coords, pool.records, pool.log_weights(1.0), log_evidence, error, check)
+
+
+def _doubt(check: EvidenceCheck | None, log_evidence: float, beta: float, yields: list[float]) -> str:
+    """Why to give up, or not to use what was reached; empty if there is no reason."""
+    recent = float(np.mean(yields[-PATIENCE:]))
+    if len(yields) >= PATIENCE and recent < LOW_YIELD:
+        return f"new draws are worth {100 * recent:.2g} % of their number"
+    if check is None:
+        return f"beta = {beta:.3g} only after {MOST_STAGES} rounds" if len(yields) >= MOST_STAGES else ""
+    if not check.reliable and yields[-1] < HIGH_YIELD:
+        return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
+    if yields[-1] < LEAST_YIELD:
+        return f"fresh draws are worth {100 * yields[-1]:.2g} % of their number"
+    if abs(check.log_evidence - log_evidence) > LARGEST_DIFFERENCE:
+        return f"fresh draws change the log-evidence by {check.log_evidence - log_evidence:.2g}"
+    return ""
+
+
+def _against(mixture: Mixture, records: np.ndarray, coords: np.ndarray, beta: float) -> np.ndarray:
+    """Log-weights of draws against the one mixture they came from."""
+    alive = records["log_prob"] > -np.inf
+    log_prob = np.where(alive, records["log_prob"], 0.0)
+    tempered = (1.0 - beta) * records["log_prior"] + beta * log_prob - log_density(mixture, coords)
+    return np.where(alive, tempered, -np.inf)
