@@ -1,10 +1,17 @@
-"""Moving at a fixed beta: the tempered density, and when a population has moved enough."""
+"""Moving at a fixed beta: the tempered density, when a population has moved enough, and chains grown from leaders."""
+
+from collections.abc import Callable
 
 import numpy as np
+from emcee import State
+from emcee.model import Model
+from emcee.moves import Move
 
 from .settings import Settings
 
-__all__ = ["Memory", "tempered_log_prob"]
+__all__ = ["Memory", "Moved", "grow_chains", "move_together", "tempered_log_prob"]
+
+Moved = tuple[np.ndarray, np.ndarray, float, int]
 
 STALL_SWEEPS = 3
 
@@ -53,3 +60,82 @@ class Memory:
         if len(sweeps) >= settings.max_moves or sweeps[-1] < settings.max_correlation:
             return True
         return len(sweeps) > STALL_SWEEPS and min(sweeps[:-STALL_SWEEPS]) <= min(sweeps[-STALL_SWEEPS:])
+
+
+def move_together(
+    coords: np.ndarray,
+    records: np.ndarray,
+    beta: float,
+    model: Model,
+    pick: Callable[[], Move],
+    settings: Settings,
+    show: Callable[[float], None],
+) -> Moved:
+    """Move equally weighted points at beta until they have forgotten where they started, as the settings say.
+
+    Parameters
+    ----------
+    coords, records : (n, ndim) and (n,) — the population.
+    beta : float
+    model : emcee Model — its function gives the tempered density and, as blobs, the records.
+    pick : returns the move of the next sweep.
+    settings : Settings
+    show : called with the acceptance of each sweep.
+
+    Returns
+    -------
+    coords, records, acceptance (mean over the sweeps), number of sweeps.
+    """
+    memory = Memory(coords, records)
+    state = State(coords, log_prob=tempered_log_prob(records, beta), blobs=records)
+    acceptance = []
+    while not memory.enough(settings):
+        move = pick()
+        state, accepted = move.propose(model, state)
+        move.tune(state, accepted)
+        memory.update(state.coords, state.blobs)
+        acceptance.append(float(np.mean(accepted)))
+        show(acceptance[-1])
+    return state.coords, state.blobs, float(np.mean(acceptance)), len(acceptance)
+
+
+def grow_chains(
+    coords: np.ndarray,
+    records: np.ndarray,
+    ancestors: np.ndarray,
+    beta: float,
+    model: Model,
+    pick: Callable[[], Move],
+    settings: Settings,
+    show: Callable[[float], None],
+) -> Moved:
+    """Grow a chain from each leader, as long as the leader was drawn often (Ching & Chen 2007).
+
+    All chains make ``settings.burn_in`` steps first; then every step of a chain is a point of the new population.
+    Chains of the same age move together, so the moves must be able to move any number of points.
+
+    Parameters
+    ----------
+    coords, records, ancestors : (n, ndim), (n,), (n,) int — the resampled population and where each point came from.
+    beta, model, pick, settings, show : as in `move_together`, which returns the same.
+    """
+    _, first, owner, counts = np.unique(ancestors, return_index=True, return_inverse=True, return_counts=True)
+    place = np.argsort(owner, kind="stable")
+    start = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    chains = State(coords[first], log_prob=tempered_log_prob(records[first], beta), blobs=records[first])
+    coords, records = coords.copy(), records.copy()
+    accepted_steps, steps = 0, 0
+    for age in range(-settings.burn_in, int(counts.max())):
+        growing = np.flatnonzero(counts > age)
+        move = pick()
+        state = State(chains.coords[growing], log_prob=chains.log_prob[growing], blobs=chains.blobs[growing])
+        state, accepted = move.propose(model, state)
+        move.tune(state, accepted)
+        chains.coords[growing], chains.log_prob[growing] = state.coords, state.log_prob
+        chains.blobs[growing] = state.blobs
+        if age >= 0:
+            rows = place[start[growing] + age]
+            coords[rows], records[rows] = state.coords, state.blobs
+        accepted_steps, steps = accepted_steps + int(np.sum(accepted)), steps + len(growing)
+        show(float(np.mean(accepted)))
+    return coords, records, accepted_steps / steps, settings.burn_in + 1

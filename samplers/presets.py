@@ -9,6 +9,10 @@ literal
     The target itself shrinks by 5 % a stage, 950, 902, 857, ..., with a floor of 50.
 
 The scale of their random walk is not given; 2.38 / sqrt(ndim) is taken.
+
+Ching & Chen (2007), for ``TMCMCSampler(1000, ndim, log_prob_fn, **CHING_CHEN_2007)``: coefficient of variation 1,
+multinomial leaders, one Metropolis step a point, covariance 0.04 times the weighted one. It can collapse on sharp
+posteriors; the default of `TMCMCSampler` does not.
 """
 
 from collections.abc import Mapping
@@ -17,7 +21,7 @@ from typing import Any
 
 from .moves import RandomWalkMove
 
-__all__ = ["RAMANCHA_2022_CONSTANT", "RAMANCHA_2022_LITERAL"]
+__all__ = ["CHING_CHEN_2007", "RAMANCHA_2022_CONSTANT", "RAMANCHA_2022_LITERAL"]
 
 _COMMON = {
     "moves": RandomWalkMove(),  # a sampler copies its moves, so runs do not share it
@@ -28,3 +32,12 @@ _COMMON = {
 }
 RAMANCHA_2022_CONSTANT: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "constant"})
 RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "declining", "ess_floor": 50.0})
+CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
+    {
+        "moves": RandomWalkMove(scale=0.2),
+        "coefficient_of_variation": 1.0,
+        "resampling": "multinomial",
+        "chains": "leaders",
+        "burn_in": 0,
+    }
+)

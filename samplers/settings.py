@@ -22,6 +22,9 @@ class Settings:
     min_moves, max_moves : int — sweeps of the ensemble a stage; equal for a fixed number.
     max_correlation : float — between the two, moving stops once the correlation of every parameter and of the
         log-likelihood with the resampled start is below this, or falls no further.
+    chains : "equal", every resampled point is moved as long as the others, or "leaders", a chain grows from each
+        distinct one, as many steps as it was drawn (then the number of moves is `burn_in` + 1).
+    burn_in : int — steps of a chain before its points count, with "leaders".
     recycle : bool — climb by importance sampling over every point evaluated (`samplers.recycling`), and by moves only
         where that may not be trusted.
     check_draws : int, optional — evaluations spent at the end on an evidence independent of the ladder; by default as
@@ -35,6 +38,8 @@ class Settings:
     min_moves: int = 2
     max_moves: int = 7
     max_correlation: float = 0.15
+    chains: str = "equal"
+    burn_in: int = 0
     recycle: bool = False
     check_draws: int | None = None
 
@@ -51,6 +56,10 @@ class Settings:
             raise ValueError(f"1 <= min_moves <= max_moves is needed; got {self.min_moves} and {self.max_moves}")
         if not 0.0 < self.max_correlation <= 1.0:
             raise ValueError(f"max_correlation must lie in (0, 1]; got {self.max_correlation}")
+        if self.chains not in ("equal", "leaders"):
+            raise ValueError(f'chains must be "equal" or "leaders"; got {self.chains!r}')
+        if not self.burn_in >= 0:
+            raise ValueError(f"burn_in must not be negative; got {self.burn_in}")
         if self.check_draws is not None and not self.check_draws >= 0:
             raise ValueError(f"check_draws must not be negative; got {self.check_draws}")
 

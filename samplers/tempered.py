@@ -37,7 +37,7 @@ from .ladder import (
 )
 from .mixtures import fit_mixture, log_density
 from .moves import RandomWalkMove
-from .mutation import Memory, tempered_log_prob
+from .mutation import Moved, grow_chains, move_together, tempered_log_prob
 from .recycling import recycle
 from .settings import Settings
 
@@ -380,9 +380,7 @@ class TemperedSampler(EnsembleSampler):
             coords, packed = coords[ancestors], packed[ancestors]
             distinct = len(np.unique(coords, axis=0))
             ess = effective_sample_size(log_weights)
-            coords, packed, acceptance, moves = self._mutate(
-                coords, packed, beta, lambda share, b=beta, e=ess: self._show(bar, b, e, share)
-            )
+            coords, packed, acceptance, moves = self._mutate(coords, packed, ancestors, beta, bar, ess)
             self._add_stage(
                 beta=beta,
                 effective_sample_size=ess,
@@ -428,7 +426,7 @@ class TemperedSampler(EnsembleSampler):
         ancestors = np.minimum(ancestors, len(weights) - 1)
         ess = effective_sample_size(found.log_weights)
         coords, packed, acceptance, moves = self._mutate(
-            found.coords[ancestors], found.records[ancestors], 1.0, lambda share: self._show(bar, 1.0, ess, share)
+            found.coords[ancestors], found.records[ancestors], ancestors, 1.0, bar, ess
         )
         self._add_stage(
             beta=1.0,
@@ -480,29 +478,25 @@ class TemperedSampler(EnsembleSampler):
                 move.calibrate(coords, weights, self._inside)
 
     def _mutate(
-        self, coords: np.ndarray, packed: np.ndarray, beta: float, show: Callable[[float], None]
-    ) -> tuple[np.ndarray, np.ndarray, float, int]:
-        """Move equally weighted points at beta until they have forgotten where they started, as the settings say.
-
-        Returns coordinates, records, acceptance and number of sweeps.
-        """
+        self, coords: np.ndarray, packed: np.ndarray, ancestors: np.ndarray, beta: float, bar: Any, ess: float
+    ) -> Moved:
+        """Move resampled points at beta: coordinates, records, acceptance and number of sweeps."""
 
         def compute(points):
             records = self._evaluate(points)
             return tempered_log_prob(records, beta), records
 
         model = Model(self.log_prob_fn, compute, map if self.pool is None else self.pool.map, self._random)
-        memory = Memory(coords, packed)
-        state = State(coords, log_prob=tempered_log_prob(packed, beta), blobs=packed)
-        acceptance = []
-        while not memory.enough(self.settings):
-            move = self._random.choice(self._moves, p=self._weights)
-            state, accepted = move.propose(model, state)
-            move.tune(state, accepted)
-            memory.update(state.coords, state.blobs)
-            acceptance.append(float(np.mean(accepted)))
-            show(acceptance[-1])
-        return state.coords, state.blobs, float(np.mean(acceptance)), len(acceptance)
+        common = {
+            "beta": beta,
+            "model": model,
+            "pick": lambda: self._random.choice(self._moves, p=self._weights),
+            "settings": self.settings,
+            "show": lambda share: self._show(bar, beta, ess, share),
+        }
+        if self.settings.chains == "leaders":
+            return grow_chains(coords, packed, ancestors, **common)
+        return move_together(coords, packed, **common)
 
     def _show(self, bar: Any, beta: float, ess: float, acceptance: float) -> None:
         """One sweep further on the progress bar."""

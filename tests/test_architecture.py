@@ -26,6 +26,8 @@ SAMPLERS = {
     "alarms": {"importance", "ladder"},
     "settings": {"resampling"},
     "mutation": {"settings"},
+    "smc": {"moves", "settings", "tempered"},
+    "tmcmc": {"moves", "settings", "tempered"},
     "tempered": {
         "alarms",
         "backends",

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from samplers import (
+    CHING_CHEN_2007,
     RAMANCHA_2022_CONSTANT,
     RAMANCHA_2022_LITERAL,
     SamplingWarning,
     SMCSampler,
     TemperedSampler,
+    TMCMCSampler,
     read_ladder,
 )
 from samplers.report import ladder_plot, ladder_table, pair_plot, summary, to_arviz
@@ -168,6 +170,58 @@ def test_a_finished_run_is_not_seeded_again(tmp_path):
         assert np.all(ours == theirs)
 
 
+def test_published_tmcmc_grows_chains_from_leaders():
+    posterior = Gaussian(2)
+    sampler = TMCMCSampler(200, 2, posterior, vectorize=True, seed=1, **CHING_CHEN_2007)
+    sampler.run_mcmc(None, 0)
+    for stage in sampler.ladder:
+        assert stage.moves == 1
+        assert stage.evaluations <= 200 * (2 if stage is sampler.ladder[0] else 1)
+    for stage in sampler.ladder[:-1]:  # a coefficient of variation of one
+        assert 200 / stage.effective_sample_size - 1 == pytest.approx(1.0, rel=1e-3)
+    burnt = TMCMCSampler(200, 2, Gaussian(2), vectorize=True, seed=1, **{**CHING_CHEN_2007, "burn_in": 5})
+    burnt.run_mcmc(None, 0)
+    assert {s.moves for s in burnt.ladder} == {6}
+    stage = burnt.ladder[2]
+    assert 5 * stage.distinct_ancestors + 200 <= stage.evaluations < 6 * 200
+
+
+def test_points_of_a_chain_follow_each_other():
+    """Every point of the new population is one step from the last point of its leader's chain."""
+    from emcee.model import Model
+
+    from samplers.moves import RandomWalkMove
+    from samplers.mutation import grow_chains
+    from samplers.settings import Settings
+
+    random = np.random.RandomState(0)
+    ancestors = np.sort(random.randint(5, size=30))[random.permutation(30)]
+    founders = 100.0 * random.standard_normal((5, 2))
+    records = np.zeros(30, dtype=[("log_prob", float), ("log_prior", float)])
+
+    def compute(points):
+        return np.zeros(len(points)), np.zeros(len(points), dtype=records.dtype)
+
+    move = RandomWalkMove(scale=1.0)
+    move.calibrate(random.standard_normal((100, 2)), np.full(100, 0.01))
+    model = Model(None, compute, map, random)
+    grown, _, acceptance, _ = grow_chains(
+        founders[ancestors],
+        records,
+        ancestors,
+        1.0,
+        model,
+        lambda: move,
+        Settings(chains="leaders"),
+        lambda share: None,
+    )
+    assert acceptance == 1.0
+    assert len(np.unique(grown, axis=0)) == 30
+    for leader in range(5):
+        chain = np.concatenate([founders[leader : leader + 1], grown[ancestors == leader]])
+        assert np.max(np.abs(np.diff(chain, axis=0))) < 6.0  # the founders are hundreds apart
+
+
 # ---------------------------------------------------------------- storage
 
 
@@ -285,6 +339,15 @@ def test_no_evidence_before_a_run():
 def test_impossible_settings(settings):
     with pytest.raises(ValueError, match=next(iter(settings)).replace("min_moves", "moves")):
         SMCSampler(N, 3, Gaussian(), **settings)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"coefficient_of_variation": 0.0}, {"coefficient_of_variation": np.inf}, {"chains": "long"}, {"burn_in": -1}],
+)
+def test_impossible_settings_of_tmcmc(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        TMCMCSampler(N, 3, Gaussian(), **settings)
 
 
 def test_impossible_problems():
