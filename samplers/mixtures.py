@@ -41,7 +41,7 @@ ITERATIONS = 30
 ENOUGH = 1e-3
 TRIAL_ITERATIONS = 4
 RIDGE = 1e-10
-NEGLIGIBLE = 1e-4
+NEGLIGIBLE = 1e-3
 SHEAR_NUMBERS = 4
 
 
@@ -168,17 +168,18 @@ def fit_mixture(
     Parameters
     ----------
     coords : (n, ndim) float
-    weights : (n,) float — non-negative, sum 1. Points that carry less than 1e-4 of the mean weight are left out.
+    weights : (n,) float — non-negative, sum 1. Points that carry less than 1e-3 of the mean weight are left out.
     max_components : int
     dof : float — degrees of freedom, above 2.
     """
     shears = find_shears(coords, weights)
-    mixture, criterion = _fit_straight((), coords, weights, max_components, dof)
-    if shears:
-        sheared, other = _fit_straight(shears, coords, weights, max_components, dof)
-        if other < criterion:
-            return sheared
-    return mixture
+    if not shears:
+        return _fit_straight((), coords, weights, max_components, dof)[0]
+    sheared, criterion = _fit_straight(shears, coords, weights, max_components, dof)
+    # to pay, doing without shears may not need many components more
+    most = min(max_components, len(sheared.weights) + 2)
+    plain, plain_criterion = _fit_straight((), coords, weights, most, dof)
+    return sheared if criterion < plain_criterion else plain
 
 
 def _fit_straight(

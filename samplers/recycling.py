@@ -7,7 +7,10 @@ draws are added until the effective sample size suffices. A posterior that is ne
 need be, takes a small part of the evaluations of moves this way.
 
 Proposals adapted to their own weights can be confidently wrong. So the last fit is tried on fresh draws that had no
-part in it, and the result is used only if their weights behave and their evidence agrees (`Recycled.trusted`).
+part in it, and the result is used only if their weights behave and their evidence agrees (`Recycled.trusted`). If they
+do not, they join the other points, and the next fit is tried, a few times. Points that shaped later proposals end up
+with too little weight, and the smaller of two modes with them: the population that is handed on consists of the draws
+made at beta = 1 only, each weighted by the one proposal it came from.
 
 References
 ----------
@@ -29,11 +32,14 @@ __all__ = ["Recycled", "recycle"]
 TARGET_SHARE = 0.2
 POINTS_PER_DIMENSION = 5
 LOW_YIELD = 0.05
-LEAST_YIELD = 0.2
+LEAST_YIELD = 0.3
 HIGH_YIELD = 0.5
 PATIENCE = 6
 MOST_STAGES = 100
-LARGEST_DIFFERENCE = 0.5
+LARGEST_DIFFERENCE = 0.25
+MOST_CHECKS = 4
+EVENED = 0.25
+MOST_COMPONENTS = 8
 
 
 class Recycled(NamedTuple):
@@ -42,10 +48,11 @@ class Recycled(NamedTuple):
     Attributes
     ----------
     doubt : str — why the result may not be trusted; empty if it may.
-    coords : (n, ndim) float — every point evaluated.
+    coords : (n, ndim) float — the draws made at beta = 1, those of the check among them.
     records : (n,) — their records (log_prob, log_prior[, blobs]).
-    log_weights : (n,) float — at beta = 1.
-    log_evidence, log_evidence_error : float — and standard error, without the draws of the check.
+    log_weights : (n,) float — round by round against the one mixture of the round, whose fit they had no part in; a
+        round counts by its effective sample size.
+    log_evidence, log_evidence_error : float — by the ladder: all points but those of the check.
     check : EvidenceCheck, or None if beta = 1 was not reached.
     """
 
@@ -119,11 +126,12 @@ def recycle(
     n, ndim = coords.shape
     target = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
     pool = _Pool(coords, records)
-    beta, yields = 0.0, []
+    beta, yields, checks = 0.0, [], 0
+    final: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     alive = effective_sample_size(pool.log_weights(0.0))
     if alive < target:
         doubt = f"only {alive:.0f} of {n} draws of the prior have a likelihood above zero"
-        return Recycled(doubt, coords, records, pool.log_weights(1.0), float("-inf"), float("inf"), None)
+        return Recycled(doubt, coords, records, np.zeros(n), float("-inf"), float("inf"), None)
     while True:
         base, last_beta = pool.log_weights(beta), beta
         if beta < 1.0 and effective_sample_size(base) >= target:
@@ -143,17 +151,38 @@ def recycle(
                 log_evidence=log_evidence,
                 log_evidence_error=error,
             )
-        mixture = fit_mixture(pool.coords, coarse_weights(log_weights))
+        mixture = _evened(fit_mixture(pool.coords, coarse_weights(log_weights), MOST_COMPONENTS))
         finished = beta == 1.0 and effective >= n
         new, made = draw_inside(mixture, n if finished else int(round(2.0 * target)), random, inside)
         new_records = evaluate(new)
         new_weights = _against(mixture, new_records, new, beta)
         yields.append(effective_sample_size(new_weights) / max(len(new), 1))
         pool.add(mixture, made, new, new_records)
+        if beta == 1.0:
+            final.append((new, new_records, _of_round(new_weights)))
+        checks += finished
         check = evidence_from_weights(new_weights, made) if finished else None
         doubt = _doubt(check, log_evidence, beta, yields)
-        if finished or doubt:
-            return Recycled(doubt, pool.coords, pool.records, pool.log_weights(1.0), log_evidence, error, check)
+        # draws that tell a fit from the truth also mend it: check again, as long as that is cheap
+        if (finished and (not doubt or checks == MOST_CHECKS)) or (doubt and not finished):
+            columns = (
+                np.concatenate(column) for column in zip(*final or [(new, new_records, new_weights)], strict=True)
+            )
+            return Recycled(doubt, *columns, log_evidence, error, check)
+
+
+def _evened(mixture: Mixture) -> Mixture:
+    """The mixture with a quarter of its weight spread evenly: a small component is not missed by few draws."""
+    weights = (1.0 - EVENED) * mixture.weights + EVENED / len(mixture.weights)
+    return mixture._replace(weights=weights)
+
+
+def _of_round(log_weights: np.ndarray) -> np.ndarray:
+    """Log-weights whose sum is their effective sample size."""
+    effective = effective_sample_size(log_weights)
+    if effective == 0.0:
+        return log_weights
+    return log_weights - log_mean_weight(log_weights) - np.log(len(log_weights)) + np.log(effective)
 
 
 def _doubt(check: EvidenceCheck | None, log_evidence: float, beta: float, yields: list[float]) -> str:

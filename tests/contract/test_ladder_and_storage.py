@@ -86,7 +86,8 @@ def test_two_estimates_that_disagree_widen_the_error():
     assert sampler.log_evidence == sampler.log_evidence_ladder
 
 
-def test_recycling_that_fails_falls_back_to_moves():
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_recycling_that_fails_falls_back_to_moves(caplog):
     """A ring in two dimensions and an exponential corner in six: no mixture proposes well in it."""
 
     def log_likelihood(x):
@@ -94,8 +95,9 @@ def test_recycling_that_fails_falls_back_to_moves():
         return ring - 400.0 * np.sum(x[..., 2:], axis=-1)
 
     posterior = Box(np.zeros(8), np.ones(8), log_likelihood)
-    with pytest.warns(SamplingWarning):
+    with caplog.at_level("INFO", logger="samplers"):
         sampler = climbed(posterior, nsteps=0)
+    assert "recycling is not trusted here, because" in caplog.text
     assert all(s.moves >= 2 for s in sampler.ladder)
     check = sampler.log_evidence_check
     assert sum(s.evaluations for s in sampler.ladder) + check.evaluations == sampler.evaluations
