@@ -21,16 +21,18 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 
+from .edges import Edges, close, log_slope, only_felt, open_up
 from .shears import Shear, bend, find_shears, straighten
 
 __all__ = [
     "Mixture",
-    "component_log_densities",
     "draw",
     "fit_mixture",
+    "flatten",
     "location_and_root",
     "log_density",
-    "responsibilities",
+    "log_responsibilities",
+    "unflatten",
 ]
 
 DOF = 6.0
@@ -55,7 +57,8 @@ class Mixture(NamedTuple):
     roots : (K, ndim, ndim) float — lower-triangular roots of the scale matrices (covariance times (dof - 2) / dof).
     inverses : (K, ndim, ndim) float — of the roots.
     dof : float — degrees of freedom.
-    shears : tuple of Shear — the components live among the points that these have straightened.
+    shears : tuple of Shear — the components live among the points that these have straightened,
+    edges : Edges, optional — after these have been moved to infinity.
     """
 
     weights: np.ndarray
@@ -64,6 +67,7 @@ class Mixture(NamedTuple):
     inverses: np.ndarray
     dof: float
     shears: tuple[Shear, ...] = ()
+    edges: Edges | None = None
 
 
 def location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,9 +121,21 @@ def _from_distances(mixture: Mixture, distances: np.ndarray) -> np.ndarray:
     return np.log(mixture.weights) + constant - log_root - 0.5 * (dof + ndim) * np.log1p(distances / dof)
 
 
-def component_log_densities(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
-    """Logarithm of weight times density of every component (n, K) at points (n, ndim)."""
-    return _from_distances(mixture, _distances(mixture, straighten(mixture.shears, coords)))
+def log_responsibilities(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
+    """Log probability (n, K) that a point (n, ndim) came from a component."""
+    parts = _from_distances(mixture, _distances(mixture, flatten(mixture, coords)))
+    return parts - _log_sum(parts)[:, None]
+
+
+def flatten(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
+    """Points (n, ndim) as the components see them: without edges, straightened."""
+    return straighten(mixture.shears, coords if mixture.edges is None else open_up(mixture.edges, coords))
+
+
+def unflatten(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
+    """Points (n, ndim) as they are, of points as the components see them."""
+    coords = bend(mixture.shears, coords)
+    return coords if mixture.edges is None else close(mixture.edges, coords)
 
 
 def _log_sum(parts: np.ndarray) -> np.ndarray:
@@ -129,14 +145,9 @@ def _log_sum(parts: np.ndarray) -> np.ndarray:
 
 
 def log_density(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
-    """Log density (n,) at points (n, ndim)."""
-    return _log_sum(component_log_densities(mixture, coords))
-
-
-def responsibilities(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
-    """Probability (n, K) that a point (n, ndim) came from a component; rows sum to one."""
-    parts = component_log_densities(mixture, coords)
-    return np.exp(parts - _log_sum(parts)[:, None])
+    """Log density (n,) at points (n, ndim); -inf beyond an edge."""
+    log_sum = _log_sum(_from_distances(mixture, _distances(mixture, flatten(mixture, coords))))
+    return log_sum if mixture.edges is None else log_sum + log_slope(mixture.edges, coords)
 
 
 def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
@@ -150,13 +161,14 @@ def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
     for k in range(len(mixture.weights)):
         rows = component == k
         coords[rows] = mixture.means[k] + z[rows] @ mixture.roots[k].T
-    return bend(mixture.shears, coords[random.permutation(n)])
+    return unflatten(mixture, coords[random.permutation(n)])
 
 
 def fit_mixture(
     coords: np.ndarray,
     weights: np.ndarray,
     max_components: int = 6,
+    edges: Edges | None = None,
     dof: float = DOF,
 ) -> Mixture:
     """Mixture of the best Bayesian information criterion.
@@ -170,16 +182,30 @@ def fit_mixture(
     coords : (n, ndim) float
     weights : (n,) float — non-negative, sum 1. Points that carry less than 1e-3 of the mean weight are left out.
     max_components : int
+    edges : Edges, optional — of the support; those that the population feels are moved to infinity if that pays.
     dof : float — degrees of freedom, above 2.
     """
+    mixture, criterion = _fit_bent(coords, weights, max_components, dof)
+    felt = None if edges is None else only_felt(edges, coords, weights)
+    if felt is not None and np.any(np.isfinite([felt.low, felt.high])):
+        opened, other = _fit_bent(open_up(felt, coords), weights, max_components, dof)
+        kept = weights > 0.0
+        other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_slope(felt, coords[kept]))
+        if other < criterion:
+            return opened._replace(edges=felt)
+    return mixture
+
+
+def _fit_bent(coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float) -> tuple[Mixture, float]:
+    """The best mixture of points, straightened where that pays, and its criterion."""
     shears = find_shears(coords, weights)
     if not shears:
-        return _fit_straight((), coords, weights, max_components, dof)[0]
+        return _fit_straight((), coords, weights, max_components, dof)
     sheared, criterion = _fit_straight(shears, coords, weights, max_components, dof)
     # to pay, doing without shears may not need many components more
     most = min(max_components, len(sheared.weights) + 2)
-    plain, plain_criterion = _fit_straight((), coords, weights, most, dof)
-    return sheared if criterion < plain_criterion else plain
+    plain, other = _fit_straight((), coords, weights, most, dof)
+    return (sheared, criterion) if criterion < other else (plain, other)
 
 
 def _fit_straight(
@@ -204,7 +230,7 @@ def _fit_straight(
             break
         tried = [_maximise(white, weights, effective, shares, dof, TRIAL_ITERATIONS) for shares in starts]
         found, _ = max(tried, key=lambda trial: trial[1])
-        found, log_likelihood = _maximise(white, weights, effective, responsibilities(found, white), dof)
+        found, log_likelihood = _maximise(white, weights, effective, np.exp(log_responsibilities(found, white)), dof)
         criterion = _criterion(len(found.weights), ndim, effective, log_likelihood)
         if criterion >= best_criterion:
             break
@@ -228,7 +254,7 @@ def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np
     the former if they are of similar size and in the latter if one is small, however many other directions there are
     (invariant coordinate selection: Tyler et al. 2009, doi:10.1111/j.1467-9868.2009.00706.x).
     """
-    owner = component_log_densities(mixture, white).argmax(axis=1)
+    owner = log_responsibilities(mixture, white).argmax(axis=1)
     count, ndim = len(mixture.weights), white.shape[1]
     starts = []
     for k in range(count):

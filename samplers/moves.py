@@ -17,15 +17,17 @@ from emcee.model import Model
 from emcee.moves import MHMove, Move
 from scipy.linalg import solve_triangular
 
+from .edges import Edges, find_edges, log_slope
 from .mixtures import (
     Mixture,
-    component_log_densities,
     draw,
     fit_mixture,
+    flatten,
     location_and_root,
     log_density,
+    log_responsibilities,
+    unflatten,
 )
-from .shears import bend, straighten
 
 __all__ = ["AlternatingMove", "MixtureMove", "RandomWalkMove", "StudentTMove"]
 WHOLE_DIFFERENCES = 0.1
@@ -193,6 +195,7 @@ class MixtureMove(MHMove):
         self.enough = enough
         self.target = target
         self._mixture: Mixture | None = None
+        self._edges: Edges | None = None
         self._kernels = (self._independence, self._local_walk, self._differences)
         self._log_factors = [0.0, 0.0, 0.0]
         self._turn = -1
@@ -200,9 +203,11 @@ class MixtureMove(MHMove):
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit the mixture to weighted points (n, ndim), (n,); the next sweep is an independent one."""
-        self._mixture = fit_mixture(coords, weights, self.max_components)
+        if inside is not None and self._edges is None:
+            self._edges = find_edges(inside, coords)
+        self._mixture = fit_mixture(coords, weights, self.max_components, self._edges)
         self._inside = inside
-        self._archive = straighten(self._mixture.shears, coords)
+        self._archive = flatten(self._mixture, coords)
         self._cumulated = np.cumsum(weights)
         self._turn, self._doing_well = -1, False
 
@@ -239,18 +244,25 @@ class MixtureMove(MHMove):
 
     def _local_walk(self, coords, random):
         n, ndim = coords.shape
-        before = component_log_densities(self._mixture, coords)
-        total = np.logaddexp.reduce(before, axis=1)
-        cumulated = np.cumsum(np.exp(before - total[:, None]), axis=1)
+        before = log_responsibilities(self._mixture, coords)
+        cumulated = np.cumsum(np.exp(before), axis=1)
         component = np.sum(cumulated < random.uniform(size=n)[:, None] * cumulated[:, -1:], axis=1)
         scale = 2.38 / math.sqrt(ndim) * math.exp(self._log_factors[1])
         steps = np.einsum("nij,nj->ni", self._mixture.roots[component], random.standard_normal((n, ndim)))
-        proposed = bend(self._mixture.shears, straighten(self._mixture.shears, coords) + scale * steps)
-        after = component_log_densities(self._mixture, proposed)
+        proposed, factors = self._step(coords, scale * steps)
         rows = np.arange(n)
-        return proposed, (after[rows, component] - np.logaddexp.reduce(after, axis=1)) - (
-            before[rows, component] - total
-        )
+        return proposed, factors + log_responsibilities(self._mixture, proposed)[rows, component] - before[
+            rows, component
+        ]
+
+    def _step(self, coords, steps):
+        """Points moved by steps among the flat ones, and the ratio of volumes for it."""
+        proposed = unflatten(self._mixture, flatten(self._mixture, coords) + steps)
+        if self._mixture.edges is None:
+            return proposed, np.zeros(len(coords))
+        before, after = (log_slope(self._mixture.edges, points) for points in (coords, proposed))
+        possible = (before > -np.inf) & (after > -np.inf)
+        return proposed, np.where(possible, np.where(possible, before, 0.0) - np.where(possible, after, 0.0), -np.inf)
 
     def _differences(self, coords, random):
         n, ndim = coords.shape
@@ -263,4 +275,4 @@ class MixtureMove(MHMove):
         scale = 2.38 / np.sqrt(2.0 * crossed.sum(axis=1)) * math.exp(self._log_factors[2])
         scale[random.uniform(size=n) < WHOLE_DIFFERENCES] = 1.0
         steps = crossed * scale[:, None] * (self._archive[first] - self._archive[second])
-        return bend(self._mixture.shears, straighten(self._mixture.shears, coords) + steps), np.zeros(n)
+        return self._step(coords, steps)

@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .edges import find_edges
 from .importance import EvidenceCheck, draw_inside, evidence_from_weights
 from .ladder import coarse_weights, effective_sample_size, log_mean_weight, next_beta
 from .mixtures import Mixture, fit_mixture, log_density
@@ -31,8 +32,8 @@ __all__ = ["Recycled", "recycle"]
 
 TARGET_SHARE = 0.2
 POINTS_PER_DIMENSION = 5
-LOW_YIELD = 0.05
-LEAST_YIELD = 0.3
+LOW_YIELD = 0.03
+LEAST_YIELD = 0.25
 HIGH_YIELD = 0.5
 PATIENCE = 6
 MOST_STAGES = 100
@@ -126,6 +127,7 @@ def recycle(
     n, ndim = coords.shape
     target = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
     pool = _Pool(coords, records)
+    edges = find_edges(inside, coords)
     beta, yields, checks = 0.0, [], 0
     final: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     alive = effective_sample_size(pool.log_weights(0.0))
@@ -151,7 +153,7 @@ def recycle(
                 log_evidence=log_evidence,
                 log_evidence_error=error,
             )
-        mixture = _evened(fit_mixture(pool.coords, coarse_weights(log_weights), MOST_COMPONENTS))
+        mixture = _evened(fit_mixture(pool.coords, coarse_weights(log_weights), MOST_COMPONENTS, edges))
         finished = beta == 1.0 and effective >= n
         new, made = draw_inside(mixture, n if finished else int(round(2.0 * target)), random, inside)
         new_records = evaluate(new)

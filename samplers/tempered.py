@@ -24,6 +24,7 @@ from emcee.pbar import get_progress_bar
 
 from .alarms import check_evidence, check_ladder, sound
 from .backends import read_check, read_ladder, write_check, write_stage
+from .edges import find_edges
 from .evaluation import Records, log_probabilities
 from .importance import EvidenceCheck, draw_inside, evidence_from_weights
 from .ladder import (
@@ -442,7 +443,7 @@ class TemperedSampler(EnsembleSampler):
     def _check_evidence(self, coords: np.ndarray) -> EvidenceCheck:
         """The evidence from fresh draws of a mixture fitted to the final population."""
         n = self.nwalkers if self.settings.check_draws is None else self.settings.check_draws
-        mixture = fit_mixture(coords, np.full(len(coords), 1.0 / len(coords)))
+        mixture = fit_mixture(coords, np.full(len(coords), 1.0 / len(coords)), edges=find_edges(self._inside, coords))
         drawn, made = draw_inside(mixture, n, self._random, self._inside)
         return evidence_from_weights(self._evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
 

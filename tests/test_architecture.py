@@ -17,11 +17,12 @@ SAMPLERS = {
     "ladder": set(),
     "resampling": set(),
     "shears": set(),
-    "mixtures": {"shears"},
+    "edges": set(),
+    "mixtures": {"edges", "shears"},
     "importance": {"ladder", "mixtures"},
-    "recycling": {"importance", "ladder", "mixtures"},
+    "recycling": {"edges", "importance", "ladder", "mixtures"},
     "evaluation": set(),
-    "moves": {"mixtures", "shears"},
+    "moves": {"edges", "mixtures"},
     "backends": {"importance", "ladder"},
     "alarms": {"importance", "ladder"},
     "settings": {"resampling"},
@@ -31,6 +32,7 @@ SAMPLERS = {
     "tempered": {
         "alarms",
         "backends",
+        "edges",
         "evaluation",
         "importance",
         "ladder",
@@ -139,7 +141,7 @@ def test_samplers_stand_in_storeys():
             continue
         below = {m.split(".")[1] for m, _ in imports(path) if m.split(".")[0] == "samplers"}
         assert below <= SAMPLERS[path.stem], f"{name(path)} imports {below - SAMPLERS[path.stem]}"
-        if path.stem in ("ladder", "resampling", "shears", "mixtures", "importance", "recycling"):
+        if path.stem in ("ladder", "resampling", "edges", "shears", "mixtures", "importance", "recycling"):
             outside = {m.split(".")[0] for m, _ in imports(path)} - {"samplers"}
             assert outside <= {"numpy", "scipy", *sys.stdlib_module_names}, name(path)
 

@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from samplers.mixtures import draw, fit_mixture, log_density, responsibilities
+from samplers.edges import Edges, close, find_edges, log_slope, open_up
+from samplers.mixtures import draw, fit_mixture, log_density, log_responsibilities
 from samplers.moves import MixtureMove
 from samplers.shears import bend, find_shears, straighten
 
@@ -32,7 +33,7 @@ def test_groups_are_found(rng):
     x, second = groups(rng)
     mixture = fit_mixture(x, uniform(len(x)))
     assert len(mixture.weights) == 2
-    owner = responsibilities(mixture, x).argmax(axis=1) == mixture.weights.argmin()
+    owner = log_responsibilities(mixture, x).argmax(axis=1) == mixture.weights.argmin()
     assert np.mean(owner == second) > 0.995
     assert mixture.weights.min() == pytest.approx(second.mean(), abs=0.01)
 
@@ -138,3 +139,79 @@ def test_each_kernel_keeps_the_target(kernel, rng):
 def test_impossible_mixtures():
     with pytest.raises(ValueError, match="max_components"):
         MixtureMove(max_components=0)
+
+
+# ---------------------------------------------------------------- edges
+
+
+def box(low, high):
+    return lambda x: np.all((x >= low) & (x <= high), axis=1)
+
+
+@pytest.mark.parametrize("unit", [1e-11, 1.0, 1e11])
+def test_edges_are_found(rng, unit):
+    low, high = np.array([0.0, -3.0, -np.inf, -np.inf]) * unit, np.array([np.inf, 7.0, 5.0, np.inf]) * unit
+    points = rng.uniform(-1, 1, size=(100, 4)) * unit + np.array([1.5, 2.0, 3.0, 0.0]) * unit
+    edges = find_edges(box(low, high), points)
+    assert np.array_equal(np.isfinite(edges.low), np.isfinite(low))
+    assert np.array_equal(np.isfinite(edges.high), np.isfinite(high))
+    finite = np.isfinite(low)
+    assert np.allclose(edges.low[finite], low[finite], rtol=0, atol=1e-14 * unit)
+    assert np.all(edges.low <= low) and np.all(edges.high >= high)  # a point in the support is never beyond
+
+
+def test_a_triangle_has_no_edges_where_they_depend_on_the_rest(rng):
+    points = np.sort(rng.uniform(size=(200, 2)), axis=1)
+    edges = find_edges(lambda x: (0 <= x[:, 0]) & (x[:, 0] <= x[:, 1]) & (x[:, 1] <= 1), points)
+    assert edges.high[0] == np.inf and edges.low[1] == -np.inf
+    assert edges.low[0] == pytest.approx(0, abs=1e-12) and edges.high[1] == pytest.approx(1)
+
+
+def test_points_open_up_and_close(rng):
+    edges = Edges(np.array([0.0, -3.0, -np.inf, -np.inf]), np.array([np.inf, 7.0, 5.0, np.inf]), np.ones(4))
+    x = np.array([1.0, 2.0, 4.0, 0.0]) + 0.9 * rng.uniform(-1, 1, size=(50, 4))
+    assert np.allclose(close(edges, open_up(edges, x)), x, rtol=1e-12)
+    step = 1e-6
+    slopes = [(open_up(edges, x + step * e) - open_up(edges, x - step * e))[:, j] for j, e in enumerate(np.eye(4))]
+    assert np.allclose(log_slope(edges, x), np.sum(np.log(np.array(slopes) / (2 * step)), axis=0), atol=1e-6)
+    assert np.all(log_slope(edges, x - [10, 0, 0, 0]) == -np.inf)
+
+
+def corner(rng, n):
+    return rng.exponential(size=(n, 3)) * np.array([1e-3, 1.0, 1e3])
+
+
+def test_a_corner_is_followed_to_the_edge(rng):
+    """The density of a mixture at an exponential corner is the one drawn from, and it is nearly that of the corner."""
+    scale = np.array([1e-3, 1.0, 1e3])
+    x = corner(rng, 2000)
+    edges = find_edges(box(np.zeros(3), np.full(3, np.inf)), x)
+    mixture = fit_mixture(x, uniform(2000), edges=edges)
+    assert np.all(np.isfinite(mixture.edges.low))
+    drawn = draw(mixture, 20_000, rng)
+    assert drawn.min() > -1e-12
+    weights = np.exp(-np.sum(drawn / scale, axis=1) - np.sum(np.log(scale)) - log_density(mixture, drawn))
+    assert abs(weights.mean() - 1.0) < 4.5 * weights.std() / np.sqrt(len(drawn))
+    assert weights.sum() ** 2 / np.sum(weights**2) > 0.6 * len(drawn)
+
+
+@pytest.mark.parametrize("kernel", [0, 1, 2], ids=["independence", "local walk", "differences"])
+def test_each_kernel_keeps_a_target_at_an_edge(kernel, rng):
+    n = 20_000
+    x = corner(rng, n)
+    scale = np.array([1e-3, 1.0, 1e3])
+    inside = box(np.zeros(3), np.full(3, np.inf))
+    move = MixtureMove()
+    move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0]), uniform(300), inside)
+    assert move._mixture.edges is not None
+    random = np.random.RandomState(rng.integers(2**31))
+    start = x.copy()
+    for _ in range(5):
+        move._turn = kernel
+        proposed, factors = move._draw(x, random)
+        change = np.where(inside(proposed), -np.sum((proposed - x) / scale, axis=1), -np.inf)
+        accepted = np.log(random.uniform(size=n)) < change + factors
+        x = np.where(accepted[:, None], proposed, x)
+    assert accepted.mean() > 0.1
+    for column in range(3):
+        assert stats.ks_2samp(x[: n // 2, column], start[n // 2 :, column]).pvalue > 1e-4

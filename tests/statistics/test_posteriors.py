@@ -130,6 +130,15 @@ def test_edges_of_a_truncated_prior(recycle, seed):
     assert within(evidence_deviation(samplers, truth), samplers)
 
 
+def test_a_corner_in_eight_dimensions(seed):
+    """Exponentials a hundred times shorter than the box, all at its corner; one run, some 600 independent points."""
+    posterior = Box(np.zeros(8), np.ones(8), lambda x: 8 * np.log(100) - 100.0 * np.sum(x, axis=-1))
+    sampler = runs(posterior, seed, count=1, nwalkers=500)[0]
+    chain = sampler.get_chain(flat=True)
+    assert np.all(np.abs(100 * chain.mean(axis=0) - 1) < 5 / np.sqrt(600))
+    assert abs(sampler.log_evidence) < 4 * sampler.log_evidence_error
+
+
 def test_flat_likelihood(seed):
     """Nothing is learnt: one stage, the prior comes back, the evidence is exact and so says its error."""
     posterior = Box([0, -2], [1, 5], lambda x: 0.0 * x[..., 0] - 1234.5)
