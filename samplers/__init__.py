@@ -2,6 +2,7 @@
 
 from .alarms import SamplingWarning
 from .backends import read_ladder
+from .importance import EvidenceCheck
 from .ladder import Stage
 from .presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 from .smc import SMCSampler
@@ -10,6 +11,7 @@ from .tmcmc import TMCMCSampler
 
 __all__ = [
     "CHING_CHEN_2007",
+    "EvidenceCheck",
     "RAMANCHA_2022_CONSTANT",
     "RAMANCHA_2022_LITERAL",
     "SMCSampler",

@@ -132,7 +132,7 @@ def _climbed(sampler: Any) -> tuple:
 
 
 def ladder_table(sampler: Any) -> str:
-    """The ladder as text: one line a stage, and the evidence."""
+    """The ladder as text: one line a stage, the evidence, and the two estimates it was chosen from."""
     head = f"{'stage':>5} {'beta':>10} {'ESS':>7} {'accept':>7} {'moves':>6} {'distinct':>9} {'dlogZ':>10} "
     rows = [head + f"{'evaluations':>12} {'seconds':>9}"]
     for number, s in enumerate(_climbed(sampler), start=1):
@@ -145,6 +145,13 @@ def ladder_table(sampler: Any) -> str:
         f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "
         f"{total[0]} evaluations in {total[1]:.3g} s"
     )
+    check = sampler.log_evidence_check
+    if check is not None:
+        rows.append(
+            f"by the ladder {sampler.log_evidence_ladder:.3f} +- {sampler.ladder[-1].log_evidence_error:.3f}; "
+            f"by {check.evaluations} independent draws {check.log_evidence:.3f} +- {check.error:.3f} "
+            f"(worth {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
+        )
     return "\n".join(rows)
 
 

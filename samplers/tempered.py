@@ -160,7 +160,7 @@ class TemperedSampler(EnsembleSampler):
     def log_evidence_error(self) -> float:
         """Standard error of `log_evidence`, from this run alone.
 
-        At least half the difference of the two estimates if they differ by more than twice their joint error.
+        At least half the difference of the two estimates if they differ by more than three times their joint error.
         """
         return self._evidence()[1]
 
@@ -183,7 +183,7 @@ class TemperedSampler(EnsembleSampler):
         difference, joint = abs(value - check.log_evidence), np.hypot(error, check.error)
         if check.error < error:
             value, error = check.log_evidence, check.error
-        return value, max(error, 0.5 * difference) if difference > 2.0 * joint else error
+        return value, max(error, 0.5 * difference) if difference > 3.0 * joint else error
 
     def _finished_ladder(self) -> list[Stage]:
         if not self._on_top():
