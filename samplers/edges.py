@@ -14,9 +14,9 @@ from scipy.special import expit
 
 __all__ = ["Edges", "close", "find_edges", "log_slope", "only_felt", "open_up"]
 
-PROBES = 5
-DOUBLINGS = 60
-BISECTIONS = 60
+PROBES = 3
+DOUBLINGS = 30
+BISECTIONS = 55
 AGREEMENT = 1e-9
 FELT = 4.0
 
@@ -40,7 +40,7 @@ def find_edges(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -
 
     Parameters
     ----------
-    inside : function of points (m, ndim) that tells which lie in the support; called some 120 times.
+    inside : function of points (m, ndim) that tells which lie in the support; called some 85 times.
     coords : (n, ndim) float — points in the support, such as draws of the prior.
     """
     ndim = coords.shape[1]
@@ -48,30 +48,30 @@ def find_edges(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -
     rows = coords[np.linspace(0, len(coords) - 1, PROBES).astype(int)]
     # one probe for each row, parameter and side
     row, parameter, side = (a.ravel() for a in np.meshgrid(range(PROBES), range(ndim), (-1.0, 1.0), indexing="ij"))
-    each = np.arange(len(row))
     start = rows[row, parameter]
 
-    def reaches(distance):
-        probes = rows[row]
-        probes[each, parameter] = start + side * distance
+    def reaches(which: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        probes = rows[row[which]]
+        probes[np.arange(len(which)), parameter[which]] = start[which] + side[which] * distance
         return inside(probes)
 
     within, beyond = np.zeros(len(row)), np.full(len(row), np.inf)
     distance = span[parameter]
     for _ in range(DOUBLINGS):
-        searching = np.isinf(beyond)
-        if not searching.any():
+        searching = np.flatnonzero(np.isinf(beyond))
+        if len(searching) == 0:
             break
-        found = reaches(np.where(searching, distance, within))
-        within = np.where(searching & found, distance, within)
-        beyond = np.where(searching & ~found, distance, beyond)
+        found = reaches(searching, distance[searching])
+        within[searching[found]] = distance[searching[found]]
+        beyond[searching[~found]] = distance[searching[~found]]
         distance = 2.0 * distance
     bounded = np.isfinite(beyond)
-    for _ in range(BISECTIONS):
-        middle = np.where(bounded, 0.5 * (within + beyond), within)
-        found = reaches(middle)
-        within = np.where(bounded & found, middle, within)
-        beyond = np.where(bounded & ~found, middle, beyond)
+    which = np.flatnonzero(bounded)
+    for _ in range(BISECTIONS if len(which) else 0):
+        middle = 0.5 * (within[which] + beyond[which])
+        found = reaches(which, middle)
+        within[which[found]] = middle[found]
+        beyond[which[~found]] = middle[~found]
 
     edges = np.where(bounded, start + side * beyond, side * np.inf).reshape(PROBES, ndim, 2)
     with np.errstate(invalid="ignore"):
