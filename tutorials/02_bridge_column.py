@@ -171,14 +171,21 @@ def table2() -> list[dict[str, str]]:
             nominal = model.nominal[name]
             reported = nominal if unit in ("1/s", "s") else from_si(nominal, unit).item()
             shown = f"{reported:.5g} {unit}"
-            row = (f"normal(1, {posterior.prior.distributions[name].sd:.2f}), > 0", shown, f"{mean:.5g} x {shown}", f"{true:.5g}")
+            row = (
+                f"normal(1, {posterior.prior.distributions[name].sd:.2f}), > 0",
+                shown,
+                f"{mean:.5g} x {shown}",
+                f"{true:.5g}",
+            )
         else:
             percent = f" ({100 * from_si(mean, 'g').item():.3g} % g)" if unit == "in/s2" else ""
             mean, true = (from_si(v, unit).item() for v in (mean, true))
             scale = from_si(posterior.prior.distributions[name].sd, unit).item()
             row = (f"half-normal({scale:.4g} {unit})", "-", f"{mean:.4g} {unit}{percent}", f"{true:.4g} {unit}")
         keys = ("Parameter", "Prior", "Reported value", "Posterior mean", "Truth (synthetic)")
-        rows.append(dict(zip(keys, (name, *row), strict=True)) | {"CV": f"{cv:.2e}", "(mean-truth)/sd": f"{distance:+.2f}"})
+        rows.append(
+            dict(zip(keys, (name, *row), strict=True)) | {"CV": f"{cv:.2e}", "(mean-truth)/sd": f"{distance:+.2f}"}
+        )
     return rows
 
 
@@ -239,9 +246,7 @@ for column, (title, response) in enumerate(predictions.items()):
     for i, channel in enumerate(measured.channels):
         axis = axes[i, column]
         axis.plot(measured.time, from_si(measured.values[i], channel.unit), color="0.55", linewidth=0.8, label="data")
-        axis.plot(
-            measured.time, from_si(response[i], channel.unit), color="#d9822b", linewidth=0.7, label="model"
-        )
+        axis.plot(measured.time, from_si(response[i], channel.unit), color="#d9822b", linewidth=0.7, label="model")
         axis.set_title(f"{title}\n{channel.quantity}, RRMSE {100 * errors[title][i]:.1f} %", fontsize=10)
         if column == 0:
             axis.set_ylabel(f"{channel.quantity} [{channel.unit}]")

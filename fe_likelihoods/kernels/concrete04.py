@@ -2,7 +2,8 @@
 
 The law, compression negative, with memory (eps_min, eps_max), the extreme strains committed so far::
 
-    eps < eps_min            sigma = fc eta r / (r - 1 + eta^r),  eta = eps/eps_0,  r = Ec/(Ec - fc/eps_0)   (0 beyond eps_cu)
+    eps < eps_min            sigma = fc eta r / (r - 1 + eta^r)   down to eps_cu, then 0
+                             eta = eps/eps_0,  r = Ec/(Ec - fc/eps_0)
     eps_min <= eps < eps_end sigma = slope (eps - eps_end)        unloading towards the plastic strain
     eps_end <= eps < 0       sigma = 0                            crack closing
     0 <= eps <= eps_max      sigma = (sigma_env(eps_max)/eps_max) eps

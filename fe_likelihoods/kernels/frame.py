@@ -18,6 +18,7 @@ from .jit import kernel
 __all__ = ["Column", "allocate", "initialise_column", "assemble", "commit_sections"]
 
 N_VECTORS = 16
+LARGEST_AXIAL_STRAIN = 0.2
 N_MATRICES = 5
 
 
@@ -124,7 +125,11 @@ def initialise_column(column):
 
 @kernel(inline=True)
 def assemble(u, column, force, stiffness):
-    """Restoring forces (n,) and tangent (n, n) at the displacements `u` (n,); False when an element fails."""
+    """Restoring forces (n,) and tangent (n, n) at the displacements `u` (n,); False when an element fails.
+
+    An element that has become a fifth shorter or longer has lost its meaning, whatever its materials still carry: a
+    crushed column would otherwise "find equilibrium" on its bars at half its length.
+    """
     n = u.shape[0]
     for i in range(n):
         force[i] = 0.0
@@ -139,6 +144,8 @@ def assemble(u, column, force, stiffness):
             duy -= u[first + 1]
             theta_i = u[first + 2]
         v1, v2, v3, c, s, chord = deformations(dux, duy, theta_i, u[j + 2], column.length, column.corotational)
+        if not abs(v1) < LARGEST_AXIAL_STRAIN * column.length:
+            return False
         converged = advance(
             v1,
             v2,

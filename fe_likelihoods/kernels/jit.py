@@ -51,7 +51,7 @@ def _cache_folder() -> str:
         except OSError:
             continue
     raise OSError(
-        f"no writable folder for compiled kernels among {roots}: set FE_LIKELIHOODS_CACHE to a folder that can be written"
+        f"no writable folder for compiled kernels among {roots}: set FE_LIKELIHOODS_CACHE to one that can be written"
     )
 
 

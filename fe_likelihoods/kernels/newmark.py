@@ -48,7 +48,7 @@ def newmark(
 
     gravity, mass : (n_dof,) static load and diagonal mass. every : one sample in `every` steps is kept.
     initial_velocity : of the top, along x. history : (7, n_kept) out, rows as HISTORY_ROWS.
-    Returns (status, retries, iterations): status 0 when all went well, -1 when gravity failed, k > 0 when step k failed.
+    Returns (status, retries, iterations): status 0 when all went well, -1 when gravity failed, k when step k failed.
     """
     n = gravity.shape[0]
     rows = column.vectors

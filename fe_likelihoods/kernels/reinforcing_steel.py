@@ -1,4 +1,4 @@
-"""Reinforcing steel with a yield plateau, strain hardening and Menegotto-Pinto reversals (OpenSees ``ReinforcingSteel``).
+"""Reinforcing steel: yield plateau, hardening, Menegotto-Pinto reversals (OpenSees ``ReinforcingSteel``).
 
 The law works in natural coordinates, x = ln(1 + eps), and is returned in engineering ones::
 
@@ -183,7 +183,7 @@ def _fit_root(r, ea, eb, es, r_min):
 
 @kernel
 def _fit(xa, sa, ea, xb, sb, eb, clip, c, curve):
-    """Curve from (xa, sa, ea) to (xb, sb, eb) into `curve` (9,); `clip` keeps the slopes on either side of the chord."""
+    """Curve from (xa, sa, ea) to (xb, sb, eb) into `curve` (9,); `clip` keeps the slopes astride the chord's."""
     es = (sb - sa) / (xb - xa) if xb != xa else ea
     if clip:
         if es < eb:

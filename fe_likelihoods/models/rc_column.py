@@ -24,9 +24,10 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from numbers import Integral
 
 import numba
 import numpy as np
@@ -38,7 +39,7 @@ from ..kernels.jit import KERNEL_HASH
 from ..kernels.newmark import HISTORY_ROWS, newmark
 from ..kernels.static import impose_displacement
 from ..records import DisplacementHistory, Record
-from ..units import G0, to_si
+from ..units import G0, find_unit, to_si
 from .base import MisfitBatch, SimulationBatch, SimulationFailed
 from .circular_section import (
     Confinement,
@@ -48,93 +49,9 @@ from .circular_section import (
     gauss_lobatto,
     mander_confinement,
 )
+from .column_inputs import Bars, Concrete, Hoops, Patches, Steel, number, refuse, whole_number
 
 __all__ = ["Bars", "ColumnHistory", "Concrete", "Hoops", "Patches", "RCColumn", "Steel"]
-
-
-@dataclass(frozen=True)
-class Concrete:
-    """Unconfined concrete (Popovics envelope, exponential softening in tension).
-
-    Attributes
-    ----------
-    fc, ec, ft : float
-        Compressive strength (positive), initial modulus and tensile strength [Pa].
-    peak_strain : float or None
-        Strain at fc (positive). None: 2 fc/Ec, which follows an updated Ec. A fixed strain below fc/Ec makes the
-        envelope ignore Ec.
-    ultimate_strain : float
-        Strain beyond which the cover carries nothing (positive); at least 1.5 times the peak strain is taken.
-    softening_strain : float
-        Strain from cracking, ft/Ec, to where tension has decayed to `softening_ratio` ft and is dropped.
-    softening_ratio : float
-        Share of ft left there.
-    """
-
-    fc: float
-    ec: float
-    ft: float
-    peak_strain: float | None = None
-    ultimate_strain: float = 0.006
-    softening_strain: float = 0.001
-    softening_ratio: float = 0.1
-
-
-@dataclass(frozen=True)
-class Steel:
-    """Longitudinal steel.
-
-    Attributes
-    ----------
-    fy, fu, es, esh : float
-        Yield strength, ultimate strength, modulus and modulus at the onset of hardening [Pa].
-    hardening_strain, ultimate_strain : float
-        Strains at the onset of hardening and at fu.
-    """
-
-    fy: float
-    fu: float
-    es: float
-    esh: float
-    hardening_strain: float
-    ultimate_strain: float
-
-
-@dataclass(frozen=True)
-class Bars:
-    """`number` longitudinal bars of `diameter` [m] and `area` [m2; None: of the circle], evenly on a circle.
-
-    first_angle [rad] : of the first bar from the direction of loading.
-    """
-
-    number: int
-    diameter: float
-    area: float | None = None
-    first_angle: float = 0.0
-
-
-@dataclass(frozen=True)
-class Hoops:
-    """Transverse steel: hoops or a spiral of bar `diameter` [m], `area` [m2] of one set, at `spacing` [m].
-
-    fy : yield strength [Pa]. ultimate_strain : at fracture. area None: that of one bar (bundled hoops have more).
-    """
-
-    diameter: float
-    spacing: float
-    fy: float
-    area: float | None = None
-    ultimate_strain: float = 0.12
-    spiral: bool = False
-
-
-@dataclass(frozen=True)
-class Patches:
-    """Mesh of rings and wedges, as many codes have it (the strips of the default are the better quadrature)."""
-
-    wedges: int = 20
-    core_rings: int = 10
-    cover_rings: int = 2
 
 
 @dataclass(frozen=True)
@@ -345,7 +262,7 @@ class RCColumn:
             core, cover = circular_patches(radius, core_radius, m.wedges, m.core_rings, m.cover_rings)
         else:
             core, cover = circular_strips(radius, core_radius, self.mesh)
-        return core, cover, bar_circle(self._bar_radius, self.bars.number, self._bar_area, self.bars.first_angle)
+        return core, cover, bar_circle(self._bar_radius, self.bars.number, self.bars.area_each, self.bars.first_angle)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (n_channels, n_steps) [SI] at multiples `theta` (n_parameters,) of the nominal parameters.
@@ -369,6 +286,7 @@ class RCColumn:
 
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses at `thetas` (n, n_parameters), on numba's number of threads."""
+        thetas = self._checked(thetas)
         rows = self._rows()
         response, reasons = self._map(
             lambda history: history.values[rows], thetas, (len(rows), self.n_steps), self._runner()
@@ -377,11 +295,27 @@ class RCColumn:
 
     def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
         """Sums of squared residuals (n, n_channels) against `measured` (n_channels, n_steps); no response is kept."""
+        thetas, measured = self._checked(thetas), np.asarray(measured, dtype=float)
         rows = self._rows()
+        if measured.shape != (len(rows), self.n_steps):
+            raise ValueError(
+                f"expected measured responses of shape {(len(rows), self.n_steps)}, a row for each of "
+                f"{[c.name for c in self.channels]}; got {measured.shape}; bring record and measurements to one step "
+                "and length"
+            )
         misfit, reasons = self._map(
             lambda history: ((history.values[rows] - measured) ** 2).sum(axis=1), thetas, (len(rows),), self._runner()
         )
         return MisfitBatch(misfit, reasons)
+
+    def _checked(self, thetas: np.ndarray) -> np.ndarray:
+        thetas = np.asarray(thetas, dtype=float)
+        if thetas.ndim != 2 or thetas.shape[1] != len(self.parameters):
+            raise ValueError(
+                f"expected rows with one value for each of {self.parameters}, shape (n, {len(self.parameters)}); "
+                f"got {thetas.shape}"
+            )
+        return thetas
 
     @staticmethod
     def _map(
@@ -414,20 +348,15 @@ class RCColumn:
         return [_CHANNEL_ROWS[c.name] for c in self.channels]
 
     @property
-    def _bar_area(self) -> float:
-        return self.bars.area if self.bars.area is not None else 0.25 * math.pi * self.bars.diameter**2
-
-    @property
     def _bar_radius(self) -> float:
         return 0.5 * self.diameter - self.cover - self.hoops.diameter - 0.5 * self.bars.diameter
 
     def _confinement(self, fc: float) -> Confinement:
-        hoop_area = self.hoops.area if self.hoops.area is not None else 0.25 * math.pi * self.hoops.diameter**2
         return mander_confinement(
             fc,
             core_diameter=self.core_diameter,
-            steel_ratio=self.bars.number * self._bar_area / (0.25 * math.pi * self.core_diameter**2),
-            hoop_area=hoop_area,
+            steel_ratio=self.bars.number * self.bars.area_each / (0.25 * math.pi * self.core_diameter**2),
+            hoop_area=self.hoops.area_each,
             spacing=self.hoops.spacing,
             clear_spacing=self.hoops.spacing - self.hoops.diameter,
             fyh=self.hoops.fy,
@@ -542,39 +471,26 @@ def _check_parameters(v: dict[str, float], steel: Steel) -> None:
 
 def _check(m: RCColumn) -> None:
     """ValueError for a column that cannot be built, before anything is run."""
-
-    def refuse(what: str, got: object, advice: str) -> None:
-        raise ValueError(f"RCColumn: expected {what}; got {got}; {advice}")
-
     if not isinstance(m.loading, (Record, DisplacementHistory)):
         refuse("a Record or a DisplacementHistory as loading", type(m.loading).__name__, "read one with records.read_*")
-    positive = {"diameter": m.diameter, "height": m.height, "mass": m.mass, "spacing of hoops": m.hoops.spacing}
-    positive |= {"diameter of hoops": m.hoops.diameter, "diameter of bars": m.bars.diameter, "fyh": m.hoops.fy}
-    positive |= {"area of hoops": 1.0 if m.hoops.area is None else m.hoops.area}
-    positive |= {"area of bars": 1.0 if m.bars.area is None else m.bars.area}
-    positive |= {f"concrete {n}": getattr(m.concrete, n) for n in ("fc", "ec", "ultimate_strain", "softening_strain")}
-    positive |= {f.name: getattr(m.steel, f.name) for f in fields(m.steel)}
-    positive |= {"tolerance": m.tolerance, "element_tolerance": m.element_tolerance}
-    if m.concrete.peak_strain is not None:
-        positive |= {"peak_strain": m.concrete.peak_strain}
-    if m.max_increment is not None:
-        positive |= {"max_increment": m.max_increment}
-    for name, value in positive.items():
-        if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value > 0.0):
-            refuse(f"a positive {name}", value, "give it in SI units")
+    for kind in (Concrete, Steel, Bars, Hoops):
+        part = getattr(m, kind.__name__.lower())
+        if not isinstance(part, kind):
+            refuse(f"{kind.__name__}(...) as {kind.__name__.lower()}", part, "import it from this module")
+    for name in ("diameter", "height", "mass", "tolerance", "element_tolerance"):
+        number(name, getattr(m, name))
     for name in ("cover", "rotational_inertia", "a0", "a1"):
-        if not (math.isfinite(getattr(m, name)) and getattr(m, name) >= 0.0):
-            refuse(f"a {name} of zero or more", getattr(m, name), "give it in SI units")
-    if not 0.0 <= m.concrete.ft < m.concrete.fc:
-        refuse("a tensile strength between 0 and fc", m.concrete.ft, "give both positive, in Pa")
-    if not 0.0 < m.concrete.softening_ratio < 1.0:
-        refuse("a softening_ratio between 0 and 1", m.concrete.softening_ratio, "0.1 is the default")
+        number(name, getattr(m, name), zero=True)
+    if m.axial_load is not None:
+        number("axial_load", m.axial_load, any_sign=True)
+    if m.max_increment is not None:
+        number("max_increment", m.max_increment)
+    counts = {"n_elements": (1, 50), "n_points": (2, 7), "substeps": (1, 1000), "max_iterations": (2, 1000)}
+    for name, (low, high) in (counts | {"halvings": (0, 30)}).items():
+        whole_number(name, getattr(m, name), low, high)
+
     if m.core_diameter <= 0.0:
-        refuse(
-            f"a cover smaller than the radius {m.diameter / 2:.4g} m less the hoops", m.cover, "cover is clear, in m"
-        )
-    if m.bars.number < 3:
-        refuse("at least three bars", m.bars.number, "a circular column needs them all around")
+        refuse(f"a cover smaller than the radius {m.diameter / 2:.4g} m less hoops", m.cover, "cover is clear, in m")
     chord = 2.0 * m._bar_radius * math.sin(math.pi / m.bars.number)
     if m._bar_radius <= 0.0 or chord < m.bars.diameter:
         refuse(
@@ -582,33 +498,37 @@ def _check(m: RCColumn) -> None:
             f"{m.bars.number} bars of {m.bars.diameter:.4g} m, {chord:.4g} m apart",
             "take fewer or thinner bars, or less cover",
         )
-    if m.hoops.spacing <= m.hoops.diameter:
-        refuse("hoops further apart than their diameter", m.hoops.spacing, "spacing is centre to centre, in m")
-    if not m.steel.fy / m.steel.es < m.steel.hardening_strain < m.steel.ultimate_strain or m.steel.fu <= m.steel.fy:
-        refuse("fy/es < hardening_strain < ultimate_strain and fy < fu", m.steel, "check the units of the steel")
-    unknown = [p for p in m.parameters if p not in PARAMETERS]
-    if unknown or len(set(m.parameters)) != len(m.parameters) or not m.parameters:
-        refuse(
-            f"parameters out of {tuple(PARAMETERS)}, each once", m.parameters, "see RCColumn.nominal for their values"
-        )
-    zero = [p for p in m.parameters if m.nominal[p] == 0.0]
-    if zero:
-        refuse("non-zero nominal values to take multiples of", zero, "give them, or leave them out of parameters")
-    shaken = isinstance(m.loading, Record)
-    idle = [p for p in m.parameters if not shaken and p in ("a0", "a1")]
-    if idle:
-        refuse("parameters that act under imposed displacement", idle, "leave damping out of parameters")
-    known = ("acceleration", "displacement") if shaken else ("force",)
-    if m.outputs is not None and (not m.outputs or any(n not in known for n in m.outputs)):
-        refuse(f"outputs out of {known}", m.outputs, "these are what the loading gives")
-    if not (isinstance(m.mesh, Patches) or (isinstance(m.mesh, (int, np.integer)) and m.mesh >= 4 and m.mesh % 2 == 0)):
+    steel_ratio = m.bars.number * m.bars.area_each / (0.25 * math.pi * m.core_diameter**2)
+    if steel_ratio > 0.3:
+        refuse("an area of bars below 30 % of the core's", f"{100 * steel_ratio:.3g} %", "give the area of one, in m2")
+    if m.hoops.spacing - m.hoops.diameter >= 2.0 * m.core_diameter:
+        refuse("a spacing of hoops below two core diameters", m.hoops.spacing, "beyond that no core is confined")
+    if not (isinstance(m.mesh, Patches) or (isinstance(m.mesh, Integral) and m.mesh >= 4 and m.mesh % 2 == 0)):
         refuse("an even number of at least 4 strips, or Patches", m.mesh, "40 strips are the default")
-    if isinstance(m.mesh, Patches) and (m.mesh.wedges < 4 or m.mesh.core_rings < 1 or m.mesh.cover_rings < 1):
-        refuse("Patches with 4 wedges and one ring of each kind or more", m.mesh, "20, 10 and 2 are the default")
     if m.geometry not in ("corotational", "linear"):
         refuse('geometry "corotational" or "linear"', m.geometry, "corotational is the default")
-    counts = {"n_elements": (1, 50), "n_points": (2, 7), "substeps": (1, 1000), "max_iterations": (2, 1000)}
-    for name, (low, high) in (counts | {"halvings": (0, 30)}).items():
-        value = getattr(m, name)
-        if not isinstance(value, (int, np.integer)) or not low <= value <= high:
-            refuse(f"{name} between {low} and {high}", value, "see the documentation of RCColumn")
+
+    shaken = isinstance(m.loading, Record)
+    names = m.parameters
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names or set(names) - set(PARAMETERS):
+        refuse(f"parameters out of {tuple(PARAMETERS)}", names, "see RCColumn.nominal for their values")
+    if len(set(names)) != len(names):
+        refuse("each of the parameters once", names, "leave the repeated one out")
+    idle = [p for p in names if not shaken and p in ("a0", "a1")]
+    if idle:
+        refuse("parameters that act under imposed displacement", idle, "leave damping out of parameters")
+    zero = [p for p in names if m.nominal[p] == 0.0]
+    if zero:
+        refuse("non-zero nominal values to take multiples of", zero, "give them, or leave them out of parameters")
+    known = ("acceleration", "displacement") if shaken else ("force",)
+    if m.outputs is not None and (
+        not m.outputs or set(m.outputs) - set(known) or len(set(m.outputs)) != len(m.outputs)
+    ):
+        refuse(f"outputs out of {known}, each once", m.outputs, "these are what the loading gives")
+    for name, unit in dict(m.units).items():
+        if name not in _CHANNEL_ROWS:
+            refuse(f"display units of channels out of {tuple(_CHANNEL_ROWS)}", name, 'such as {"displacement": "in"}')
+        try:
+            find_unit(unit, name)
+        except ValueError as error:
+            refuse(f"a display unit of {name}", unit, str(error))

@@ -1,0 +1,248 @@
+"""The bridge column built in OpenSees, a peer for tests and benchmarks.
+
+The same column as `RCColumn`, from OpenSees' own parts: Concrete04 and ReinforcingSteel fibers, force-based
+elements with Gauss-Lobatto points, corotational transformation, Newmark's average acceleration with Newton iterations.
+`peer_of` translates an `RCColumn` and its parameters from their published definitions into kip and inch (it uses the
+model's fibers and confinement, none of its kernels), and `shake` and `push` run it.
+
+OpenSees holds one model per process and may end that process, so each run has one of its own: it starts
+``python -m tests.opensees_column JOB RESULT`` and reads what it leaves.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import pickle
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.units import G0, to_si
+
+if TYPE_CHECKING:  # the process that runs OpenSees need not wait for the compiled model
+    from fe_likelihoods.models.rc_column import RCColumn
+
+__all__ = ["PeerColumn", "Push", "Shake", "peer_of", "push", "require_opensees", "shake"]
+
+KIP, INCH, KSI = (to_si(1.0, unit).item() for unit in ("kip", "in", "ksi"))
+CORE, COVER, STEEL = 1, 2, 3  # material tags
+MAX_ITERATIONS = 50
+
+
+class PeerColumn(NamedTuple):
+    """What OpenSees is told, in kip, inch and second."""
+
+    core: tuple  # Concrete04: fc, eps_c, eps_cu (negative), Ec, ft, eps_tu, beta
+    cover: tuple
+    steel: tuple  # ReinforcingSteel: fy, fu, Es, Esh, eps_sh, eps_u
+    fibers: np.ndarray  # (3, n): y, area, material (CORE, COVER, STEEL)
+    mass: tuple  # along x, along y, rotational
+    axial_load: float
+    a0: float
+    a1: float
+    height: float
+    n_elements: int
+    n_points: int
+    geometry: str  # "Corotational" or "Linear"
+
+
+class Shake(NamedTuple):
+    """Response to base acceleration; shorter than the record when OpenSees did not converge."""
+
+    response: (
+        np.ndarray
+    )  # (3, n): relative displacement [in], absolute acceleration [in/s2], vertical displacement [in]
+    iterations: np.ndarray  # (n,)
+    seconds: float  # CPU time of the analysis alone
+
+
+class Push(NamedTuple):
+    """Response to imposed displacement; shorter than the targets when OpenSees did not converge."""
+
+    response: np.ndarray  # (5, n): lateral displacement [in], force [kip], vertical displacement, and rotation of the
+    # top, base moment [kip in]
+    seconds: float
+
+
+def require_opensees() -> None:
+    """Skip the test, saying so, where OpenSees cannot be imported."""
+    if importlib.util.find_spec("openseespy") is None:
+        pytest.skip("NO OPENSEES: install openseespy (extra 'test') to compare with it")
+    probe = subprocess.run([sys.executable, "-c", "import openseespy.opensees"], capture_output=True, text=True)
+    if probe.returncode:
+        last = (probe.stderr.strip() or "no message").splitlines()[-1]
+        pytest.skip(f"NO OPENSEES: openseespy does not start (it needs libblas3 and liblapack3): {last}")
+
+
+def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
+    """The column of `model` at multiples `theta` of its nominal parameters."""
+    values = dict(model.nominal)
+    for name, factor in zip(model.parameters, theta, strict=True):
+        values[name] *= float(factor)
+    if values["fc"] != model.concrete.fc:
+        raise ValueError("the confinement of the peer is that of the nominal fc: leave fc out of the parameters")
+    concrete, steel, confinement = model.concrete, model.steel, model.confinement
+    fc, ec, ft = (values[name] / KSI for name in ("fc", "Ec", "ft"))
+    peak = 2.0 * fc / ec if concrete.peak_strain is None else concrete.peak_strain
+    core_peak = peak * confinement.strain_ratio
+    tension = (ec, ft, ft / ec + concrete.softening_strain, concrete.softening_ratio)
+    core, cover, bars = model.section()
+    fibers = [
+        np.column_stack([part[:, 0] / INCH, part[:, 1] / INCH**2, np.full(len(part), tag)])
+        for part, tag in ((core, CORE), (cover, COVER), (bars, STEEL))
+    ]
+    mass = values["mass"] / (KIP / INCH)
+    return PeerColumn(
+        core=(-fc * confinement.strength_ratio, -core_peak, -max(confinement.ultimate_strain, 1.05 * core_peak))
+        + tension,
+        cover=(-fc, -peak, -max(concrete.ultimate_strain, 1.5 * peak)) + tension,
+        steel=tuple(values[name] / KSI for name in ("fy", "fu", "Es", "Esh"))
+        + (steel.hardening_strain, steel.ultimate_strain),
+        fibers=np.concatenate(fibers).T,
+        mass=(mass, mass * model.vertical_mass, model.rotational_inertia / (KIP * INCH)),
+        axial_load=(values["mass"] * G0 if model.axial_load is None else model.axial_load) / KIP,
+        a0=values["a0"],
+        a1=values["a1"],
+        height=model.height / INCH,
+        n_elements=model.n_elements,
+        n_points=model.n_points,
+        geometry=model.geometry.capitalize(),
+    )
+
+
+def shake(column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10) -> Shake:
+    """Gravity, then base acceleration (n,) [in/s2] at the step `dt` [s], in a process of its own.
+
+    tolerance : norm of the last displacement increment [in and rad].
+    """
+    return _in_process("_shake", column, np.asarray(acceleration, dtype=float), dt, tolerance)
+
+
+def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10) -> Push:
+    """Gravity, then lateral displacement of the top through `targets` (n,) [in], one step each, in a process."""
+    return _in_process("_push", column, np.asarray(targets, dtype=float), tolerance)
+
+
+def _in_process(function: str, *arguments) -> Shake | Push:
+    with tempfile.TemporaryDirectory() as folder:
+        job, result = Path(folder) / "job", Path(folder) / "result"
+        job.write_bytes(pickle.dumps((function, arguments)))
+        command = [sys.executable, "-m", "tests.opensees_column", str(job), str(result)]
+        run = subprocess.run(command, cwd=Path(__file__).resolve().parents[1], capture_output=True, text=True)
+        if not result.exists():
+            raise RuntimeError(f"OpenSees ended with code {run.returncode}: {run.stderr[-2000:]}")
+        kind, values = pickle.loads(result.read_bytes())
+        return {"Shake": Shake, "Push": Push}[kind](*values)
+
+
+def _build(ops, column: PeerColumn, tolerance: float) -> None:
+    """The column under its gravity load, clock at zero."""
+    n = column.n_elements
+    ops.wipe()
+    ops.model("basic", "-ndm", 2, "-ndf", 3)
+    for i in range(n + 1):
+        ops.node(i + 1, 0.0, column.height * i / n)
+    ops.fix(1, 1, 1, 1)
+    ops.mass(n + 1, *column.mass)
+    ops.uniaxialMaterial("Concrete04", CORE, *column.core)
+    ops.uniaxialMaterial("Concrete04", COVER, *column.cover)
+    ops.uniaxialMaterial("ReinforcingSteel", STEEL, *column.steel)
+    ops.section("Fiber", 1)
+    for y, area, material in column.fibers.T:
+        ops.fiber(y, 0.0, area, int(material))
+    ops.geomTransf(column.geometry, 1)
+    ops.beamIntegration("Lobatto", 1, 1, column.n_points)
+    for i in range(n):
+        ops.element("forceBeamColumn", i + 1, i + 1, i + 2, 1, 1)
+    ops.timeSeries("Linear", 1)
+    ops.pattern("Plain", 1, 1)
+    ops.load(n + 1, 0.0, -column.axial_load, 0.0)
+    ops.constraints("Plain")
+    ops.numberer("Plain")
+    ops.system("BandGeneral")
+    ops.test("NormDispIncr", tolerance, MAX_ITERATIONS)
+    ops.algorithm("Newton")
+    ops.integrator("LoadControl", 0.1)
+    ops.analysis("Static")
+    if ops.analyze(10):
+        raise RuntimeError("OpenSees did not converge under gravity")
+    ops.loadConst("-time", 0.0)
+
+
+def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float) -> Shake:
+    _build(ops, column, tolerance)
+    top = column.n_elements + 1
+    ops.rayleigh(column.a0, 0.0, 0.0, column.a1)
+    # a path ends at its last point: round-off in the clock must not step over it
+    values = np.append(acceleration, acceleration[-1]).tolist()
+    ops.timeSeries("Path", 2, "-dt", dt, "-values", *values)
+    ops.pattern("UniformExcitation", 2, 1, "-accel", 2)
+    ops.wipeAnalysis()
+    ops.constraints("Plain")
+    ops.numberer("Plain")
+    ops.system("BandGeneral")
+    ops.test("NormDispIncr", tolerance, MAX_ITERATIONS)
+    ops.algorithm("Newton")
+    ops.integrator("Newmark", 0.5, 0.25)
+    ops.analysis("Transient")
+    response = np.empty((3, len(acceleration)))
+    iterations = np.zeros(len(acceleration), dtype=int)
+    response[:, 0] = ops.nodeDisp(top, 1), acceleration[0], ops.nodeDisp(top, 2)
+    done = 1
+    start = time.process_time()
+    while done < len(acceleration) and ops.analyze(1, dt) == 0:
+        response[0, done] = ops.nodeDisp(top, 1)
+        response[1, done] = ops.nodeAccel(top, 1)
+        response[2, done] = ops.nodeDisp(top, 2)
+        iterations[done] = ops.testIter()
+        done += 1
+    seconds = time.process_time() - start
+    response[1, 1:] += acceleration[1:]
+    return Shake(response[:, :done], iterations[:done], seconds)
+
+
+def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float) -> Push:
+    _build(ops, column, tolerance)
+    top = column.n_elements + 1
+    ops.timeSeries("Linear", 2)
+    ops.pattern("Plain", 2, 2)
+    ops.load(top, 1.0, 0.0, 0.0)
+    response = np.empty((5, len(targets)))
+    done = 0
+    start = time.process_time()
+    for target in targets:
+        increment = target - ops.nodeDisp(top, 1)
+        if increment != 0.0:
+            ops.integrator("DisplacementControl", top, 1, increment)
+            if ops.analyze(1):
+                break
+        response[:, done] = (
+            ops.nodeDisp(top, 1),
+            ops.getTime(),
+            ops.nodeDisp(top, 2),
+            ops.nodeDisp(top, 3),
+            ops.eleResponse(1, "section", 1, "force")[1],
+        )
+        done += 1
+    return Push(response[:, :done], time.process_time() - start)
+
+
+def main() -> None:
+    """Run one job: the file of the function and its arguments, and the file for the result."""
+    import openseespy.opensees as ops
+
+    function, arguments = pickle.loads(Path(sys.argv[1]).read_bytes())
+    result = {"_shake": _shake, "_push": _push}[function](ops, *arguments)
+    # the classes of this module have another name while it runs as a program
+    plain = (type(result).__name__, tuple(result))
+    Path(sys.argv[2]).write_bytes(pickle.dumps(plain))
+
+
+if __name__ == "__main__":
+    main()
