@@ -66,8 +66,8 @@ args.out.mkdir(parents=True, exist_ok=True)
 # %% [markdown]
 # ## The data and the posterior
 #
-# `problems.bridge_column` puts together what the paper describes: the model, normal priors truncated at zero on the five
-# multiples of nominal values, half-normal priors on the noise levels, and the likelihood of its equation (3).
+# `problems.bridge_column` puts together what the paper describes: the model, normal priors truncated at zero on the
+# five multiples of nominal values, half-normal priors on the noise levels, and the likelihood of its equation (3).
 
 
 # %%
@@ -96,8 +96,8 @@ print(f"base motion: {record.name} x {args.scale:g}; measurements: {measurements
 print(f"{measured.n_steps} samples at {measured.dt:g} s of {[c.name for c in measured.channels]}")
 if every > 1:
     print(
-        f"REDUCED SETTING ({args.preset}): one sample in {every} is kept and the model takes steps {every} times longer,"
-        "\n  so the posterior is wider and its mesh in time coarser than with all data (--preset default)."
+        f"REDUCED SETTING ({args.preset}): one sample in {every} is kept and the model takes steps {every} times\n"
+        "  longer, so the posterior is wider and its mesh in time coarser than with all data (--preset default)."
     )
 
 
@@ -282,7 +282,10 @@ result = {
 }
 (args.out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
 for title, error in errors.items():
-    print(f"{title}: RRMSE " + ", ".join(f"{c.name} {100 * e:.1f} %" for c, e in zip(measured.channels, error)))
+    print(
+        f"{title}: RRMSE "
+        + ", ".join(f"{c.name} {100 * e:.1f} %" for c, e in zip(measured.channels, error, strict=True))
+    )
 print(
     f"log evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}; {len(sampler.ladder)} stages, "
     f"{report['simulations']} simulations ({report['failure_count']} failed) in {seconds:.0f} s\n"
