@@ -199,7 +199,8 @@ def _fit(xa, sa, ea, xb, sb, eb, clip, c, curve):
             r_min = max(0.0, (eb - es) / (es - ea))
             if r <= r_min:
                 r = r_min + 0.01
-            a = _fit_root(r, ea, eb, es, r_min)
+            # The chord not between the end slopes: no curve, A = 0 makes it the straight line to the target.
+            a = _fit_root(r, ea, eb, es, r_min) if r_min > 0.0 else 0.0
         q = (es / ea - a) / (1.0 - a)
         sch = sa + ea * (xb - xa) * a / (1.0 - a**r) ** (1.0 / r)
     curve[XA], curve[SA], curve[EA] = xa, sa, ea

@@ -1,0 +1,184 @@
+"""The transformation against rigid motions, differences at large rotations, and the P-Delta cantilever."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.kernels.corotational import add_to_stiffness, deformations
+from fe_likelihoods.kernels.jit import kernel
+from fe_likelihoods.kernels.static import apply_gravity, equilibrate
+
+from . import golden
+from .test_beam_column import stiffness_of_section, symmetric
+
+LENGTH = 1.3
+# Basic stiffness K11 K12 K13 K22 K23 K33 of an imaginary linear element: nothing is zero or equal by chance.
+STIFFNESS = np.array([7.0, 0.4, -0.3, 3.0, 1.1, 2.5])
+
+
+@kernel
+def end_forces(u, q0, k, length, corotational, force, stiffness):
+    """End forces and tangent of an element with basic forces q0 + k v at the displacements of both ends (6,)."""
+    v1, v2, v3, c, s, chord = deformations(u[3] - u[0], u[4] - u[1], u[2], u[5], length, corotational)
+    force[:] = 0.0
+    stiffness[:] = 0.0
+    add_to_stiffness(
+        0,
+        q0[0] + k[0] * v1 + k[1] * v2 + k[2] * v3,
+        q0[1] + k[1] * v1 + k[3] * v2 + k[4] * v3,
+        q0[2] + k[2] * v1 + k[4] * v2 + k[5] * v3,
+        k[0],
+        k[1],
+        k[2],
+        k[3],
+        k[4],
+        k[5],
+        c,
+        s,
+        chord,
+        corotational,
+        force,
+        stiffness,
+    )
+
+
+def element(u, q0=(0.0, 0.0, 0.0), k=STIFFNESS, corotational=True):
+    force, stiffness = np.zeros(6), np.zeros((6, 6))
+    end_forces(np.asarray(u, float), np.asarray(q0, float), k, LENGTH, corotational, force, stiffness)
+    return force, stiffness
+
+
+def basic(u, corotational=True):
+    return np.array(deformations(u[3] - u[0], u[4] - u[1], u[2], u[5], LENGTH, corotational)[:3])
+
+
+def displaced(rng, size):
+    """Both ends displaced and turned; the chord stays within half a turn."""
+    u = rng.normal(size=6) * size
+    u[4] += 0.1
+    return u
+
+
+def central(function, u, step):
+    return np.column_stack([(function(u + h) - function(u - h)) / (2 * step) for h in step * np.eye(6)])
+
+
+@pytest.mark.parametrize("angle", [1e-9, 0.01, 0.5, 1.5, 3.0, -2.5])
+def test_rigid_motion_deforms_nothing(angle):
+    """Turned by `angle` (counter-clockwise) about a point anywhere, and shifted."""
+    centre, shift = np.array([0.7, -0.4]), np.array([0.3, -1.1])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    u = np.zeros(6)
+    for end, position in enumerate(([0.0, 0.0], [0.0, LENGTH])):
+        u[3 * end : 3 * end + 2] = turn @ (np.array(position) - centre) + centre + shift - position
+        u[3 * end + 2] = angle
+    np.testing.assert_allclose(basic(u), 0.0, atol=1e-15 * 10)
+    force, _ = element(u)
+    np.testing.assert_allclose(force, 0.0, atol=1e-13)
+    # control: for the linear variant a large turn is a deformation
+    if abs(angle) > 0.1:
+        assert np.abs(basic(u, corotational=False)).max() > 1e-3
+
+
+def test_small_elongation_is_not_lost():
+    """chord - length without cancellation: 1e-14 of the length keeps its digits."""
+    for elongation in (1e-14, 1e-10, -1e-12):
+        v1, _, _, c, s, chord = deformations(0.0, elongation, 0.0, 0.0, LENGTH, True)
+        assert v1 == pytest.approx(elongation, rel=1e-12)
+        assert (c, s, chord) == (1.0, 0.0, LENGTH + elongation)
+
+
+@pytest.mark.parametrize("corotational", [True, False])
+@pytest.mark.parametrize("size", [0.01, 0.5])
+def test_end_forces_are_work_conjugate(rng, corotational, size):
+    """p = T' Q with T = dv/du: for each unit basic force the end forces are a row of the derivative."""
+    for _ in range(20):
+        u = displaced(rng, size)
+        derivative = central(lambda w: basic(w, corotational), u, 1e-5)
+        rows = [element(u, q0, np.zeros(6), corotational)[0] for q0 in np.eye(3)]
+        np.testing.assert_allclose(rows, derivative, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("corotational", [True, False])
+@pytest.mark.parametrize("size", [0.01, 0.5])
+def test_tangent_is_the_derivative_of_the_forces(rng, corotational, size):
+    """Material and geometric part together, at forces of the size of the stiffness."""
+    for _ in range(20):
+        u, q0 = displaced(rng, size), rng.normal(size=3) * 3.0
+        _, stiffness = element(u, q0, corotational=corotational)
+        derivative = central(lambda w, q0=q0: element(w, q0, corotational=corotational)[0], u, 1e-5)
+        np.testing.assert_allclose(stiffness, derivative, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(stiffness, stiffness.T, rtol=0, atol=1e-12)
+
+
+def test_without_its_geometric_part_the_tangent_fails_the_same_comparison(rng):
+    u, q0 = displaced(rng, 0.5), np.array([3.0, 1.0, -2.0])
+    derivative = central(lambda w: element(w, q0)[0], u, 1e-5)
+    transformation = np.array([element(u, row, np.zeros(6))[0] for row in np.eye(3)])
+    material = transformation.T @ symmetric(STIFFNESS) @ transformation
+    assert np.abs(material - derivative).max() > 0.1
+
+
+def test_end_forces_are_in_equilibrium(rng):
+    """Forces sum to zero, and so do moments about the base in the deformed position."""
+    for _ in range(20):
+        u = displaced(rng, 0.5)
+        force, _ = element(u, rng.normal(size=3))
+        np.testing.assert_allclose(force[:2], -force[3:5], atol=1e-13)
+        arm = np.array([u[3] - u[0], LENGTH + u[4] - u[1]])
+        assert abs(force[2] + force[5] + arm[0] * force[4] - arm[1] * force[3]) < 1e-12
+
+
+def test_both_variants_agree_for_small_displacements(rng):
+    u = 1e-9 * rng.normal(size=6)
+    np.testing.assert_allclose(element(u)[0], element(u, corotational=False)[0], rtol=0, atol=1e-16)
+    np.testing.assert_allclose(element(u)[1], element(u, corotational=False)[1], rtol=0, atol=1e-7)
+
+
+def test_fixed_base_takes_the_rows_of_the_free_end(rng):
+    """first = -3: only end J enters."""
+    u = displaced(rng, 0.3)
+    u[:3] = 0.0
+    q0 = np.array([1.0, 2.0, -0.5])
+    force, stiffness = element(u, q0)
+    basic_forces = q0 + symmetric(STIFFNESS) @ basic(u)
+    _, _, _, c, s, chord = deformations(u[3], u[4], 0.0, u[5], LENGTH, True)
+    out, matrix = np.zeros(3), np.zeros((3, 3))
+    add_to_stiffness(-3, *basic_forces, *STIFFNESS, c, s, chord, True, out, matrix)
+    np.testing.assert_allclose(out, force[3:], rtol=1e-13)
+    np.testing.assert_allclose(matrix, stiffness[3:, 3:], rtol=1e-13)
+
+
+def amplified_deflection(n_elements, corotational=True):
+    """Tip deflection over P h^3 / 3 EI of a very slender cantilever with k h = 1, and the closed form.
+
+    So slender that its strains stay below 1e-6, where concrete and steel are linear to 1e-6.
+    """
+    column = golden.column(
+        golden.circle(),
+        n_elements=n_elements,
+        height=100 * golden.HEIGHT,
+        corotational=corotational,
+        element_tolerance=1e-24,
+    )
+    _, ei = stiffness_of_section(column)
+    h = 100 * golden.HEIGHT
+    n = 3 * n_elements
+    weight, lateral = ei / h**2, 1e-5 * ei / h**2
+    u, force, stiffness = np.zeros(n), np.zeros(n), np.zeros((n, n))
+    load = golden.gravity(n_elements, weight)
+    assert apply_gravity(column, u, load, force, stiffness, 1e-9, 20, 0) == 0
+    load[-3] = lateral
+    assert equilibrate(column, u, load, -1, 0.0, force, stiffness, 1e-9, 20)
+    return u[-3] / (lateral * h**3 / (3 * ei)), 3 * (np.tan(1.0) - 1.0)
+
+
+def test_p_delta_amplification_converges_to_the_closed_form():
+    """Each element is a straight chord: second order in the number of elements."""
+    n = np.array([2, 4, 8, 16])
+    deflections = [amplified_deflection(k) for k in n]
+    errors = np.array([abs(value - exact) for value, exact in deflections])
+    rates = np.log2(errors[:-1] / errors[1:])
+    assert np.all(np.abs(rates - 2.0) < 0.1)
+    assert errors[-1] < 2e-3 * deflections[-1][1]
+    # control: without geometric effects there is no amplification
+    assert amplified_deflection(4, corotational=False)[0] == pytest.approx(1.0, abs=1e-4)

@@ -1,0 +1,279 @@
+"""The compiled kernels against their own Python, and the cache that must never be stale."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import kernels
+from fe_likelihoods.kernels import concrete04, corotational, fiber_section, jit, linear_solve, reinforcing_steel
+from fe_likelihoods.kernels.newmark import HISTORY_ROWS, newmark
+from fe_likelihoods.kernels.static import impose_displacement
+
+from . import golden
+
+SOURCES = Path(kernels.__file__).parent
+ROOT = Path(__file__).resolve().parents[2]
+ROUND_OFF = 1e-13
+
+
+def python(code, *arguments, cwd=SOURCES.parents[1], **environment):
+    """Run `code` in a new interpreter that finds the package under test and these tests; its standard output."""
+    paths = [str(cwd), str(ROOT), os.environ.get("PYTHONPATH", "")]
+    result = subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+# --- the cache ---
+
+
+def test_hash_names_the_folder_of_the_machine_code(tmp_path):
+    code = "from fe_likelihoods.kernels import jit; print(jit.KERNEL_HASH)"
+    found = python(code, FE_LIKELIHOODS_CACHE=str(tmp_path)).strip()
+    assert found == jit.KERNEL_HASH
+    assert [path.name for path in tmp_path.iterdir()] == [f"kernels-{found}"]
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """A copy of the kernels as a package of its own, with a caller of `concrete04.envelope` in another file."""
+    folder = tmp_path / "copied" / "kernels"
+    shutil.copytree(SOURCES, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "caller.py").write_text(
+        "from .concrete04 import commit\nfrom .jit import kernel\n\n\n"
+        "@kernel\ndef call(eps):\n    return commit(eps, -1.0, 1.0)[1]\n"
+    )
+    return folder
+
+
+def result_of(copied, cache):
+    """Hash of the copied sources, what the compiled caller returns, and the number of its disk cache hits."""
+    code = (
+        "import json; from kernels import jit, caller; value = caller.call(2.0); "
+        "print(json.dumps([jit.KERNEL_HASH, value, sum(caller.call.stats.cache_hits.values())]))"
+    )
+    return json.loads(python(code, cwd=copied.parent, FE_LIKELIHOODS_CACHE=str(cache), NUMBA_DISABLE_JIT="0"))
+
+
+def test_an_edit_in_a_called_kernel_is_noticed(copied, tmp_path):
+    """numba alone would go on with the old code: the caller's own file has not changed."""
+    cache = tmp_path / "cache"
+    first = result_of(copied, cache)
+    assert first[1:] == [2.0, 0]
+    again = result_of(copied, cache)
+    assert again == [first[0], 2.0, 1]  # from the disk
+    source = copied / "concrete04.py"
+    edited = source.read_text().replace("max(eps_max, eps)", "max(eps_max, eps) + 10.0")
+    assert edited != source.read_text()
+    source.write_text(edited)
+    hash_, value, hits = result_of(copied, cache)
+    assert hash_ != first[0]
+    assert (value, hits) == (12.0, 0)
+    assert len(list(cache.iterdir())) == 2
+
+
+@pytest.mark.parametrize("change", ["content", "name", "new file"])
+def test_any_change_of_the_sources_changes_the_hash(copied, change):
+    before = result_of_hash(copied)
+    if change == "content":
+        (copied / "corotational.py").write_text((copied / "corotational.py").read_text() + "\n")
+    elif change == "name":
+        (copied / "caller.py").rename(copied / "another.py")
+    else:
+        (copied / "new.py").write_text("")
+    assert result_of_hash(copied) != before
+
+
+def result_of_hash(copied):
+    """The hash, without importing numba's compiler for it."""
+    return python("from kernels.jit import KERNEL_HASH; print(KERNEL_HASH)", cwd=copied.parent).strip()
+
+
+def test_a_cache_folder_that_cannot_be_written_is_passed_over(tmp_path):
+    """A file in the way: the next of the roots serves."""
+    blocked = tmp_path / "blocked"
+    blocked.write_text("")
+    home = tmp_path / "home"
+    code = "from fe_likelihoods.kernels import jit; print(jit._CACHE_FOLDER)"
+    folder = python(code, FE_LIKELIHOODS_CACHE=str(blocked), XDG_CACHE_HOME=str(home)).strip()
+    assert Path(folder).is_relative_to(home)
+
+
+def test_decorating_leaves_the_setting_of_others_alone():
+    import numba
+
+    before = numba.config.CACHE_DIR
+    jit.kernel(lambda x: x, cache=False)
+    assert before == numba.config.CACHE_DIR
+
+
+# --- compiled against pure Python ---
+
+
+def short_subset() -> dict[str, np.ndarray]:
+    """A few materials, one section, a pushover and a run, short enough for pure Python; cracked and yielding."""
+    rng = np.random.default_rng(7)
+    out = {}
+    for name, args in (("core", golden.CORE), ("r400", (-6.0, -0.0026, -0.05, 1958.8, 0.744, 0.00138, 0.1))):
+        for number, strain in enumerate(golden.random_walks(rng, 3, 150, 0.003)):
+            out[f"{name} {number}"] = np.zeros((5, 150))
+            golden.concrete_history(strain, golden.concrete_constants(args), out[f"{name} {number}"])
+    # nested reversals decide clips by their last digit: straight runs only
+    peaks = 0.02 * np.linspace(0.1, 1.0, 15) * (-1.0) ** np.arange(15)
+    strain = np.interp(np.arange(150) / 10.0, np.arange(16), np.concatenate([[0.0], peaks]))
+    out["steel"] = np.zeros((3, 150))
+    golden.steel_history(strain, golden.steel_constants(golden.STEEL), out["steel"])
+
+    def column():
+        return golden.column(golden.circle(4, 3), n_points=3)
+
+    out["section"] = np.zeros((5, 60))
+    e0, kappa = rng.normal(size=(2, 60)) * [[5e-4], [1e-4]]
+    golden.section_history(e0, kappa, column(), out["section"])
+    out["pushover"] = np.zeros((8, 12))
+    impose_displacement(column(), golden.gravity(), np.linspace(0.0, 4.0, 12), 1e-10, 50, 4, out["pushover"])
+    out["run"] = np.zeros((len(HISTORY_ROWS), 40))
+    ground = 300.0 * np.sin(np.linspace(0.0, 6.0, 40))
+    status = newmark(
+        column(),
+        golden.gravity(),
+        golden.mass(),
+        golden.A0,
+        golden.A1,
+        ground,
+        0.02,
+        1e-10,
+        50,
+        4,
+        1,
+        0.0,
+        out["run"],
+    )
+    out["status"] = np.array(status)
+    return out
+
+
+def test_pure_python_gives_the_same_results(tmp_path):
+    code = (
+        "import sys, numba, numpy; assert numba.config.DISABLE_JIT; "
+        "from tests.kernels.test_jit import short_subset; numpy.savez(sys.argv[1], **short_subset())"
+    )
+    python(code, tmp_path / "pure.npz", NUMBA_DISABLE_JIT="1")
+    compiled = short_subset()
+    with np.load(tmp_path / "pure.npz") as pure:
+        assert set(pure.files) == set(compiled)
+        for name, values in compiled.items():
+            scale = np.maximum(np.abs(values).max(axis=-1, keepdims=True), 1e-300)
+            # the iterations of the column stop at 1e-10 in, and carry round-off of the sums that far
+            limit = ROUND_OFF if name not in ("pushover", "run") else 1e-9
+            np.testing.assert_allclose(pure[name] / scale, values / scale, rtol=0, atol=limit, err_msg=name)
+    assert np.abs(compiled["run"][0]).max() > 1.0
+    assert compiled["status"][0] == 0
+
+
+@golden.compiled_only
+def test_single_kernels_equal_their_own_python(rng):
+    """`.py_func` of the kernels that hold a formula; what they call stays compiled."""
+    c = golden.concrete_constants(golden.CORE)
+    for eps in rng.uniform(-0.018, 0.0015, 100):
+        assert concrete04.envelope.py_func(eps, c) == pytest.approx(concrete04.envelope(eps, c), rel=ROUND_OFF)
+        memory = sorted(rng.uniform(-0.01, 0.001, 2))
+        memory = min(memory[0], 0.0), max(memory[1], 0.0)
+        unloading = concrete04.unloading(*memory, c)
+        assert concrete04.unloading.py_func(*memory, c) == pytest.approx(unloading, rel=ROUND_OFF)
+        compiled = concrete04.stress_tangent(eps, *memory, *unloading, c)
+        assert concrete04.stress_tangent.py_func(eps, *memory, *unloading, c) == pytest.approx(compiled, rel=ROUND_OFF)
+        assert concrete04.commit.py_func(eps, *memory) == concrete04.commit(eps, *memory)
+    np.testing.assert_allclose(pure_constants(concrete04, golden.CORE), c, rtol=ROUND_OFF)
+
+    c = golden.steel_constants(golden.STEEL)
+    np.testing.assert_allclose(pure_constants(reinforcing_steel, golden.STEEL), c, rtol=ROUND_OFF)
+    names = reinforcing_steel.E0, reinforcing_steel.EP, reinforcing_steel.F0
+    for x in rng.uniform(-0.13, 0.13, 100):
+        assert reinforcing_steel.backbone.py_func(x, c) == pytest.approx(
+            reinforcing_steel.backbone(x, c), rel=ROUND_OFF
+        )
+        low = 0.01 * x
+        assert reinforcing_steel.virgin_stress_tangent.py_func(low, *c[list(names)]) == pytest.approx(
+            reinforcing_steel.virgin_stress_tangent(low, *c[list(names)]), rel=ROUND_OFF
+        )
+    for strain in golden.random_walks(rng, 5, 60, 0.02):
+        state, pure_state = np.zeros((2, reinforcing_steel.N_STATE))
+        for eps in strain:
+            compiled = reinforcing_steel.update(eps, state, c)
+            assert reinforcing_steel.update.py_func(eps, pure_state, c) == pytest.approx(compiled, rel=1e-12, abs=1e-12)
+
+    for u in rng.normal(size=(50, 4)):
+        for variant in (True, False):
+            compiled = corotational.deformations(*u, 1.3, variant)
+            assert corotational.deformations.py_func(*u, 1.3, variant) == pytest.approx(
+                compiled, rel=ROUND_OFF, abs=ROUND_OFF
+            )
+
+
+@golden.compiled_only
+def test_section_forces_equal_their_own_python(rng):
+    """The sums are reordered by the compiler."""
+    column = golden.column(golden.circle())
+    for e0, kappa in rng.normal(size=(30, 2)) * (5e-4, 5e-5):
+        arguments = (
+            column.core_count,
+            column.y,
+            column.area,
+            column.concrete,
+            column.concrete_memory,
+            column.bar_y,
+            column.bar_area,
+            column.steel,
+            column.steel_memory,
+            column.virgin,
+            column.trial,
+        )
+        pure = fiber_section.forces.py_func(e0, kappa, 0, *arguments)
+        compiled = golden.section_forces(e0, kappa, column)
+        for one, other, scale in zip(pure, compiled, (1e3, 1e4, 1e6, 1e7, 1e9), strict=True):
+            assert one == pytest.approx(other, rel=1e-12, abs=ROUND_OFF * scale)
+        golden.section_commit(e0, kappa, column)
+
+
+def pure_constants(module, args):
+    out = np.zeros(module.N_CONSTANTS)
+    module.constants.py_func(*args, out)
+    return out
+
+
+def banded(rng, n, definite):
+    """Symmetric, half bandwidth five; diagonally heavy, of either sign where it need not be definite."""
+    a = np.triu(np.tril(rng.normal(size=(n, n)), 5), -5)
+    signs = np.ones(n) if definite else rng.choice([-1.0, 1.0], n)
+    return a + a.T + 20.0 * np.diag(signs)
+
+
+@pytest.mark.parametrize("definite", [True, False])
+@pytest.mark.parametrize("n", [3, 6, 15, 30])
+def test_banded_solution_is_that_of_numpy(rng, n, definite):
+    a, b = banded(rng, n, definite), rng.normal(size=n)
+    expected = np.linalg.solve(a, b)
+    solved = b.copy()
+    linear_solve.solve_banded(a.copy(), solved)
+    np.testing.assert_allclose(solved, expected, rtol=0, atol=1e-12)
+
+
+def test_singular_matrix_does_not_give_a_finite_answer():
+    """The iterations see it, and count the step as failed."""
+    b = np.ones(3)
+    linear_solve.solve_banded(np.zeros((3, 3)), b)
+    assert not np.isfinite(b).any()

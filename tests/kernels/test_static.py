@@ -1,0 +1,142 @@
+"""Gravity and pushover against the reference results; retries and failures."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.kernels import concrete04
+from fe_likelihoods.kernels.static import GRAVITY_STEPS, apply_gravity, impose_displacement
+
+from . import golden
+
+pytestmark = golden.compiled_only
+
+# Rows of a history, and where they stand in the reference results.
+ROWS = {
+    "ux": "ux3",
+    "uy": "uy3",
+    "theta": "rz3",
+    "force": "lateral_load_kip",
+    "e0": "base_sec_e0",
+    "kappa": "base_sec_kappa",
+    "N": "base_sec_N",
+    "M": "base_sec_M",
+}
+TOLERANCE = 1e-10
+
+
+def push(column, targets, tolerance=TOLERANCE, max_iterations=100, halvings=6, gravity=None):
+    history = np.full((8, len(targets)), np.nan)
+    load = golden.gravity(column.element_state.shape[0]) if gravity is None else gravity
+    return impose_displacement(column, load, np.asarray(targets), tolerance, max_iterations, halvings, history), history
+
+
+def cases(arrays):
+    for key in arrays:
+        if key.endswith(("/Corotational", "/Linear")):
+            prefix, amplitude, geometry = key.rsplit("/", 2)
+            column = golden.reference_column(arrays, prefix, corotational=geometry == "Corotational")
+            reference = arrays[key]
+            yield key, amplitude, column, arrays[f"{prefix}/{amplitude}/target"][: reference.shape[1]], reference
+
+
+def deviation(history, reference, names):
+    """Largest deviation of each row over the largest of its reference."""
+    reference = reference[[names.index(name) for name in ROWS.values()]]
+    return np.abs(history - reference).max(axis=1) / np.abs(reference).max(axis=1)
+
+
+def test_reference_pushovers(reference):
+    arrays = golden.load(reference, "pushover")
+    results = {}
+    for key, amplitude, column, targets, expected in cases(arrays):
+        status, history = push(column, targets)
+        assert status[0] == 0
+        results[key] = amplitude, deviation(history, expected, arrays["_meta"]["rows"]).max()
+    assert results
+    # measured: 4e-12 and 5e-6; both codes stop their iterations at 1e-10 in
+    limits = {"small": 5e-11, "large": 2e-5}
+    assert not {key: r for key, r in results.items() if not r[1] < limits[r[0]]}
+
+
+def test_the_comparison_sees_a_tension_strength_one_percent_off():
+    arrays = golden.load(golden.BUNDLED, "pushover")
+    for _, _, column, targets, expected in cases(arrays):
+        column.concrete[:, concrete04.FT] *= 1.01
+        _, history = push(column, targets)
+        assert deviation(history, expected, arrays["_meta"]["rows"]).max() > 1e-4
+
+
+@pytest.fixture
+def column():
+    return golden.column(golden.circle())
+
+
+def test_gravity_is_the_weight_on_every_section(column):
+    u, force, stiffness = np.zeros(6), np.zeros(6), np.zeros((6, 6))
+    assert apply_gravity(column, u, golden.gravity(), force, stiffness, TOLERANCE, 20, 4) == 0
+    np.testing.assert_allclose(force, golden.gravity(), atol=1e-9 * golden.WEIGHT)
+    sections = column.element_state[:, 12:].reshape(-1, 7)
+    np.testing.assert_allclose(sections[:, 5], -golden.WEIGHT, rtol=1e-7)
+    np.testing.assert_allclose(sections[:, 6], 0.0, atol=1e-6)
+    assert u[4] < 0.0
+    assert abs(u[3]) < 1e-12
+    assert GRAVITY_STEPS == 10
+
+
+def test_imposed_displacement_is_met_and_the_base_balances_it(column):
+    """M at the base = force x height of the top + weight x its drift: equilibrium in the deformed position."""
+    targets = 2.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, 400)) * np.linspace(0.0, 1.0, 400)
+    status, history = push(column, targets)
+    assert status == (0, 0)
+    np.testing.assert_allclose(history[0], targets, atol=1e-12)
+    moment = -history[3] * (golden.HEIGHT + history[1]) - golden.WEIGHT * history[0]
+    largest = np.abs(history[7]).max()
+    assert largest > 5000.0  # cracked: kip in
+    np.testing.assert_allclose(history[7], moment, atol=1e-6 * largest)
+    np.testing.assert_allclose(history[6], -golden.WEIGHT, rtol=0.03)
+
+
+def test_every_closed_cycle_dissipates(column):
+    """The first most (it cracks the section), the next ones less and less."""
+    cycle = 3.0 * np.sin(np.linspace(0.0, 2.0 * np.pi, 241))
+    _, history = push(column, np.concatenate([cycle, cycle[1:], cycle[1:]]))
+    work = np.diff(history[0]) * 0.5 * (history[3, 1:] + history[3, :-1])
+    first, second, third = (work[i * 240 : (i + 1) * 240].sum() for i in range(3))
+    assert first > second > third > 0.0
+
+
+def test_same_result_again(column):
+    """The analysis makes the column virgin first."""
+    targets = np.linspace(0.0, 4.0, 200)
+    _, first = push(column, targets)
+    _, again = push(column, targets)
+    np.testing.assert_array_equal(again, first)
+
+
+def test_large_steps_are_retried_and_reach_the_same_force():
+    """With four iterations a step of half an inch fails; halved, it follows the path of small steps."""
+    fine = np.linspace(0.0, 3.0, 601)
+    coarse = fine[::100]
+    status, expected = push(golden.column(golden.circle()), fine)
+    assert status == (0, 0)
+    (status, retries), history = push(golden.column(golden.circle()), coarse, max_iterations=4, halvings=10)
+    assert status == 0
+    assert retries > 0
+    np.testing.assert_allclose(history[3], expected[3, ::100], rtol=0, atol=2e-3 * np.abs(expected[3]).max())
+
+
+def test_hopeless_step_ends_the_run_with_its_number():
+    targets = np.concatenate([np.linspace(0.0, 1.0, 50), [1.0e4], np.ones(5)])
+    (status, _), history = push(golden.column(golden.circle()), targets, halvings=2)
+    assert status == 51
+    assert np.isfinite(history[:, :50]).all()
+    assert np.isnan(history[:, 50:]).all()
+    _, shorter = push(golden.column(golden.circle()), targets[:50], halvings=2)
+    np.testing.assert_array_equal(history[:, :50], shorter)
+
+
+def test_hopeless_gravity_is_reported():
+    """A weight far above the strength of the column."""
+    status, history = push(golden.column(golden.circle()), np.zeros(3), halvings=2, gravity=golden.gravity(weight=1e6))
+    assert status[0] == -1
+    assert np.isnan(history).all()
