@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: help update test test-slow bench lint format data clean
+.PHONY: help update test test-slow tutorials bench lint format data clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/'
@@ -22,6 +22,9 @@ test: $(READY)   ## the quick tests
 
 test-slow: $(READY) ## the slow tests
 	$(BIN)/python -m pytest -m slow
+
+tutorials: $(READY) ## every tutorial from top to bottom, with all data
+	for t in tutorials/[0-9]*.py; do $(BIN)/python $$t || exit 1; done
 
 bench: $(READY)  ## speed beside the peers, one table
 	$(BIN)/python -m tests.benchmarks
