@@ -36,11 +36,14 @@ from .reinforcing_steel import (
     YIELD_STRAIN,
     monotonic_stress_tangent,
     stress_tangent,
+    switch_backbone,
     update,
     virgin_stress_tangent,
 )
 
-__all__ = ["reset", "forces", "commit"]
+__all__ = ["reset", "forces", "commit", "release"]
+
+VERGE = 0.995
 
 _EC = concrete04.EC
 
@@ -239,3 +242,37 @@ def commit(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel,
             beyond += 1.0 if abs(e0 - bar_y[i] * kappa) >= limit else 0.0
     if beyond > 0.0:
         _commit_bars(e0, kappa, j, bar_y, steel, steel_memory, virgin)
+
+
+@kernel
+def release(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel, steel_memory, virgin):
+    """Take the fibers of section `j` that stand on the verge of a jump of their stress across it; how many.
+
+    The laws have jumps: concrete loses its stress at once at eps_cu and at eps_tu, and a bar whose two backbones have
+    different origins changes from one to the other at zero stress (`reinforcing_steel.switch_backbone`). Where the
+    jump itself takes the fiber back, there is equilibrium neither before nor after it, however small the step. All
+    three jumps are for good, so a fiber that stands there is taken across. `VERGE` is the share of the strain from
+    which on concrete counts as there.
+    """
+    count = 0
+    for i in range(y.shape[0]):
+        c = concrete[0 if i < core_count else 1]
+        eps = e0 - y[i] * kappa
+        eps_min, eps_max = concrete_memory[j, 0, i], concrete_memory[j, 1, i]
+        if eps_min >= c[concrete04.ECU] and eps <= VERGE * c[concrete04.ECU]:
+            eps_min = (1.0 + 1e-9) * c[concrete04.ECU]
+        elif eps_max <= c[concrete04.ETU] and eps >= VERGE * c[concrete04.ETU] and c[concrete04.FT] > 0.0:
+            eps_max = (1.0 + 1e-9) * c[concrete04.ETU]
+        else:
+            continue
+        eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)
+        concrete_memory[j, 0, i] = eps_min
+        concrete_memory[j, 1, i] = eps_max
+        concrete_memory[j, 2, i] = eps_end
+        concrete_memory[j, 3, i] = slope
+        concrete_memory[j, 4, i] = tension_slope
+        count += 1
+    if virgin[j] == 0.0:
+        for i in range(steel_memory.shape[1]):
+            count += switch_backbone(steel_memory[j, i], steel)
+    return count

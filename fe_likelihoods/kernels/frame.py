@@ -15,7 +15,7 @@ from .beam_column import HEAD, PER_SECTION, advance, initialise
 from .corotational import add_to_stiffness, deformations
 from .jit import kernel
 
-__all__ = ["Column", "allocate", "initialise_column", "assemble", "commit_sections"]
+__all__ = ["Column", "allocate", "initialise_column", "assemble", "commit_sections", "release_sections"]
 
 N_VECTORS = 16
 LARGEST_AXIAL_STRAIN = 0.2
@@ -214,3 +214,27 @@ def commit_sections(column):
                 column.steel_memory,
                 column.virgin,
             )
+
+
+@kernel
+def release_sections(column):
+    """Take every fiber on the verge of a jump of its stress across it (`fiber_section.release`); how many."""
+    n_points = column.points.shape[0]
+    count = 0
+    for e in range(column.element_state.shape[0]):
+        for m in range(n_points):
+            k = HEAD + PER_SECTION * m
+            count += fiber_section.release(
+                column.element_state[e, k],
+                column.element_state[e, k + 1],
+                e * n_points + m,
+                column.core_count,
+                column.y,
+                column.concrete,
+                column.concrete_memory,
+                column.bar_y,
+                column.steel,
+                column.steel_memory,
+                column.virgin,
+            )
+    return count

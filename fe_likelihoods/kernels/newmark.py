@@ -9,8 +9,9 @@ From the committed (U, V, A) a step of size h starts with U unchanged, V <- -V, 
 solves (K + 2/h C + 4/h^2 M) dU = residual, then U += dU, V += 2 dU/h, A += 4 dU/h^2, until |dU| < tolerance.
 
 A step that fails is retried with a tolerance a hundred times looser, then halved (ground acceleration linear within the
-step), again and again down to h / 2^halvings; the retries are counted, and a step that still fails ends the run with
-its number. Nothing is ever carried on unconverged.
+step), again and again down to h / 2^halvings. Where that fails too, fibers on the verge of a jump of their stress are
+taken across it (`fiber_section.release`), as there may be no equilibrium before they are. The retries are counted, and
+a step that still fails ends the run with its number. Nothing is ever carried on unconverged.
 
 Energy is summed by the trapezoidal rule, with which average acceleration balances exactly up to the tolerance:
 kinetic + damped + absorbed = input.
@@ -22,10 +23,10 @@ from __future__ import annotations
 
 import math
 
-from .frame import assemble, commit_sections
+from .frame import assemble, commit_sections, release_sections
 from .jit import kernel
 from .linear_solve import copy_matrix, solve_banded
-from .static import LOOSER, apply_gravity
+from .static import LOOSER, MAX_RELEASES, apply_gravity
 
 __all__ = ["HISTORY_ROWS", "newmark"]
 
@@ -85,7 +86,7 @@ def newmark(
     history[6, 0] = supplied
 
     for step in range(1, ground.shape[0]):
-        done, part, loose = 0.0, 1.0, False
+        done, part, loose, releases = 0.0, 1.0, False, 0
         while done < 1.0:
             h = part * dt
             at_start = ground[step - 1] + done * (ground[step] - ground[step - 1])
@@ -145,7 +146,10 @@ def newmark(
                 loose = False
                 part *= 0.5
                 if part < smallest:
-                    return step, retries, total_iterations
+                    releases += 1
+                    if releases > MAX_RELEASES or release_sections(column) == 0:
+                        return step, retries, total_iterations
+                    part = 1.0 - done
                 continue
 
             kinetic = 0.0

@@ -39,6 +39,7 @@ __all__ = [
     "virgin_stress_tangent",
     "monotonic_stress_tangent",
     "stress_tangent",
+    "switch_backbone",
     "update",
 ]
 
@@ -53,6 +54,7 @@ N_STATE = 10 + 9 * 9
 
 TRANSITION = 0.0002  # strain over which the plateau turns into hardening
 TIE = 1e-14  # strains closer than this are equal
+NEAR_ZERO = 1e-6  # strain from the origin of a backbone within which a bar counts as being there
 VIRGIN_Q = 0.6  # the series of virgin_stress_tangent are exact to round-off up to here
 
 
@@ -439,3 +441,22 @@ def stress_tangent(eps, state, c, trial):
     for i in range(N_STATE):
         trial[i] = state[i]
     return update(eps, trial, c)
+
+
+@kernel
+def switch_backbone(state, c):
+    """Change a bar at zero stress from one backbone to the other, in place; 1 if it stands there, else 0.
+
+    After small yielding the backbones in tension and compression have different origins, and the law jumps from one to
+    the other where the stress of the present one passes zero.
+    """
+    b = int(state[BRANCH])
+    if b != 1 and b != 2 or state[OP] == state[ON]:
+        return 0
+    origin, other = (state[OP], state[ON]) if b == 1 else (state[ON], state[OP])
+    if abs(state[XC] - origin) > NEAR_ZERO:
+        return 0
+    s, _ = backbone(state[XC] - other, c)
+    state[BRANCH] = _mirror_branch(b)
+    state[SC] = s
+    return 1

@@ -2,7 +2,8 @@
 
 Newton on equilibrium with the tangent; where a lateral displacement is imposed, the row of that degree of freedom is
 replaced by its increment, and the force it takes is the restoring force there. A step that does not converge is
-retried with a tolerance a hundred times looser, then halved, and what was committed before stays.
+retried with a tolerance a hundred times looser, then halved, and what was committed before stays; at the smallest part,
+fibers on the verge of a jump of their stress are taken across it (`fiber_section.release`).
 
 References: specs/bridge_column.md, sections 1, 8 and 9.
 """
@@ -12,14 +13,15 @@ from __future__ import annotations
 import math
 
 from .beam_column import HEAD
-from .frame import assemble, commit_sections, initialise_column
+from .frame import assemble, commit_sections, initialise_column, release_sections
 from .jit import kernel
 from .linear_solve import copy_matrix, copy_vector, solve_banded
 
-__all__ = ["GRAVITY_STEPS", "LOOSER", "equilibrate", "apply_gravity", "impose_displacement"]
+__all__ = ["GRAVITY_STEPS", "LOOSER", "MAX_RELEASES", "equilibrate", "apply_gravity", "impose_displacement"]
 
 GRAVITY_STEPS = 10
 LOOSER = 100.0
+MAX_RELEASES = 20
 
 
 @kernel
@@ -75,7 +77,7 @@ def _advance_to(
 
     Returns the number of retries, or -1 when it failed.
     """
-    done, part, retries = 0.0, 1.0, 0
+    done, part, retries, releases = 0.0, 1.0, 0, 0
     smallest = 0.5**halvings
     while done < 1.0:
         for i in range(u.shape[0]):
@@ -94,7 +96,10 @@ def _advance_to(
             load[i] -= part * share * total[i]
         part *= 0.5
         if part < smallest:
-            return -1
+            releases += 1
+            if releases > MAX_RELEASES or release_sections(column) == 0:
+                return -1
+            part = 1.0 - done
     return retries
 
 

@@ -22,7 +22,7 @@ from fe_likelihoods.models.rc_column import PARAMETERS, Bars, Concrete, Hoops, P
 from fe_likelihoods.posterior import Posterior
 from fe_likelihoods.priors import HalfNormal, TruncatedNormal
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
-from fe_likelihoods.records import DisplacementHistory, Record
+from fe_likelihoods.records import DisplacementHistory, Record, read_csv
 from fe_likelihoods.units import G0, to_si
 from tests.opensees_column import CORE, COVER, INCH, KIP, KSI, STEEL, peer_of
 
@@ -653,3 +653,16 @@ def test_nothing_is_refused_that_is_right(column):
     for changes in (dict(cover=0.0), dict(mesh=4), dict(mesh=Patches(4, 1, 1)), dict(n_points=2), dict(n_points=7)):
         assert np.isfinite(replace(column, **changes).simulate(NOMINAL)).all()
     assert to_si(24.0, "ft").item() == pytest.approx(column.height)
+
+
+def test_a_jump_of_the_law_is_crossed(shared):
+    """A bar changes backbone at zero stress, by 35 MPa: no equilibrium on either side, however small the step."""
+    path = shared / "records" / "loma_prieta_1989_apeel2_redwood_city_133.csv"
+    record = read_csv(path).scale(0.85).trim(0.0, 12.0)
+    theta = [0.5284587364146686, 1.0214677685625493, 0.32405312400652414, 0.9625611775286573, 1.432206729992988]
+    crossed = RCColumn.lhpost(record).history(theta)
+    assert crossed.retries > 10
+    response = crossed.values[:2]
+    finer = RCColumn.lhpost(record, substeps=2).history(theta).values[:2]
+    error = np.sqrt(np.sum((response - finer) ** 2, axis=1) / np.sum(finer**2, axis=1))
+    assert np.all(error < 0.02), error
