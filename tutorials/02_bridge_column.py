@@ -41,7 +41,7 @@ from samplers.report import ladder_plot, ladder_table, pair_plot, summary, to_ar
 # walkers, one sample kept in `every`, sweeps at beta = 1, settings of the sampler
 PRESETS = {
     "default": (500, 1, 10, {}),
-    "reduced": (200, 4, 10, {}),
+    "reduced": (500, 4, 4, {}),
     "fast": (40, 16, 4, {"max_moves": 3}),
     "ramancha2022": (1000, 1, 1, RAMANCHA_2022_LITERAL),
     "ramancha2022-constant": (1000, 1, 1, RAMANCHA_2022_CONSTANT),

@@ -461,12 +461,9 @@ def _check_parameters(v: dict[str, float], steel: Steel) -> None:
         if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name not in ("a0", "a1", "ft")):
             raise SimulationFailed(f"{name} = {value:.4g} {PARAMETERS[name]} makes no column: it must be positive")
     if v["fy"] / v["Es"] >= steel.hardening_strain:
-        raise SimulationFailed(
-            f"steel yields at {v['fy'] / v['Es']:.4g}, beyond the strain where hardening begins, "
-            f"{steel.hardening_strain:.4g}: no plateau is left at these parameters"
-        )
+        raise SimulationFailed("steel yields beyond the strain where its hardening begins: no plateau is left")
     if v["fu"] <= v["fy"]:
-        raise SimulationFailed(f"steel with fu = {v['fu']:.4g} Pa not above fy = {v['fy']:.4g} Pa")
+        raise SimulationFailed("the ultimate strength of the steel is not above its yield strength")
 
 
 def _check(m: RCColumn) -> None:
