@@ -463,7 +463,7 @@ def _check_parameters(v: dict[str, float], steel: Steel) -> None:
     if v["fy"] / v["Es"] >= steel.hardening_strain:
         raise SimulationFailed("steel yields beyond the strain where its hardening begins: no plateau is left")
     if v["fu"] <= v["fy"]:
-        raise SimulationFailed("the ultimate strength of the steel is not above its yield strength")
+        raise SimulationFailed(f"the steel has no hardening: fu = {v['fu']:.4g} Pa is not above fy = {v['fy']:.4g} Pa")
 
 
 def _check(m: RCColumn) -> None:
