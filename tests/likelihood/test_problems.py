@@ -260,4 +260,5 @@ def test_no_holes_on_the_real_record(shared, rng, which, n, allowed):
     model = RCColumn.lhpost(record)
     draws = bridge_column_prior().rvs(n, rng)[:, :5] if which == "prior" else around_the_papers_posterior(n, rng)
     told = [reason for part in np.split(draws, range(100, n, 100)) for reason in failures(model, part)]
+    print(f"\n{len(told)} of {n} draws of the {which} failed: {told}")
     assert len(told) <= allowed, told
