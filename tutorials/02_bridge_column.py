@@ -97,7 +97,7 @@ print(f"{measured.n_steps} samples at {measured.dt:g} s of {[c.name for c in mea
 if every > 1:
     print(
         f"REDUCED SETTING ({args.preset}): one sample in {every} is kept and the model takes steps {every} times\n"
-        "  longer, so the posterior is wider, and what the long steps add to the damping is made up by the parameters:\n"
+        "  longer, so the posterior is wider, and the parameters make up for the damping that long steps add:\n"
         "  expect Ec, Es, a0, a1 and ft some sd from the truth here, and near it with all data (--preset default)."
     )
 
