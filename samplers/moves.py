@@ -29,13 +29,27 @@ from .mixtures import (
     unflatten,
 )
 
-__all__ = ["AlternatingMove", "MixtureMove", "RandomWalkMove", "StudentTMove"]
+__all__ = ["AlternatingMove", "MixtureMove", "RandomWalkMove", "StudentTMove", "describe"]
 WHOLE_DIFFERENCES = 0.1
 REDRAWS = 20
 SHARES = (0.5, 0.25, 0.25)
 SHARES_DOING_WELL = (0.8, 0.1, 0.1)
 Inside = Callable[[np.ndarray], np.ndarray]
 CROSSOVERS = (1.0 / 3.0, 2.0 / 3.0, 1.0)
+
+
+def describe(move: Move) -> dict:
+    """A move as plain data: its class and its settings, which are its public attributes of plain type."""
+    settings = {}
+    for name, value in sorted(vars(move).items()):
+        if not name.startswith("_"):
+            if isinstance(value, Move):
+                settings[name] = describe(value)
+            elif value is None or isinstance(value, bool | int | float | str):
+                settings[name] = value
+            elif isinstance(value, list | tuple) and all(isinstance(item, Move) for item in value):
+                settings[name] = [describe(item) for item in value]
+    return {"class": type(move).__name__, **settings}
 
 
 class _FittedMove(MHMove):

@@ -29,6 +29,8 @@ class Settings:
         where that may not be trusted.
     check_draws : int, optional — evaluations spent at the end on an evidence independent of the ladder; by default as
         many as there are walkers, none with 0.
+    max_failure_share : float — the run stops with an error once more than this share of the evaluations failed (by an
+        exception or by NaN; a returned -inf is no failure); 0 stops at the first one.
     """
 
     ess_ratio: float = 0.5
@@ -42,6 +44,7 @@ class Settings:
     burn_in: int = 0
     recycle: bool = False
     check_draws: int | None = None
+    max_failure_share: float = 0.5
 
     def __post_init__(self):
         if not 0.0 < self.ess_ratio < 1.0:
@@ -62,6 +65,8 @@ class Settings:
             raise ValueError(f"burn_in must not be negative; got {self.burn_in}")
         if self.check_draws is not None and not self.check_draws >= 0:
             raise ValueError(f"check_draws must not be negative; got {self.check_draws}")
+        if not 0.0 <= self.max_failure_share <= 1.0:
+            raise ValueError(f"max_failure_share must lie in [0, 1]; got {self.max_failure_share}")
 
     @property
     def resample(self) -> Callable:

@@ -28,8 +28,9 @@ class SMCSampler(TemperedSampler):
     log_prior_fn, seed : as in `TemperedSampler`.
     recycle : bool, optional — climb by recycling every evaluated point (`samplers.recycling`), and by moves where that
         may not be trusted. By default yes if `moves` are not given.
-    ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation, check_draws : as in
-        `samplers.settings.Settings`; all but the last for a climb by moves.
+    ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation : as in
+        `samplers.settings.Settings`, for a climb by moves.
+    check_draws, max_failure_share : as there.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class SMCSampler(TemperedSampler):
         max_correlation: float = 0.15,
         recycle: bool | None = None,
         check_draws: int | None = None,
+        max_failure_share: float = 0.5,
     ):
         if recycle is None:
             recycle = moves is None
@@ -86,5 +88,6 @@ class SMCSampler(TemperedSampler):
                 max_correlation=max_correlation,
                 recycle=recycle,
                 check_draws=check_draws,
+                max_failure_share=max_failure_share,
             ),
         )

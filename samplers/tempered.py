@@ -11,22 +11,26 @@ emcee's private names are touched in this module only.
 """
 
 import copy
+import json
 import logging
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from emcee import EnsembleSampler, State
+from emcee.backends import HDFBackend
 from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
 from emcee.model import Model
 from emcee.pbar import get_progress_bar
 
 from .alarms import check_evidence, check_ladder, sound
-from .backends import read_check, read_ladder, write_check, write_stage
+from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
 from .edges import find_edges
-from .evaluation import Records, log_probabilities
+from .evaluation import Failures, Guarded, Memo, Records, log_probabilities, outcomes
 from .importance import EvidenceCheck, draw_inside, evidence_from_weights
+from .journal import Contents, Evaluated, Start
 from .ladder import (
     EvidenceError,
     Stage,
@@ -37,7 +41,7 @@ from .ladder import (
     normalised_weights,
 )
 from .mixtures import fit_mixture, log_density
-from .moves import RandomWalkMove
+from .moves import RandomWalkMove, describe
 from .mutation import Moved, grow_chains, move_together, tempered_log_prob
 from .recycling import recycle
 from .settings import Settings
@@ -47,6 +51,11 @@ __all__ = ["TemperedSampler"]
 logger = logging.getLogger(__name__)
 
 
+def _plain(value: Any) -> Any:
+    """A setting as JSON takes it: a function by its name."""
+    return f"{value.__module__}.{value.__qualname__}" if callable(value) else value
+
+
 class TemperedSampler(EnsembleSampler):
     """emcee's ensemble sampler with a ladder from the prior to the posterior.
 
@@ -54,7 +63,9 @@ class TemperedSampler(EnsembleSampler):
     ----------
     nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names :
         as in `emcee.EnsembleSampler`, in its order. `moves` are the mutation kernels, copied; by default a random walk.
-        NaN from `log_prob_fn` counts as -inf; it is not called outside the support of the prior.
+        A point for which `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`);
+        it is not called outside the support of the prior. With an emcee `HDFBackend` a journal is kept beside the file,
+        and a run that was killed goes on from it (`run_mcmc`).
     log_prior_fn : callable, optional
         Log density of the normalised prior, of the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but without `args` and `kwargs`. By default
@@ -107,7 +118,14 @@ class TemperedSampler(EnsembleSampler):
 
         self.log_prior_fn = log_prior_fn
         self.settings = settings
-        self._records = Records(blobs_dtype)
+        if type(backend) is HDFBackend and not backend.read_only:
+            backend = JournaledBackend.of(backend)
+        self._contents = backend.contents if isinstance(backend, JournaledBackend) else None
+        self._memo: Memo | None = None
+        self._recorded: list[Stage] = []
+        self._evaluations = 0
+        self._failures = Failures()
+        self._records = Records()
         self._ladder: list[Stage] = []
         self._check: EvidenceCheck | None = None
         self._previous_state = None
@@ -138,13 +156,18 @@ class TemperedSampler(EnsembleSampler):
 
     @property
     def evaluations(self) -> int:
-        """Points handed to `log_prob_fn` by this object."""
-        return self._records.evaluations
+        """Points handed to `log_prob_fn` by this object, and by the killed run that it goes on with."""
+        return self._evaluations
 
     @property
-    def nan_count(self) -> int:
-        """How many of their values were NaN, and counted as -inf."""
-        return self._records.nan_count
+    def failure_count(self) -> int:
+        """How many of them failed, by an exception or by NaN, and counted as -inf."""
+        return self._failures.count
+
+    @property
+    def failures(self) -> list[dict]:
+        """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failures."""
+        return list(self._failures.kept)
 
     @property
     def ladder(self) -> tuple[Stage, ...]:
@@ -213,6 +236,10 @@ class TemperedSampler(EnsembleSampler):
             draw ``log_prob_fn.sample_prior(nwalkers, random)``. After a climb, a State of this sampler (or the
             coordinates of its last one) goes on from there; any other coordinates start a new climb.
         nsteps : int — sweeps stored in the chain; 0 climbs only.
+
+        With an emcee `HDFBackend`, a new sampler on the file of a run that was killed goes on where it was, inside a
+        stage or a sweep too, and ends bit for bit as it would have: pass None or the draws of the prior it began with.
+        A call that was cut off is completed by the same call; any other number of steps is added to what is there.
         **kwargs : of `sample`.
 
         Returns
@@ -258,12 +285,19 @@ class TemperedSampler(EnsembleSampler):
         if state.log_prob is None and last is not None and np.array_equal(state.coords, last.coords):
             state.log_prob, state.blobs = copy.deepcopy((last.log_prob, last.blobs))
 
-        nan_count = self.nan_count
+        failure_count, ended, made = self.failure_count, False, 0
+        bar = {"progress": progress, "progress_kwargs": progress_kwargs}
         try:
-            if self._climb_is_due(state):
-                state = self._climb(state, skip_initial_state_check, progress, progress_kwargs or {})
+            if self._contents is not None:
+                state, made = self._go_on(state, iterations, bar)
+                iterations = None if iterations is None else iterations - made
+                skip_initial_state_check = True
+            elif self._climb_is_due(state):
+                state = self._climb(state, skip_initial_state_check, bar)
                 skip_initial_state_check = True
             self._summit = state
+            if isinstance(self.backend, JournaledBackend) and store and not made:
+                self.backend.call(iterations)
             yield from super().sample(
                 state,
                 iterations=iterations,
@@ -272,15 +306,96 @@ class TemperedSampler(EnsembleSampler):
                 thin_by=thin_by,
                 thin=thin,
                 store=store,
-                progress=progress,
-                progress_kwargs=progress_kwargs,
+                **bar,
             )
+            ended = True
+        except GeneratorExit:  # whoever takes the states wants no more
+            ended = True
+            raise
         finally:
-            if self.nan_count > nan_count:
-                sound(f"log_prob_fn returned NaN for {self.nan_count - nan_count} points, taken as -inf")
+            if isinstance(self.backend, JournaledBackend):
+                self.backend.flush()
+                if ended and store:
+                    self.backend.done()
+            if self.failure_count > failure_count:
+                sound(
+                    f"{self.failure_count - failure_count} evaluations failed and count as impossible "
+                    f"({self._failures.told()}); see failures"
+                )
+
+    def _go_on(self, state: State, iterations: int | None, bar: dict) -> tuple[State, int]:
+        """Take up the run of the journal: climb from its start again, at no evaluation, and go to its last step.
+
+        Returns
+        -------
+        state, and how many of the iterations wanted now it has made already.
+        """
+        contents = self._contents
+        start, last = contents.start, contents.last
+        if not any(np.array_equal(state.coords, known.coords) for known in (start, last) if known is not None):
+            raise ValueError(
+                f"{self.backend.filename} holds a run from other draws of the prior: pass None as initial_state to go "
+                "on with it, or give another file; backend.reset(nwalkers, ndim) gives it up"
+            )
+        self._check_same(contents)
+        self._contents = None
+        self.backend.go_on(contents)
+        self._memo = Memo(contents.evaluated)
+        self._recorded = list(read_ladder(self.backend))
+        self.random_state = start.random_state
+        state = self._climb(State(start.coords, copy=True), True, bar)
+        if last is not None:
+            state = State(last.coords, log_prob=last.log_prob, blobs=last.blobs, random_state=last.random_state)
+            self.random_state = last.random_state
+            self._evaluations, self._failures = 0, Failures()
+            for batch in contents.evaluated[: contents.before_last]:
+                self._count(batch)
+        asked_again = iterations is not None and iterations == contents.wanted
+        return state, contents.made if asked_again else 0
+
+    def _header(self) -> dict:
+        """What a run is: enough to refuse another one."""
+        header = {
+            "nwalkers": self.nwalkers,
+            "ndim": self.ndim,
+            "log_prob_fn": getattr(self.log_prob_fn.f, "fingerprint", None),
+        }
+        header |= {name: _plain(value) for name, value in asdict(self.settings).items()}
+        header["moves"] = [describe(move) for move in self._moves]
+        header["weights"] = list(self._weights)
+        return json.loads(json.dumps(header))
+
+    def _check_same(self, contents: Contents) -> None:
+        """ValueError unless the journal is one of this posterior and these settings."""
+        ours, theirs = self._header(), contents.header
+        differing = [
+            f"{name} was {theirs.get(name)}, is {value}" for name, value in ours.items() if theirs.get(name) != value
+        ]
+        start = contents.start
+        if not differing and not np.allclose(self._log_prior(start.coords), start.log_prior, rtol=1e-9, atol=1e-9):
+            differing = ["the log-prior of the first draws is another"]
+        if not differing and ours["log_prob_fn"] is None:
+            differing = self._compare_one_point(contents.evaluated)
+        if differing:
+            raise ValueError(
+                f"{self.backend.filename} holds another run, which cannot be continued here: {'; '.join(differing)}. "
+                "Give what it was begun with, or another file"
+            )
+
+    def _compare_one_point(self, evaluated: list[Evaluated]) -> list[str]:
+        """Evaluate again one point of the journal: what differs, in words."""
+        for batch in evaluated:
+            row = int(np.argmax(np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)))
+            if np.isfinite(batch.log_prob[row]):
+                before, again = batch.log_prob[row], self._ask(batch.coords[row : row + 1]).log_prob[0]
+                same = np.isclose(before, again, rtol=1e-9, atol=1e-9)
+                return [] if same else [f"log_prob_fn was {before:.10g} at {batch.coords[row]}, is {again:.10g}"]
+        return []
 
     def _last_or_prior(self):
         """The state to start from when none is given."""
+        if self._contents is not None:
+            return State((self._contents.last or self._contents.start).coords, copy=True)
         if self._previous_state is not None:
             return self._previous_state
         if self.backend.iteration > 0:
@@ -315,9 +430,44 @@ class TemperedSampler(EnsembleSampler):
         """Records (log_prob, log_prior[, blobs]) of points (n, ndim)."""
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
-        return self._records.evaluate(
-            coords, self._log_prior(coords), lambda points: self._call(self.log_prob_fn, points, self.pool)
-        )
+        log_prior = self._log_prior(coords)
+        inside = log_prior > -np.inf
+        return self._records.evaluated(log_prior, inside, self._outcome(coords[inside]) if inside.any() else None)
+
+    def _outcome(self, coords: np.ndarray) -> Evaluated:
+        """What `log_prob_fn` gives for points (n, ndim): recalled from a killed run, or asked for and entered."""
+        batch = None if self._memo is None else self._memo.recall(coords)
+        if batch is None:
+            batch = self._ask(coords)
+            self._stop_if_too_many_fail(batch)
+            if isinstance(self.backend, JournaledBackend):
+                self.backend.evaluated(batch)
+        self._count(batch)
+        return batch
+
+    def _count(self, batch: Evaluated) -> None:
+        self._evaluations += len(batch.coords)
+        self._failures.add(batch.coords, batch.reasons)
+
+    def _ask(self, coords: np.ndarray) -> Evaluated:
+        """Call `log_prob_fn` for points (n, ndim)."""
+        function = self.log_prob_fn
+        guarded = Guarded(function.f, function.args, function.kwargs)
+        results = self._call(guarded.of_batch if self.vectorize else guarded, coords, self.pool)
+        return Evaluated(coords, *outcomes(results, len(coords), self.blobs_dtype))
+
+    def _stop_if_too_many_fail(self, batch: Evaluated) -> None:
+        """RuntimeError if all points of a batch failed, or too large a share so far; such a batch is not stored."""
+        n, most = len(batch.coords), self.settings.max_failure_share
+        total, count = self._evaluations + n, self.failure_count + len(batch.reasons)
+        broken = len(batch.reasons) == n >= self.ndim + 2
+        if broken or (total >= self.nwalkers and count > most * total):
+            share = f"all {n} evaluations of a batch" if broken else f"{count} of {total} evaluations"
+            raise RuntimeError(
+                f"{share} failed, where max_failure_share={most:g} of the run is allowed: "
+                f"{batch.reasons[min(batch.reasons)]} at {batch.coords[min(batch.reasons)]}. What was evaluated before "
+                "is kept (see failures), and a run with a backend in a file goes on from there once the cause is cured"
+            )
 
     def _log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Log-prior of points (n, ndim); -inf for NaN."""
@@ -337,12 +487,13 @@ class TemperedSampler(EnsembleSampler):
 
     # ------------------------------------------------------------------ climbing
 
-    def _climb(self, state: State, skip_check: bool, progress: bool | str, progress_kwargs: dict) -> State:
+    def _climb(self, state: State, skip_check: bool, bar: dict) -> State:
         """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
         self._mark = time.perf_counter(), self.evaluations
         self._check = None
         packed = self._enter(state, skip_check)
-        with get_progress_bar(progress, None, **{"desc": "ladder", "unit": " sweeps", **progress_kwargs}) as bar:
+        labels = {"desc": "ladder", "unit": " sweeps", **(bar["progress_kwargs"] or {})}
+        with get_progress_bar(bar["progress"], None, **labels) as bar:
             climbed = self._climb_by_recycling(state.coords, packed, bar) if self.settings.recycle else None
             coords, packed = climbed or self._climb_by_moves(state.coords, packed, bar)
         if self._check is None and self.settings.check_draws != 0:
@@ -359,6 +510,10 @@ class TemperedSampler(EnsembleSampler):
         seconds, evaluations = self._mark
         self._mark = time.perf_counter(), self.evaluations
         stage = Stage(seconds=self._mark[0] - seconds, evaluations=self._mark[1] - evaluations, **fields)
+        if len(self._ladder) < len(self._recorded):
+            recorded = self._recorded[len(self._ladder)]
+            if recorded == stage._replace(seconds=recorded.seconds):  # climbed before: what it took then
+                stage = recorded
         self._ladder.append(stage)
         write_stage(self.backend, len(self._ladder) - 1, stage)
 
@@ -468,6 +623,8 @@ class TemperedSampler(EnsembleSampler):
                 f"{len(outside)} of {self.nwalkers} initial points lie outside the prior's support (log_prior -inf or "
                 f"NaN), the first of them {state.coords[outside[0]]}: pass draws of the prior"
             )
+        if isinstance(self.backend, JournaledBackend) and self._memo is None:
+            self.backend.begin(self._header(), Start(state.coords, log_prior, self.random_state))
         if state.log_prob is None:
             return self._evaluate(state.coords)
         log_prob, _ = log_probabilities(np.asarray(state.log_prob), self.nwalkers, "the initial state's log_prob")

@@ -32,7 +32,8 @@ class TMCMCSampler(TemperedSampler):
     coefficient_of_variation : float — of the incremental weights, which sets the next exponent.
     chains, burn_in : as in `samplers.settings.Settings`. Moves that need many walkers, such as emcee's stretch move,
         need chains="equal".
-    resampling, min_moves, max_moves, max_correlation, check_draws : as in `samplers.settings.Settings`.
+    resampling, min_moves, max_moves, max_correlation, check_draws, max_failure_share : as in
+        `samplers.settings.Settings`.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class TMCMCSampler(TemperedSampler):
         max_moves: int = 7,
         max_correlation: float = 0.15,
         check_draws: int | None = None,
+        max_failure_share: float = 0.5,
     ):
         if not 0.0 < coefficient_of_variation < float("inf"):
             raise ValueError(f"coefficient_of_variation must be positive and finite; got {coefficient_of_variation}")
@@ -86,5 +88,6 @@ class TMCMCSampler(TemperedSampler):
                 max_moves=max_moves,
                 max_correlation=max_correlation,
                 check_draws=check_draws,
+                max_failure_share=max_failure_share,
             ),
         )

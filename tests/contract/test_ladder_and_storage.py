@@ -249,7 +249,7 @@ def test_a_new_climb_replaces_the_ladder(tmp_path):
     backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
     sampler = climbed(Gaussian(sd=0.01), backend=backend)
     long = len(sampler.ladder)
-    sampler.reset()
+    backend.reset(N, 3)
     sampler = SMCSampler(N, 3, Gaussian(sd=0.5), backend=backend, vectorize=True)
     sampler.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 1)
     assert read_ladder(backend) == sampler.ladder
@@ -428,10 +428,12 @@ def test_nan_counts_as_impossible_and_is_reported():
 
     posterior = Box([0, 0], [1, 1], log_likelihood)
     sampler = SMCSampler(N, 2, posterior, vectorize=True, seed=1)
-    with pytest.warns(SamplingWarning, match="log_prob_fn returned NaN for") as caught:
+    with pytest.warns(SamplingWarning, match="evaluations failed and count as impossible") as caught:
         sampler.run_mcmc(None, 5)
-    assert sampler.nan_count > 0
-    assert f"for {sampler.nan_count} points" in str(caught[0].message)
+    assert sampler.failure_count > 0
+    assert f"{sampler.failure_count} evaluations failed" in str(caught[0].message)
+    assert f"{sampler.failure_count} x log_prob_fn returned NaN" in str(caught[0].message)
+    assert all(failure["parameters"][0] < 0.25 for failure in sampler.failures)
     chain = sampler.get_chain(flat=True)
     assert chain[:, 0].min() >= 0.25
     assert np.all(np.isfinite(sampler.get_log_prob()))

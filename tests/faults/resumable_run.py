@@ -1,0 +1,47 @@
+"""A run that a test can kill: ``python -m tests.faults.resumable_run PATH SAMPLER STEPS [SECONDS]``.
+
+The posterior takes SECONDS a batch, so that there is time to kill it anywhere; blobs travel along.
+"""
+
+import sys
+import time
+
+import emcee
+
+from samplers import RAMANCHA_2022_LITERAL, SMCSampler, TMCMCSampler
+from tests.contract.targets import WithBlobs
+
+N, NDIM = 40, 3
+SAMPLERS = {
+    "smc": (SMCSampler, {}),
+    "moves": (SMCSampler, {"recycle": False}),
+    "tmcmc": (TMCMCSampler, {}),
+    "leaders": (TMCMCSampler, {"chains": "leaders", "burn_in": 1}),
+    "literal": (SMCSampler, RAMANCHA_2022_LITERAL),
+    "stretch": (SMCSampler, {"moves": emcee.moves.StretchMove(), "max_moves": 5}),
+}
+
+
+class Slow(WithBlobs):
+    """Takes its time for every batch."""
+
+    def __init__(self, seconds, **kwargs):
+        super().__init__(**kwargs)
+        self.seconds = seconds
+
+    def __call__(self, x):
+        time.sleep(self.seconds)
+        return super().__call__(x)
+
+
+def make(path, name, seconds=0.0, sd=0.01, **changes):
+    """The sampler on a file; the first run brings the seed, a later one goes on whatever its own seed is."""
+    Sampler, settings = SAMPLERS[name]
+    posterior = Slow(seconds, ndim=NDIM, sd=sd)
+    backend = emcee.backends.HDFBackend(str(path))
+    return Sampler(N, NDIM, posterior, vectorize=True, backend=backend, **{"seed": 5, **settings, **changes})
+
+
+if __name__ == "__main__":
+    path, name, steps, seconds = (*sys.argv[1:], "0")[:4]
+    make(path, name, float(seconds)).run_mcmc(None, int(steps))

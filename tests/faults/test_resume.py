@@ -1,0 +1,276 @@
+"""A run that is killed goes on from its file and ends bit for bit as if it had not been."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers.journal import read_journal
+from tests.contract.targets import Gaussian
+from tests.faults.resumable_run import NDIM, SAMPLERS, N, make
+
+ROOT = Path(__file__).parents[2]
+STEPS = 12
+
+
+def spawn(path, name, steps=STEPS, seconds=0.004):
+    command = [sys.executable, "-m", "tests.faults.resumable_run", path, name, steps, seconds]
+    return subprocess.Popen([str(part) for part in command], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+
+
+def journal_of(path):
+    return path.with_name(path.name + ".mcmc.journal")
+
+
+def same(sampler, whole):
+    """Everything but the wall time."""
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+    assert np.array_equal(sampler.get_log_prob(), whole.get_log_prob())
+    assert np.array_equal(sampler.get_blobs(), whole.get_blobs())
+    assert np.array_equal(sampler.backend.accepted, whole.backend.accepted)
+    for ours, theirs in zip(sampler.backend.random_state, whole.backend.random_state, strict=True):
+        assert np.all(ours == theirs)
+    assert [s._replace(seconds=0) for s in sampler.ladder] == [s._replace(seconds=0) for s in whole.ladder]
+    assert sampler.log_evidence_check == whole.log_evidence_check
+    assert (sampler.log_evidence, sampler.log_evidence_error) == (whole.log_evidence, whole.log_evidence_error)
+    return True
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SAMPLERS if name not in ("smc", "moves")]
+
+
+@pytest.mark.parametrize("name", ["smc", "moves", *SLOW])
+def test_killed_again_and_again(name, tmp_path, rng):
+    """The same script is started until it ends, and killed by -9 at places of chance along the way."""
+    whole = make(tmp_path / "whole.h5", name)
+    whole.run_mcmc(None, STEPS)
+    size = journal_of(tmp_path / "whole.h5").stat().st_size
+    path = tmp_path / "killed.h5"
+    for place in np.sort(rng.uniform(0.01, 0.95, size=3)) * size:
+        with spawn(path, name) as process:
+            while not journal_of(path).exists() or journal_of(path).stat().st_size < place:
+                assert process.poll() is None, process.stderr.read()
+                time.sleep(0.001)
+            process.kill()
+        assert process.returncode < 0
+    with spawn(path, name, seconds=0) as process:
+        assert process.wait() == 0, process.stderr.read()
+    sampler = make(path, name)
+    assert sampler.iteration == STEPS
+    assert same(sampler, whole)
+    for s in (sampler, whole):  # and so does what comes after
+        s.run_mcmc(None, 3)
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+
+
+@pytest.fixture
+def finished(tmp_path):
+    """The file of a run of SMC, and the run."""
+    path = tmp_path / "run.h5"
+    sampler = make(path, "smc")
+    sampler.run_mcmc(None, STEPS)
+    sampler.backend._journal.close()
+    return path, sampler
+
+
+def cut(path, share):
+    """The file as a killed process would have left it, after that share of the journal."""
+    data = journal_of(path).read_bytes()
+    journal_of(path).write_bytes(data[: int(share * len(data))])
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.97, 0.999])
+def test_cut_off_anywhere(finished, share):
+    """Nothing that the journal holds is evaluated again."""
+    path, whole = finished
+    cut(path, share)
+    contents = read_journal(journal_of(path))
+    known = sum(len(batch.coords) for batch in contents.evaluated)
+    sampler = make(path, "smc", seed=99)
+    posterior = sampler.log_prob_fn.f
+    sampler.run_mcmc(None, STEPS)
+    assert same(sampler, whole)
+    assert posterior.calls == sampler.evaluations - known + (known > 0)  # one to see whether it is the same posterior
+    assert sampler.evaluations == whole.evaluations
+
+
+def test_the_rest_can_be_asked_for(finished):
+    path, whole = finished
+    cut(path, 0.97)
+    sampler = make(path, "smc")
+    done = sampler.iteration
+    assert 0 < done < STEPS
+    sampler.run_mcmc(None, STEPS - done)
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+
+
+def test_the_same_draws_go_on_and_others_are_refused(tmp_path):
+    draws = Gaussian(NDIM).sample_prior(N, np.random.default_rng(0))
+    path = tmp_path / "run.h5"
+    sampler = make(path, "smc")
+    sampler.run_mcmc(draws, 3)
+    whole = sampler.get_chain()
+    sampler.backend._journal.close()
+    cut(path, 0.4)
+    with pytest.raises(ValueError, match="run from other draws"):
+        make(path, "smc").run_mcmc(draws + 1e-9, 3)
+    again = make(path, "smc")
+    again.run_mcmc(draws, 3)
+    assert np.array_equal(again.get_chain(), whole)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"max_moves": 9}, "max_moves was 7, is 9"),
+        ({"recycle": False}, "recycle was True, is False"),
+        ({"moves": emcee.moves.DEMove(), "recycle": True}, "moves was"),
+        ({"sd": 0.02}, "log_prob_fn was"),
+        ({"log_prior_fn": lambda x: -np.sum(np.abs(x), axis=-1)}, "log-prior"),
+    ],
+    ids=lambda value: str(next(iter(value))) if isinstance(value, dict) else "",
+)
+def test_another_run_is_refused(finished, changes, message):
+    path, _ = finished
+    cut(path, 0.5)
+    before = journal_of(path).read_bytes()
+    with pytest.raises(ValueError, match=message):
+        make(path, "smc", **changes).run_mcmc(None, STEPS)
+    assert journal_of(path).read_bytes() == before
+
+
+@pytest.mark.parametrize("place", [0.0, 0.01, 0.3, 0.7, 0.99])
+def test_a_damaged_journal_is_refused(finished, place):
+    path, _ = finished
+    data = bytearray(journal_of(path).read_bytes())
+    data[int(place * len(data))] ^= 0x10
+    journal_of(path).write_bytes(data)
+    with pytest.raises(ValueError, match="is damaged"):
+        make(path, "smc")
+
+
+@pytest.mark.parametrize("damage", ["truncated", "overwritten", "a step lost", "acceptance"])
+def test_a_damaged_chain_is_made_again(finished, damage, caplog):
+    """What a process that dies inside HDF5 can leave."""
+    import h5py
+
+    path, whole = finished
+    chain = whole.get_chain()
+    if damage == "truncated":
+        os.truncate(path, path.stat().st_size // 2)
+    elif damage == "overwritten":
+        path.write_bytes(b"\0" * 4096)
+    else:
+        with h5py.File(path, "a") as file:
+            if damage == "a step lost":
+                file["mcmc"].attrs["iteration"] = STEPS - 1
+            else:
+                file["mcmc/accepted"][0] += 1
+    sampler = make(path, "smc")
+    assert np.array_equal(sampler.get_chain(), chain)
+    sampler.run_mcmc(None, 2)
+    assert np.array_equal(sampler.get_chain()[:STEPS], chain)
+    if damage in ("truncated", "overwritten"):
+        assert "set aside" in caplog.text and path.with_name(path.name + ".damaged").exists()
+
+
+def test_a_damaged_file_without_a_journal_is_refused(finished):
+    path, _ = finished
+    journal_of(path).unlink()
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(ValueError, match="is damaged"):
+        make(path, "smc")
+
+
+def test_a_file_that_is_gone_or_reset_starts_anew(finished):
+    path, whole = finished
+    first = whole.get_chain()[0]
+    emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+    sampler = make(path, "smc", seed=6)
+    sampler.run_mcmc(None, 2)
+    assert sampler.iteration == 2 and not np.array_equal(sampler.get_chain()[0], first)
+    sampler.backend._journal.close()
+    path.unlink()
+    sampler = make(path, "smc", seed=7)
+    sampler.run_mcmc(None, 2)
+    assert sampler.iteration == 2
+
+
+def test_a_lost_journal_leaves_the_chain(finished):
+    """Then the run goes on at beta = 1, as emcee does."""
+    path, whole = finished
+    journal_of(path).unlink()
+    sampler = make(path, "smc")
+    sampler.run_mcmc(None, 2)
+    assert sampler.iteration == STEPS + 2 and sampler.ladder == whole.ladder
+
+
+def test_reset_after_burn_in(tmp_path):
+    """The chain is thrown away, the place is not."""
+    chains = []
+    for broken in (False, True):
+        path = tmp_path / f"{broken}.h5"
+        sampler = make(path, "smc")
+        sampler.run_mcmc(None, 5)
+        sampler.reset()
+        if broken:
+            sampler.backend._journal.close()
+            sampler = make(path, "smc")
+        sampler.run_mcmc(None, 4)
+        chains.append(sampler.get_chain())
+    assert chains[0].shape == (4, N, NDIM)
+    assert np.array_equal(*chains)
+
+
+def test_two_runs_on_one_file(finished):
+    """The second one is told, also from another process."""
+    path, sampler = finished
+    shutil.copy(path, path.with_name("copy.h5"))
+    with spawn(path.with_name("new.h5"), "smc", seconds=0.2) as first:
+        while not journal_of(path.with_name("new.h5")).exists():
+            time.sleep(0.01)
+        with spawn(path.with_name("new.h5"), "smc") as second:
+            _, told = second.communicate(timeout=60)
+        first.kill()
+    assert second.returncode != 0 and "another run is writing" in told
+
+
+def test_failures_are_remembered(tmp_path):
+    """A point that raised counts as impossible, before and after the kill."""
+
+    class Fragile(Gaussian):
+        def __call__(self, x):
+            if np.any(x[..., 0] < 0):
+                raise ArithmeticError("no equilibrium")
+            return super().__call__(x)
+
+    from samplers import SamplingWarning, SMCSampler
+
+    def run(path, steps):
+        sampler = SMCSampler(
+            N,
+            2,
+            Fragile(2),
+            vectorize=True,
+            seed=3,
+            backend=emcee.backends.HDFBackend(str(path)),
+            max_failure_share=0.7,
+        )
+        with pytest.warns(SamplingWarning, match="ArithmeticError: no equilibrium"):
+            sampler.run_mcmc(None, steps)
+        return sampler
+
+    whole = run(tmp_path / "run.h5", 6)
+    whole.backend._journal.close()
+    cut(tmp_path / "run.h5", 0.8)
+    again = run(tmp_path / "run.h5", 6)
+    assert np.array_equal(again.get_chain(), whole.get_chain())
+    assert again.get_chain()[..., 0].min() >= 0
+    assert again.failure_count == whole.failure_count > 0
+    assert [f["reason"] for f in again.failures] == [f["reason"] for f in whole.failures]
