@@ -2,7 +2,7 @@
 
 Parameters go to the model, its response to sums of squared residuals J, J and the noise's parameters to a number. The
 middle of this chain, `FELikelihood.misfit`, is the only place where simulations are asked for: it decides which rows
-are run, counts them, and records those that fail.
+are run, counts them, records those that fail, and remembers what came out.
 """
 
 import hashlib
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .channels import Measurements
+from .memory import MisfitMemory
 from .models.base import Model, misfit_batch
 from .noise import GaussianNoise
 
@@ -74,6 +75,10 @@ class FELikelihood:
     pool : object with ``map(function, items)``, optional
         Runs the simulations of a model without batch methods, as many at once as it has workers. It does not travel
         when the likelihood is pickled.
+    memory : int
+        Number of simulations whose misfits are remembered (some 250 bytes each), so that none of them is run again,
+        those that failed included; 0 for none. What is remembered does not travel when the likelihood is pickled: every
+        process remembers what it simulated itself.
 
     Attributes
     ----------
@@ -83,8 +88,10 @@ class FELikelihood:
         Indices of the parameters whose change costs no simulation: the noise's.
     simulations : int
         Simulations run by this object in this process.
+    cache_hits : int
+        Rows whose misfit was remembered instead.
     failure_count : int
-        How many of them failed.
+        How many simulations failed.
     failures : list of dict
         ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures.
     failure_reasons : dict of str to int
@@ -98,7 +105,9 @@ class FELikelihood:
         If channels, step or length of model and measurements differ, or parameter names repeat.
     """
 
-    def __init__(self, model: Model, measurements: Measurements, noise: Any = None, pool: Any = None) -> None:
+    def __init__(
+        self, model: Model, measurements: Measurements, noise: Any = None, pool: Any = None, *, memory: int = 100_000
+    ) -> None:
         if pool is not None and not hasattr(pool, "map"):
             raise ValueError(f"FELikelihood: pool must have a method map(function, items); got {pool!r}")
         self.model = model
@@ -110,7 +119,9 @@ class FELikelihood:
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
         self._n_structural = len(model.parameter_names)
         self.simulation_free = tuple(range(self._n_structural, len(self.parameter_names)))
+        self._memory = MisfitMemory(memory)
         self.simulations = 0
+        self.cache_hits = 0
         self.failure_count = 0
         self.failures: list[dict] = []
         self.failure_reasons: Counter[str] = Counter()
@@ -131,7 +142,9 @@ class FELikelihood:
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals. Equal rows are simulated once; rows that are not finite are not simulated.
+        """Sums of squared residuals.
+
+        Equal rows are simulated once, remembered ones not again, and rows that are not finite not at all.
 
         Parameters
         ----------
@@ -149,8 +162,14 @@ class FELikelihood:
             return result
         first: dict[bytes, int] = {}  # in order of appearance; adding zero makes -0.0 and 0.0 one key
         distinct = [first.setdefault(row.tobytes(), len(first)) for row in thetas[finite] + 0.0]
-        rows = np.frombuffer(b"".join(first), dtype=float).reshape(len(first), -1).copy()
-        result[finite] = self._simulate(rows)[distinct]
+        keys = list(first)
+        misfit, known = self._memory.look_up(keys, result.shape[1])
+        self.cache_hits += int(known[distinct].sum())
+        if not known.all():
+            new = [key for key, remembered in zip(keys, known, strict=True) if not remembered]
+            misfit[~known] = self._simulate(np.frombuffer(b"".join(new), dtype=float).reshape(len(new), -1).copy())
+            self._memory.store(new, misfit[~known])
+        result[finite] = misfit[distinct]
         return result
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:

@@ -41,6 +41,10 @@ class GaussianNoise:
         if not self.channels:
             raise ValueError("GaussianNoise expects at least one channel; got none")
 
+    def __repr__(self) -> str:
+        # display units change nothing, so they do not enter
+        return f"GaussianNoise({', '.join(f'{channel.name}: {channel.quantity}' for channel in self.channels)})"
+
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """``sigma_<channel>``: standard deviations, each in the SI unit of its channel."""

@@ -6,6 +6,10 @@ promises make it safe to hand to them: a value is a finite number or -inf, whate
 nothing is simulated where the prior is zero.
 """
 
+import hashlib
+import json
+import re
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +19,18 @@ from .likelihood import FELikelihood, as_points
 from .priors import Distribution, Prior, RandomState
 
 __all__ = ["Posterior"]
+
+
+def _description(thing: Any) -> str:
+    """The ``repr`` of something, complete and the same in every process, or ValueError."""
+    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+        text = repr(thing)
+    if re.search(r"\bat 0x[0-9a-fA-F]+", text):
+        raise ValueError(
+            f"a fingerprint needs a repr that says what {type(thing).__qualname__} is, not where it lies: make it a "
+            f"frozen dataclass or give it a __repr__ of all its values; got {text}"
+        )
+    return text
 
 
 class Posterior:
@@ -74,6 +90,23 @@ class Posterior:
         """Indices of the parameters whose change costs no simulation."""
         return self.likelihood.simulation_free
 
+    @property
+    def fingerprint(self) -> str:
+        """Hex digest (BLAKE2b, 128 bits) of all that the density depends on: likelihood, noise and prior.
+
+        It is the same in another process. The coarse posterior does not enter.
+
+        Raises
+        ------
+        ValueError
+            If the noise or a distribution is of a class whose ``repr`` does not say what it is.
+        """
+        noise = self.likelihood.noise
+        parts = [self.likelihood.fingerprint, type(noise).__qualname__, *noise.parameter_names, _description(noise)]
+        for name, distribution in self.prior.distributions.items():
+            parts += [name, type(distribution).__qualname__, _description(distribution)]
+        return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()
+
     def __call__(self, x: Any) -> np.ndarray | float:
         """Same as `log_prob`."""
         return self.log_prob(x)
@@ -107,12 +140,13 @@ class Posterior:
         Returns
         -------
         dict
-            ``simulations``, ``cache_hits``, ``failures`` (list of ``{"parameters", "reason"}``, the first thousand),
-            ``failure_count``, ``failure_reasons`` (count of each), ``seconds`` (wall time in simulations).
+            ``simulations``, ``cache_hits`` (rows whose misfit was remembered instead), ``failures`` (list of
+            ``{"parameters", "reason"}``, the first thousand), ``failure_count``, ``failure_reasons`` (count of
+            each), ``seconds`` (wall time in simulations).
         """
         return {
             "simulations": self.likelihood.simulations,
-            "cache_hits": 0,
+            "cache_hits": self.likelihood.cache_hits,
             "failures": list(self.likelihood.failures),
             "failure_count": self.likelihood.failure_count,
             "failure_reasons": dict(self.likelihood.failure_reasons),

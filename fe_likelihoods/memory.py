@@ -1,0 +1,78 @@
+"""Misfits of the structural parameters simulated lately.
+
+The misfit does not depend on the noise. So whoever changes the noise's parameters alone, comes back to a point, or
+evaluates a chain again is served from memory, as long as it is not too long ago.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+
+__all__ = ["MisfitMemory"]
+
+
+class MisfitMemory:
+    """Misfits by the bytes of their structural parameters; the ones not asked for longest are forgotten first.
+
+    Failures are remembered as well, as NaN. Threads may share a memory. A pickled one comes back empty: it would be
+    larger than anything it travels with.
+
+    Parameters
+    ----------
+    rows : int
+        The most that are remembered; 0 for none.
+
+    Raises
+    ------
+    ValueError
+        If `rows` is not a whole number, or negative.
+    """
+
+    def __init__(self, rows: int) -> None:
+        if isinstance(rows, bool) or not isinstance(rows, int | np.integer) or rows < 0:
+            raise ValueError(
+                f"memory is the number of simulations whose misfits are remembered, 0 or more; got {rows!r}"
+            )
+        self.rows = int(rows)
+        self._misfits: OrderedDict[bytes, bytes] = OrderedDict()  # from the one not asked for longest to the last one
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.rows,)
+
+    def __len__(self) -> int:
+        return len(self._misfits)
+
+    def look_up(self, keys: Sequence[bytes], n_channels: int) -> tuple[np.ndarray, np.ndarray]:
+        """What is known of distinct keys.
+
+        Parameters
+        ----------
+        keys : sequence of n bytes
+        n_channels : int
+
+        Returns
+        -------
+        misfit : (n, n_channels) float — NaN where the simulation had failed, and where nothing is known.
+        known : (n,) bool
+        """
+        found = []
+        with self._lock:
+            for key in keys:
+                misfit = self._misfits.get(key)
+                if misfit is not None:
+                    self._misfits.move_to_end(key)
+                found.append(misfit)
+        unknown = np.full(n_channels, np.nan).tobytes()
+        filled = b"".join([unknown if misfit is None else misfit for misfit in found])
+        misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), n_channels).copy()
+        return misfits, np.array([misfit is not None for misfit in found], dtype=bool)
+
+    def store(self, keys: Sequence[bytes], misfits: np.ndarray) -> None:
+        """Remember the misfits (n, n_channels) of distinct keys."""
+        with self._lock:
+            self._misfits.update(zip(keys, map(np.ndarray.tobytes, misfits), strict=True))
+            while len(self._misfits) > self.rows:
+                self._misfits.popitem(last=False)
