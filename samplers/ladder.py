@@ -42,11 +42,12 @@ class Stage(NamedTuple):
     beta : tempering exponent reached, 0 < beta <= 1.
     effective_sample_size : of the incremental weights that led here.
     acceptance : share of the proposals of this stage that were accepted.
-    moves : sweeps of the whole ensemble made at this beta.
+    moves : sweeps of the whole ensemble made at this beta; simulation-free ones are not counted.
     distinct_ancestors : number of different points that survived the resampling.
     log_evidence_increment : log of the mean incremental weight.
     log_evidence_error : standard error of the sum of the increments so far.
-    evaluations : points handed to ``log_prob_fn`` in this stage (the first stage includes the draws of the prior).
+    evaluations : points handed to ``log_prob_fn`` in this stage (the first stage includes the draws of the prior);
+        simulation-free ones are, so this may exceed the number of simulations.
     seconds : wall time of the stage [s].
     """
 

@@ -9,12 +9,12 @@ Fits are made per unit of the weighted standard deviations, so a parameter of 2e
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from emcee import State
 from emcee.model import Model
-from emcee.moves import MHMove, Move
+from emcee.moves import MHMove
 from scipy.linalg import solve_triangular
 
 from .edges import Edges, find_edges, log_slope
@@ -29,7 +29,7 @@ from .mixtures import (
     unflatten,
 )
 
-__all__ = ["AlternatingMove", "MixtureMove", "RandomWalkMove", "StudentTMove", "describe"]
+__all__ = ["MixtureMove", "RandomWalkMove", "StudentTMove", "describe"]
 WHOLE_DIFFERENCES = 0.1
 REDRAWS = 20
 SHARES = (0.5, 0.25, 0.25)
@@ -137,44 +137,6 @@ class StudentTMove(_FittedMove):
         stretch = np.sqrt(self.dof / random.chisquare(self.dof, size=len(coords)))
         proposed = self._mean + (z * stretch[:, None]) @ self._root.T
         return proposed, self._log_density(coords) - self._log_density(proposed)
-
-
-class AlternatingMove(Move):
-    """Several moves in turn; the first one alone while it does well.
-
-    Parameters
-    ----------
-    moves : sequence of emcee moves.
-    enough : float — acceptance of the first move above which the others rest until the next calibration. Decided in
-        ``tune`` only, so that the kernel is a fixed cycle when nobody tunes.
-    """
-
-    def __init__(self, moves: Sequence[Move], enough: float = 0.5):
-        if len(moves) == 0:
-            raise ValueError("moves is empty: give at least one emcee move")
-        self.moves = list(moves)
-        self.enough = enough
-        self._last = -1
-        self._first_alone = False
-
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Calibrate every move that learns, and start the cycle again."""
-        self._last = -1
-        self._first_alone = False
-        for move in self.moves:
-            if hasattr(move, "calibrate"):
-                move.calibrate(coords, weights, inside)
-
-    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """One sweep of the move whose turn it is: the new state and which proposals (nwalkers,) were accepted."""
-        self._last = 0 if self._first_alone else (self._last + 1) % len(self.moves)
-        return self.moves[self._last].propose(model, state)
-
-    def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Tune the move made last; let the first one work alone if enough of its proposals were accepted."""
-        if self._last == 0:
-            self._first_alone = float(np.mean(accepted)) > self.enough
-        self.moves[self._last].tune(state, accepted)
 
 
 class MixtureMove(MHMove):

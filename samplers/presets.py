@@ -13,6 +13,8 @@ The scale of their random walk is not given; 2.38 / sqrt(ndim) is taken.
 Ching & Chen (2007), for ``TMCMCSampler(1000, ndim, log_prob_fn, **CHING_CHEN_2007)``: coefficient of variation 1,
 multinomial leaders, one Metropolis step a point, covariance 0.04 times the weighted one. It can collapse on sharp
 posteriors; the default of `TMCMCSampler` does not.
+
+None of them has sweeps over simulation-free parameters, which are not in the papers.
 """
 
 from collections.abc import Mapping
@@ -29,6 +31,7 @@ _COMMON = {
     "resampling": "multinomial",
     "min_moves": 10,
     "max_moves": 10,
+    "free_sweeps": 0,
 }
 RAMANCHA_2022_CONSTANT: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "constant"})
 RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "declining", "ess_floor": 50.0})
@@ -39,5 +42,6 @@ CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
         "resampling": "multinomial",
         "chains": "leaders",
         "burn_in": 0,
+        "free_sweeps": 0,
     }
 )

@@ -25,6 +25,8 @@ class Settings:
     chains : "equal", every resampled point is moved as long as the others, or "leaders", a chain grows from each
         distinct one, as many steps as it was drawn (then the number of moves is `burn_in` + 1).
     burn_in : int — steps of a chain before its points count, with "leaders".
+    free_sweeps : int — sweeps after every move over the parameters whose change costs no simulation, where
+        `log_prob_fn` has an attribute ``simulation_free`` with their indices (`samplers.free_sweeps`); 0 for none.
     recycle : bool — climb by importance sampling over every point evaluated (`samplers.recycling`), and by moves only
         where that may not be trusted.
     check_draws : int, optional — evaluations spent at the end on an evidence independent of the ladder; by default as
@@ -42,6 +44,7 @@ class Settings:
     max_correlation: float = 0.15
     chains: str = "equal"
     burn_in: int = 0
+    free_sweeps: int = 2
     recycle: bool = False
     check_draws: int | None = None
     max_failure_share: float = 0.5
@@ -63,6 +66,8 @@ class Settings:
             raise ValueError(f'chains must be "equal" or "leaders"; got {self.chains!r}')
         if not self.burn_in >= 0:
             raise ValueError(f"burn_in must not be negative; got {self.burn_in}")
+        if not isinstance(self.free_sweeps, int) or self.free_sweeps < 0:
+            raise ValueError(f"free_sweeps must be a whole number, 0 for none; got {self.free_sweeps!r}")
         if self.check_draws is not None and not self.check_draws >= 0:
             raise ValueError(f"check_draws must not be negative; got {self.check_draws}")
         if not 0.0 <= self.max_failure_share <= 1.0:

@@ -30,7 +30,7 @@ class SMCSampler(TemperedSampler):
         may not be trusted. By default yes if `moves` are not given.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation : as in
         `samplers.settings.Settings`, for a climb by moves.
-    check_draws, max_failure_share : as there.
+    free_sweeps, check_draws, max_failure_share : as there.
     """
 
     def __init__(
@@ -56,6 +56,7 @@ class SMCSampler(TemperedSampler):
         min_moves: int = 2,
         max_moves: int = 7,
         max_correlation: float = 0.15,
+        free_sweeps: int = 2,
         recycle: bool | None = None,
         check_draws: int | None = None,
         max_failure_share: float = 0.5,
@@ -86,6 +87,7 @@ class SMCSampler(TemperedSampler):
                 min_moves=min_moves,
                 max_moves=max_moves,
                 max_correlation=max_correlation,
+                free_sweeps=free_sweeps,
                 recycle=recycle,
                 check_draws=check_draws,
                 max_failure_share=max_failure_share,

@@ -29,6 +29,7 @@ from .alarms import check_evidence, check_ladder, sound
 from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
 from .edges import find_edges
 from .evaluation import Failures, Guarded, Memo, Records, log_probabilities, outcomes
+from .free_sweeps import with_free_sweeps
 from .importance import EvidenceCheck, draw_inside, evidence_from_weights
 from .journal import Contents, Evaluated, Start
 from .ladder import (
@@ -63,6 +64,8 @@ class TemperedSampler(EnsembleSampler):
     ----------
     nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names :
         as in `emcee.EnsembleSampler`, in its order. `moves` are the mutation kernels, copied; by default a random walk.
+        Where `log_prob_fn` has ``simulation_free``, each is followed by ``settings.free_sweeps`` (but not with a `pool`
+        and without `vectorize`: workers forget what they simulated, so nothing is free there).
         A point for which `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`);
         it is not called outside the support of the prior. With an emcee `HDFBackend` a journal is kept beside the file,
         and a run that was killed goes on from it (`run_mcmc`).
@@ -143,6 +146,9 @@ class TemperedSampler(EnsembleSampler):
             blobs_dtype=blobs_dtype,
             parameter_names=parameter_names,
         )
+        if pool is None or vectorize:
+            free = getattr(log_prob_fn, "simulation_free", ())
+            self._moves = with_free_sweeps(self._moves, free, ndim, settings.free_sweeps)
         self._ladder = list(read_ladder(self.backend))
         self._check = read_check(self.backend)
         if self.backend.random_state is None:
@@ -156,7 +162,10 @@ class TemperedSampler(EnsembleSampler):
 
     @property
     def evaluations(self) -> int:
-        """Points handed to `log_prob_fn` by this object, and by the killed run that it goes on with."""
+        """Points handed to `log_prob_fn` by this object, and by the killed run that it goes on with.
+
+        Those of simulation-free sweeps are among them.
+        """
         return self._evaluations
 
     @property

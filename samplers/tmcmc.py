@@ -32,7 +32,7 @@ class TMCMCSampler(TemperedSampler):
     coefficient_of_variation : float — of the incremental weights, which sets the next exponent.
     chains, burn_in : as in `samplers.settings.Settings`. Moves that need many walkers, such as emcee's stretch move,
         need chains="equal".
-    resampling, min_moves, max_moves, max_correlation, check_draws, max_failure_share : as in
+    resampling, min_moves, max_moves, max_correlation, free_sweeps, check_draws, max_failure_share : as in
         `samplers.settings.Settings`.
     """
 
@@ -59,6 +59,7 @@ class TMCMCSampler(TemperedSampler):
         min_moves: int = 2,
         max_moves: int = 7,
         max_correlation: float = 0.15,
+        free_sweeps: int = 2,
         check_draws: int | None = None,
         max_failure_share: float = 0.5,
     ):
@@ -87,6 +88,7 @@ class TMCMCSampler(TemperedSampler):
                 min_moves=min_moves,
                 max_moves=max_moves,
                 max_correlation=max_correlation,
+                free_sweeps=free_sweeps,
                 check_draws=check_draws,
                 max_failure_share=max_failure_share,
             ),

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from samplers import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler, TMCMCSampler
-from samplers.moves import AlternatingMove, MixtureMove, RandomWalkMove, StudentTMove
+from samplers.moves import MixtureMove, RandomWalkMove, StudentTMove
 from tests.contract.targets import Box, Gaussian
 
 MODES = {
@@ -221,19 +221,3 @@ def test_evidence_error_covers(mode, seed):
     covered = int(np.sum(np.abs(error) < 2 * stated))
     assert covered >= stats.binom(40, 0.93).ppf(1e-3)
     assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < 1.6
-
-
-def test_alternation_rests_the_walk_where_independent_draws_do_well(seed):
-    class Counting(RandomWalkMove):
-        proposals = 0
-
-        def propose(self, model, state):
-            type(self).proposals += 1
-            return super().propose(model, state)
-
-    runs(Gaussian(2, sd=0.3), seed, count=1, moves=AlternatingMove([StudentTMove(), Counting()]), min_moves=6)
-    assert Counting.proposals == 0
-    runs(
-        Gaussian(2, sd=0.3), seed, count=1, moves=AlternatingMove([StudentTMove(), Counting()], enough=1.0), min_moves=6
-    )
-    assert Counting.proposals > 6
