@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from . import column, samplers, startup
+from . import column, peers, samplers, startup
 from .rows import as_table, machine, write_json
 
 BENCHMARKS = {
@@ -12,6 +12,7 @@ BENCHMARKS = {
     "imports": startup.imports,
     "compilation": startup.compilation,
     "samplers": samplers.rows,
+    "peers": peers.rows,
 }
 
 

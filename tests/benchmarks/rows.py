@@ -13,11 +13,11 @@ __all__ = ["Row", "as_table", "machine", "write_json"]
 
 
 class Row(NamedTuple):
-    """One figure: what was measured, on which case, its value and unit, and what else a reader needs."""
+    """One figure: what was measured, on which case, its value (None: not measured) and unit, and what else to know."""
 
     what: str
     case: str
-    value: float
+    value: float | None
     unit: str
     note: str = ""
 
@@ -43,9 +43,11 @@ def machine() -> dict[str, str | int | list[float]]:
 
 
 def as_table(rows: Sequence[Row]) -> str:
-    """The rows as aligned text, the value with three significant digits."""
+    """The rows as aligned text, the value with three significant digits, a dash for none."""
     cells = [("what", "case", "value", "unit", "note")]
-    cells += [(row.what, row.case, f"{row.value:.3g}", row.unit, row.note) for row in rows]
+    cells += [
+        (row.what, row.case, "-" if row.value is None else f"{row.value:.3g}", row.unit, row.note) for row in rows
+    ]
     widths = [max(len(line[i]) for line in cells) for i in range(5)]
     lines = []
     for line in cells:

@@ -1,0 +1,215 @@
+"""Other samplers on the same targets, counted and scored as ours are; the library itself never imports them.
+
+Every run has a process of its own and ``LIMIT`` seconds of wall time, imports and compilation included; a run that is
+stopped, fails or has no peer to run says so in its row. Settings are the peer's own defaults, but for these:
+
+* emcee and zeus: 100 walkers from the prior, 1000 steps of which the second half counts; no evidence.
+* PyMC ``sample_smc``: one chain of 2000 draws in one process (2000 is its default, and what our chains hold).
+* pocomc: defaults (256 active particles, 512 effective, 4096 samples), with its normalising flow and without.
+* dynesty: the static sampler, 500 live points (its default).
+
+emcee, zeus and pocomc get the likelihood of a whole batch, PyMC and dynesty ask point by point: their CPU time per
+evaluation contains as many calls from Python, and PyMC's its compilation.
+
+On Python 3.11 with numpy 2.4 all of them live in one environment. What to know: PyMC holds numba back (pytensor 2.38
+wants < 0.66), so that the times of compiled kernels belong to that older numba; pocomc wants torch even without its
+flow, by default gigabytes with CUDA, and is therefore not in the extra:
+``pip install pocomc torch --extra-index-url https://download.pytorch.org/whl/cpu`` brings the small one.
+"""
+
+import importlib.util
+import logging
+import multiprocessing
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import emcee
+import numpy as np
+
+from .rows import Row
+from .targets import Target, as_row, errors, target_named, target_names
+
+__all__ = ["rows"]
+
+LIMIT = 150.0  # s of wall time for one run
+WALKERS, STEPS = 100, 1000
+DRAWS = 2000  # of PyMC
+LIVE_POINTS = 500  # of dynesty
+
+
+class _Outcome(NamedTuple):
+    samples: np.ndarray
+    weights: np.ndarray | None = None
+    log_evidence: float | None = None
+    log_evidence_error: float | None = None
+
+
+def _prior_stream(seed: int) -> np.random.RandomState:
+    """Random numbers of our own beside a peer that seeds its stream with `seed`: the two must not be the same."""
+    return np.random.RandomState([seed, 1])
+
+
+def _emcee(target: Target, seed: int) -> _Outcome:
+    random = np.random.RandomState(seed)
+    start = target.sample_prior(WALKERS, random)
+    sampler = emcee.EnsembleSampler(WALKERS, target.ndim, target, vectorize=True)
+    sampler.random_state = random.get_state()
+    sampler.run_mcmc(start, STEPS)
+    return _Outcome(sampler.get_chain(flat=True, discard=STEPS // 2))
+
+
+def _zeus(target: Target, seed: int) -> _Outcome:
+    import zeus
+
+    np.random.seed(seed)  # noqa: NPY002 - zeus draws from numpy's global stream
+    start = target.sample_prior(WALKERS, _prior_stream(seed))
+    sampler = zeus.EnsembleSampler(WALKERS, target.ndim, target, vectorize=True, verbose=False)
+    sampler.run_mcmc(start, STEPS, progress=False)
+    return _Outcome(sampler.get_chain(flat=True, discard=STEPS // 2))
+
+
+def _pymc(target: Target, seed: int) -> _Outcome:
+    import pymc
+    import pytensor.tensor as pt
+    from pytensor.graph.op import Op
+
+    logging.getLogger("pymc").setLevel(logging.WARNING)
+
+    class LogLikelihood(Op):
+        itypes, otypes = [pt.dvector], [pt.dscalar]
+
+        def perform(self, node, inputs, outputs):
+            outputs[0][0] = np.array(target.log_likelihood(inputs[0][None])[0])
+
+    kinds = {
+        "tn": lambda name, a, b: pymc.TruncatedNormal(name, a, b, lower=0.0),
+        "hn": lambda name, a, b: pymc.HalfNormal(name, a),
+        "u": lambda name, a, b: pymc.Uniform(name, a, b),
+        "ln": lambda name, a, b: pymc.LogNormal(name, a, b),
+    }
+    names = [f"x{i}" for i in range(target.ndim)]
+    with pymc.Model():
+        x = [kinds[kind](name, a, b) for name, (kind, a, b) in zip(names, target.prior, strict=True)]
+        pymc.Potential("log_likelihood", LogLikelihood()(pt.stack(x)))
+        trace = pymc.sample_smc(
+            DRAWS, chains=1, cores=1, random_seed=seed, progressbar=False, compute_convergence_checks=False
+        )
+    samples = np.stack([trace.posterior[name].values.ravel() for name in names], axis=1)
+    by_stage = trace.sample_stats["log_marginal_likelihood"].values[0]  # of the only chain
+    return _Outcome(samples, log_evidence=float(by_stage[-1]))
+
+
+def _dynesty(target: Target, seed: int) -> _Outcome:
+    import dynesty
+
+    sampler = dynesty.NestedSampler(
+        lambda x: float(target.log_likelihood(x[None])[0]),
+        target.prior_transform,
+        target.ndim,
+        nlive=LIVE_POINTS,
+        rstate=np.random.default_rng(seed),
+    )
+    sampler.run_nested(print_progress=False)
+    found = sampler.results
+    return _Outcome(found.samples, found.importance_weights(), found.logz[-1], found.logzerr[-1])
+
+
+class _PocoPrior:
+    """The prior as pocomc wants it."""
+
+    def __init__(self, target: Target, seed: int):
+        self.bounds = np.array([(a, b) if kind == "u" else (0.0, np.inf) for kind, a, b in target.prior])
+        self.dim, self.logpdf = target.ndim, target.log_prior
+        self._target, self._random = target, _prior_stream(seed)
+
+    def rvs(self, size=1):
+        return self._target.sample_prior(size, self._random)
+
+
+def _pocomc(target: Target, seed: int, flow: bool = True) -> _Outcome:
+    import pocomc
+
+    sampler = pocomc.Sampler(
+        _PocoPrior(target, seed),
+        target.log_likelihood,
+        target.ndim,
+        vectorize=True,
+        precondition=flow,
+        random_state=seed,
+    )
+    sampler.run(progress=False)
+    samples, weights, _, _ = sampler.posterior()
+    log_evidence, error = sampler.evidence()
+    return _Outcome(samples, weights, float(log_evidence), None if error is None else float(error))
+
+
+def _pocomc_no_flow(target: Target, seed: int) -> _Outcome:
+    return _pocomc(target, seed, flow=False)
+
+
+class _Peer(NamedTuple):
+    module: str
+    run: Callable[[Target, int], _Outcome]
+    install: str = "pip install '.[peers]'"
+
+
+_POCOMC = "pip install pocomc torch --extra-index-url https://download.pytorch.org/whl/cpu"
+PEERS = {
+    "emcee, stretch move": _Peer("emcee", _emcee),
+    "zeus": _Peer("zeus", _zeus),
+    "PyMC, sample_smc": _Peer("pymc", _pymc),
+    "dynesty": _Peer("dynesty", _dynesty),
+    "pocomc": _Peer("pocomc", _pocomc, _POCOMC),
+    "pocomc, no flow": _Peer("pocomc", _pocomc_no_flow, _POCOMC),
+}
+
+
+def _work(peer: str, name: str, seed: int, count, answer) -> None:
+    """In the process of a run: its cost and errors, or why there are none, into the pipe `answer`."""
+    target = target_named(name)
+    target.count = count
+    try:
+        start = time.process_time()
+        outcome = PEERS[peer].run(target, seed)
+        seconds = time.process_time() - start
+        run = {"microseconds": 1e6 * seconds / target.evaluations}
+        run |= errors(target, outcome.samples, outcome.weights)
+        if outcome.log_evidence is not None:
+            run["evidence"] = outcome.log_evidence - target.log_evidence
+        if outcome.log_evidence_error is not None:
+            run["error"] = outcome.log_evidence_error
+    except Exception as error:  # whatever a peer raises belongs into its row
+        run = {"reason": f"failed: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}"}
+    answer.send(run)
+
+
+def _run(peer: str, name: str, seed: int) -> dict:
+    """One run in a process of its own, stopped at the limit."""
+    context = multiprocessing.get_context("spawn")  # a fork would inherit numba's threads
+    count = context.RawValue("q", 0)
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(peer, name, seed, count, sender), daemon=True)
+    process.start()
+    sender.close()  # the child's end alone is open: its death ends the wait
+    try:
+        run = receiver.recv() if receiver.poll(LIMIT) else {"reason": f"stopped at {LIMIT:.0f} s"}
+    except EOFError:
+        process.join()
+        run = {"reason": f"ended without an answer, exit code {process.exitcode}"}
+    process.kill()
+    process.join()
+    return {"evaluations": count.value} | run
+
+
+def rows(repeats: int) -> list[Row]:
+    """One row for every peer and target, as `samplers.rows` has them; one for a peer that is not installed."""
+    table = []
+    for peer, (module, _, install) in PEERS.items():
+        if importlib.util.find_spec(module) is None:
+            table.append(Row(f"{peer}: evaluations", "", None, "", f"not installed: {install}"))
+            continue
+        for name in target_names():
+            runs = [_run(peer, name, seed) for seed in range(1, repeats + 1)]
+            table.append(as_row(peer, name, runs))
+    return table
