@@ -14,8 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from emcee import State
 from emcee.model import Model
-from emcee.moves import MHMove
-from scipy.linalg import solve_triangular
+from emcee.moves import MHMove, Move
 
 from .edges import Edges, find_edges, log_slope
 from .mixtures import (
@@ -23,6 +22,7 @@ from .mixtures import (
     draw,
     fit_mixture,
     flatten,
+    invert_roots,
     location_and_root,
     log_density,
     log_responsibilities,
@@ -125,7 +125,7 @@ class StudentTMove(_FittedMove):
         """Fit mean and covariance to points (n, ndim) with normalised weights (n,)."""
         super().calibrate(coords, weights, inside)
         self._root = self._root * math.sqrt((self.dof - 2.0) / self.dof)
-        self._inverse = solve_triangular(self._root, np.eye(len(self._root)), lower=True)
+        self._inverse = invert_roots(self._root[None])[0]
 
     def _log_density(self, coords):
         """Log density up to a constant."""
