@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from . import column, peers, samplers, startup
+from . import column, cost, peers, samplers, startup
 from .rows import as_table, machine, write_json
 
 BENCHMARKS = {
@@ -11,6 +11,7 @@ BENCHMARKS = {
     "batch": column.batch,
     "imports": startup.imports,
     "compilation": startup.compilation,
+    "cost": cost.cost,
     "samplers": samplers.rows,
     "peers": peers.rows,
 }
