@@ -9,16 +9,24 @@ from tests.benchmarks import peers
 from tests.benchmarks.rows import Row, as_table, machine, write_json
 from tests.benchmarks.targets import as_row, errors, target_named
 
-ANSWER = {"evaluations": 100, "microseconds": 5.0, "z": 0.3, "sd": 0.04, "evidence": -0.2, "error": 0.1}
+ANSWER = {
+    "evaluations": 100,
+    "microseconds": 5.0,
+    "z": 0.3,
+    "sd": 0.04,
+    "evidence": -0.2,
+    "error": 0.1,
+    "warned": False,
+}
 STOPPED = {"evaluations": 900, "reason": "stopped at 150 s"}
 
 
 def test_row_scores_the_answers_and_names_the_runs_without_one():
-    row = as_row("peer", "T1", [ANSWER, STOPPED, ANSWER | {"z": 0.4, "evidence": 0.5}])
+    row = as_row("peer", "T1", [ANSWER, STOPPED, ANSWER | {"z": 0.4, "evidence": 0.5, "warned": True}])
     assert row.value == pytest.approx(1100 / 3)
     assert row.note == (
         f"z {np.sqrt((0.3**2 + 0.4**2) / 2):.3f}; sd 4.0 %; log Z -0.20(0.10) +0.50(0.10); 5.0 us CPU; "
-        "1 of 3 stopped at 150 s"
+        "1 of 3 stopped at 150 s; warned"
     )
 
 

@@ -1,7 +1,8 @@
 """Other samplers on the same targets, counted and scored as ours are; the library itself never imports them.
 
-Every run has a process of its own and ``LIMIT`` seconds of wall time, imports and compilation included; a run that is
-stopped, fails or has no peer to run says so in its row. Settings are the peer's own defaults, but for these:
+Every run has a process of its own and ``LIMIT`` seconds of wall time, imports and compilation included (a busy machine
+stops more of them); a run that is stopped, fails or has no peer to run says so in its row, one that warns is marked.
+The whole takes about twenty minutes for each of the ``--repeats``. Settings are the peer's own defaults, but for these:
 
 * emcee and zeus: 100 walkers from the prior, 1000 steps of which the second half counts; no evidence.
 * PyMC ``sample_smc``: one chain of 2000 draws in one process (2000 is its default, and what our chains hold).
@@ -12,15 +13,17 @@ emcee, zeus and pocomc get the likelihood of a whole batch, PyMC and dynesty ask
 evaluation contains as many calls from Python, and PyMC's its compilation.
 
 On Python 3.11 with numpy 2.4 all of them live in one environment. What to know: PyMC holds numba back (pytensor 2.38
-wants < 0.66), so that the times of compiled kernels belong to that older numba; pocomc wants torch even without its
-flow, by default gigabytes with CUDA, and is therefore not in the extra:
-``pip install pocomc torch --extra-index-url https://download.pytorch.org/whl/cpu`` brings the small one.
+wants 0.65.1 at most), so that the times of compiled kernels belong to that older numba; pocomc wants torch even without
+its flow, by default gigabytes with CUDA, and is therefore not in the extra: install the CPU build of torch (see
+https://pytorch.org/get-started) and then ``pip install pocomc``.
 """
 
 import importlib.util
 import logging
 import multiprocessing
+import random
 import time
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -51,10 +54,10 @@ def _prior_stream(seed: int) -> np.random.RandomState:
 
 
 def _emcee(target: Target, seed: int) -> _Outcome:
-    random = np.random.RandomState(seed)
-    start = target.sample_prior(WALKERS, random)
+    stream = np.random.RandomState(seed)
+    start = target.sample_prior(WALKERS, stream)
     sampler = emcee.EnsembleSampler(WALKERS, target.ndim, target, vectorize=True)
-    sampler.random_state = random.get_state()
+    sampler.random_state = stream.get_state()
     sampler.run_mcmc(start, STEPS)
     return _Outcome(sampler.get_chain(flat=True, discard=STEPS // 2))
 
@@ -62,7 +65,8 @@ def _emcee(target: Target, seed: int) -> _Outcome:
 def _zeus(target: Target, seed: int) -> _Outcome:
     import zeus
 
-    np.random.seed(seed)  # noqa: NPY002 - zeus draws from numpy's global stream
+    np.random.seed(seed)  # noqa: NPY002 - zeus draws from the global streams of numpy and of Python
+    random.seed(seed)
     start = target.sample_prior(WALKERS, _prior_stream(seed))
     sampler = zeus.EnsembleSampler(WALKERS, target.ndim, target, vectorize=True, verbose=False)
     sampler.run_mcmc(start, STEPS, progress=False)
@@ -154,7 +158,7 @@ class _Peer(NamedTuple):
     install: str = "pip install '.[peers]'"
 
 
-_POCOMC = "pip install pocomc torch --extra-index-url https://download.pytorch.org/whl/cpu"
+_POCOMC = "pip install torch (its CPU build is small), then pocomc"
 PEERS = {
     "emcee, stretch move": _Peer("emcee", _emcee),
     "zeus": _Peer("zeus", _zeus),
@@ -171,7 +175,9 @@ def _work(peer: str, name: str, seed: int, count, answer) -> None:
     target.count = count
     try:
         start = time.process_time()
-        outcome = PEERS[peer].run(target, seed)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            outcome = PEERS[peer].run(target, seed)
         seconds = time.process_time() - start
         run = {"microseconds": 1e6 * seconds / target.evaluations}
         run |= errors(target, outcome.samples, outcome.weights)
@@ -179,6 +185,7 @@ def _work(peer: str, name: str, seed: int, count, answer) -> None:
             run["evidence"] = outcome.log_evidence - target.log_evidence
         if outcome.log_evidence_error is not None:
             run["error"] = outcome.log_evidence_error
+        run["warned"] = any(issubclass(warning.category, UserWarning) for warning in caught)
     except Exception as error:  # whatever a peer raises belongs into its row
         run = {"reason": f"failed: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}"}
     answer.send(run)
@@ -210,6 +217,5 @@ def rows(repeats: int) -> list[Row]:
             table.append(Row(f"{peer}: evaluations", "", None, "", f"not installed: {install}"))
             continue
         for name in target_names():
-            runs = [_run(peer, name, seed) for seed in range(1, repeats + 1)]
-            table.append(as_row(peer, name, runs))
+            table.append(as_row(peer, name, [_run(peer, name, seed) for seed in range(1, repeats + 1)]))
     return table

@@ -1,4 +1,8 @@
-"""Every mode of the samplers on the targets: evaluations, how wrong the answer is, and whether the run warned."""
+"""Every mode of the samplers on the targets: evaluations, how wrong the answer is, and whether the run warned.
+
+TMCMC by default and SMC by moves only give equal figures: a coefficient of variation of 1 is an effective sample of
+half the walkers, and everything else is common to the two.
+"""
 
 import time
 import warnings
@@ -28,13 +32,15 @@ MODES = {
 }
 
 
-def _run(mode: str, name: str, seed: int) -> dict[str, float]:
-    """One run: its cost and its errors."""
+def _run(mode: str, name: str, seed: int) -> dict:
+    """One run: its cost, its errors, and whether it warned."""
     Sampler, nwalkers, nsteps, settings = MODES[mode]
     target = target_named(name)
     start = time.process_time()
-    sampler = Sampler(nwalkers, target.ndim, target, vectorize=True, seed=seed, **settings)
-    sampler.run_mcmc(None, nsteps)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SamplingWarning)
+        sampler = Sampler(nwalkers, target.ndim, target, vectorize=True, seed=seed, **settings)
+        sampler.run_mcmc(None, nsteps)
     seconds = time.process_time() - start
     return {
         "evaluations": target.evaluations,
@@ -42,17 +48,14 @@ def _run(mode: str, name: str, seed: int) -> dict[str, float]:
         **errors(target, sampler.get_chain(flat=True)),
         "evidence": sampler.log_evidence - target.log_evidence,
         "error": sampler.log_evidence_error,
+        "warned": any(issubclass(warning.category, SamplingWarning) for warning in caught),
     }
 
 
 def rows(repeats: int) -> list[Row]:
     """One row for every mode and target: evaluations (mean over `repeats` seeds), the errors in the note."""
-    table = []
-    for mode in MODES:
-        for name in target_names():
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", SamplingWarning)
-                runs = [_run(mode, name, seed) for seed in range(1, repeats + 1)]
-            warned = any(issubclass(warning.category, SamplingWarning) for warning in caught)
-            table.append(as_row(mode, name, runs, "warned" if warned else ""))
-    return table
+    return [
+        as_row(mode, name, [_run(mode, name, seed) for seed in range(1, repeats + 1)])
+        for mode in MODES
+        for name in target_names()
+    ]

@@ -95,11 +95,12 @@ def errors(target: Target, samples: np.ndarray, weights: np.ndarray | None = Non
     return found
 
 
-def as_row(what: str, case: str, runs: list[dict], remark: str = "") -> Row:
+def as_row(what: str, case: str, runs: list[dict]) -> Row:
     """One row of several runs: mean evaluations, the errors of those runs that gave an answer in the note.
 
-    Every run has ``evaluations``. One that gave an answer has ``microseconds`` of CPU per evaluation, the `errors` and
-    perhaps ``evidence`` and ``error`` (of log Z: how wrong, and what the sampler says); one that did not, a ``reason``.
+    Every run has ``evaluations``. One that gave an answer has ``microseconds`` of CPU per evaluation, the `errors`,
+    whether it ``warned``, and perhaps ``evidence`` and ``error`` (of log Z: how wrong, and what the sampler says); one
+    that did not, a ``reason``.
     """
     note = []
     answers = [run for run in runs if "reason" not in run]
@@ -117,7 +118,7 @@ def as_row(what: str, case: str, runs: list[dict], remark: str = "") -> Row:
         note.append(f"{column['microseconds'].mean():.1f} us CPU")
     for reason in dict.fromkeys(run["reason"] for run in runs if "reason" in run):
         note.append(f"{sum(run.get('reason') == reason for run in runs)} of {len(runs)} {reason}")
-    if remark:
-        note.append(remark)
+    if answers and column["warned"].any():
+        note.append("warned")
     evaluations = np.mean([run["evaluations"] for run in runs])
     return Row(f"{what}: evaluations", case, evaluations, "", "; ".join(note))
