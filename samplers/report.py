@@ -1,21 +1,18 @@
-"""From a finished run to what one reads: arviz data, a table and a figure of the ladder, a pair plot, a summary.
+"""From a finished run to what one reads: a summary, arviz data, the ladder as a table, samplers side by side.
 
-Samples come in as arrays (n, ndim), ladders from the sampler. matplotlib and arviz are imported where they are used.
+Samples come in as arrays (n, ndim), ladders from the sampler. arviz is imported where it is used. Figures are drawn in
+`samplers.figures`.
 """
 
 import json
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import gaussian_kde
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from .ladder import Stage
 
-__all__ = ["Summary", "ladder_plot", "ladder_table", "pair_plot", "summary", "to_arviz"]
-
-BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
+__all__ = ["Comparison", "Summary", "comparison_table", "finished_ladder", "ladder_table", "summary", "to_arviz"]
 
 
 class Summary(NamedTuple):
@@ -26,18 +23,21 @@ class Summary(NamedTuple):
     names : tuple of str
     mean, sd : (ndim,) float — in the parameters' units.
     cv : (ndim,) float — sd / |mean| [-]; inf where the mean is zero and the sd is not.
+    mean_error : (ndim,) float, or None — Monte-Carlo standard error of `mean`, in the parameters' units.
     """
 
     names: tuple[str, ...]
     mean: np.ndarray
     sd: np.ndarray
     cv: np.ndarray
+    mean_error: np.ndarray | None = None
 
     def __str__(self) -> str:
         width = max(len("parameter"), *(len(name) for name in self.names))
-        rows = [f"{'parameter':<{width}} {'mean':>12} {'sd':>12} {'CV':>10}"]
-        for name, mean, sd, cv in zip(*self, strict=True):
-            rows.append(f"{name:<{width}} {mean:>12.5g} {sd:>12.4g} {cv:>10.3g}")
+        errors = ["-"] * len(self.names) if self.mean_error is None else [f"{error:.2g}" for error in self.mean_error]
+        rows = [f"{'parameter':<{width}} {'mean':>12} {'MC error':>10} {'sd':>12} {'CV':>10}"]
+        for name, mean, error, sd, cv in zip(self.names, self.mean, errors, self.sd, self.cv, strict=True):
+            rows.append(f"{name:<{width}} {mean:>12.5g} {error:>10} {sd:>12.4g} {cv:>10.3g}")
         return "\n".join(rows)
 
 
@@ -57,16 +57,29 @@ def _samples(samples: np.ndarray) -> np.ndarray:
     return samples
 
 
-def summary(samples: np.ndarray, names: Sequence[str] | None = None, weights: np.ndarray | None = None) -> Summary:
-    """Posterior mean, standard deviation and coefficient of variation.
+def summary(
+    samples: np.ndarray,
+    names: Sequence[str] | None = None,
+    weights: np.ndarray | None = None,
+    mean_error: np.ndarray | None = None,
+) -> Summary:
+    """Posterior mean, its Monte-Carlo error, standard deviation and coefficient of variation.
 
     Parameters
     ----------
     samples : (n, ndim) float
     names : one name a parameter.
     weights : (n,) float, optional — non-negative, need not sum to one.
+    mean_error : (ndim,) float, optional — ``sampler.mean_error()`` of the chain that the samples are; samples alone do
+        not tell which of them are copies.
     """
     samples = _samples(samples)
+    if mean_error is not None:
+        mean_error = np.asarray(mean_error, dtype=float)
+        if mean_error.shape != samples.shape[1:] or not np.all(mean_error >= 0.0):
+            raise ValueError(
+                f"mean_error must be {samples.shape[1]} non-negative numbers, as sampler.mean_error() gives"
+            )
     if weights is None:
         weights = np.full(len(samples), 1.0)
     weights = np.asarray(weights, dtype=float)
@@ -76,7 +89,7 @@ def summary(samples: np.ndarray, names: Sequence[str] | None = None, weights: np
     mean = weights @ samples
     sd = np.sqrt(weights @ (samples - mean) ** 2)
     cv = np.divide(sd, np.abs(mean), out=np.where(sd > 0.0, np.inf, 0.0), where=mean != 0.0)
-    return Summary(_names(names, samples.shape[1]), mean, sd, cv)
+    return Summary(_names(names, samples.shape[1]), mean, sd, cv, mean_error)
 
 
 def to_arviz(sampler: Any, parameter_names: Sequence[str] | None = None) -> Any:
@@ -125,7 +138,8 @@ def to_arviz(sampler: Any, parameter_names: Sequence[str] | None = None) -> Any:
     return data
 
 
-def _climbed(sampler: Any) -> tuple:
+def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
+    """The ladder of a sampler; an error where there is none yet."""
     if not sampler.ladder:
         raise ValueError("the sampler has no ladder yet: call run_mcmc first")
     return sampler.ladder
@@ -135,7 +149,7 @@ def ladder_table(sampler: Any) -> str:
     """The ladder as text: one line a stage, the evidence, and the two estimates it was chosen from."""
     head = f"{'stage':>5} {'beta':>10} {'ESS':>7} {'accept':>7} {'moves':>6} {'distinct':>9} {'dlogZ':>10} "
     rows = [head + f"{'evaluations':>12} {'seconds':>9}"]
-    for number, s in enumerate(_climbed(sampler), start=1):
+    for number, s in enumerate(finished_ladder(sampler), start=1):
         rows.append(
             f"{number:>5} {s.beta:>10.3e} {s.effective_sample_size:>7.0f} {s.acceptance:>7.3f} {s.moves:>6} "
             f"{s.distinct_ancestors:>9} {s.log_evidence_increment:>10.3f} {s.evaluations:>12} {s.seconds:>9.3g}"
@@ -155,141 +169,91 @@ def ladder_table(sampler: Any) -> str:
     return "\n".join(rows)
 
 
-def ladder_plot(sampler: Any) -> "Figure":
-    """Figure of the climb: beta, effective sample size and distinct points, acceptance and moves against the stage."""
-    import matplotlib.pyplot as plt
-    from matplotlib.ticker import MaxNLocator
+class Comparison(NamedTuple):
+    """Samplers side by side, one entry a sampler; None where a figure is not known.
 
-    stages = _climbed(sampler)
-    number = np.arange(1, len(stages) + 1)
-    column = {name: np.array([getattr(s, name) for s in stages]) for name in stages[0]._fields}
-    figure, (top, middle, bottom) = plt.subplots(3, 1, sharex=True, figsize=(7.0, 7.0), layout="constrained")
+    Attributes
+    ----------
+    names : tuple of str
+    evaluations : tuple of int — points handed to ``log_prob_fn``.
+    seconds : tuple of float — wall time [s].
+    effective_sample_size : tuple of float — independent draws that the mean of the worst parameter is worth.
+    log_evidence, log_evidence_error : tuple of float
+    """
 
-    top.semilogy(number, column["beta"], "o-", color=BLUE, markersize=4)
-    top.set_ylabel(r"$\beta$ [-]")
-    if stages[-1].beta == 1.0:
-        top.set_title(
-            f"{len(stages)} stages, {column['evaluations'].sum()} evaluations, "
-            rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2f}",
-            fontsize="medium",
-        )
-    middle.plot(number, column["effective_sample_size"], "o-", color=BLUE, markersize=4, label="effective sample size")
-    middle.plot(number, column["distinct_ancestors"], "s--", color=ORANGE, markersize=4, label="distinct survivors")
-    middle.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
-    middle.set_ylim(0, 1.08 * sampler.nwalkers)
-    middle.set_ylabel("points")
-    middle.legend(frameon=False, fontsize="small", ncols=3, loc="lower left")
-    bottom.bar(number, column["moves"], color=GREY, alpha=0.35, width=0.7)
-    bottom.set_ylabel("sweeps a stage (bars)")
-    bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
-    share = bottom.twinx()
-    share.plot(number, column["acceptance"], "o-", color=BLUE, markersize=4)
-    share.set_ylim(0, 1)
-    share.set_ylabel("acceptance [-]", color=BLUE)
-    bottom.set_xlabel("stage")
-    bottom.set_xlim(0.3, len(stages) + 0.7)
-    bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
-    for axes in (top, middle):
-        axes.grid(alpha=0.25)
-    return figure
+    names: tuple[str, ...]
+    evaluations: tuple[int, ...]
+    seconds: tuple[float | None, ...]
+    effective_sample_size: tuple[float, ...]
+    log_evidence: tuple[float | None, ...]
+    log_evidence_error: tuple[float | None, ...]
+
+    @property
+    def efficiency(self) -> tuple[float, ...]:
+        """Effective sample size per evaluation."""
+        return tuple(ess / n for ess, n in zip(self.effective_sample_size, self.evaluations, strict=True))
+
+    def __str__(self) -> str:
+        width = max(len("sampler"), *(len(name) for name in self.names))
+        head = f"{'sampler':<{width}} {'evaluations':>12} {'seconds':>9} {'ESS':>8} {'ESS/evaluation':>15} "
+        rows = [head + f"{'log evidence':>20}"]
+        for name, n, seconds, ess, value, error in zip(*self, strict=True):
+            time = "-" if seconds is None else f"{seconds:.3g}"
+            evidence = "-" if value is None else f"{value:.3f} +- {error:.3f}"
+            rows.append(f"{name:<{width}} {n:>12} {time:>9} {ess:>8.0f} {ess / n:>15.2e} {evidence:>20}")
+        return "\n".join(rows)
 
 
-def _kde(values: np.ndarray) -> gaussian_kde | None:
-    """Kernel density of (n,) or (k, n) values; None where they have no spread."""
-    try:
-        return gaussian_kde(values)
-    except np.linalg.LinAlgError:
-        return None
+def comparison_table(
+    samplers: Mapping[str, Any], seconds: Mapping[str, float] | None = None, discard: int = 0
+) -> Comparison:
+    """What several samplers cost on one posterior, and what they gave for it.
 
-
-def pair_plot(
-    samples: np.ndarray,
-    labels: Sequence[str] | None = None,
-    truth: Sequence[float] | None = None,
-    max_points: int = 2000,
-    grid: int = 60,
-) -> "Figure":
-    """Pair plot in the manner of Ramancha et al. (2022), Fig. 4.
-
-    Diagonal: histogram and kernel density, the coefficient of variation on top. Above it the samples, below it
-    contours of the kernel density with Pearson's r.
+    The effective sample size is that of the parameter for which it is smallest: (sd / Monte-Carlo error)^2 for our
+    samplers, and for a chain of emcee's own sampler its length over its autocorrelation time, which a short chain
+    underestimates. It says nothing about modes that were never found.
 
     Parameters
     ----------
-    samples : (n, ndim) float
-    labels : one a parameter, with its unit.
-    truth : (ndim,) float, optional — marked by lines, where the truth is known.
-    max_points : int — at most so many samples are drawn, and used for the two-dimensional densities.
-    grid : int — points a side of the density grids.
+    samplers : samplers that have run in this process, by name; `emcee.EnsembleSampler` too, whose evaluations are
+        counted as iterations times walkers (a chain not thinned, moves that propose once a walker).
+    seconds : wall times [s] of samplers that do not measure their own, by name.
+    discard : int — first iterations left out of the chains of emcee's own sampler: its burn-in.
+
+    Raises
+    ------
+    ValueError
+        If a sampler has not run here, or a time is given for a name that is not there.
     """
-    import matplotlib.pyplot as plt
-    from matplotlib.ticker import MaxNLocator
-
-    samples = _samples(samples)
-    moments = summary(samples, labels)
-    ndim = samples.shape[1]
-    shown = samples[np.linspace(0, len(samples) - 1, min(max_points, len(samples))).astype(int)]
-    low, high = np.quantile(samples, [0.002, 0.998], axis=0)
-    margin = np.where(high > low, 0.12 * (high - low), np.maximum(0.05 * np.abs(low), 1e-12))
-    low, high = low - margin, high + margin
-    size = max(4.0, 1.5 * ndim + 0.8)
-    figure, axes = plt.subplots(ndim, ndim, figsize=(size, size), squeeze=False, layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
-
-    for i in range(ndim):
-        for j in range(ndim):
-            ax = axes[i, j]
-            x, y = samples[:, j], samples[:, i]
-            ax.set_xlim(low[j], high[j])
-            if i == j:
-                ax.hist(x, bins=40, range=(low[j], high[j]), density=True, color=BLUE, alpha=0.3)
-                density = _kde(x)
-                if density is not None:
-                    t = np.linspace(low[j], high[j], 200)
-                    ax.plot(t, density(t), color=BLUE, linewidth=1.4)
-                ax.set_title(f"CV = {moments.cv[j]:.2e}", fontsize="small", pad=3)
-                ax.set_yticks([])
-            else:
-                ax.set_ylim(low[i], high[i])
-            if i < j:
-                ax.plot(shown[:, j], shown[:, i], ".", color=BLUE, markersize=2, alpha=0.35, markeredgewidth=0)
-            elif i > j:
-                _density_contours(ax, shown[:, j], shown[:, i], (low[j], high[j]), (low[i], high[i]), grid)
-                if np.ptp(x) > 0.0 and np.ptp(y) > 0.0:
-                    r = np.corrcoef(x, y)[0, 1]
-                    ax.text(0.05, 0.95, f"r = {r:.2f}", transform=ax.transAxes, va="top", fontsize="small")
-            if truth is not None:
-                ax.axvline(truth[j], color=ORANGE, linewidth=1)
-                if i != j:
-                    ax.axhline(truth[i], color=ORANGE, linewidth=1)
-            _dress(ax, MaxNLocator, bottom=i == ndim - 1, left=j == 0 and i > 0)
-            if i == ndim - 1:
-                ax.set_xlabel(moments.names[j])
-            if j == 0:
-                ax.set_ylabel(moments.names[i])
-    figure.align_ylabels(axes[:, 0])
-    return figure
-
-
-def _density_contours(ax, x, y, xlim, ylim, grid):
-    """Contours that hold 20, 40, 60, 80 and 95 % of the samples."""
-    density = _kde(np.stack([x, y])) if np.ptp(x) > 0.0 and np.ptp(y) > 0.0 else None
-    if density is None:
-        return
-    u, v = np.meshgrid(np.linspace(*xlim, grid), np.linspace(*ylim, grid))
-    height = density(np.stack([u.ravel(), v.ravel()])).reshape(u.shape)
-    levels = np.unique(np.quantile(density(np.stack([x, y])), [0.05, 0.2, 0.4, 0.6, 0.8]))
-    shades = [BLUE + f"{alpha:02x}" for alpha in np.linspace(40, 230, len(levels)).astype(int)]
-    ax.contourf(u, v, height, [*levels, 2.0 * max(height.max(), levels[-1])], colors=shades)
-    ax.contour(u, v, height, levels, colors=BLUE, linewidths=0.5)
-
-
-def _dress(ax, locator, bottom, left):
-    """Few ticks, labelled at the outer edges only."""
-    ax.xaxis.set_major_locator(locator(3, prune="both"))
-    if ax.get_yticks().size:
-        ax.yaxis.set_major_locator(locator(3, prune="both"))
-    ax.tick_params(labelsize="x-small", labelbottom=bottom, labelleft=left, length=2.5)
-    ax.tick_params(axis="x", labelrotation=35)
-    ax.xaxis.get_offset_text().set_fontsize("x-small")
-    ax.yaxis.get_offset_text().set_fontsize("x-small")
+    given = {} if seconds is None else dict(seconds)
+    if not samplers:
+        raise ValueError("no samplers to compare: give them by name")
+    if unknown := set(given) - set(samplers):
+        raise ValueError(f"seconds are given for {sorted(unknown)}, the samplers are {list(samplers)}")
+    columns = []
+    for name, sampler in samplers.items():
+        tempered = hasattr(sampler, "mean_error")
+        evaluations = sampler.evaluations if tempered else sampler.iteration * sampler.nwalkers
+        if evaluations == 0 or sampler.iteration == 0:
+            raise ValueError(
+                f"sampler {name!r} has made no chain here: run it first (what a chain on file has cost is not kept)"
+            )
+        if tempered:
+            spread, error = sampler.get_chain(flat=True).std(axis=0), sampler.mean_error()
+            ess = float(np.min((spread / error)[error > 0.0] ** 2, initial=np.inf))
+        else:
+            chain = sampler.get_chain(discard=discard)
+            time = sampler.get_autocorr_time(discard=discard, tol=0)
+            ess = chain.shape[0] * chain.shape[1] / float(np.max(time))
+        known = getattr(sampler, "seconds", None)
+        columns.append(
+            (
+                name,
+                evaluations,
+                given.get(name, known),
+                ess if np.isfinite(ess) else 0.0,
+                sampler.log_evidence if tempered else None,
+                sampler.log_evidence_error if tempered else None,
+            )
+        )
+    return Comparison(*zip(*columns, strict=True))

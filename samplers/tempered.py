@@ -29,6 +29,7 @@ from .alarms import check_evidence, check_ladder, sound
 from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
 from .edges import find_edges
 from .evaluation import Failures, Guarded, Memo, Records, log_probabilities, outcomes
+from .families import follow, standard_error_of_mean
 from .free_sweeps import with_free_sweeps
 from .importance import EvidenceCheck, draw_inside, evidence_from_weights
 from .journal import Contents, Evaluated, Start
@@ -77,6 +78,10 @@ class TemperedSampler(EnsembleSampler):
         Seed of the run. By default one drawn from NumPy's global generator, so that ``np.random.seed`` governs and two
         samplers never share a stream. A backend with a chain brings its own random state, which goes before.
     settings : Settings
+
+    Attributes
+    ----------
+    seconds : float — wall time spent by this object in finished climbs and sweeps [s].
 
     Raises
     ------
@@ -131,6 +136,8 @@ class TemperedSampler(EnsembleSampler):
         self._records = Records()
         self._ladder: list[Stage] = []
         self._check: EvidenceCheck | None = None
+        self._generations: list[np.ndarray] = []
+        self.seconds = 0.0
         self._previous_state = None
         self._summit = None
         super().__init__(
@@ -206,6 +213,17 @@ class TemperedSampler(EnsembleSampler):
         """The evidence by importance sampling after the climb; None without (``check_draws=0``)."""
         self._finished_ladder()
         return self._check
+
+    def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
+        """Monte-Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
+
+        Copies made by the latest resamplings and the correlation along the chain are taken into account (see
+        `samplers.families`). A chain that goes on in a re-opened file has lost the record of its resampling: each
+        walker then counts as independent of the others. Of moves that tie walkers together, such as emcee's stretch
+        move, the ties are not seen.
+        """
+        families = self._generations[0] if self._generations else np.arange(self.nwalkers)
+        return standard_error_of_mean(self.get_chain(discard=discard, thin=thin), families)
 
     def _evidence(self) -> tuple[float, float]:
         value, error = self.log_evidence_ladder, self._ladder[-1].log_evidence_error
@@ -294,7 +312,7 @@ class TemperedSampler(EnsembleSampler):
         if state.log_prob is None and last is not None and np.array_equal(state.coords, last.coords):
             state.log_prob, state.blobs = copy.deepcopy((last.log_prob, last.blobs))
 
-        failure_count, ended, made = self.failure_count, False, 0
+        failure_count, ended, made, start = self.failure_count, False, 0, time.perf_counter()
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
         try:
             if self._contents is not None:
@@ -307,7 +325,9 @@ class TemperedSampler(EnsembleSampler):
             self._summit = state
             if isinstance(self.backend, JournaledBackend) and store and not made:
                 self.backend.call(iterations)
-            yield from super().sample(
+            self.seconds += time.perf_counter() - start
+            start = time.perf_counter()
+            for advanced in super().sample(
                 state,
                 iterations=iterations,
                 tune=tune,
@@ -316,7 +336,10 @@ class TemperedSampler(EnsembleSampler):
                 thin=thin,
                 store=store,
                 **bar,
-            )
+            ):
+                self.seconds += time.perf_counter() - start
+                yield advanced
+                start = time.perf_counter()
             ended = True
         except GeneratorExit:  # whoever takes the states wants no more
             ended = True
@@ -499,7 +522,7 @@ class TemperedSampler(EnsembleSampler):
     def _climb(self, state: State, skip_check: bool, bar: dict) -> State:
         """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
         self._mark = time.perf_counter(), self.evaluations
-        self._check = None
+        self._check, self._generations = None, []
         packed = self._enter(state, skip_check)
         labels = {"desc": "ladder", "unit": " sweeps", **(bar["progress_kwargs"] or {})}
         with get_progress_bar(bar["progress"], None, **labels) as bar:
@@ -542,6 +565,7 @@ class TemperedSampler(EnsembleSampler):
 
             ancestors = self.settings.resample(weights, self._random)
             error.resample(ancestors)
+            self._generations = follow(self._generations, ancestors)
             coords, packed = coords[ancestors], packed[ancestors]
             distinct = len(np.unique(coords, axis=0))
             ess = effective_sample_size(log_weights)
@@ -589,6 +613,7 @@ class TemperedSampler(EnsembleSampler):
             np.cumsum(weights), (np.arange(self.nwalkers) + self._random.uniform()) / self.nwalkers, side="right"
         )
         ancestors = np.minimum(ancestors, len(weights) - 1)
+        self._generations = [ancestors]
         ess = effective_sample_size(found.log_weights)
         coords, packed, acceptance, moves = self._mutate(
             found.coords[ancestors], found.records[ancestors], ancestors, 1.0, bar, ess

@@ -36,7 +36,8 @@ from fe_likelihoods import problems, records
 from fe_likelihoods.models.rc_column import PARAMETERS
 from fe_likelihoods.units import from_si
 from samplers import RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler
-from samplers.report import ladder_plot, ladder_table, pair_plot, summary, to_arviz
+from samplers.figures import ladder_plot, pair_plot
+from samplers.report import ladder_table, summary, to_arviz
 
 # walkers, one sample kept in `every`, sweeps at beta = 1, settings of the sampler
 PRESETS = {

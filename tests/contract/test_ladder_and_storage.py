@@ -18,7 +18,8 @@ from samplers import (
     TMCMCSampler,
     read_ladder,
 )
-from samplers.report import ladder_plot, ladder_table, pair_plot, summary, to_arviz
+from samplers.figures import ladder_plot, pair_plot
+from samplers.report import comparison_table, ladder_table, summary, to_arviz
 from samplers.resampling import stratified
 from tests.contract.targets import Box, Gaussian
 
@@ -524,6 +525,48 @@ def test_summary_with_weights():
     for weights in ([1, 1], [0, 0, 0], [1, -1, 1]):
         with pytest.raises(ValueError, match="weights"):
             summary(values, weights=weights)
+
+
+def test_summary_with_the_error_of_the_mean():
+    sampler = climbed()
+    result = summary(sampler.get_chain(flat=True), mean_error=sampler.mean_error())
+    assert np.array_equal(result.mean_error, sampler.mean_error())
+    rows = str(result).splitlines()
+    assert "MC error" in rows[0] and f"{result.mean_error[2]:.2g}" in rows[3].split()
+    with pytest.raises(ValueError, match="mean_error must be 3"):
+        summary(sampler.get_chain(flat=True), mean_error=[0.1, 0.1])
+
+
+def test_samplers_side_by_side():
+    posterior = Gaussian()
+    tmcmc = TMCMCSampler(N, 3, posterior, vectorize=True, seed=1)
+    tmcmc.run_mcmc(None, 4)
+    plain = emcee.EnsembleSampler(N, 3, posterior, vectorize=True)
+    plain.random_state = np.random.RandomState(1).get_state()
+    plain.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 600)
+    samplers = {"SMC": climbed(), "TMCMC": tmcmc, "emcee": plain}
+    table = comparison_table(samplers, seconds={"emcee": 12.5}, discard=100)
+    assert table.names == tuple(samplers)
+    assert table.evaluations == (samplers["SMC"].evaluations, tmcmc.evaluations, 600 * N)
+    assert 0 < table.seconds[0] == samplers["SMC"].seconds and table.seconds[2] == 12.5
+    assert sum(s.seconds for s in tmcmc.ladder) < tmcmc.seconds < 60
+    worst = (tmcmc.get_chain(flat=True).std(axis=0) / tmcmc.mean_error()).min() ** 2
+    assert table.effective_sample_size[1] == pytest.approx(worst)
+    assert N / 3 < worst < 8 * N
+    # the autocorrelation time of the stretch move in three dimensions is some 30 to 50 sweeps
+    assert 500 * N / 80 < table.effective_sample_size[2] < 500 * N / 15
+    assert table.log_evidence == (samplers["SMC"].log_evidence, tmcmc.log_evidence, None)
+    assert table.efficiency[0] == table.effective_sample_size[0] / table.evaluations[0]
+    rows = str(table).splitlines()
+    assert len(rows) == 4 and len({len(row) for row in rows}) == 1
+    assert rows[3].split()[0] == "emcee" and rows[3].split()[-1] == "-"
+    assert str(comparison_table({"emcee": plain})).splitlines()[1].split()[2] == "-"
+    with pytest.raises(ValueError, match="seconds are given"):
+        comparison_table(samplers, seconds={"dynesty": 1.0})
+    again = SMCSampler(N, 3, posterior, backend=tmcmc.backend)
+    for nothing in (again, SMCSampler(N, 3, posterior)):
+        with pytest.raises(ValueError, match="has made no chain here"):
+            comparison_table({"nothing": nothing})
 
 
 def test_tempered_sampler_works_alone():

@@ -1,0 +1,123 @@
+"""The Monte-Carlo error of posterior means from one run: against independent draws, and against the truth over runs."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers import SMCSampler
+from samplers.families import follow, standard_error_of_mean
+from samplers.moves import RandomWalkMove
+from samplers.resampling import multinomial
+from tests.contract.targets import Box, Gaussian
+from tests.statistics.test_posteriors import MODES, runs
+
+
+class TwoModes(Box):
+    """Weights 1:2, ten standard deviations apart."""
+
+    centres, width, weights = np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.5]]), 0.1, np.array([1.0, 2.0]) / 3
+
+    def __init__(self):
+        super().__init__([0, 0, 0], [3, 3, 3], self._log_likelihood)
+        self.mean = self.weights @ self.centres
+
+    def _log_likelihood(self, x):
+        parts = [
+            np.log(weight) + np.sum(stats.norm.logpdf(x, centre, self.width), axis=-1)
+            for weight, centre in zip(self.weights, self.centres, strict=True)
+        ]
+        return np.logaddexp(*parts)
+
+
+def test_walkers_of_their_own_are_independent_draws(rng):
+    chain = 3e10 * rng.standard_normal((1, 400, 2))
+    expected = chain[0].std(axis=0, ddof=1) / np.sqrt(400)
+    assert np.allclose(standard_error_of_mean(chain, np.arange(400)), expected, rtol=1e-12)
+    constant = np.repeat(chain, 7, axis=0)  # sweeps that change nothing add nothing
+    assert np.allclose(standard_error_of_mean(constant, rng.permutation(400)), expected, rtol=1e-12)
+
+
+def test_copies_count_once(rng):
+    chain = rng.standard_normal((1, 400, 2))
+    expected = standard_error_of_mean(chain, np.arange(400))
+    copies, families = np.repeat(chain, 5, axis=1), np.repeat(np.arange(400), 5)
+    assert np.allclose(standard_error_of_mean(copies, families), expected, rtol=1e-12)
+    assert np.all(standard_error_of_mean(copies, np.arange(2000)) < expected / 2)
+
+
+def test_resampled_weights_give_the_error_of_importance_sampling(rng):
+    n, estimates, errors = 300, [], []
+    for _ in range(300):
+        x = rng.standard_normal(n)
+        weights = np.exp(1.5 * x)
+        ancestors = multinomial(weights / weights.sum(), rng)
+        estimates.append(x[ancestors].mean())
+        errors.append(standard_error_of_mean(x[ancestors][None, :, None], ancestors)[0])
+    # the error of one run is uneven here (few points carry the weight); its square is right on average
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(estimates), rel=0.2)
+
+
+def test_founders_are_followed_while_there_are_enough(rng):
+    n, generations, lineage = 200, [], np.arange(200)
+    for _ in range(4):
+        ancestors = multinomial(np.full(n, 1 / n), rng)
+        generations = follow(generations, ancestors, quorum=0.1)
+        lineage = lineage[ancestors]
+    assert len(generations) == 4
+    assert np.array_equal(generations[0], lineage) and np.array_equal(generations[-1], ancestors)
+    few = follow(generations, np.repeat([3, 7], n // 2), quorum=0.1)
+    assert len(few) == 1 and set(few[0]) == {3, 7}
+
+
+def test_what_does_not_fit_is_refused():
+    assert np.all(standard_error_of_mean(np.zeros((2, 5, 3)), np.zeros(5)) == np.inf)
+    for chain, families in ((np.zeros((5, 3)), np.arange(5)), (np.zeros((2, 5, 3)), np.arange(4))):
+        with pytest.raises(ValueError, match="the family of each walker"):
+            standard_error_of_mean(chain, families)
+
+
+def scores(posterior, samplers, stated):
+    """Per parameter: how many of the runs two stated errors cover, and the rms of (error / stated)."""
+    error = np.array([s.get_chain(flat=True).mean(axis=0) - posterior.mean for s in samplers])
+    return np.sum(np.abs(error) < 2 * stated, axis=0), np.sqrt(np.mean((error / stated) ** 2, axis=0))
+
+
+@pytest.mark.parametrize(
+    "mode, target",
+    [
+        *((mode, Gaussian) for mode in ("default", "moves", "literal", "tmcmc")),
+        ("default", TwoModes),
+        ("moves", TwoModes),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_mean_error_covers(mode, target, seed):
+    """Two standard errors cover the truth in nearly 95 % of 40 cheap runs, and are not idly wide."""
+    posterior = target()
+    samplers = runs(posterior, seed, count=40, nwalkers=100, nsteps=2, **MODES[mode])
+    covered, ratio = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
+    assert np.all(covered >= stats.binom(40, 0.93).ppf(1e-3))
+    assert np.all((0.6 < ratio) & (ratio < 1.6))
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_walkers_taken_for_independent_state_too_small_an_error(seed):
+    """Negative control: moves too short to tell copies apart. The families say so, the walkers alone do not."""
+    posterior = Gaussian(2, sd=0.1)
+    samplers = runs(
+        posterior, seed, count=40, nwalkers=400, nsteps=1, moves=RandomWalkMove(scale=0.3), min_moves=1, max_moves=1
+    )
+    alone = [standard_error_of_mean(s.get_chain(), np.arange(s.nwalkers)) for s in samplers]
+    families = [s.mean_error() for s in samplers]
+    assert np.max(scores(posterior, samplers, np.array(alone))[1]) > 1.6
+    assert np.all(scores(posterior, samplers, np.array(families))[1] < 1.6)
+
+
+def test_a_chain_that_goes_on_elsewhere_has_no_families():
+    posterior = Gaussian()
+    sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=1, recycle=False)
+    sampler.run_mcmc(None, 3)
+    again = SMCSampler(60, 3, posterior, vectorize=True, backend=sampler.backend)
+    assert np.array_equal(again.mean_error(), standard_error_of_mean(sampler.get_chain(), np.arange(60)))
+    assert not np.array_equal(again.mean_error(), sampler.mean_error())
+    assert sampler.mean_error(discard=1).shape == (3,)
