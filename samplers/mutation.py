@@ -1,6 +1,7 @@
 """Moving at a fixed beta: the tempered density, when a population has moved enough, and chains grown from leaders."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from emcee import State
@@ -11,9 +12,25 @@ from .settings import Settings
 
 __all__ = ["Memory", "Moved", "grow_chains", "move_together", "tempered_log_prob"]
 
-Moved = tuple[np.ndarray, np.ndarray, float, int]
-
 STALL_SWEEPS = 3
+
+
+class Moved(NamedTuple):
+    """A population after its moves at one beta.
+
+    Attributes
+    ----------
+    coords, records : (n, ndim) and (n,) — the population.
+    acceptance : float — mean over the sweeps.
+    moves : int — number of sweeps.
+    memory : float — largest correlation with the start that is left (see `Memory`).
+    """
+
+    coords: np.ndarray
+    records: np.ndarray
+    acceptance: float
+    moves: int
+    memory: float
 
 
 def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
@@ -81,10 +98,6 @@ def move_together(
     pick : returns the move of the next sweep.
     settings : Settings
     show : called with the acceptance of each sweep.
-
-    Returns
-    -------
-    coords, records, acceptance (mean over the sweeps), number of sweeps.
     """
     memory = Memory(coords, records)
     state = State(coords, log_prob=tempered_log_prob(records, beta), blobs=records)
@@ -96,7 +109,7 @@ def move_together(
         memory.update(state.coords, state.blobs)
         acceptance.append(float(np.mean(accepted)))
         show(acceptance[-1])
-    return state.coords, state.blobs, float(np.mean(acceptance)), len(acceptance)
+    return Moved(state.coords, state.blobs, float(np.mean(acceptance)), len(acceptance), memory.correlations[-1])
 
 
 def grow_chains(
@@ -123,6 +136,7 @@ def grow_chains(
     place = np.argsort(owner, kind="stable")
     start = np.concatenate([[0], np.cumsum(counts)[:-1]])
     chains = State(coords[first], log_prob=tempered_log_prob(records[first], beta), blobs=records[first])
+    memory = Memory(coords, records)
     coords, records = coords.copy(), records.copy()
     accepted_steps, steps = 0, 0
     for age in range(-settings.burn_in, int(counts.max())):
@@ -138,4 +152,5 @@ def grow_chains(
             coords[rows], records[rows] = state.coords, state.blobs
         accepted_steps, steps = accepted_steps + int(np.sum(accepted)), steps + len(growing)
         show(float(np.mean(accepted)))
-    return coords, records, accepted_steps / steps, settings.burn_in + 1
+    memory.update(coords, records)
+    return Moved(coords, records, accepted_steps / steps, settings.burn_in + 1, memory.correlations[-1])

@@ -25,7 +25,7 @@ from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
 from emcee.model import Model
 from emcee.pbar import get_progress_bar
 
-from .alarms import check_evidence, check_ladder, sound
+from .alarms import check_climb, check_evidence, check_ladder, sound
 from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
 from .edges import find_edges
 from .evaluation import Failures, Guarded, Memo, Records, log_probabilities, outcomes
@@ -569,7 +569,7 @@ class TemperedSampler(EnsembleSampler):
             coords, packed = coords[ancestors], packed[ancestors]
             distinct = len(np.unique(coords, axis=0))
             ess = effective_sample_size(log_weights)
-            coords, packed, acceptance, moves = self._mutate(coords, packed, ancestors, beta, bar, ess)
+            coords, packed, acceptance, moves, memory = self._mutate(coords, packed, ancestors, beta, bar, ess)
             self._add_stage(
                 beta=beta,
                 effective_sample_size=ess,
@@ -580,6 +580,7 @@ class TemperedSampler(EnsembleSampler):
                 log_evidence_error=standard_error,
             )
             check_ladder(self._ladder, self.nwalkers, self.ndim)
+        check_climb(self._ladder, self.nwalkers, self.ndim, memory)
         return coords, packed
 
     def _climb_by_recycling(
@@ -615,7 +616,7 @@ class TemperedSampler(EnsembleSampler):
         ancestors = np.minimum(ancestors, len(weights) - 1)
         self._generations = [ancestors]
         ess = effective_sample_size(found.log_weights)
-        coords, packed, acceptance, moves = self._mutate(
+        coords, packed, acceptance, moves, _ = self._mutate(
             found.coords[ancestors], found.records[ancestors], ancestors, 1.0, bar, ess
         )
         self._add_stage(
@@ -672,7 +673,7 @@ class TemperedSampler(EnsembleSampler):
     def _mutate(
         self, coords: np.ndarray, packed: np.ndarray, ancestors: np.ndarray, beta: float, bar: Any, ess: float
     ) -> Moved:
-        """Move resampled points at beta: coordinates, records, acceptance and number of sweeps."""
+        """Move resampled points at beta."""
 
         def compute(points):
             records = self._evaluate(points)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import emcee
@@ -19,6 +20,7 @@ from samplers import (
     read_ladder,
 )
 from samplers.figures import ladder_plot, pair_plot
+from samplers.moves import RandomWalkMove
 from samplers.report import comparison_table, ladder_table, summary, to_arviz
 from samplers.resampling import stratified
 from tests.contract.targets import Box, Gaussian
@@ -193,7 +195,6 @@ def test_points_of_a_chain_follow_each_other():
     """Every point of the new population is one step from the last point of its leader's chain."""
     from emcee.model import Model
 
-    from samplers.moves import RandomWalkMove
     from samplers.mutation import grow_chains
     from samplers.settings import Settings
 
@@ -208,7 +209,7 @@ def test_points_of_a_chain_follow_each_other():
     move = RandomWalkMove(scale=1.0)
     move.calibrate(random.standard_normal((100, 2)), np.full(100, 0.01))
     model = Model(None, compute, map, random)
-    grown, _, acceptance, _ = grow_chains(
+    grown, _, acceptance, *_ = grow_chains(
         founders[ancestors],
         records,
         ancestors,
@@ -465,6 +466,38 @@ def test_collapse_is_loud():
     with pytest.warns(SamplingWarning, match="distinct points of 40 survived"):
         posterior = Gaussian(sd=1e-3)
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, ess_ratio=0.03, recycle=False).run_mcmc(None, 1)
+
+
+def alarms(Sampler, posterior, nwalkers=200, **settings):
+    """The messages of one run."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SamplingWarning)
+        Sampler(nwalkers, posterior.ndim, posterior, vectorize=True, **{"seed": 1, **settings}).run_mcmc(None, 1)
+    return [str(warning.message) for warning in caught]
+
+
+def test_moves_too_short_are_loud():
+    """The published steps of TMCMC leave the points where they were resampled; ten full steps of a walk do not."""
+    found = [m for m in alarms(TMCMCSampler, Gaussian(2), **CHING_CHEN_2007) if "remember where they" in m]
+    assert len(found) == 1 and "0.9" in found[0]
+    for preset in (RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, {}, {"recycle": False}):
+        assert not [m for m in alarms(SMCSampler, Gaussian(3), **preset) if "remember where they" in m]
+    burnt = {**CHING_CHEN_2007, "moves": RandomWalkMove(), "burn_in": 15}
+    assert not [m for m in alarms(TMCMCSampler, Gaussian(2), **burnt) if "remember where they" in m]
+
+
+@pytest.mark.parametrize("dead, loud", [(0.5, False), (0.97, True)])
+def test_a_stage_that_carries_all_is_loud(dead, loud):
+    """Where most of the prior is impossible the first stage stands on few points, whatever beta is chosen."""
+
+    def log_likelihood(x):
+        return np.where(x[..., 0] > 1.0 - dead, -np.inf, -10.0 * x[..., 1])
+
+    box = Box([0, 0], [1, 1], log_likelihood)
+    for seed in range(1, 5):
+        messages = [m for m in alarms(SMCSampler, box, seed=seed, recycle=False) if "all stands on stage" in m]
+        assert len(messages) == loud
+        assert not loud or "few draws of the prior are possible" in messages[0]
 
 
 # ---------------------------------------------------------------- reports

@@ -44,6 +44,12 @@ def column(targets):
     return targets["T1"]
 
 
+healthy = pytest.mark.filterwarnings(
+    "error:(the points remember|all stands on|stuck|collapse):samplers.SamplingWarning",
+)
+
+
+@healthy
 @pytest.mark.parametrize(
     "preset, stages, evaluations",
     [(RAMANCHA_2022_CONSTANT, 126, 1.04e6), (RAMANCHA_2022_LITERAL, 30, 235e3)],
@@ -60,12 +66,14 @@ def test_readings_of_table_1(column, preset, stages, evaluations, seed):
     assert np.max(np.abs(z)) < 4 * np.sqrt(4 / 1000)
 
 
-@pytest.mark.parametrize("name", ["T1", "T2"])
+@pytest.mark.parametrize("name", ["T1", "T2", "T3", "T4"])
 def test_published_tmcmc_fails_loudly(targets, name, seed):
     target = targets[name]
     sampler = TMCMCSampler(1000, target.ndim, target, vectorize=True, seed=seed, **CHING_CHEN_2007)
-    with pytest.warns(SamplingWarning):
+    with pytest.warns(SamplingWarning, match="remember where they were resampled"):
         sampler.run_mcmc(None, 1)
+    if name in ("T3", "T4"):  # how far off these are is a matter of luck
+        return
     z = (sampler.get_chain(flat=True).mean(axis=0) - target.mean) / target.sd
     assert np.sqrt(np.mean(z**2)) > 0.3
 
@@ -82,6 +90,7 @@ DEFAULTS = {
 }
 
 
+@healthy
 @pytest.mark.parametrize("case", DEFAULTS, ids=" ".join)
 def test_defaults_on_the_targets(targets, case, seed):
     """One run, 500 walkers; four standard errors of some 800 independent points."""
