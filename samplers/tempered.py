@@ -220,7 +220,8 @@ class TemperedSampler(EnsembleSampler):
         Copies made by the latest resamplings and the correlation along the chain are taken into account (see
         `samplers.families`). A chain that goes on in a re-opened file has lost the record of its resampling: each
         walker then counts as independent of the others. Of moves that tie walkers together, such as emcee's stretch
-        move, the ties are not seen.
+        move, the ties are not seen. Nor can one run tell of a mode it lost, or of a climb whose moves did not move:
+        after a `SamplingWarning` the errors are too small.
         """
         families = self._generations[0] if self._generations else np.arange(self.nwalkers)
         return standard_error_of_mean(self.get_chain(discard=discard, thin=thin), families)
