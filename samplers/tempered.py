@@ -11,51 +11,33 @@ emcee's private names are touched in this module only.
 """
 
 import copy
-import json
-import logging
+import functools
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from emcee import EnsembleSampler, State
 from emcee.backends import HDFBackend
 from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
-from emcee.model import Model
 from emcee.pbar import get_progress_bar
 
-from .alarms import check_climb, check_evidence, check_ladder, sound
+from .alarms import check_evidence, sound
 from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
-from .edges import find_edges
+from .climb import Tempering, climb
 from .evaluation import Failures, Guarded, Memo, Records, log_probabilities, outcomes
-from .families import follow, standard_error_of_mean
+from .families import standard_error_of_mean
 from .free_sweeps import with_free_sweeps
-from .importance import EvidenceCheck, draw_inside, evidence_from_weights
-from .journal import Contents, Evaluated, Start
+from .importance import EvidenceCheck
+from .journal import Evaluated, Start
 from .ladder import (
-    EvidenceError,
     Stage,
-    coarse_weights,
-    effective_sample_size,
-    log_mean_weight,
-    next_beta,
-    normalised_weights,
 )
-from .mixtures import fit_mixture, log_density
-from .moves import RandomWalkMove, describe
-from .mutation import Moved, grow_chains, move_together, tempered_log_prob
-from .recycling import recycle
+from .moves import RandomWalkMove
+from .resume import differences, header
 from .settings import Settings
 
 __all__ = ["TemperedSampler"]
-
-logger = logging.getLogger(__name__)
-
-
-def _plain(value: Any) -> Any:
-    """A setting as JSON takes it: a function by its name."""
-    return f"{value.__module__}.{value.__qualname__}" if callable(value) else value
 
 
 class TemperedSampler(EnsembleSampler):
@@ -370,7 +352,11 @@ class TemperedSampler(EnsembleSampler):
                 f"{self.backend.filename} holds a run from other draws of the prior: pass None as initial_state to go "
                 "on with it, or give another file; backend.reset(nwalkers, ndim) gives it up"
             )
-        self._check_same(contents)
+        if differing := differences(self._header(), contents, self._log_prior, self._ask):
+            raise ValueError(
+                f"{self.backend.filename} holds another run, which cannot be continued here: {'; '.join(differing)}. "
+                "Give what it was begun with, or another file"
+            )
         self._contents = None
         self.backend.go_on(contents)
         self._memo = Memo(contents.evaluated)
@@ -387,43 +373,9 @@ class TemperedSampler(EnsembleSampler):
         return state, contents.made if asked_again else 0
 
     def _header(self) -> dict:
-        """What a run is: enough to refuse another one."""
-        header = {
-            "nwalkers": self.nwalkers,
-            "ndim": self.ndim,
-            "log_prob_fn": getattr(self.log_prob_fn.f, "fingerprint", None),
-        }
-        header |= {name: _plain(value) for name, value in asdict(self.settings).items()}
-        header["moves"] = [describe(move) for move in self._moves]
-        header["weights"] = list(self._weights)
-        return json.loads(json.dumps(header))
-
-    def _check_same(self, contents: Contents) -> None:
-        """ValueError unless the journal is one of this posterior and these settings."""
-        ours, theirs = self._header(), contents.header
-        differing = [
-            f"{name} was {theirs.get(name)}, is {value}" for name, value in ours.items() if theirs.get(name) != value
-        ]
-        start = contents.start
-        if not differing and not np.allclose(self._log_prior(start.coords), start.log_prior, rtol=1e-9, atol=1e-9):
-            differing = ["the log-prior of the first draws is another"]
-        if not differing and ours["log_prob_fn"] is None:
-            differing = self._compare_one_point(contents.evaluated)
-        if differing:
-            raise ValueError(
-                f"{self.backend.filename} holds another run, which cannot be continued here: {'; '.join(differing)}. "
-                "Give what it was begun with, or another file"
-            )
-
-    def _compare_one_point(self, evaluated: list[Evaluated]) -> list[str]:
-        """Evaluate again one point of the journal: what differs, in words."""
-        for batch in evaluated:
-            row = int(np.argmax(np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)))
-            if np.isfinite(batch.log_prob[row]):
-                before, again = batch.log_prob[row], self._ask(batch.coords[row : row + 1]).log_prob[0]
-                same = np.isclose(before, again, rtol=1e-9, atol=1e-9)
-                return [] if same else [f"log_prob_fn was {before:.10g} at {batch.coords[row]}, is {again:.10g}"]
-        return []
+        """What this run is begun with."""
+        fingerprint = getattr(self.log_prob_fn.f, "fingerprint", None)
+        return header(self.nwalkers, self.ndim, fingerprint, self.settings, self._moves, self._weights)
 
     def _last_or_prior(self):
         """The state to start from when none is given."""
@@ -523,120 +475,44 @@ class TemperedSampler(EnsembleSampler):
     def _climb(self, state: State, skip_check: bool, bar: dict) -> State:
         """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
         self._mark = time.perf_counter(), self.evaluations
-        self._check, self._generations = None, []
-        packed = self._enter(state, skip_check)
+        self._check, self._ladder, self._generations = None, [], []
+        records = self._enter(state, skip_check)
         labels = {"desc": "ladder", "unit": " sweeps", **(bar["progress_kwargs"] or {})}
-        with get_progress_bar(bar["progress"], None, **labels) as bar:
-            climbed = self._climb_by_recycling(state.coords, packed, bar) if self.settings.recycle else None
-            coords, packed = climbed or self._climb_by_moves(state.coords, packed, bar)
-        if self._check is None and self.settings.check_draws != 0:
-            self._check = self._check_evidence(coords)
+        with get_progress_bar(bar["progress"], None, **labels) as shown:
+            found = climb(
+                state.coords,
+                records,
+                Tempering(
+                    evaluate=self._evaluate,
+                    inside=self._inside,
+                    random=self._random,
+                    moves=self._moves,
+                    shares=self._weights,
+                    settings=self.settings,
+                    map=map if self.pool is None else self.pool.map,
+                    ladder=self._ladder,
+                    enter=self._add_stage,
+                    show=functools.partial(self._show, shown),
+                ),
+            )
+        self._generations, self._check = found.generations, found.check
         if self._check is not None:
             write_check(self.backend, self._check)
-            last = self._ladder[-1]
-            check_evidence(self.log_evidence_ladder, last.log_evidence_error, self._check)
-        log_prob, blobs = self._records.unpack(packed)
-        return State(coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
+            check_evidence(self.log_evidence_ladder, self._ladder[-1].log_evidence_error, self._check)
+        log_prob, blobs = self._records.unpack(found.records)
+        return State(found.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
 
-    def _add_stage(self, **fields: float) -> None:
-        """Enter a finished stage, and store it: what it cost is counted since the stage before."""
+    def _add_stage(self, apart: int = 0, **fields: float) -> None:
+        """Enter a finished stage, and store it: it cost what was spent since the one before, but for those `apart`."""
         seconds, evaluations = self._mark
         self._mark = time.perf_counter(), self.evaluations
-        stage = Stage(seconds=self._mark[0] - seconds, evaluations=self._mark[1] - evaluations, **fields)
+        stage = Stage(seconds=self._mark[0] - seconds, evaluations=self._mark[1] - evaluations - apart, **fields)
         if len(self._ladder) < len(self._recorded):
             recorded = self._recorded[len(self._ladder)]
             if recorded == stage._replace(seconds=recorded.seconds):  # climbed before: what it took then
                 stage = recorded
         self._ladder.append(stage)
         write_stage(self.backend, len(self._ladder) - 1, stage)
-
-    def _climb_by_moves(self, coords: np.ndarray, packed: np.ndarray, bar: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Sequential Monte Carlo: weigh, resample, move, from draws of the prior on."""
-        beta, target = 0.0, float(self.nwalkers)
-        error = EvidenceError(self.nwalkers)
-        self._ladder = []
-        while beta < 1.0:
-            log_likelihood = packed["log_prob"] - packed["log_prior"]
-            target = self.settings.target(target, self.nwalkers)
-            last_beta, beta = beta, next_beta(log_likelihood, beta, target)
-            log_weights = (beta - last_beta) * log_likelihood
-            weights = normalised_weights(log_weights)
-            standard_error = error.weigh(weights)
-            self._calibrate(coords, coarse_weights(log_weights))
-
-            ancestors = self.settings.resample(weights, self._random)
-            error.resample(ancestors)
-            self._generations = follow(self._generations, ancestors)
-            coords, packed = coords[ancestors], packed[ancestors]
-            distinct = len(np.unique(coords, axis=0))
-            ess = effective_sample_size(log_weights)
-            coords, packed, acceptance, moves, memory = self._mutate(coords, packed, ancestors, beta, bar, ess)
-            self._add_stage(
-                beta=beta,
-                effective_sample_size=ess,
-                acceptance=acceptance,
-                moves=moves,
-                distinct_ancestors=distinct,
-                log_evidence_increment=log_mean_weight(log_weights),
-                log_evidence_error=standard_error,
-            )
-            check_ladder(self._ladder, self.nwalkers, self.ndim)
-        check_climb(self._ladder, self.nwalkers, self.ndim, memory)
-        return coords, packed
-
-    def _climb_by_recycling(
-        self, coords: np.ndarray, packed: np.ndarray, bar: Any
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Adaptive importance sampling over all points; None where its result may not be trusted."""
-        self._ladder = []
-
-        def enter(log_evidence, acceptance, effective_sample_size, **fields):
-            self._add_stage(
-                effective_sample_size=effective_sample_size,
-                acceptance=acceptance,
-                moves=0,
-                distinct_ancestors=int(effective_sample_size),
-                log_evidence_increment=log_evidence - sum(s.log_evidence_increment for s in self._ladder),
-                **fields,
-            )
-            self._show(bar, fields["beta"], effective_sample_size, acceptance)
-
-        found = recycle(coords, packed, self._evaluate, self._inside, self._random, enter)
-        if not found.trusted:
-            logger.info("recycling is not trusted here, because %s: climbing by moves", found.doubt)
-            return None
-        if self.settings.check_draws != 0:
-            self._check = found.check
-            self._mark = self._mark[0], self._mark[1] + found.check.evaluations
-        weights = normalised_weights(found.log_weights)
-        self._calibrate(found.coords, coarse_weights(found.log_weights))
-        # the weights of few thousand points, thinned to as many points as there are walkers
-        ancestors = np.searchsorted(
-            np.cumsum(weights), (np.arange(self.nwalkers) + self._random.uniform()) / self.nwalkers, side="right"
-        )
-        ancestors = np.minimum(ancestors, len(weights) - 1)
-        self._generations = [ancestors]
-        ess = effective_sample_size(found.log_weights)
-        coords, packed, acceptance, moves, _ = self._mutate(
-            found.coords[ancestors], found.records[ancestors], ancestors, 1.0, bar, ess
-        )
-        self._add_stage(
-            beta=1.0,
-            effective_sample_size=ess,
-            acceptance=acceptance,
-            moves=moves,
-            distinct_ancestors=len(np.unique(ancestors)),
-            log_evidence_increment=found.log_evidence - sum(s.log_evidence_increment for s in self._ladder),
-            log_evidence_error=found.log_evidence_error,
-        )
-        return coords, packed
-
-    def _check_evidence(self, coords: np.ndarray) -> EvidenceCheck:
-        """The evidence from fresh draws of a mixture fitted to the final population."""
-        n = self.nwalkers if self.settings.check_draws is None else self.settings.check_draws
-        mixture = fit_mixture(coords, np.full(len(coords), 1.0 / len(coords)), edges=find_edges(self._inside, coords))
-        drawn, made = draw_inside(mixture, n, self._random, self._inside)
-        return evidence_from_weights(self._evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
 
     def _enter(self, state: State, skip_check: bool) -> np.ndarray:
         """Check draws of the prior and evaluate them: records of all walkers."""
@@ -665,32 +541,6 @@ class TemperedSampler(EnsembleSampler):
             return self._evaluate(state.coords)
         log_prob, _ = log_probabilities(np.asarray(state.log_prob), self.nwalkers, "the initial state's log_prob")
         return self._records.pack(log_prob, log_prior, state.blobs)
-
-    def _calibrate(self, coords: np.ndarray, weights: np.ndarray) -> None:
-        for move in self._moves:
-            if hasattr(move, "calibrate"):
-                move.calibrate(coords, weights, self._inside)
-
-    def _mutate(
-        self, coords: np.ndarray, packed: np.ndarray, ancestors: np.ndarray, beta: float, bar: Any, ess: float
-    ) -> Moved:
-        """Move resampled points at beta."""
-
-        def compute(points):
-            records = self._evaluate(points)
-            return tempered_log_prob(records, beta), records
-
-        model = Model(self.log_prob_fn, compute, map if self.pool is None else self.pool.map, self._random)
-        common = {
-            "beta": beta,
-            "model": model,
-            "pick": lambda: self._random.choice(self._moves, p=self._weights),
-            "settings": self.settings,
-            "show": lambda share: self._show(bar, beta, ess, share),
-        }
-        if self.settings.chains == "leaders":
-            return grow_chains(coords, packed, ancestors, **common)
-        return move_together(coords, packed, **common)
 
     def _show(self, bar: Any, beta: float, ess: float, acceptance: float) -> None:
         """One sweep further on the progress bar."""
