@@ -13,6 +13,8 @@ from .tempered import TemperedSampler
 
 __all__ = ["SMCSampler"]
 
+FEWEST_TO_RECYCLE = 250
+
 
 class SMCSampler(TemperedSampler):
     """Sequential Monte Carlo sampler.
@@ -27,7 +29,8 @@ class SMCSampler(TemperedSampler):
         `samplers.moves.MixtureMove`: three kernels from a mixture fitted to every stage.
     log_prior_fn, seed : as in `TemperedSampler`.
     recycle : bool, optional — climb by recycling every evaluated point (`samplers.recycling`), and by moves where that
-        may not be trusted. By default yes if `moves` are not given.
+        may not be trusted. By default yes with 250 walkers or more and no `moves` given: with fewer, a mode can be lost
+        unnoticed, and the fall back on moves is likely.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation : as in
         `samplers.settings.Settings`, for a climb by moves.
     free_sweeps, check_draws, max_failure_share : as there.
@@ -62,7 +65,7 @@ class SMCSampler(TemperedSampler):
         max_failure_share: float = 0.5,
     ):
         if recycle is None:
-            recycle = moves is None
+            recycle = moves is None and nwalkers >= FEWEST_TO_RECYCLE
         if moves is None:
             moves = MixtureMove()
         super().__init__(

@@ -57,7 +57,7 @@ def test_stages_account_for_everything():
 
 def test_recycling_accounts_for_everything():
     posterior = Gaussian(sd=0.02)
-    sampler = climbed(posterior, nsteps=0)
+    sampler = climbed(posterior, nsteps=0, recycle=True)
     betas = [s.beta for s in sampler.ladder]
     assert betas == sorted(set(betas)) and betas[-1] == 1.0
     assert [s.moves for s in sampler.ladder[:-1]] == [0] * (len(betas) - 1)
@@ -90,6 +90,14 @@ def test_two_estimates_that_disagree_widen_the_error():
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_recycling_needs_walkers():
+    """By default; with few of them a mode can be lost unnoticed."""
+    posterior = Gaussian()
+    assert [SMCSampler(n, 3, posterior).settings.recycle for n in (249, 250)] == [False, True]
+    assert SMCSampler(N, 3, posterior, recycle=True).settings.recycle
+    assert not SMCSampler(500, 3, posterior, moves=emcee.moves.StretchMove()).settings.recycle
+
+
 def test_recycling_that_fails_falls_back_to_moves(caplog):
     """A ring in two dimensions and an exponential corner in six: no mixture proposes well in it."""
 
@@ -99,7 +107,7 @@ def test_recycling_that_fails_falls_back_to_moves(caplog):
 
     posterior = Box(np.zeros(8), np.ones(8), log_likelihood)
     with caplog.at_level("INFO", logger="samplers"):
-        sampler = climbed(posterior, nsteps=0)
+        sampler = climbed(posterior, nsteps=0, recycle=True)
     assert "recycling is not trusted here, because" in caplog.text
     assert all(s.moves >= 2 for s in sampler.ladder)
     check = sampler.log_evidence_check

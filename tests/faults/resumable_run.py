@@ -13,7 +13,7 @@ from tests.contract.targets import WithBlobs
 
 N, NDIM = 40, 3
 SAMPLERS = {
-    "smc": (SMCSampler, {}),
+    "smc": (SMCSampler, {"recycle": True}),
     "moves": (SMCSampler, {"recycle": False}),
     "tmcmc": (TMCMCSampler, {}),
     "leaders": (TMCMCSampler, {"chains": "leaders", "burn_in": 1}),

@@ -10,7 +10,7 @@ from samplers.moves import MixtureMove, RandomWalkMove, StudentTMove
 from tests.contract.targets import Box, Gaussian
 
 MODES = {
-    "default": {},
+    "default": {"recycle": True},
     "moves": {"recycle": False},
     "constant": RAMANCHA_2022_CONSTANT,
     "literal": RAMANCHA_2022_LITERAL,
