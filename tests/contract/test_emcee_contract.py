@@ -1,6 +1,7 @@
 """What emcee promises of a sampler holds for ours, in memory and in HDF5: the same tests for each."""
 
 import inspect
+import multiprocessing
 import pickle
 from multiprocessing.pool import ThreadPool
 
@@ -8,7 +9,7 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from tests.contract.targets import Gaussian, WithBlobs
 
 N, STEPS = 24, 8
@@ -151,6 +152,22 @@ def test_named_text_and_single_blobs(Sampler, make_backend):
     assert np.array_equal(sampler.get_blobs(), sampler.get_chain()[..., 1])
 
 
+class Fragile(Gaussian):
+    """Has no answer for a small part of the prior."""
+
+    def __call__(self, x):
+        if np.any(x[..., 0] < 0.0) and np.any(x[..., 1] > 0.3):
+            raise ZeroDivisionError("no stiffness left")
+        return np.where(x[..., 0] < 0.0, -np.inf, super().__call__(x))[()]
+
+
+class Broken(Gaussian):
+    """Has no answer at all."""
+
+    def __call__(self, x):
+        raise TypeError("no such argument")
+
+
 def shifted(x, posterior, shift, scale=1.0):
     return posterior((x - shift) / scale)
 
@@ -191,6 +208,30 @@ def test_seed_pool_and_vectorize_give_the_same_chain(Sampler):
     for workers in (1, 3):
         with ThreadPool(workers) as pool:
             assert np.array_equal(run(Sampler, pool=pool).get_chain(), chain)
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_a_pool_of_processes(Sampler):
+    """The same chain, and an exception in a worker takes one point only."""
+    chain = run(Sampler).get_chain()
+    fragile = Fragile()
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        assert np.array_equal(run(Sampler, pool=pool).get_chain(), chain)
+        with pytest.warns(SamplingWarning, match="ZeroDivisionError: no stiffness left"):
+            sampler = run(Sampler, pool=pool, posterior=fragile)
+    assert sampler.failure_count > 0 and sampler.get_chain()[..., 0].min() > 0
+    with pytest.warns(SamplingWarning, match="ZeroDivisionError: no stiffness left"):
+        alone = run(Sampler, posterior=fragile)
+    assert np.array_equal(alone.get_chain(), sampler.get_chain())
+    with pytest.warns(SamplingWarning):
+        batched = run(Sampler, posterior=fragile, vectorize=True)
+    assert np.array_equal(batched.get_chain(), sampler.get_chain())
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_a_broken_function_stops_with_its_reason(Sampler):
+    with pytest.raises(RuntimeError, match="all 24 evaluations of a batch failed.*TypeError: no such argument"):
+        run(Sampler, posterior=Broken())
 
 
 @every

@@ -241,6 +241,23 @@ def test_two_runs_on_one_file(finished):
     assert second.returncode != 0 and "another run is writing" in told
 
 
+def test_blobs_that_cannot_be_stored(tmp_path):
+    """Told with the first batch, not at the first step of the chain."""
+    from samplers import SMCSampler
+
+    posterior = Gaussian(NDIM)
+    sampler = SMCSampler(
+        N,
+        NDIM,
+        lambda x: (posterior(x), {"any": "thing"}),
+        log_prior_fn=posterior.log_prior,
+        backend=emcee.backends.HDFBackend(str(tmp_path / "run.h5")),
+    )
+    with pytest.raises(ValueError, match="blobs of dtype object"):
+        sampler.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 1)
+    assert posterior.calls == N
+
+
 def test_failures_are_remembered(tmp_path):
     """A point that raised counts as impossible, before and after the kill."""
 
