@@ -2,9 +2,11 @@
 
 Every point so far, draws of the prior and of all proposals since, is weighted by the target over the mixture of all
 densities it could have come from (deterministic mixture weights). The next beta keeps the effective sample size of
-*all* points at a target; a mixture fitted to them at that beta is the next proposal; and once beta = 1 is reached,
-draws are added until the effective sample size suffices. A posterior that is nearly Gaussian, straightened or split if
-need be, takes a small part of the evaluations of moves this way.
+*all* points at a target; a mixture fitted to them at that beta is the next proposal. A rung is left only when the draws
+made on it are themselves worth three quarters of the target: of many old points some look good by luck, and where the
+likelihood is rough a climb led by the luckiest ends on a summit of its own. Once beta = 1 is reached, draws are added
+until the effective sample size suffices. A posterior that is nearly Gaussian, straightened or split if need be, takes a
+small part of the evaluations of moves this way.
 
 Proposals adapted to their own weights can be confidently wrong. So the last fit is tried on fresh draws that had no
 part in it, and the result is used only if their weights behave and their evidence agrees (`Recycled.trusted`). If they
@@ -32,11 +34,12 @@ __all__ = ["Recycled", "recycle"]
 
 TARGET_SHARE = 0.2
 POINTS_PER_DIMENSION = 5
+FRESH_SHARE = 0.75
 LOW_YIELD = 0.03
 LEAST_YIELD = 0.25
 HIGH_YIELD = 0.5
 PATIENCE = 6
-MOST_STAGES = 100
+MOST_STAGES = 200
 LARGEST_DIFFERENCE = 0.25
 MOST_CHECKS = 4
 EVENED = 0.25
@@ -128,7 +131,7 @@ def recycle(
     target = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
     pool = _Pool(coords, records)
     edges = find_edges(inside, coords)
-    beta, yields, checks = 0.0, [], 0
+    beta, fresh, yields, checks = 0.0, 0.0, [], 0
     final: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     alive = effective_sample_size(pool.log_weights(0.0))
     if alive < target:
@@ -136,8 +139,8 @@ def recycle(
         return Recycled(doubt, coords, records, np.zeros(n), float("-inf"), float("inf"), None)
     while True:
         base, last_beta = pool.log_weights(beta), beta
-        if beta < 1.0 and effective_sample_size(base) >= target:
-            beta = next_beta(pool.log_likelihood, beta, target, base)
+        if beta < 1.0 and effective_sample_size(base) >= target and (beta == 0.0 or fresh >= FRESH_SHARE * target):
+            beta, fresh = next_beta(pool.log_likelihood, beta, target, base), 0.0
         log_weights = pool.log_weights(beta)
         effective = effective_sample_size(log_weights)
         log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
@@ -158,6 +161,7 @@ def recycle(
         new, made = draw_inside(mixture, n if finished else int(round(2.0 * target)), random, inside)
         new_records = evaluate(new)
         new_weights = _against(mixture, new_records, new, beta)
+        fresh += effective_sample_size(new_weights)
         yields.append(effective_sample_size(new_weights) / max(len(new), 1))
         pool.add(mixture, made, new, new_records)
         if beta == 1.0:
