@@ -137,7 +137,7 @@ def run(request) -> Callable[..., Run]:
     return run
 
 
-@pytest.mark.parametrize("make", [bundled_reduced, bundled, real, real_wide_prior, real_own_mesh])
+@pytest.mark.parametrize("make", [real, real_wide_prior, real_own_mesh, bundled, bundled_reduced])
 def test_smc_agrees_with_importance_sampling(run, make):
     smc, check = run(make).smc, run(make).check
     tolerance = 4.0 * np.hypot(smc.error, check.error)
