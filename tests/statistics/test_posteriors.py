@@ -208,6 +208,42 @@ def test_one_parameter_in_another_unit(seed):
         assert np.allclose(plain.get_chain() * np.array([1, unit, 1]), scaled.get_chain(), rtol=1e-8)
 
 
+@pytest.mark.parametrize("mode", ["default", "moves", "literal", "tmcmc"])
+def test_order_of_parameters_changes_no_answer(mode, seed):
+    """Another order gives other draws; mean and evidence agree within the errors over runs."""
+
+    class Turned(Gaussian):
+        def __init__(self, order):
+            super().__init__(3)
+            self.order, self.back = np.array(order), np.argsort(order)
+            self.scale = np.array([0.02, 0.1, 0.5])
+
+        def log_likelihood(self, x):
+            return -0.5 * np.sum(((x[..., self.back] - 0.7) / self.scale) ** 2, axis=-1)
+
+    means, evidences = [], []
+    for k, order in enumerate(([0, 1, 2], [2, 0, 1])):
+        posterior = Turned(order)
+        samplers = runs(posterior, seed + 100 * k, **MODES[mode])
+        means.append([s.get_chain(flat=True).mean(axis=0)[posterior.back] for s in samplers])
+        evidences.append([s.log_evidence for s in samplers])
+    for first, second in (means, evidences):
+        error = np.sqrt((np.var(first, axis=0, ddof=1) + np.var(second, axis=0, ddof=1)) / len(first))
+        deviation = (np.mean(first, axis=0) - np.mean(second, axis=0)) / error
+        assert np.all(np.abs(deviation) < stats.t(2 * len(first) - 2).isf(stats.norm.sf(4.0)))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_backend_changes_no_draw(mode, seed, tmp_path):
+    memory, stored = (
+        runs(Gaussian(3), seed, count=1, backend=backend, **MODES[mode])[0]
+        for backend in (None, emcee.backends.HDFBackend(str(tmp_path / "run.h5")))
+    )
+    assert np.array_equal(memory.get_chain(), stored.get_chain())
+    assert np.array_equal(memory.get_log_prob(), stored.get_log_prob())
+    assert memory.log_evidence == stored.log_evidence
+
+
 # ---------------------------------------------------------------- the error of the evidence
 
 
