@@ -71,7 +71,7 @@ class JournaledBackend(HDFBackend):
     @property
     def journal_path(self) -> Path:
         """Where the journal is."""
-        return Path(f"{self.filename}.{self.name}.journal")
+        return Path(f"{self.filename}.{self.name.replace('/', '.')}.journal")
 
     # ------------------------------------------------------------------ the chain, as emcee writes it
 
@@ -143,7 +143,7 @@ class JournaledBackend(HDFBackend):
     def go_on(self, contents: Contents) -> None:
         """Go on with the journal that was read."""
         self._run = contents.header[RUN]
-        self._journal = Journal(self.journal_path, contents.size)
+        self._journal = Journal(self.journal_path, contents)
 
     def evaluated(self, batch: Evaluated) -> None:
         """A batch of points has been evaluated."""
@@ -181,7 +181,7 @@ class JournaledBackend(HDFBackend):
                 self._run = run
                 if _agree(file[self.name], contents.steps):
                     return contents
-        except OSError as error:
+        except (OSError, KeyError, RuntimeError) as error:
             contents = read_journal(self.journal_path)
             if contents is None:
                 raise ValueError(

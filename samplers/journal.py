@@ -20,6 +20,7 @@ import io
 import json
 import os
 import struct
+import weakref
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -38,6 +39,9 @@ MAGIC = b"samplers journal 1\n"
 HEADER = struct.Struct("<4sQI")
 CHECKSUM = struct.Struct("<I")
 BEFORE_CONTENT = HEADER.size + CHECKSUM.size
+
+
+_open: "weakref.WeakValueDictionary[Path, Journal]" = weakref.WeakValueDictionary()
 
 
 class Start(NamedTuple):
@@ -79,7 +83,7 @@ class Contents(NamedTuple):
     steps : list of Step — since the chain was last reset.
     last : Step, or None — the last one since the start, even if the chain was reset after it.
     wanted, made : int or None, and int — steps that the last call asked for, None if it is done, and how many it made.
-    size : int — bytes up to the end of the last whole block.
+    size, whole : int — bytes of the file, and those up to the end of the last whole block.
     """
 
     header: dict
@@ -91,6 +95,7 @@ class Contents(NamedTuple):
     wanted: int | None
     made: int
     size: int
+    whole: int
 
 
 def _pack_arrays(arrays: Sequence[np.ndarray]) -> bytes:
@@ -129,17 +134,24 @@ class Journal:
     Parameters
     ----------
     path : of the file.
-    size : int, optional — where to go on in a file that is there; what lies behind is dropped. A new file by default.
+    contents : Contents, optional — of the file that is there, to go on with; a last block that was cut off is dropped.
+        A new file by default.
 
     Raises
     ------
     ValueError
-        If another process writes to the file.
+        If another process writes to the file, or it has changed since it was read.
     """
 
-    def __init__(self, path: Path, size: int | None = None):
+    def __init__(self, path: Path, contents: Contents | None = None):
         self.path = path
-        self._file = open(path, "r+b" if size is not None else "ab", buffering=0)  # noqa: SIM115  open as long as the run
+        if contents is not None and path.stat().st_size != contents.size:
+            raise ValueError(f"another run has written to {path} since it was read: make a new sampler on the file")
+        # locks belong to the process: within it, the last one to open the file has it
+        if (earlier := _open.get(path.resolve())) is not None:
+            earlier.close()
+        _open[path.resolve()] = self
+        self._file = open(path, "ab" if contents is None else "r+b", buffering=0)  # noqa: SIM115  as long as the run
         if lockf is not None:
             try:
                 lockf(self._file, LOCK_EX | LOCK_NB)
@@ -148,7 +160,7 @@ class Journal:
                 raise ValueError(
                     f"another run is writing to {path}: wait for it or stop it, or give this one another file"
                 ) from None
-        self._file.truncate(size or 0)
+        self._file.truncate(0 if contents is None else contents.whole)
         self._file.seek(0, os.SEEK_END)
 
     @classmethod
@@ -163,6 +175,8 @@ class Journal:
         self._file.close()
 
     def _write(self, data: bytes) -> None:
+        if self._file.closed:
+            raise ValueError(f"another sampler has gone on with {self.path}: use that one, or give it another file")
         start = self._file.tell()
         try:
             written = 0
@@ -261,9 +275,9 @@ def read_journal(path: Path) -> Contents | None:
     if not data.startswith(MAGIC):
         raise ValueError(_damaged(path, "it does not begin as a journal"))
     header, start, evaluated, steps, last = {}, None, [], [], None
-    before_last, wanted, made, size = 0, None, 0, len(MAGIC)
+    before_last, wanted, made, whole = 0, None, 0, len(MAGIC)
     for kind, content, end in _blocks(data, path):
-        size = end
+        whole = end
         if kind == b"HEAD":
             header = json.loads(content)
         elif kind == b"INIT":
@@ -290,4 +304,4 @@ def read_journal(path: Path) -> Contents | None:
             raise ValueError(_damaged(path, f"it has a block of unknown kind {kind!r}"))
     if not header:
         return None
-    return Contents(header, start, evaluated, before_last, steps, last, wanted, made, size)
+    return Contents(header, start, evaluated, before_last, steps, last, wanted, made, len(data), whole)

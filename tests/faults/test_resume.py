@@ -258,6 +258,21 @@ def test_blobs_that_cannot_be_stored(tmp_path):
     assert posterior.calls == N
 
 
+def test_two_samplers_of_one_process(finished):
+    """The later one has the file; the earlier one is told."""
+    path, _ = finished
+    first, second = make(path, "smc"), make(path, "smc")
+    first.run_mcmc(None, 1)
+    with pytest.raises(ValueError, match="since it was read"):
+        second.run_mcmc(None, 1)
+    first.run_mcmc(None, 1)
+    third = make(path, "smc")
+    third.run_mcmc(None, 1)
+    with pytest.raises(ValueError, match="another sampler has gone on"):
+        first.run_mcmc(None, 1)
+    assert make(path, "smc").iteration == STEPS + 3
+
+
 def test_failures_are_remembered(tmp_path):
     """A point that raised counts as impossible, before and after the kill."""
 
