@@ -56,6 +56,7 @@ parser.add_argument("--preset", choices=PRESETS, default="fast" if os.environ.ge
 parser.add_argument("--walkers", type=int, help="number of particles (default: that of the preset)")
 parser.add_argument("--every", type=int, help="keep one sample in EVERY (default: that of the preset)")
 parser.add_argument("--seed", type=int, default=1)
+parser.add_argument("--resume", action="store_true", help="go on with the killed run in OUT, begun with these options")
 parser.add_argument("--out", type=Path, default=Path("results"))
 args = parser.parse_args()
 
@@ -133,11 +134,13 @@ plot_data(args.out / "fig3_data.png")
 # ## Sampling
 #
 # SMC climbs from the prior (beta = 0) to the posterior (beta = 1); the chain holds the draws at beta = 1. Chain and
-# ladder are kept in `chain.h5` while the run goes on, and can be read there after an interruption.
+# ladder are kept in `chain.h5` while the run goes on, and every evaluation in the journal beside it: a run that was
+# killed goes on with `--resume`, and ends as if it had not been.
 
 # %%
 backend = emcee.backends.HDFBackend(args.out / "chain.h5")
-backend.reset(walkers, posterior.ndim)
+if not args.resume:
+    backend.reset(walkers, posterior.ndim)
 start = time.perf_counter()
 sampler = SMCSampler(
     walkers, posterior.ndim, posterior, vectorize=True, backend=backend, seed=args.seed, **dict(settings)
