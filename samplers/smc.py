@@ -3,6 +3,10 @@
 Del Moral, Doucet & Jasra (2006), doi:10.1111/j.1467-9868.2006.00553.x, with the adaptation usual since: the next
 exponent by the effective sample size, resampling at every stage, proposals fitted to the weighted population, and as
 many moves as it takes to forget the resampled start. The settings of papers are in `samplers.presets`.
+
+Tempering has a limit that no setting lifts: of several modes of like mass, one much narrower than the others has hardly
+any mass on the lower rungs, and is lost unless draws of the prior happen to meet it (Woodard, Schmidler & Huber 2009,
+doi:10.1214/EJP.v14-638). Where such modes are possible, compare runs with more walkers.
 """
 
 from collections.abc import Callable
