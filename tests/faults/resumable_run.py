@@ -17,7 +17,7 @@ SAMPLERS = {
     "moves": (SMCSampler, {"recycle": False}),
     "tmcmc": (TMCMCSampler, {}),
     "leaders": (TMCMCSampler, {"chains": "leaders", "burn_in": 1}),
-    "literal": (SMCSampler, RAMANCHA_2022_LITERAL),
+    "literal": (SMCSampler, {**RAMANCHA_2022_LITERAL, "ess_floor": 10.0}),  # its own floor is above N
     "stretch": (SMCSampler, {"moves": emcee.moves.StretchMove(), "max_moves": 5}),
 }
 
