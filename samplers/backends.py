@@ -141,7 +141,8 @@ class JournaledBackend(HDFBackend):
         self._journal.start(start)
 
     def go_on(self, contents: Contents) -> None:
-        """Go on with the journal that was read."""
+        """Go on with the journal that was read; its contents are not kept."""
+        self.contents = None
         self._run = contents.header[RUN]
         self._journal = Journal(self.journal_path, contents)
 

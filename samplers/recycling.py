@@ -138,11 +138,12 @@ def recycle(
         doubt = f"only {alive:.0f} of {n} draws of the prior have a likelihood above zero"
         return Recycled(doubt, coords, records, np.zeros(n), float("-inf"), float("inf"), None)
     while True:
-        base, last_beta = pool.log_weights(beta), beta
-        if beta < 1.0 and effective_sample_size(base) >= target and (beta == 0.0 or fresh >= FRESH_SHARE * target):
-            beta, fresh = next_beta(pool.log_likelihood, beta, target, base), 0.0
-        log_weights = pool.log_weights(beta)
+        log_weights, last_beta = pool.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
+        if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= FRESH_SHARE * target):
+            beta, fresh = next_beta(pool.log_likelihood, beta, target, log_weights), 0.0
+            log_weights = pool.log_weights(beta)
+            effective = effective_sample_size(log_weights)
         log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
         # proposals were chosen by weights worth `target` points: their luck lives on in all that follows
         luck = 1.0 / target if yields else 0.0
@@ -161,8 +162,9 @@ def recycle(
         new, made = draw_inside(mixture, n if finished else int(round(2.0 * target)), random, inside)
         new_records = evaluate(new)
         new_weights = _against(mixture, new_records, new, beta)
-        fresh += effective_sample_size(new_weights)
-        yields.append(effective_sample_size(new_weights) / max(len(new), 1))
+        worth = effective_sample_size(new_weights)
+        fresh += worth
+        yields.append(worth / max(len(new), 1))
         pool.add(mixture, made, new, new_records)
         if beta == 1.0:
             final.append((new, new_records, _of_round(new_weights)))

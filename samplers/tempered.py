@@ -30,9 +30,7 @@ from .families import standard_error_of_mean
 from .free_sweeps import with_free_sweeps
 from .importance import EvidenceCheck
 from .journal import Evaluated, Start
-from .ladder import (
-    Stage,
-)
+from .ladder import Stage
 from .moves import RandomWalkMove
 from .resume import differences, header
 from .settings import Settings
@@ -200,10 +198,10 @@ class TemperedSampler(EnsembleSampler):
         """Monte-Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
 
         Copies made by the latest resamplings and the correlation along the chain are taken into account (see
-        `samplers.families`). A chain that goes on in a re-opened file has lost the record of its resampling: each
-        walker then counts as independent of the others. Of moves that tie walkers together, such as emcee's stretch
-        move, the ties are not seen. Nor can one run tell of a mode it lost, or of a climb whose moves did not move:
-        after a `SamplingWarning` the errors are too small.
+        `samplers.families`). A chain that goes on in another sampler without its journal has lost the record of its
+        resampling: each walker then counts as independent of the others. Of moves that tie walkers together, such as
+        emcee's stretch move, the ties are not seen. Nor can one run tell of a mode it lost, or of a climb whose moves
+        did not move: after a `SamplingWarning` the errors are too small.
         """
         families = self._generations[0] if self._generations else np.arange(self.nwalkers)
         return standard_error_of_mean(self.get_chain(discard=discard, thin=thin), families)
@@ -240,16 +238,16 @@ class TemperedSampler(EnsembleSampler):
     def run_mcmc(self, initial_state, nsteps, **kwargs):
         """Climb the ladder if that has not been done, then make `nsteps` sweeps at beta = 1.
 
+        With an emcee `HDFBackend`, a new sampler on the file of a run that was killed goes on where it was, inside a
+        stage or a sweep too, and ends bit for bit as it would have: pass None or the draws of the prior it began with.
+        A call that was cut off is completed by the same call; any other number of steps is added to what is there.
+
         Parameters
         ----------
         initial_state : (nwalkers, ndim) draws of the prior, or None: go on from the last state if there is one, else
             draw ``log_prob_fn.sample_prior(nwalkers, random)``. After a climb, a State of this sampler (or the
             coordinates of its last one) goes on from there; any other coordinates start a new climb.
         nsteps : int — sweeps stored in the chain; 0 climbs only.
-
-        With an emcee `HDFBackend`, a new sampler on the file of a run that was killed goes on where it was, inside a
-        stage or a sweep too, and ends bit for bit as it would have: pass None or the draws of the prior it began with.
-        A call that was cut off is completed by the same call; any other number of steps is added to what is there.
         **kwargs : of `sample`.
 
         Returns
@@ -328,6 +326,8 @@ class TemperedSampler(EnsembleSampler):
             ended = True
             raise
         finally:
+            # what was taken up serves this call only: a later climb is a new one, and no point is looked up any more
+            self._memo, self._recorded = None, []
             if isinstance(self.backend, JournaledBackend):
                 self.backend.flush()
                 if ended and store:

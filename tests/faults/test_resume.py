@@ -211,6 +211,22 @@ def test_a_lost_journal_leaves_the_chain(finished):
     assert sampler.iteration == STEPS + 2 and sampler.ladder == whole.ladder
 
 
+def test_a_new_climb_after_a_resumed_run(finished):
+    """It is entered in the journal as the first one was: a third sampler goes on with it, not with the old one."""
+    path, _ = finished
+    sampler = make(path, "smc")
+    sampler.run_mcmc(None, 1)
+    draws = Gaussian(NDIM).sample_prior(N, np.random.default_rng(1))
+    sampler.run_mcmc(draws, 2)
+    chain = sampler.get_chain()
+    assert np.array_equal(read_journal(journal_of(path)).start.coords, draws)
+    again = make(path, "smc")
+    again.run_mcmc(None, 1)
+    sampler = make(path, "smc")
+    assert sampler.iteration == STEPS + 4
+    assert np.array_equal(sampler.get_chain()[: STEPS + 3], chain)
+
+
 def test_reset_after_burn_in(tmp_path):
     """The chain is thrown away, the place is not."""
     chains = []
