@@ -8,28 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Integral
 
-__all__ = ["Bars", "Concrete", "Hoops", "Patches", "Steel", "number", "refuse", "whole_number"]
+from .inputs import number, refuse, whole_number
 
-
-def refuse(expected: str, got: object, advice: str) -> None:
-    """ValueError in the words of all inputs of a column."""
-    raise ValueError(f"RCColumn: expected {expected}; got {got!r}; {advice}")
-
-
-def number(name: str, value: object, *, zero: bool = False, any_sign: bool = False) -> None:
-    """Refuse a `value` that is not a finite number, or not positive (`zero`: or zero; `any_sign`: either sign)."""
-    kind = "finite" if any_sign else "zero or positive" if zero else "positive"
-    is_number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    if not is_number or not (any_sign or value > 0.0 or (zero and value == 0.0)):
-        refuse(f"a {kind} {name}", value, "give one number in SI units (fe_likelihoods.units.to_si converts)")
-
-
-def whole_number(name: str, value: object, low: int, high: int) -> None:
-    """Refuse a `value` that is not a whole number from `low` to `high`."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or not low <= value <= high:
-        refuse(f"{name} between {low} and {high}, a whole number", value, "see the documentation of RCColumn")
+__all__ = ["Bars", "Concrete", "Hoops", "Patches", "Steel"]
 
 
 @dataclass(frozen=True)

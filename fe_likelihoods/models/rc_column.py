@@ -23,13 +23,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from numbers import Integral
 
-import numba
 import numpy as np
 
 from ..channels import Channel
@@ -49,7 +46,9 @@ from .circular_section import (
     gauss_lobatto,
     mander_confinement,
 )
-from .column_inputs import Bars, Concrete, Hoops, Patches, Steel, number, refuse, whole_number
+from .column_inputs import Bars, Concrete, Hoops, Patches, Steel
+from .inputs import channel_rows, number, refuse, theta_rows, whole_number
+from .threads import map_threads
 
 __all__ = ["Bars", "ColumnHistory", "Concrete", "Hoops", "Patches", "RCColumn", "Steel"]
 
@@ -286,63 +285,19 @@ class RCColumn:
 
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses at `thetas` (n, n_parameters), on numba's number of threads."""
-        thetas = self._checked(thetas)
-        rows = self._rows()
-        response, reasons = self._map(
-            lambda history: history.values[rows], thetas, (len(rows), self.n_steps), self._runner()
-        )
-        return SimulationBatch(response, reasons)
+        run, rows = self._runner(), self._rows()
+        thetas = theta_rows(thetas, self.parameters)
+        return SimulationBatch(*map_threads(lambda theta: run(theta).values[rows], thetas, (len(rows), self.n_steps)))
 
     def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
         """Sums of squared residuals (n, n_channels) against `measured` (n_channels, n_steps); no response is kept."""
-        thetas, measured = self._checked(thetas), np.asarray(measured, dtype=float)
-        rows = self._rows()
-        if measured.shape != (len(rows), self.n_steps):
-            raise ValueError(
-                f"expected measured responses of shape {(len(rows), self.n_steps)}, a row for each of "
-                f"{[c.name for c in self.channels]}; got {measured.shape}; bring record and measurements to one step "
-                "and length"
-            )
-        misfit, reasons = self._map(
-            lambda history: ((history.values[rows] - measured) ** 2).sum(axis=1), thetas, (len(rows),), self._runner()
-        )
-        return MisfitBatch(misfit, reasons)
+        run, rows = self._runner(), self._rows()
+        measured = channel_rows(measured, self.channels, self.n_steps)
 
-    def _checked(self, thetas: np.ndarray) -> np.ndarray:
-        thetas = np.asarray(thetas, dtype=float)
-        if thetas.ndim != 2 or thetas.shape[1] != len(self.parameters):
-            raise ValueError(
-                f"expected rows with one value for each of {self.parameters}, shape (n, {len(self.parameters)}); "
-                f"got {thetas.shape}"
-            )
-        return thetas
+        def misfit(theta: np.ndarray) -> np.ndarray:
+            return ((run(theta).values[rows] - measured) ** 2).sum(axis=1)
 
-    @staticmethod
-    def _map(
-        reduce: Callable, thetas: np.ndarray, shape: tuple[int, ...], run: Callable
-    ) -> tuple[np.ndarray, list[str]]:
-        """`reduce` of each history, on threads: the kernels hold no lock, and each run has its own memory."""
-        out = np.full((len(thetas), *shape), np.nan)
-        reasons = [""] * len(thetas)
-
-        def one(i: int) -> None:
-            try:
-                out[i] = reduce(run(thetas[i]))
-            except SimulationFailed as failure:
-                reasons[i] = failure.reason
-
-        n_threads = min(numba.get_num_threads(), len(thetas), os.cpu_count() or 1)
-        if n_threads <= 1:
-            for i in range(len(thetas)):
-                one(i)
-            return out, reasons
-        with ThreadPoolExecutor(n_threads) as threads:
-            try:
-                list(threads.map(one, range(len(thetas))))
-            except BaseException:  # Ctrl-C: do not wait for what has not begun
-                threads.shutdown(wait=False, cancel_futures=True)
-                raise
-        return out, reasons
+        return MisfitBatch(*map_threads(misfit, theta_rows(thetas, self.parameters), (len(rows),)))
 
     def _rows(self) -> list[int]:
         return [_CHANNEL_ROWS[c.name] for c in self.channels]
