@@ -106,16 +106,18 @@ def elastic_plastic(increment, displacement, velocity, z, weight, bearing, c, la
     """Slider that is a spring of stiffness k0 up to mu(v) W, and rubber; z is the slider's force [N]."""
     mu, dmu = friction(velocity, bearing[0], bearing[1], bearing[2])
     force, stiffness, half_loop, slope = rubber(displacement, law)
-    capacity = mu * weight
+    capacity, dcapacity = mu * weight, dmu * weight
     slider, dslider, dv = z + bearing[4] * increment, bearing[4], 0.0
-    if abs(slider) > capacity:
-        sign = 1.0 if slider > 0.0 else -1.0
-        slider, dslider, dv = sign * capacity, 0.0, sign * dmu * weight
-    share = slider / capacity if capacity > 0.0 else 0.0
+    share, dshare, share_dv = 0.0, 0.0, 0.0  # of the capacity, and its derivatives to U and v
+    if abs(slider) >= capacity:  # also where nothing presses on the bearing
+        share = 1.0 if slider > 0.0 else -1.0
+        slider, dslider, dv = share * capacity, 0.0, share * dcapacity
+    else:
+        share, dshare, share_dv = slider / capacity, dslider / capacity, -slider / capacity**2 * dcapacity
     return (
         slider + half_loop * share + force,
-        dslider * (1.0 + (half_loop / capacity if capacity > 0.0 else 0.0)) + stiffness + slope * share,
-        dv,
+        dslider + half_loop * dshare + slope * share + stiffness,
+        dv + half_loop * share_dv,
         slider,
     )
 

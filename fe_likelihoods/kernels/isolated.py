@@ -17,7 +17,7 @@ Source: specs/isolated_bridge.md, section 7; Hochbruck & Ostermann, Exponential 
 
 import numpy as np
 
-from .bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, coulomb, elastic_plastic, regularised
+from .bearings import BOUC_WEN, ELASTIC_PLASTIC, coulomb, elastic_plastic, regularised
 from .jit import kernel
 
 __all__ = ["N_OUT", "N_STATES", "step_isolated"]
@@ -55,7 +55,7 @@ def step_isolated(
     law : (10,) float
         Rubber, as in `bearings.rubber`.
     form : int
-        BOUC_WEN, ELASTIC_PLASTIC or COULOMB.
+        BOUC_WEN, ELASTIC_PLASTIC, else COULOMB.
     tolerance : float
         Of the last correction of F [N].
     max_iterations : int

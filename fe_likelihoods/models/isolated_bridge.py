@@ -7,8 +7,8 @@ the higher terms of the rubber is linear and is stepped exactly (`kernels.isolat
 
 Channels of pier i: bearing displacement ``Ub_i``, isolator force ``Fb_i``, drift of the top of the block ``drift_i``,
 elastic shear of the pier ``shear_i``, absolute acceleration of the top of the block ``acc_pi``; of the deck: ``Ud`` and
-absolute acceleration ``acc_d``. ``mean_Ub``, ``mean_Fb``, ``mean_drift``, ``mean_shear`` and ``mean_acc_p`` are means of
-the two piers, which do not tell the piers apart.
+absolute acceleration ``acc_d``. ``mean_Ub``, ``mean_Fb``, ``mean_drift``, ``mean_shear`` and ``mean_acc_p`` are means
+of the two piers, which do not tell the piers apart.
 
 Most nominal values are assumed (specs/isolated_bridge.md, section 4): results are of a bridge *like* the tested one.
 
@@ -22,6 +22,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -41,6 +42,7 @@ from .threads import map_threads
 __all__ = ["CHANNEL_SETS", "Bearing", "BridgeHistory", "Damper", "IsolatedBridge", "Pier", "Rubber"]
 
 logger = logging.getLogger(__name__)
+_WARNED: weakref.WeakSet[IsolatedBridge] = weakref.WeakSet()
 
 PARAMETERS = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
 
@@ -147,7 +149,7 @@ class IsolatedBridge:
     p_delta: bool = False
     vertical: Record | None = None
     gravity: float = 9.81
-    tolerance: float = 1e-6
+    tolerance: float = 1e-5
     max_iterations: int = 50
 
     def __post_init__(self) -> None:
@@ -383,10 +385,11 @@ class IsolatedBridge:
         def run(theta: np.ndarray) -> np.ndarray:
             values, _ = self._integrate(theta)
             largest = np.abs(b @ values[:5]).max()
-            if largest > end_of_law:
+            if largest > end_of_law and self not in _WARNED:
+                _WARNED.add(self)
                 logger.warning(
                     "a bearing moved by %.1f mm, beyond the %.1f mm for which the rubber's law holds: it was continued "
-                    "along its tangent, at %s",
+                    "along its tangent, at %s; further ones are not told, see history(theta).beyond_range",
                     1e3 * largest,
                     1e3 * end_of_law,
                     dict(zip(self.parameters, theta.tolist(), strict=True)),
