@@ -4,10 +4,14 @@
 values with normal priors truncated at zero, two noise levels with half-normal priors. The measured record and
 responses of the paper could not be had; the bundled data are **synthetic** (see ``data/README.md``), and
 `bridge_column_measurements` makes such data for any other base motion.
+
+`isolated_bridge` is the isolated bridge of the paper on TMCMC: ten multiples of nominal values of friction and dampers.
+Its data are **synthetic** and most nominal values are **assumed**.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from types import MappingProxyType
 
@@ -15,7 +19,9 @@ import numpy as np
 
 from .channels import Dataset, Measurements, read_dataset
 from .likelihood import FELikelihood
+from .models.isolated_bridge import CHANNEL_SETS, IsolatedBridge
 from .models.rc_column import RCColumn
+from .noise import GaussianNoise, SharedGaussianNoise
 from .posterior import Posterior
 from .priors import HalfNormal, Prior, TruncatedNormal
 from .records import Record
@@ -24,10 +30,17 @@ from .units import to_si
 __all__ = [
     "BRIDGE_COLUMN_MEANS",
     "BRIDGE_COLUMN_NOISE",
+    "ISOLATED_BRIDGE_NOISE",
+    "ISOLATED_BRIDGE_OUTPUTS",
+    "ISOLATED_BRIDGE_TRUTH",
     "bridge_column",
     "bridge_column_data",
     "bridge_column_measurements",
     "bridge_column_prior",
+    "isolated_bridge",
+    "isolated_bridge_data",
+    "isolated_bridge_measurements",
+    "isolated_bridge_prior",
 ]
 
 BRIDGE_COLUMN_MEANS = MappingProxyType({"Ec": 0.59, "Es": 0.96, "a0": 0.27, "a1": 4.78, "ft": 2.43})
@@ -39,10 +52,14 @@ BRIDGE_COLUMN_NOISE = MappingProxyType(
 """Noise levels of the paper (Table 2) [SI]: standard deviations of the white noise of the synthetic data."""
 
 
+def _bundled(name: str) -> Dataset:
+    with resources.as_file(resources.files("fe_likelihoods.data") / name) as path:
+        return read_dataset(path)
+
+
 def bridge_column_data() -> Dataset:
     """The bundled synthetic EQ1: base record, measured channels and how they were made (``data/README.md``)."""
-    with resources.as_file(resources.files("fe_likelihoods.data") / "bridge_column_eq1.h5") as path:
-        return read_dataset(path)
+    return _bundled("bridge_column_eq1.h5")
 
 
 def bridge_column_measurements(
@@ -137,3 +154,169 @@ def bridge_column(
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
     return Posterior(FELikelihood(model, measurements), bridge_column_prior())
+
+
+# ------------------------------------------------------------------ isolated bridge
+
+_DEVICES = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
+ISOLATED_BRIDGE_TRUTH = MappingProxyType(
+    {
+        "twin": MappingProxyType(
+            dict(zip(_DEVICES, (1.15, 0.85, 1.2, 0.9, 1.1, 0.8, 0.8, 1.25, 1.3, 0.9), strict=True))
+        ),
+        "means": MappingProxyType(dict.fromkeys(_DEVICES, 1.0) | {"df_1": 0.8, "df_2": 1.2}),
+    }
+)
+"""Multiples of the nominal values from which the two synthetic data sets were made (assumed)."""
+
+ISOLATED_BRIDGE_OUTPUTS = MappingProxyType(
+    {"twin": CHANNEL_SETS[10], "means": ("mean_Ub", "mean_Fb", "mean_drift", "mean_shear", "mean_acc_p")}
+)
+"""Channels of the two synthetic data sets."""
+
+ISOLATED_BRIDGE_NOISE = MappingProxyType({"twin": 0.05, "means": 0.10})
+"""White noise of the two synthetic data sets, in root mean squares of each channel (assumed)."""
+
+
+def isolated_bridge_data(data: str = "twin") -> Dataset:
+    """A bundled synthetic test of the isolated bridge, nominal values assumed (``data/README.md``).
+
+    Parameters
+    ----------
+    data : {"twin", "means"}
+        Ten channels of both piers; or five means of the two piers, whose posterior has two modes.
+
+    Raises
+    ------
+    ValueError
+        For another name.
+    """
+    if data not in ISOLATED_BRIDGE_TRUTH:
+        raise ValueError(f'expected data="twin" or "means"; got {data!r}; for your own give record= and measurements=')
+    return _bundled("isolated_bridge.h5" if data == "twin" else "isolated_bridge_means.h5")
+
+
+def isolated_bridge_measurements(
+    record: Record,
+    *,
+    theta: Mapping[str, float] = ISOLATED_BRIDGE_TRUTH["twin"],
+    outputs: tuple[str, ...] | int = 10,
+    noise: float = 0.05,
+    seed: int = 1,
+    step: float = 0.05e-3,
+    every: int = 2,
+    **changes,
+) -> Measurements:
+    """Synthetic measurements of the isolated bridge under `record`: a finer step of integration, plus white noise.
+
+    Parameters
+    ----------
+    record : Record
+        Acceleration of the table.
+    theta : mapping of str to float
+        Multiples of the nominal values of all ten parameters.
+    outputs : tuple of str, 5, 6 or 10
+        Channels (see `IsolatedBridge`).
+    noise : float
+        Standard deviation of the noise, in root mean squares of each channel; 0 for the response alone.
+    seed : int
+        Of the noise.
+    step : float
+        Of integration [s]; the updated model has .25 ms.
+    every : int
+        One sample in so many of the record's.
+    **changes
+        Other arguments of `IsolatedBridge`.
+    """
+    model = IsolatedBridge(record, outputs=outputs, step=step, every=every, **changes)
+    values = model.simulate([theta[name] for name in model.parameter_names])
+    rms = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
+    values = values + noise * rms * np.random.default_rng(seed).standard_normal(values.shape)
+    description = (
+        f"SYNTHETIC, nominal values assumed: response of IsolatedBridge (step {1e3 * step:g} ms) to {record.name}"
+        + (f", plus white noise of {100 * noise:g} % of each channel's root mean square (seed {seed})" if noise else "")
+    )
+    return Measurements(model.channels, model.dt, values, description)
+
+
+def isolated_bridge_prior(parameter_names: Sequence[str], sigmas: Mapping[str, float]) -> Prior:
+    """Multiples of nominal N(1, .5) within [.2, 2.5]; half-normal noise of .3 scales, above a thousandth: all assumed.
+
+    The paper gives no prior (specs/isolated_bridge.md, section 5).
+
+    Parameters
+    ----------
+    parameter_names : sequence of str
+        Structural parameters.
+    sigmas : mapping of str to float
+        Noise parameters and the scale of each: 1 for a shared sigma, the measured root mean square of a channel [SI].
+    """
+    structural = {name: TruncatedNormal(1.0, 0.5, 0.2, 2.5) for name in parameter_names}
+    return Prior(structural | {name: TruncatedNormal(0.0, 0.3 * s, 1e-3 * s) for name, s in sigmas.items()})
+
+
+def isolated_bridge(
+    *,
+    data: str = "twin",
+    channels: tuple[str, ...] | int | None = None,
+    noise: str = "shared",
+    record: Record | None = None,
+    measurements: Measurements | None = None,
+    seed: int = 1,
+    **changes,
+) -> Posterior:
+    """Posterior of the isolated bridge: ten parameters of friction and dampers, and the noise.
+
+    Parameters
+    ----------
+    data : {"twin", "means"}
+        Bundled synthetic test: "twin" has a known truth and one mode; "means" holds only means of the two piers, so
+        the devices of the piers can be exchanged: exactly two modes, whose masses are known
+        (`IsolatedBridge.exchanged`).
+    channels : tuple of str, 5, 6 or 10, optional
+        Measured channels that are used. Default: six of "twin", as in the paper's figure of the fit; all of any other.
+    noise : {"shared", "per channel"}
+        One sigma for all channels, in root mean squares of the measured channel, as in the paper's results, or one for
+        each channel [SI], its general formulation.
+    record, measurements : optional
+        Table motion and responses of your own. With a record alone, synthetic measurements are made for it
+        (`isolated_bridge_measurements`). Measurements may have a step that is a multiple of the record's.
+    seed : int
+        Of the noise, where measurements are made.
+    **changes
+        Other arguments of `IsolatedBridge`: step, friction, bearings, parameters ...
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    ValueError
+        For unknown names, for measurements without a record, or that do not fit it.
+    """
+    if noise not in ("shared", "per channel"):
+        raise ValueError(f'expected noise="shared" or "per channel"; got {noise!r}')
+    if record is None:
+        if measurements is not None:
+            raise ValueError("measurements came without the record that caused them: give record= too")
+        bundled = isolated_bridge_data(data)
+        record, measurements = bundled.record, bundled.measurements
+        channels = 6 if channels is None and data == "twin" else channels
+    elif measurements is None:
+        measurements = isolated_bridge_measurements(record, seed=seed)
+    names = CHANNEL_SETS.get(channels) if isinstance(channels, int) else channels
+    if isinstance(channels, int) and names is None:
+        raise ValueError(f"expected channels by name, or one of the sets {tuple(CHANNEL_SETS)}; got {channels}")
+    if names is not None:
+        measurements = measurements.select(names)
+    every = round(measurements.dt / record.dt)
+    model = IsolatedBridge(
+        record, outputs=tuple(c.name for c in measurements.channels), **({"every": max(1, every)} | changes)
+    )
+    if noise == "shared":
+        law, scales = SharedGaussianNoise.of(measurements), [1.0]
+    else:
+        law, scales = GaussianNoise(measurements.channels), SharedGaussianNoise.of(measurements).scales
+    prior = isolated_bridge_prior(model.parameter_names, dict(zip(law.parameter_names, scales, strict=True)))
+    return Posterior(FELikelihood(model, measurements, law), prior)

@@ -235,6 +235,18 @@ class IsolatedBridge:
             *map_threads(lambda theta: np.square(run(theta) - measured).sum(axis=1), thetas, (len(self.outputs),))
         )
 
+    def exchanged(self, thetas: np.ndarray) -> np.ndarray:
+        """The same devices, each at the other pier: multiples (..., 10) with the same physical values.
+
+        Where the piers are alike and the data do not tell them apart, the likelihood is the same at both, and as the
+        map keeps volumes, the masses of the two modes are as the prior's densities.
+        """
+        if self.parameters != PARAMETERS:
+            raise ValueError(f"expected a model with the parameters {PARAMETERS}, in this order; got {self.parameters}")
+        nominal = np.array(list(self.nominal.values()))
+        physical = np.asarray(thetas, dtype=float) * nominal
+        return physical[..., [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]] / nominal
+
     # ------------------------------------------------------------------ the linear part
 
     def _kinematics(self) -> np.ndarray:

@@ -109,7 +109,8 @@ def test_a_block_on_a_sliding_table():
     gentle = model.with_record(Record("gentle", 0.01, 0.9 * mu * G * np.sin(np.linspace(0.0, 12.0, 101))))
     _, acceleration, bearing_displacement = gentle.simulate([1.0])
     assert np.abs(bearing_displacement).max() < 1e-7  # at rest at every step; in between the table turns under it
-    np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=2e-3)
+    steepest = np.abs(np.diff(gentle.record.acceleration)).max() / gentle.dt
+    np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=3.0 * model.step * steepest)
 
 
 def test_without_hysteresis_the_bridge_is_linear(rng):
