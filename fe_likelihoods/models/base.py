@@ -60,7 +60,8 @@ class Model(Protocol):
     """What a likelihood needs of a model.
 
     It may also have ``simulate_batch(thetas) -> SimulationBatch`` and
-    ``misfit_batch(thetas, measured) -> MisfitBatch``, which must give for each row what `simulate` gives.
+    ``misfit_batch(thetas, measured) -> MisfitBatch``, which must give for each row what `simulate` gives; and
+    ``with_record(record)``, the same model under another excitation, for predictions.
     """
 
     @property

@@ -151,6 +151,12 @@ class LinearOscillator:
         text = f"LinearOscillator {self.record.fingerprint} {self.period!r} {self.damping_ratio!r}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
+    def with_record(self, record: Record) -> "LinearOscillator":
+        """The same oscillator under another base acceleration; ValueError if it is no `Record`."""
+        if not isinstance(record, Record):
+            raise ValueError(f"LinearOscillator: expected a Record as excitation; got {type(record).__name__}")
+        return type(self)(record, self.period, self.damping_ratio)
+
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response at one set of parameters.
 

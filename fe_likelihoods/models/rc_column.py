@@ -24,7 +24,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from numbers import Integral
 
 import numpy as np
@@ -252,6 +252,15 @@ class RCColumn:
         ]
         parts += [repr([c.name for c in self.channels]), self.loading.fingerprint, KERNEL_HASH, type(self).__name__]
         return hashlib.blake2b("|".join(parts).encode(), digest_size=16).hexdigest()
+
+    def with_record(self, record: Record | DisplacementHistory) -> RCColumn:
+        """The same column under another loading of the same kind; ValueError for one of another kind."""
+        kind = type(self.loading)
+        if not isinstance(record, kind):
+            refuse(
+                f"a {kind.__name__}, as the loading of this column is", type(record).__name__, "channels depend on it"
+            )
+        return replace(self, loading=record)
 
     def section(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fibers (y [m], area [m2]) of core, cover and bars, each (n, 2)."""
