@@ -1,0 +1,184 @@
+"""What goes into a prediction, checked, and what is kept of its simulations while they come in, batch by batch."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .likelihood import as_points
+from .moments import Kept, Moments
+
+__all__ = ["Gathered", "distinct_rows", "members_of", "parts_of", "split_samples"]
+
+
+def parts_of(thing: Any, pool: Any) -> tuple[Any, Any, Any]:
+    """Model, noise (None for a bare model) and pool."""
+    likelihood = getattr(thing, "likelihood", thing)
+    if hasattr(likelihood, "measurements") and hasattr(likelihood, "model"):
+        return likelihood.model, likelihood.noise, getattr(likelihood, "pool", None) if pool is None else pool
+    if not (hasattr(thing, "simulate") and hasattr(thing, "parameter_names")):
+        raise ValueError(f"expected a Posterior, an FELikelihood or a model with simulate(theta); got {thing!r}")
+    return thing, None, pool
+
+
+def split_samples(model: Any, noise_model: Any, samples: Any, noise: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Structural parameters (n, n_structural), and standard deviations of the noise (n, n_channels) if it is wanted."""
+    structural = tuple(model.parameter_names)
+    names = structural + (() if noise_model is None else tuple(noise_model.parameter_names))
+    if noise and noise_model is None:
+        raise ValueError("noise=True needs the posterior, whose samples have the noise's parameters; got a model")
+    width = len(samples) if isinstance(samples, Mapping) else np.shape(samples)[-1:]
+    alone = not noise and width in (len(structural), (len(structural),))
+    try:
+        points = as_points(samples, structural if alone else names)
+    except TypeError as error:
+        raise ValueError(f"samples must be numbers, (n, {len(names)}): {error}") from error
+    if points.ndim != 2 or len(points) == 0:
+        raise ValueError(
+            f"expected samples of shape (n, {len(names)}), as sampler.get_chain(flat=True) gives; got {points.shape}"
+        )
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"samples must be finite: {bad.size} of {len(points)} are not, the first is sample {bad[0]}: "
+            f"{points[bad[0]]}; leave them out"
+        )
+    thetas = points[:, : len(structural)]
+    if not noise:
+        return thetas, None
+    if not hasattr(noise_model, "standard_deviations"):
+        raise ValueError(
+            f"{type(noise_model).__name__} cannot be drawn from: give it a method standard_deviations(parameters (n, "
+            "n_parameters)) that returns (n, n_channels) in SI"
+        )
+    deviations = np.asarray(noise_model.standard_deviations(points[:, len(structural) :]), dtype=float)
+    if deviations.shape != (len(points), len(model.channels)) or not np.all((deviations > 0) & (deviations < np.inf)):
+        raise ValueError(
+            f"the noise needs a positive standard deviation for each of {len(points)} samples and "
+            f"{len(model.channels)} channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
+        )
+    return thetas, deviations
+
+
+@dataclass(eq=False)
+class Gathered:
+    """What is left of the simulations while they come in.
+
+    A result is what is computed from one response; with noise every sample has its own, else equal samples share one.
+    """
+
+    members: list[np.ndarray]  # indices of the samples of each distinct theta
+    deviations: np.ndarray | None  # of the noise, (n, n_channels)
+    evaluate: Callable[[np.ndarray], np.ndarray]
+    rows: list[int] | None  # channels whose histories are wanted
+    result_of_sample: np.ndarray
+    probabilities: tuple[float, ...]
+    memory: int | None
+    seeds: np.random.SeedSequence
+    moments: Moments = field(default_factory=Moments)
+    noise_variance: Moments = field(default_factory=Moments)
+    kept: Kept | None = None
+    failed: list[np.ndarray] = field(default_factory=list)
+    reasons: Counter = field(default_factory=Counter)
+    shape: tuple[int, ...] | None = None
+
+    def prepare(self, shape: tuple[int, ...]) -> None:
+        """Room for what is kept, once the shape of a result is known."""
+        self.shape = shape
+        histories = self.rows is not None
+        if histories and not self.probabilities:
+            return
+        # numbers are kept whatever the memory; of arrays without quantiles, what fits
+        bound = None if shape == () else self.memory
+        if not self.probabilities and bound is not None and self._bytes(shape) > bound:
+            return
+        rng = np.random.default_rng(np.random.SeedSequence(self.seeds.entropy, spawn_key=(0,)))
+        self.kept = Kept(self.result_of_sample, shape, np.float32 if histories else np.float64, bound, rng)
+
+    def _bytes(self, shape: tuple[int, ...]) -> int:
+        return 8 * int(np.prod(shape)) * (int(self.result_of_sample.max()) + 1)
+
+    def add(self, start: int, responses: np.ndarray, reasons: list[str]) -> None:
+        """Enter the responses of the distinct thetas from `start` on."""
+        members = self.members[start : start + len(responses)]
+        usable = []
+        for j, reason in enumerate(reasons):
+            if reason:
+                self._leave_out(members[j], reason)
+            else:
+                usable.append(j)
+        if not usable:
+            return
+        if self.rows is not None:
+            self._add_histories(start, responses[usable][:, self.rows], usable, members)
+        elif self.deviations is None:
+            values = [self._value(responses[j]) for j in usable]
+            self._add_values(values, [start + j for j in usable], [members[j] for j in usable])
+        else:
+            for j in usable:
+                values = [self._value(responses[j] + self._noise(i, responses[j].shape)) for i in members[j]]
+                self._add_values(values, list(members[j]), [np.array([i]) for i in members[j]])
+
+    def _add_histories(
+        self, start: int, histories: np.ndarray, usable: list[int], members: Sequence[np.ndarray]
+    ) -> None:
+        self.moments.add(histories, np.array([len(members[j]) for j in usable]))
+        if self.deviations is None:
+            if self.kept is not None:
+                self.kept.add(start + np.array(usable), histories)
+            return
+        everyone = np.concatenate([members[j] for j in usable])
+        self.noise_variance.add(np.square(self.deviations[everyone][:, self.rows]), np.ones(len(everyone)))
+        if self.kept is None:
+            return
+        for history, j in zip(histories, usable, strict=True):
+            for i in members[j]:
+                if i in self.kept:
+                    # drawn for all channels: what one of them reads does not depend on which others are asked for
+                    noise = self._noise(i, (self.deviations.shape[1], history.shape[1]))
+                    self.kept.add(np.array([i]), (history + noise[self.rows])[None])
+
+    def _add_values(self, values: list[np.ndarray], results: list[int], members: list[np.ndarray]) -> None:
+        finite = [bool(np.isfinite(value).all()) for value in values]
+        for fine, who in zip(finite, members, strict=True):
+            if not fine:
+                self._leave_out(who, "the quantity is not finite")
+        if any(finite):
+            rows = np.array([value for value, fine in zip(values, finite, strict=True) if fine])
+            counts = np.array([len(who) for who, fine in zip(members, finite, strict=True) if fine])
+            self.moments.add(rows, counts)
+            if self.kept is not None:
+                self.kept.add(np.array(results)[finite], rows)
+
+    def _value(self, response: np.ndarray) -> np.ndarray:
+        value = np.asarray(self.evaluate(response), dtype=float)
+        if self.shape is None:
+            self.prepare(value.shape)
+        if value.shape != self.shape:
+            raise ValueError(f"quantity must return one shape for every response; got {self.shape}, then {value.shape}")
+        return value
+
+    def _noise(self, sample: int, shape: tuple[int, int]) -> np.ndarray:
+        # a stream a sample: neither batches nor failures change what it gets
+        stream = np.random.default_rng(np.random.SeedSequence(self.seeds.entropy, spawn_key=(1, int(sample))))
+        return self.deviations[sample][:, None] * stream.standard_normal(shape)
+
+    def _leave_out(self, members: np.ndarray, reason: str) -> None:
+        self.failed.append(members)
+        self.reasons[reason] += len(members)
+
+
+def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct rows in the order of their first appearance, and which of them each row is."""
+    first: dict[bytes, int] = {}  # adding zero makes -0.0 and 0.0 one key
+    result = np.array([first.setdefault(row.tobytes(), len(first)) for row in thetas + 0.0])
+    rows = np.frombuffer(b"".join(first), dtype=float).reshape(len(first), -1)
+    return rows.copy(), result
+
+
+def members_of(result_of_theta: np.ndarray, n_results: int) -> list[np.ndarray]:
+    """Which rows are each of the distinct ones."""
+    order = np.argsort(result_of_theta, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(result_of_theta, minlength=n_results))[:-1])
