@@ -30,6 +30,7 @@ SAMPLERS = {
     "alarms": {"importance", "ladder"},
     "settings": {"resampling"},
     "mutation": {"settings"},
+    "comparison": set(),
     "smc": {"moves", "settings", "tempered"},
     "tmcmc": {"moves", "settings", "tempered"},
     "climb": {

@@ -1,0 +1,191 @@
+"""Which model the data prefer: posterior probabilities of models from their evidences.
+
+With prior probabilities pi_k and evidences Z_k the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j. The
+evidences of samplers are estimates; their errors go through to first order, which holds while the errors of the
+logarithms are well below one. Intervals are made for the log-odds, where the first order reaches further, and stay
+between zero and one.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import expit, logsumexp
+from scipy.stats import norm
+
+__all__ = ["ModelComparison", "compare_models"]
+
+_LARGE_ERROR = 0.5
+
+
+class ModelComparison(NamedTuple):
+    """Models side by side, one entry a model, in the order given.
+
+    Attributes
+    ----------
+    names : tuple of str
+    log_evidence, log_evidence_error : (n,) float
+    prior : (n,) float — probabilities before the data.
+    probability : (n,) float — and after them.
+    probability_error : (n,) float — standard error, to first order in the errors of the log-evidences.
+    lower, upper : (n,) float — 95 % interval, from the log-odds.
+    log_bayes_factor : (n,) float — log-evidence less that of the best model, the one with the largest evidence.
+    log_bayes_factor_error : (n,) float — zero for the best model itself.
+    rough : bool — whether an error of the log-odds exceeds one half: then `probability_error` is no more than an order
+        of magnitude, and longer runs are needed.
+    """
+
+    names: tuple[str, ...]
+    log_evidence: np.ndarray
+    log_evidence_error: np.ndarray
+    prior: np.ndarray
+    probability: np.ndarray
+    probability_error: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    log_bayes_factor: np.ndarray
+    log_bayes_factor_error: np.ndarray
+    rough: bool
+
+    @property
+    def best(self) -> str:
+        """Name of the model with the largest evidence."""
+        return self.names[int(np.argmax(self.log_evidence))]
+
+    @property
+    def probabilities(self) -> dict[str, float]:
+        """Posterior probabilities by name, as model averaging takes them."""
+        return dict(zip(self.names, self.probability.tolist(), strict=True))
+
+    def table(self) -> str:
+        """The comparison as text, one line a model, the most probable first."""
+        width = max(len("model"), *(len(name) for name in self.names))
+        head = f"{'model':<{width}} {'log evidence':>20} {'log Bayes factor':>20} {'prior':>7} "
+        rows = [head + f"{'probability':>22} {'95 % interval':>22}"]
+        for k in np.argsort(-self.probability, kind="stable"):
+            evidence = f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}"
+            factor = f"{self.log_bayes_factor[k]:.3f} +- {self.log_bayes_factor_error[k]:.3f}"
+            probability = f"{self.probability[k]:.4g} +- {self.probability_error[k]:.2g}"
+            interval = f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}"
+            row = f"{self.names[k]:<{width}} {evidence:>20} {factor:>20} {self.prior[k]:>7.3g} "
+            rows.append(row + f"{probability:>22} {interval:>22}")
+        if self.rough:
+            rows.append("the errors of the log-evidences are large: probabilities are rough, make longer runs")
+        return "\n".join(rows)
+
+    def __str__(self) -> str:
+        return self.table()
+
+
+def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None = None) -> ModelComparison:
+    """Posterior probabilities of models of the same data.
+
+    Parameters
+    ----------
+    models : by name, each a sampler that has run (anything with ``log_evidence`` and ``log_evidence_error``) or a pair
+        (log_evidence, error). The evidence must be of a normalised prior and a normalised likelihood.
+    prior : probabilities of the models before the data, by the same names; by default all the same.
+
+    Returns
+    -------
+    ModelComparison
+
+    Raises
+    ------
+    ValueError
+        For fewer than two models, evidences or errors that are no finite numbers, priors of other names or that do not
+        sum to one, and samplers whose posteriors have different measurements (evidences of different data cannot be
+        compared).
+
+    Examples
+    --------
+    >>> print(compare_models({"elastic": sampler_1, "inelastic": sampler_2}))
+    """
+    if not isinstance(models, Mapping) or len(models) < 2:
+        raise ValueError(f"compare_models needs two models or more, by name; got {models!r}")
+    names = tuple(models)
+    pairs = [_evidence(name, model) for name, model in models.items()]
+    log_evidence, error = np.array(pairs).T
+    _same_data(models)
+    before = _prior(names, prior)
+    with np.errstate(divide="ignore"):  # a prior of zero excludes a model
+        score = np.log(before) + log_evidence
+    probability = np.exp(score - logsumexp(score))
+
+    # d p_k / d log Z_j = p_k (delta_kj - p_j)
+    jacobian = probability[:, None] * (np.eye(len(names)) - probability)
+    probability_error = np.sqrt(jacobian**2 @ error**2)
+    # d logit(p_k) / d log Z_j = delta_kj - (1 - delta_kj) p_j / (1 - p_k)
+    odds, odds_error = np.empty((2, len(names)))
+    for k in range(len(names)):
+        others = np.delete(np.arange(len(names)), k)
+        rest = logsumexp(score[others])
+        odds[k] = score[k] - rest
+        share = np.exp(score[others] - rest) if rest > -np.inf else np.zeros(len(others))
+        odds_error[k] = math.hypot(error[k], *(share * error[others]))
+    reach = norm.ppf(0.975) * odds_error
+    lower, upper = expit(odds - reach), expit(odds + reach)
+
+    best = int(np.argmax(log_evidence))
+    factor_error = np.where(np.arange(len(names)) == best, 0.0, np.hypot(error, error[best]))
+    possible = (before > 0.0) & (before < 1.0)
+    return ModelComparison(
+        names=names,
+        log_evidence=log_evidence,
+        log_evidence_error=error,
+        prior=before,
+        probability=probability,
+        probability_error=probability_error,
+        lower=lower,
+        upper=upper,
+        log_bayes_factor=log_evidence - log_evidence[best],
+        log_bayes_factor_error=factor_error,
+        rough=bool(np.any(odds_error[possible] > _LARGE_ERROR)),
+    )
+
+
+def _evidence(name: str, model: Any) -> tuple[float, float]:
+    if hasattr(model, "log_evidence") and hasattr(model, "log_evidence_error"):
+        pair = model.log_evidence, model.log_evidence_error
+    else:
+        pair = model
+    try:
+        value, error = (float(each) for each in pair)
+    except (TypeError, ValueError) as reason:
+        raise ValueError(
+            f"model {name!r}: expected a sampler with log_evidence and log_evidence_error, or these two numbers; got "
+            f"{model!r}"
+        ) from reason
+    if not (math.isfinite(value) and math.isfinite(error) and error >= 0.0):
+        raise ValueError(
+            f"model {name!r}: log-evidence and its error must be finite, the error not negative; got {pair}"
+        )
+    return value, error
+
+
+def _prior(names: tuple[str, ...], prior: Mapping[str, float] | None) -> np.ndarray:
+    if prior is None:
+        return np.full(len(names), 1.0 / len(names))
+    if not isinstance(prior, Mapping) or set(prior) != set(names):
+        raise ValueError(f"one prior probability for each of {', '.join(names)} is needed; got {prior!r}")
+    values = np.array([prior[name] for name in names], dtype=float)
+    if not (np.all(values >= 0.0) and abs(values.sum() - 1.0) < 1e-9):
+        raise ValueError(f"prior probabilities must be non-negative and sum to one; got {dict(prior)}")
+    return values
+
+
+def _same_data(models: Mapping[str, Any]) -> None:
+    """ValueError if posteriors behind the samplers have different measurements; others are not looked into."""
+    seen: dict[str, str] = {}
+    for name, model in models.items():
+        posterior = getattr(getattr(model, "log_prob_fn", None), "f", None)
+        measurements = getattr(getattr(posterior, "likelihood", None), "measurements", None)
+        if hasattr(measurements, "fingerprint"):
+            # two models may have the same channels in another order
+            seen[name] = measurements.select(sorted(channel.name for channel in measurements.channels)).fingerprint
+    if len(set(seen.values())) > 1:
+        raise ValueError(
+            f"the evidences of {', '.join(seen)} are of different measurements and cannot be compared: give all models "
+            "the same measurements"
+        )
