@@ -92,10 +92,11 @@ class Gathered:
             return
         # numbers are kept whatever the memory; of arrays without quantiles, what fits
         bound = None if shape == () else self.memory
-        if not self.probabilities and bound is not None and self._bytes(shape) > bound:
+        fits = bound is None or self._bytes(shape) <= bound
+        if not self.probabilities and not fits:
             return
         rng = np.random.default_rng(np.random.SeedSequence(self.seeds.entropy, spawn_key=(0,)))
-        self.kept = Kept(self.result_of_sample, shape, np.float32 if histories else np.float64, bound, rng)
+        self.kept = Kept(self.result_of_sample, shape, np.float32 if histories and not fits else np.float64, bound, rng)
 
     def _bytes(self, shape: tuple[int, ...]) -> int:
         return 8 * int(np.prod(shape)) * (int(self.result_of_sample.max()) + 1)
@@ -112,7 +113,8 @@ class Gathered:
         if not usable:
             return
         if self.rows is not None:
-            self._add_histories(start, responses[usable][:, self.rows], usable, members)
+            every = len(usable) == len(responses) and self.rows == list(range(responses.shape[1]))
+            self._add_histories(start, responses if every else responses[np.ix_(usable, self.rows)], usable, members)
         elif self.deviations is None:
             values = [self._value(responses[j]) for j in usable]
             self._add_values(values, [start + j for j in usable], [members[j] for j in usable])

@@ -41,14 +41,16 @@ class Moments:
             return
         mean = np.tensordot(counts / total, values, axes=1)
         deviations = values - mean
-        squares = np.tensordot(counts, np.square(deviations, out=deviations), axes=1)
+        with np.errstate(over="ignore"):  # the variance of responses that have blown up is infinite
+            squares = np.tensordot(counts, np.square(deviations, out=deviations), axes=1)
         if self.mean is None:
             self.count, self.mean, self._squares = total, mean, squares
             return
         joint = self.count + total
         shift = mean - self.mean
         self.mean = self.mean + shift * (total / joint)
-        self._squares = self._squares + squares + shift**2 * (self.count * total / joint)
+        with np.errstate(over="ignore"):
+            self._squares = self._squares + squares + shift**2 * (self.count * total / joint)
         self.count = joint
 
     @property
@@ -64,8 +66,7 @@ class Kept:
     ----------
     result_of_sample : (n,) int — which result a sample has; copies share one.
     shape : shape of a result.
-    dtype : type in which results are kept; of float32 the deviations from the first result are, so that a small
-        spread about a large value is not rounded away.
+    dtype : type in which results are kept.
     memory : int or None — bound of the kept results [bytes]; None for no bound.
     rng : numpy.random.Generator — chooses the part.
 
@@ -105,7 +106,7 @@ class Kept:
         self._counts = counts[kept]
         self._rows = np.empty((len(kept), size), dtype=dtype)
         self._filled = np.zeros(len(kept), dtype=bool)
-        self._origin: np.ndarray | float | None = 0.0 if np.dtype(dtype) == np.float64 else None
+        self._largest = float(np.finfo(dtype).max)
 
     def __contains__(self, result: int) -> bool:
         return self._position[result] >= 0
@@ -117,9 +118,8 @@ class Kept:
         if not wanted.any():
             return
         rows = values.reshape(len(values), -1)[wanted]
-        if self._origin is None:
-            self._origin = rows[0].copy()
-        self._rows[positions[wanted]] = rows - self._origin
+        # a response that has blown up must stay a number in single precision
+        self._rows[positions[wanted]] = np.clip(rows, -self._largest, self._largest)
         self._filled[positions[wanted]] = True
 
     @property
@@ -129,8 +129,7 @@ class Kept:
 
     def values_of(self, results: np.ndarray) -> np.ndarray:
         """Kept results (m, *shape) of the `results` (m,), which must all have been entered."""
-        rows = self._rows[self._position[results]] + self._origin
-        return rows.reshape(len(results), *self.shape)
+        return self._rows[self._position[results]].reshape(len(results), *self.shape)
 
     def quantiles(self, probabilities: Sequence[float], effective: float) -> tuple[np.ndarray, np.ndarray]:
         """Quantiles and their standard errors, (n_probabilities, *shape) each (see `quantiles_with_errors`)."""
@@ -142,7 +141,6 @@ class Kept:
             part = slice(start, start + columns)
             block = self._rows[:, part][self._filled].astype(float)
             out[:, :, part] = quantiles_with_errors(block, counts, probabilities, effective)
-        out[0] += self._origin
         return tuple(out.reshape(2, len(probabilities), *self.shape))
 
 
@@ -167,9 +165,11 @@ def quantiles_with_errors(
     tuple of (n_probabilities, k) float : quantiles and errors; an error is inf for a single sample.
     """
     n = int(counts.sum())
-    order = np.argsort(values, axis=0)
-    ascending = np.take_along_axis(values, order, axis=0)
-    cumulative = None if n == len(values) else np.cumsum(counts[order], axis=0)
+    if n == len(values):
+        ascending, cumulative = np.sort(values, axis=0), None
+    else:
+        order = np.argsort(values, axis=0)
+        ascending, cumulative = np.take_along_axis(values, order, axis=0), np.cumsum(counts[order], axis=0)
 
     def at_rank(rank: int) -> np.ndarray:
         if cumulative is None:

@@ -191,11 +191,12 @@ def propagate(
     effective_sample_size : float, optional
         Independent samples that the given ones are worth, for the Monte-Carlo errors. Default: their number, as if they
         were independent (as in the paper), which is too hopeful for the copies and chains of a sampler.
-    batch : int, optional — simulations at once; by default as many as 32 MiB of responses, at most 256.
+    batch : int, optional — simulations at once; by default as many as 32 MiB of responses, at most 256
+        (16 where they run one by one).
     memory : int, optional
-        Bound [bytes] of what is kept for quantiles: histories in single precision. What does not fit is left out at
-        random, `Prediction.n_quantile` says how much is left. None: no bound. Numbers are always kept all. Beside it
-        go some batches.
+        Bound [bytes] of what is kept for quantiles; beside it go some batches. Histories are kept in single precision
+        (seven digits) where they do not fit otherwise, and what does not fit even so is left out at random:
+        `Prediction.n_quantile` says how much is left. None: no bound. Single numbers are always kept all.
     pool : object with ``map(function, items)``, optional — as in `FELikelihood`, whose pool is the default.
     seed : int, optional — of the noise and of the choice of samples for quantiles; the result depends on neither
         `batch` nor `pool`, but for round-off.
@@ -236,7 +237,10 @@ def propagate(
     evaluate = evaluator(quantity, model.channels)
 
     distinct, result_of_theta = distinct_rows(thetas)
-    seeds = np.random.SeedSequence(seed)
+    try:
+        seeds = np.random.SeedSequence(seed)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"seed must be a whole number, zero or more, or None; got {seed!r}") from error
     gathered = Gathered(
         members=members_of(result_of_theta, len(distinct)),
         deviations=deviations,
@@ -251,7 +255,9 @@ def propagate(
     if evaluate.rows is not None:
         gathered.prepare((len(evaluate.rows), model.n_steps))
     if batch is None:
-        batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH))
+        # runs one by one show their progress the sooner the fewer there are in a batch
+        together = pool is not None or hasattr(model, "simulate_batch")
+        batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH if together else 16))
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
             responses, reasons = simulate_batch(model, distinct[start : start + batch], pool)

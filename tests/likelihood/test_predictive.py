@@ -100,14 +100,17 @@ def test_streaming_is_all_at_once_and_copies_count(rng):
         assert p.n_samples == p.n_quantile == 500
         assert np.allclose(p.mean, responses.mean(axis=0), rtol=1e-13)
         assert np.allclose(p.variance, responses.var(axis=0), rtol=1e-11)
-        assert np.allclose(p.quantiles, np.quantile(responses, p.probabilities, axis=0), atol=1e-6)
+        assert np.allclose(p.quantiles, np.quantile(responses, p.probabilities, axis=0), rtol=1e-12)
+    single = quiet(model, samples, memory=model.runs * 50 * 4)  # in single precision all fit, in double they do not
+    assert single.n_quantile == 500 and not np.array_equal(single.quantiles, p.quantiles)
+    assert np.allclose(single.quantiles, p.quantiles, rtol=1e-6)
     with ThreadPool(2) as pool:
         pooled = quiet(model, samples, batch=7, pool=pool)
     assert np.array_equal(pooled.quantiles, quiet(model, samples, batch=7).quantiles)
 
 
 def test_a_small_spread_about_a_large_value(rng):
-    """The mean of squares less the squared mean, and single precision of the values, would both give nonsense here."""
+    """The mean of squares less the squared mean would give nonsense here."""
     numbers = 1e9 + 1e-2 * rng.normal(size=5000)
     moments = Moments()
     for part in np.split(numbers, 50):
@@ -115,13 +118,17 @@ def test_a_small_spread_about_a_large_value(rng):
     assert np.isclose(moments.variance, np.var(numbers - 1e9), rtol=1e-4)
     assert np.mean(numbers**2) - np.mean(numbers) ** 2 != pytest.approx(1e-4, rel=0.5)
 
-    class Offset(Line):
-        def simulate(self, theta):
-            return 1e6 + super().simulate(theta)
 
-    samples = draws(rng, 400)
-    shifted = quiet(Offset(), samples).quantiles - 1e6
-    assert np.allclose(shifted, quiet(Line(), samples).quantiles, atol=1e-5)
+@pytest.mark.parametrize("huge", [1e50, 1e200])
+def test_responses_that_have_blown_up_stay_numbers(rng, huge):
+    class Unstable(Line):
+        def simulate(self, theta):
+            return super().simulate(theta) * (huge if theta[0] > 1.3 else 1.0)
+
+    p = quiet(Unstable(), draws(rng, 200), batch=10, memory=200 * 50 * 4)
+    for values in (p.mean, p.variance, p.standard_error, p.quantiles, p.quantile_error):
+        assert not np.isnan(values).any()
+    assert np.all(np.abs(p.quantile(0.5)) < 20.0)
 
 
 class Big:
@@ -366,6 +373,7 @@ def test_average_of_two_models_is_their_mixture(rng):
         (np.ones((5, 4)), {"effective_sample_size": 0.0}, "effective_sample_size"),
         (np.ones((5, 4)), {"batch": 0}, "batch"),
         (np.ones((5, 4)), {"memory": -1}, "memory must be"),
+        (np.ones((5, 4)), {"seed": -1}, "seed must be"),
         (np.arange(200.0).reshape(50, 4), {"memory": 1000}, "at least 20 results of 200 bytes"),
     ],
 )
