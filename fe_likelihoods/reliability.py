@@ -134,8 +134,8 @@ class FragilityCurve(NamedTuple):
     median : float — intensity at which one half exceeds.
     dispersion : float — standard deviation of the logarithm of the intensity that is borne [-].
     median_error, dispersion_error : float — Monte-Carlo errors, from resampling the samples (which all records share)
-        with the records fixed; inf where most resamplings could not be fitted. How other records would change the
-        curve they do not say.
+        with the records fixed; inf where the points say too little for it: where a tenth of the resamplings leave the
+        curve open. How other records would change the curve they do not say.
     """
 
     median: float
@@ -347,7 +347,7 @@ def _curve_with_errors(
             found.append(fit_fragility(intensity, exceeds @ weights, counted @ weights)[:2])
         except ValueError:  # this resampling leaves the curve open
             continue
-    if len(found) < _REPLICATES / 2:
+    if len(found) < 0.9 * _REPLICATES:  # those that can be fitted would be a choice
         return curve
     return curve._replace(
         **dict(zip(("median_error", "dispersion_error"), np.std(found, axis=0).tolist(), strict=True))

@@ -105,9 +105,9 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs two models or more, by name; got {models!r}")
     names = tuple(models)
+    _same_data(models)
     pairs = [_evidence(name, model) for name, model in models.items()]
     log_evidence, error = np.array(pairs).T
-    _same_data(models)
     before = _prior(names, prior)
     with np.errstate(divide="ignore"):  # a prior of zero excludes a model
         score = np.log(before) + log_evidence

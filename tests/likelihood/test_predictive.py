@@ -150,7 +150,8 @@ class Big:
 
 
 def test_memory_is_bounded(rng, caplog):
-    samples = rng.normal(size=(1500, 1))  # 240 MB of responses, 120 MB in single precision
+    # 240 MB of responses, 120 MB in single precision; in order, so that a part from one end would be seen
+    samples = np.sort(rng.normal(size=(1500, 1)), axis=0)
     memory = 8 * 2**20
     tracemalloc.start()
     try:

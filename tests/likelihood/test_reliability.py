@@ -137,6 +137,14 @@ def test_a_known_fragility_is_found(record, rng):
     assert other.curve.median == pytest.approx(scale * curve.median)
 
 
+def test_a_curve_from_too_little_has_no_error(record, rng):
+    """One exceedance among 60 samples holds the slope: a third of the resamplings lose it."""
+    samples = np.linspace(-0.2, 0.2, 60)[:, None]
+    records = [record.scale(MEDIAN * np.exp(-0.197)), record.scale(MEDIAN * np.exp(0.1))]
+    curve = fragility(Flexible(record), samples, records, peak("displacement"), 0.1, progress=False).curve
+    assert curve.median > 0.0 and np.isinf(curve.median_error) and np.isinf(curve.dispersion_error)
+
+
 def test_collapse_may_count(record, rng):
     """A simulation that fails beyond the limit hides exceedances, unless it counts as one."""
     samples = rng.normal(0.0, DISPERSION, size=(300, 1))
