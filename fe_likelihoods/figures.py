@@ -55,8 +55,10 @@ def plot_bands(
             label = f"{100 * low:g}-{100 * high:g} %" + (" with noise" if prediction.noise else "")
             axes.fill_between(time, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
         if name in measured:
-            axes.plot(time, from_si(measured[name], channel.unit), color=ORANGE, linewidth=0.8, label="measured")
-        axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=1.0, label="mean")
+            axes.plot(
+                time, from_si(measured[name], channel.unit), color=ORANGE, linewidth=2.2, alpha=0.6, label="measured"
+            )
+        axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
         axes.set_ylabel(_label(channel))
         axes.grid(alpha=0.25)
     rows[0, 0].legend(frameon=False, fontsize="small", ncols=3, loc="upper right")

@@ -66,3 +66,31 @@ def test_bridge_column_on_another_record(shared, tmp_path):
     output = run_tutorial("02_bridge_column.py", "--record", str(record), "--scale", "0.85", "--out", str(tmp_path))
     assert "x 0.85" in output and "SYNTHETIC" in output
     assert json.loads((tmp_path / "summary.json").read_text())["rrmse"]["Before updating (reported values)"]
+
+
+@pytest.fixture(scope="module")
+def bridge(tmp_path_factory) -> Path:
+    """Results of the isolated bridge."""
+    out = tmp_path_factory.mktemp("bridge")
+    assert "SYNTHETIC, nominal values assumed" in run_tutorial("03_isolated_bridge.py", "--out", str(out))
+    return out
+
+
+def test_isolated_bridge_leaves_tables_and_figures(bridge):
+    figures = {"fig5_parameters_and_fit", "fig6_marginals", "fig7_predictions", "corner", "ladder", "fragility"}
+    tables = {"parameters.txt", "ladder.txt", "summary.json", "posterior.nc", "chain.h5"}
+    for name in {f"{figure}.png" for figure in figures} | tables:
+        assert (bridge / name).stat().st_size > 200, name
+
+
+def test_isolated_bridge_is_found_and_predicts(bridge):
+    summary = json.loads((bridge / "summary.json").read_text())
+    # few samples: the well-known parameters are near their truth, which is not the nominal value
+    for name, tolerance in (("fmin_1", 0.02), ("df_1", 0.05), ("C0_1", 0.03)):
+        assert summary["posterior_mean"][name] == pytest.approx(summary["truth"][name], abs=tolerance)
+    assert summary["posterior_mean"]["sigma"] == pytest.approx(0.05, rel=0.1)
+    assert max(summary["rrmse"].values()) < 0.07  # the noise alone makes .05
+    assert summary["log_evidence"] > summary["log_evidence_constant_friction"] + 1000.0
+    probability = dict(zip(summary["fragility"]["intensity"], summary["fragility"]["probability"], strict=True))
+    assert probability[min(probability)] <= probability[max(probability)]
+    assert summary["failures"] == 0

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods.channels import Channel
-from fe_likelihoods.noise import GaussianNoise
+from fe_likelihoods.channels import Channel, Measurements
+from fe_likelihoods.noise import GaussianNoise, SharedGaussianNoise
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
 
@@ -70,3 +70,29 @@ def test_a_row_does_not_depend_on_the_others(noise, rng):
     together = noise.log_likelihood(misfit, 100, sigma)
     apart = [noise.log_likelihood(misfit[k : k + 1], 100, sigma[k : k + 1])[0] for k in range(64)]
     assert together.tolist() == apart
+
+
+def test_a_shared_sigma_is_one_in_units_of_each_channels_scale(noise, rng):
+    shared = SharedGaussianNoise(CHANNELS, [2.0, 0.03])
+    assert shared.parameter_names == ("sigma",)
+    sigma = rng.uniform(0.1, 3.0, (6, 1))
+    misfit = rng.uniform(0.1, 3.0, (6, 2))
+    each = sigma * [2.0, 0.03]
+    np.testing.assert_array_equal(shared.standard_deviations(sigma), each)
+    np.testing.assert_array_equal(
+        shared.log_likelihood(misfit, 40, sigma), noise.log_likelihood(misfit, 40, noise.standard_deviations(each))
+    )
+    assert np.isneginf(shared.log_likelihood(misfit, 40, -sigma)).all()
+
+
+def test_scales_of_a_shared_sigma_are_the_root_mean_squares(rng):
+    values = rng.normal(size=(2, 50)) * [[3.0], [0.01]]
+    shared = SharedGaussianNoise.of(Measurements(CHANNELS, 0.1, values))
+    np.testing.assert_allclose(shared.scales, np.sqrt(np.mean(values**2, axis=1)))
+    assert repr(shared) != repr(SharedGaussianNoise(CHANNELS, [1.0, 1.0]))
+
+
+@pytest.mark.parametrize("scales", [[1.0], [1.0, 0.0], [1.0, -2.0], [math.nan, 1.0]])
+def test_scales_that_cannot_be_are_refused(scales):
+    with pytest.raises(ValueError, match="scale"):
+        SharedGaussianNoise(CHANNELS, scales)

@@ -6,9 +6,10 @@ import emcee
 import h5py
 import numpy as np
 import pytest
-from fe_likelihoods.data import make_bridge_column_eq1
+from fe_likelihoods.data import make_bridge_column_eq1, make_isolated_bridge
 from scipy import stats
 
+from fe_likelihoods import problems
 from fe_likelihoods.channels import Channel, Measurements, read_dataset, write_dataset
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.problems import (
@@ -262,3 +263,104 @@ def test_no_holes_on_the_real_record(shared, rng, which, n, allowed):
     told = [reason for part in np.split(draws, range(100, n, 100)) for reason in failures(model, part)]
     print(f"\n{len(told)} of {n} draws of the {which} failed: {told}")
     assert len(told) <= allowed, told
+
+
+# --- the isolated bridge ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["twin", "means"])
+def test_the_bridges_data_say_what_they_are(name):
+    record, measurements, attributes = problems.isolated_bridge_data(name)
+    assert "SYNTHETIC" in record.source
+    assert measurements.description.startswith("SYNTHETIC, nominal values assumed")
+    assert "NOT measured data, nominal values assumed" in attributes["title"]
+    truth = problems.ISOLATED_BRIDGE_TRUTH[name]
+    assert attributes["truth"] == pytest.approx(dict(truth) | {"sigma": problems.ISOLATED_BRIDGE_NOISE[name]})
+    assert set(truth.values()) != {1.0}
+    assert [c.name for c in measurements.channels] == list(problems.ISOLATED_BRIDGE_OUTPUTS[name])
+    assert (record.dt, measurements.dt, measurements.n_steps) == (0.005, 0.01, 1501)
+    np.testing.assert_allclose(record.acceleration, make_isolated_bridge.table_motion().acceleration, atol=1e-11)
+
+
+def test_noise_of_the_bridges_data_is_white_and_of_its_level():
+    record, measurements, _ = problems.isolated_bridge_data()
+    clean = problems.isolated_bridge_measurements(record, noise=0.0, step=0.25e-3)
+    rms = np.sqrt(np.mean(clean.values**2, axis=1, keepdims=True))
+    noise = (measurements.values - clean.values) / (0.05 * rms)
+    n = noise.shape[1]
+    assert np.all(np.abs(noise.std(axis=1) - 1.0) < 4.0 / np.sqrt(2 * n))
+    assert np.all(np.abs(noise.mean(axis=1)) < 4.0 / np.sqrt(n))
+    assert np.all(np.abs((noise[:, 1:] * noise[:, :-1]).mean(axis=1)) < 4.0 / np.sqrt(n))
+
+
+def test_the_bridges_posterior_is_that_of_the_specification():
+    """Section 5: one sigma on channels divided by their measured root mean squares."""
+    posterior = problems.isolated_bridge(step=0.5e-3)
+    assert posterior.parameter_names[-1] == "sigma" and posterior.ndim == 11
+    x = np.append(np.full(10, 1.05), 0.07)
+    y = posterior.likelihood.measurements.values
+    residuals = posterior.likelihood.model.simulate(x[:10]) - y
+    rms = np.sqrt(np.mean(y**2, axis=1))
+    n_channels, n = y.shape
+    expected = (
+        -n_channels * n * np.log(0.07)
+        - np.sum(np.sum(residuals**2, axis=1) / rms**2) / (2 * 0.07**2)
+        - 0.5 * n_channels * n * np.log(2 * np.pi)
+        - n * np.log(rms).sum()
+    )
+    assert posterior.log_likelihood(x) == pytest.approx(expected, rel=1e-12)
+    assert posterior.log_prob(np.append(np.full(10, 1.05), 0.0005)) == -np.inf
+    assert posterior.log_prob(np.append(np.full(10, 0.19), 0.05)) == -np.inf
+    assert posterior.report()["simulations"] == 1, "nothing is simulated outside the support"
+
+
+def test_channels_and_noise_of_the_bridge_can_be_chosen():
+    assert problems.isolated_bridge(channels=5).likelihood.measurements.n_channels == 5
+    each = problems.isolated_bridge(channels=10, noise="per channel")
+    assert each.ndim == 20
+    rms = np.sqrt(np.mean(each.likelihood.measurements.values**2, axis=1))
+    shared = problems.isolated_bridge(channels=10)
+    x = np.full(10, 1.1)
+    assert each.log_likelihood(np.append(x, 0.06 * rms)) == pytest.approx(
+        shared.log_likelihood(np.append(x, 0.06)), rel=1e-12
+    )
+    assert problems.isolated_bridge(channels=("acc_p1", "Ub_2")).likelihood.model.outputs == ("acc_p1", "Ub_2")
+
+
+def test_the_means_do_not_tell_the_piers_apart():
+    posterior = problems.isolated_bridge(data="means")
+    model = posterior.likelihood.model
+    truth = np.array(list(problems.ISOLATED_BRIDGE_TRUTH["means"].values()))
+    other = model.exchanged(truth)
+    np.testing.assert_allclose(model.exchanged(other), truth, rtol=1e-14)
+    assert np.abs(other - truth).max() > 0.4
+    at = [posterior.log_likelihood(np.append(theta, 0.1)) for theta in (truth, other, 0.5 * (truth + other))]
+    assert at[0] == pytest.approx(at[1], abs=1e-6)
+    assert at[2] < at[0] - 100.0
+    one_pier = problems.isolated_bridge(channels=5)
+    at = [one_pier.log_likelihood(np.append(theta, 0.1)) for theta in (truth, other)]
+    assert abs(at[0] - at[1]) > 100.0
+
+
+def test_another_table_motion(rng):
+    motion = make_isolated_bridge.table_motion(7).trim(0.0, 3.0)
+    posterior = problems.isolated_bridge(record=motion, step=0.5e-3)
+    assert posterior.likelihood.measurements.n_channels == 10
+    assert np.isfinite(posterior.log_prob(np.append(np.ones(10), 0.1)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"data": "tests"}, "twin"),
+        ({"noise": "white"}, "per channel"),
+        ({"channels": 7}, "sets"),
+        ({"channels": ("Ub_9",)}, "Ub_9"),
+        ({"data": "means", "channels": 5}, "Ub_1"),
+        ({"step": 0.3e-3}, "divides"),
+        ({"measurements": 1}, "record"),
+    ],
+)
+def test_bad_arguments_of_the_bridge_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        problems.isolated_bridge(**arguments)
