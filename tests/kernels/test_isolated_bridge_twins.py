@@ -1,0 +1,199 @@
+"""The isolated bridge three times: the library's, one for `solve_ivp` from the definition alone, and one in OpenSees.
+
+The record is white noise through the filter of a soil. The peers share the definition's numbers with each other and
+nothing with the library. Where the friction is elastic-plastic, the codes that go in steps find the moment of slip to
+within a step and err in first order, both alike: between them the difference is of second order.
+"""
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+from fe_likelihoods.records import Record
+from tests.opensees_bridge import run
+from tests.opensees_column import require_opensees
+from tests.scipy_bridge import CHANNELS, Definition, peak_errors, solve
+
+DT = 0.005
+PARAMETERS = {"nominal": np.ones(10), "other": np.array([0.76, 0.6, 0.93, 1.13, 1.34, 1.03, 0.83, 0.76, 1.22, 1.49])}
+NO_LOOP = (0.0, 0.0, 0.0)  # the half loop of the rubber is left out beside OpenSees, which has none
+KINDS = ("Ub", "Fb", "drift", "shear", "acc_p", "Ud", "acc_d")
+
+
+def noise(seed, peak):
+    """Three seconds of Kanai and Tajimi's soil, 5 Hz, damped by .3, growing during half a second."""
+    time = np.arange(601) * DT
+    frequency, damping = 2.0 * np.pi * 5.0, 0.3
+    soil = ([2.0 * damping * frequency, frequency**2], [1.0, 2.0 * damping * frequency, frequency**2])
+    numerator, denominator, _ = cont2discrete(soil, DT, "bilinear")
+    shaken = lfilter(numerator.ravel(), denominator, np.random.default_rng(seed).standard_normal(time.size))
+    shaken *= np.minimum(1.0, time / 0.5)
+    return peak * shaken / np.abs(shaken).max()
+
+
+GROUND, VERTICAL = noise(7, 5.5), noise(8, 3.0)
+
+
+def ours(theta, loop=True, **options):
+    from fe_likelihoods.models.isolated_bridge import IsolatedBridge, Rubber
+
+    changes = {} if loop else {"rubber": Rubber(half_loop=NO_LOOP)}
+    return IsolatedBridge(Record("noise", DT, GROUND), outputs=CHANNELS, **changes, **options).simulate(theta)
+
+
+def by_kind(response, reference):
+    """Largest peak error among the channels of each kind."""
+    errors = dict(zip(CHANNELS, peak_errors(response, reference).tolist(), strict=True))
+    return {kind: max(value for channel, value in errors.items() if channel.startswith(kind)) for kind in KINDS}
+
+
+def too_large(errors, **bounds):
+    assert set(bounds) == set(KINDS)
+    return {kind: f"{value:.1e} > {bounds[kind]:.1e}" for kind, value in errors.items() if not value < bounds[kind]}
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    return {name: solve(Definition().at(theta), GROUND, DT).response for name, theta in PARAMETERS.items()}
+
+
+@pytest.fixture(scope="module")
+def slipping():
+    """The elastic-plastic law without half loop."""
+    bridge = Definition(loop=NO_LOOP)
+    return {
+        name: solve(bridge.at(theta), GROUND, DT, friction="elastic-plastic").response
+        for name, theta in PARAMETERS.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def opensees():
+    """At steps of .5 and .25 ms."""
+    require_opensees()
+    bridge = Definition(loop=NO_LOOP)
+    return {
+        (name, step): run(bridge.at(theta), GROUND, DT, step=step).response
+        for name, theta in PARAMETERS.items()
+        for step in (5e-4, 2.5e-4)
+    }
+
+
+# ---------------------------------------------------------------------- the peers by themselves
+
+
+def test_bearings_slide_to_and_fro(smooth, slipping):
+    for responses in (smooth, slipping):
+        for response in responses.values():
+            for displacement in response[:2]:
+                assert np.abs(displacement).max() > 0.03
+                assert np.sum(np.diff(np.sign(np.diff(displacement))) != 0) > 10
+
+
+@pytest.mark.parametrize("record", [0, 1])
+def test_reference_results(shared, record):
+    """The first four seconds of two synthetic records, by other solvers; these are kept in single precision."""
+    with np.load(shared / "golden" / "isolated_bridge" / "own_records.npz") as kept:
+        ground, dt, reference = kept[f"ag{record}"][:801], float(kept[f"dt{record}"]), kept[f"Y{record}"][..., :401]
+        assert tuple(kept["channels"]) == CHANNELS
+        for case in (record, 2 + record):
+            response = solve(Definition().at(kept["theta"][case]), ground, dt, every=2).response
+            assert peak_errors(response, reference[case]).max() < 1e-6
+
+
+def test_reference_result_with_p_delta_and_vertical_motion(shared):
+    with np.load(shared / "golden" / "isolated_bridge" / "own_records.npz") as kept:
+        ground, vertical, dt = kept["ag0"][:801], kept["av_opt"][:801], float(kept["dt0"])
+        response = solve(Definition(), ground, dt, every=2, p_delta=True, vertical=vertical).response
+        assert peak_errors(response, kept["Y_opt"][:, :401]).max() < 1e-6
+        assert peak_errors(response, kept["Y0"][0][:, :401]).max() > 1e-2
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau"])
+def test_solvers_agree(smooth, method):
+    response = solve(Definition(), GROUND[:301], DT, method=method, tolerance=1e-8).response
+    assert peak_errors(response, smooth["nominal"][:, :301]).max() < 2e-6
+
+
+def test_relaxation_of_the_elastic_plastic_law_leaves_little(slipping):
+    bridge = Definition(loop=NO_LOOP)
+    error = {
+        overshoot: peak_errors(
+            solve(bridge, GROUND, DT, friction="elastic-plastic", overshoot=overshoot).response, slipping["nominal"]
+        ).max()
+        for overshoot in (1e-5, 1e-6)
+    }
+    assert 8.0 < error[1e-5] / error[1e-6] < 12.0  # of first order: the default leaves a hundredth of the second
+    assert error[1e-6] < 1e-3
+
+
+def test_smooth_and_elastic_plastic_friction_differ(smooth):
+    """Control: what the comparisons of one law are worth."""
+    response = solve(Definition(), GROUND, DT, friction="elastic-plastic").response
+    errors = by_kind(response, smooth["nominal"])
+    assert errors["Fb"] > 0.02 and errors["acc_p"] > 0.05
+
+
+def test_half_loop_is_refused_in_opensees():
+    with pytest.raises(ValueError, match=r"expected loop=\(0.0,\)"):
+        run(Definition(), GROUND, DT, step=DT)
+    with pytest.raises(ValueError, match="expected a step that divides"):
+        run(Definition(loop=NO_LOOP), GROUND, DT, step=0.3e-3)
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_opensees_comes_to_the_elastic_plastic_solution(slipping, opensees, name):
+    errors = by_kind(opensees[name, 2.5e-4], slipping[name])
+    bounds = dict(Ub=1e-4, Fb=3e-3, drift=5e-4, shear=7e-4, acc_p=8e-3, Ud=6e-5, acc_d=2e-3)
+    assert not too_large(errors, **bounds)
+    coarse = peak_errors(opensees[name, 5e-4], slipping[name]).mean()
+    assert 1.3 * peak_errors(opensees[name, 2.5e-4], slipping[name]).mean() < coarse
+
+
+# ---------------------------------------------------------------------- the library's beside them
+
+SECOND_ORDER = (3.0, 6.0)  # by what halving the step divides an error
+# of the default step, .25 ms, about three times what was measured
+SMOOTH = dict(Ub=4e-6, Fb=2e-4, drift=1.5e-5, shear=5e-5, acc_p=6e-4, Ud=2e-6, acc_d=1.5e-4)
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_smooth_law_beside_solve_ivp(smooth, name):
+    theta = PARAMETERS[name]
+    errors = by_kind(ours(theta), smooth[name])
+    assert not too_large(errors, **SMOOTH)
+    coarse = peak_errors(ours(theta, step=5e-4), smooth[name]).mean()
+    assert SECOND_ORDER[0] < coarse / peak_errors(ours(theta), smooth[name]).mean() < SECOND_ORDER[1]
+
+
+def test_p_delta_and_vertical_motion_beside_solve_ivp():
+    reference = solve(Definition(), GROUND, DT, p_delta=True, vertical=VERTICAL).response
+    response = ours(PARAMETERS["nominal"], p_delta=True, vertical=Record("up", DT, VERTICAL))
+    assert not too_large(by_kind(response, reference), **SMOOTH)
+
+
+def test_elastic_plastic_law_with_half_loop_beside_solve_ivp():
+    reference = solve(Definition(), GROUND, DT, friction="elastic-plastic").response
+    errors = by_kind(ours(PARAMETERS["nominal"], friction="elastic-plastic"), reference)
+    assert not too_large(errors, Ub=1e-4, Fb=3e-3, drift=6e-4, shear=9e-4, acc_p=9e-3, Ud=6e-5, acc_d=3e-3)
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_elastic_plastic_law_beside_opensees(opensees, name):
+    """At the same step: the two make the same errors, and differ in second order."""
+    theta = PARAMETERS[name]
+    difference = {
+        step: by_kind(ours(theta, loop=False, friction="elastic-plastic", step=step), opensees[name, step])
+        for step in (5e-4, 2.5e-4)
+    }
+    bounds = dict(Ub=1e-5, Fb=1.2e-4, drift=3e-5, shear=5e-5, acc_p=4e-4, Ud=4e-6, acc_d=1e-4)
+    assert not too_large(difference[2.5e-4], **bounds)
+    for kind in KINDS:
+        assert SECOND_ORDER[0] < difference[5e-4][kind] / difference[2.5e-4][kind] < SECOND_ORDER[1], kind
+
+
+@pytest.mark.parametrize("place", range(10))
+def test_a_wrong_parameter_would_be_seen(smooth, place):
+    """Control: each of the ten parameters, one per cent off, is outside the bounds."""
+    errors = by_kind(ours(PARAMETERS["nominal"] + 0.01 * np.eye(10)[place]), smooth["nominal"])
+    assert too_large(errors, **SMOOTH)
