@@ -3,12 +3,13 @@
 import argparse
 from pathlib import Path
 
-from . import column, cost, peers, samplers, startup
+from . import bridge, column, cost, peers, samplers, startup
 from .rows import as_table, machine, write_json
 
 BENCHMARKS = {
     "simulation": column.simulation,
     "batch": column.batch,
+    "bridge": bridge.simulation,
     "imports": startup.imports,
     "compilation": startup.compilation,
     "cost": cost.cost,

@@ -1,0 +1,119 @@
+"""The isolated bridge beside OpenSees at the same law and step, and beside scipy's solvers: 15 s at 200 samples/s.
+
+Errors are those of the worst of twelve channels, relative to its peak, against solvers at tight tolerances. OpenSees
+runs the elastic-plastic law of its sliders without the rubber's half loop, and the model does the same beside it.
+"""
+
+import time
+from collections.abc import Callable
+from statistics import median
+
+import numpy as np
+from scipy.signal import cont2discrete, lfilter
+
+from fe_likelihoods.records import Record
+from tests.opensees_bridge import run
+from tests.scipy_bridge import CHANNELS, Definition, peak_errors, solve
+
+from .rows import Row
+
+__all__ = ["simulation"]
+
+DT, N_STEPS = 0.005, 3001
+STEPS = (5e-4, 2.5e-4)  # s; the second is the default
+TOLERANCE = 1e-8  # OpenSees': norm of the last increment [m and rad]; less does not change its error
+SOLVERS = (("LSODA", 1e-6), ("LSODA", 1e-8), ("DOP853", 1e-6), ("Radau", 1e-6))
+NO_LOOP = (0.0, 0.0, 0.0)
+NOMINAL = np.ones(10)
+
+
+def _ground() -> np.ndarray:
+    """Stationary noise through a soil of 2.5 Hz, damped by .6, growing for a second and dying out; peak 5.5 m/s2."""
+    t = np.arange(N_STEPS) * DT
+    frequency, damping = 2.0 * np.pi * 2.5, 0.6
+    soil = ([2.0 * damping * frequency, frequency**2], [1.0, 2.0 * damping * frequency, frequency**2])
+    numerator, denominator, _ = cont2discrete(soil, DT, "bilinear")
+    shaken = lfilter(numerator.ravel(), denominator, np.random.default_rng(81).standard_normal(N_STEPS))
+    shaken *= np.minimum(1.0, t) * np.exp(-np.maximum(0.0, t - 5.0) / 4.0)
+    return 5.5 * shaken / np.abs(shaken).max()
+
+
+def _timed(function: Callable[[], np.ndarray]) -> tuple[float, np.ndarray]:
+    start = time.process_time()
+    response = function()
+    return time.process_time() - start, response
+
+
+def _models(record: Record) -> dict[tuple[str, float], Callable[[], np.ndarray]]:
+    """The model's simulations by law and step."""
+    from fe_likelihoods.models.isolated_bridge import IsolatedBridge, Rubber
+
+    laws = {"bouc-wen": {}, "elastic-plastic": {"friction": "elastic-plastic", "rubber": Rubber(half_loop=NO_LOOP)}}
+    models = {
+        (law, step): IsolatedBridge(record, outputs=CHANNELS, step=step, **changes)
+        for law, changes in laws.items()
+        for step in STEPS
+    }
+    return {key: lambda model=model: model.simulate(NOMINAL) for key, model in models.items()}
+
+
+def simulation(repeats: int) -> list[Row]:
+    """CPU time of one simulation on one core, all codes in turns, with the error of each beside its time."""
+    ground = _ground()
+    plain = Definition(loop=NO_LOOP)
+    reference = {
+        "bouc-wen": solve(Definition(), ground, DT, tolerance=1e-10).response,
+        "elastic-plastic": solve(plain, ground, DT, friction="elastic-plastic", tolerance=1e-10).response,
+    }
+    ours = _models(Record("noise", DT, ground))
+    for function in ours.values():
+        function()  # compiled from here on
+    seconds, errors = {}, {}
+
+    def note(key: tuple, law: str, cost: float, response: np.ndarray) -> None:
+        seconds.setdefault(key, []).append(cost)
+        complete = response.shape == reference[law].shape
+        errors[key] = peak_errors(response, reference[law]).max() if complete else None
+
+    for _ in range(repeats):
+        for key, function in ours.items():
+            for _ in range(5):  # short: several, or the clock's resolution shows
+                note(key, key[0], *_timed(function))
+        for step in STEPS:
+            done = run(plain, ground, DT, step=step, tolerance=TOLERANCE)
+            note(("OpenSees", step), "elastic-plastic", done.seconds, done.response)
+        for method, tolerance in SOLVERS:
+            options = dict(method=method, tolerance=tolerance)
+            cost, response = _timed(lambda options=options: solve(Definition(), ground, DT, **options).response)
+            note((method, tolerance), "bouc-wen", cost, response)
+    return _rows(seconds, errors)
+
+
+def _rows(seconds: dict[tuple, list[float]], errors: dict[tuple, float | None]) -> list[Row]:
+    """Times, errors and ratios: with OpenSees at the same law and step, with scipy at its own tolerance."""
+
+    def spread(key: tuple) -> str:
+        error = "did not finish" if errors[key] is None else f"worst peak error {errors[key]:.1e}"
+        return f"{error}; from {min(seconds[key]):.3g} to {max(seconds[key]):.3g} s"
+
+    def ratio(theirs: tuple, mine: tuple) -> float:
+        return median(seconds[theirs]) / median(seconds[mine])
+
+    rows = []
+    for law in ("bouc-wen", "elastic-plastic"):
+        for step in STEPS:
+            key = (law, step)
+            case = f"{law}, {1e3 * step:g} ms"
+            rows.append(Row("IsolatedBridge, CPU time", case, median(seconds[key]), "s", spread(key)))
+    for step in STEPS:
+        key, case = ("OpenSees", step), f"elastic-plastic, {1e3 * step:g} ms"
+        rows.append(Row("OpenSees, CPU time", case, median(seconds[key]), "s", spread(key)))
+        note = "same law and step"
+        rows.append(Row("IsolatedBridge, times faster", case, ratio(key, ("elastic-plastic", step)), "", note))
+    for key in SOLVERS:
+        case = f"bouc-wen, {key[0]} {key[1]:g}"
+        rows.append(Row("scipy, CPU time", case, median(seconds[key]), "s", spread(key)))
+        for step in STEPS:
+            note = f"at {1e3 * step:g} ms; right-hand side compiled in scipy's"
+            rows.append(Row("IsolatedBridge, times faster", case, ratio(key, ("bouc-wen", step)), "", note))
+    return rows
