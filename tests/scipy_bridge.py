@@ -86,37 +86,15 @@ class Solution(NamedTuple):
     evaluations: int
 
 
-class _Constants(NamedTuple):
-    ground: np.ndarray  # (n,) at the step dt
-    vertical: np.ndarray
-    dt: float
-    elastic_plastic: bool
-    overshoot: float  # s
-    k_uu: float
-    k_up: float
-    k_pp: float
-    p_uu: np.ndarray  # (2,): what the weight takes from the stiffness
-    p_up: np.ndarray
-    p_pp: np.ndarray
-    retardation: float
-    deck: float
-    mass: float
-    rotary: float
-    height: float
-    centre: float
-    weight: np.ndarray
-    slow: np.ndarray
-    rise: np.ndarray
-    rate: np.ndarray
-    spring: np.ndarray  # all dampers of a pier
-    relaxation: np.ndarray
-    rubber_length: float
-    rubber_limit: float
-    rubber: np.ndarray
-    loop: np.ndarray
-    slip: float
-    gamma: float
-    beta: float
+# one record, because scipy hands it over at every evaluation: a tuple of as many arrays costs more than the evaluation
+_CONSTANTS = np.dtype(
+    [(name, float) for name in ("dt", "overshoot", "k_uu", "k_up", "k_pp", "retardation", "deck")]
+    + [(name, float) for name in ("mass", "rotary", "height", "centre", "rubber_length", "rubber_limit")]
+    + [(name, float) for name in ("slip", "gamma", "beta")]
+    + [(name, float, 2) for name in ("p_uu", "p_up", "p_pp", "weight", "slow", "rise", "rate")]
+    + [(name, float, 2) for name in ("spring", "relaxation")]
+    + [("rubber", float, 6), ("loop", float, 3), ("elastic_plastic", np.int64)]
+)
 
 
 @njit(cache=True)
@@ -159,10 +137,10 @@ def _isolator(c, i, u, v, z, damper, load):
 
 
 @njit(cache=True)
-def _state(t, x, c, rates, out):
+def _state(t, x, c, motion, lift, rates, out):
     """Fill the rates (14,) of the state and the channels (12,) at one instant."""
-    ground = _sample(c.ground, c.dt, t)
-    load = max(0.0, 1.0 + _sample(c.vertical, c.dt, t) / GRAVITY)
+    ground = _sample(motion, c.dt, t)
+    load = max(0.0, 1.0 + _sample(lift, c.dt, t) / GRAVITY)
     deck_force = 0.0
     for i in range(2):
         u, turn, du, dturn = x[1 + 2 * i], x[2 + 2 * i], x[6 + 2 * i], x[7 + 2 * i]
@@ -186,36 +164,32 @@ def _state(t, x, c, rates, out):
 
 
 @njit(cache=True)
-def _right_hand_side(t, x, c):
+def _right_hand_side(t, x, constants, motion, lift):
     rates = np.empty(14)
-    _state(t, x, c, rates, np.empty(12))
+    _state(t, x, constants[0], motion, lift, rates, np.empty(12))
     return rates
 
 
 @njit(cache=True)
-def _outputs(times, states, c):
+def _outputs(times, states, constants, motion, lift):
     response = np.empty((12, len(times)))
     rates, out = np.empty(14), np.empty(12)
     for k in range(len(times)):
-        _state(times[k], states[:, k], c, rates, out)
+        _state(times[k], states[:, k], constants[0], motion, lift, rates, out)
         response[:, k] = out
     return response
 
 
-def _constants(bridge, acceleration, dt, friction, p_delta, vertical, overshoot) -> _Constants:
+def _constants(bridge, dt, friction, p_delta, overshoot) -> np.ndarray:
     if friction not in ("bouc-wen", "elastic-plastic"):
         raise ValueError(f"expected the friction 'bouc-wen' or 'elastic-plastic'; got {friction!r}")
-    k = bridge.stiffness
-    weight, length = np.array(bridge.weight), bridge.length
+    k, weight, length = bridge.stiffness, np.array(bridge.weight), bridge.length
     on_pier = (weight + bridge.mass * GRAVITY) / (30.0 * length) * bool(p_delta)
     overturning = (weight * bridge.height + bridge.mass * GRAVITY * bridge.centre) * bool(p_delta)
-    ground = np.ascontiguousarray(acceleration, dtype=float)
-    return _Constants(
-        ground=ground,
-        vertical=np.zeros_like(ground) if vertical is None else np.ascontiguousarray(vertical, dtype=float),
-        dt=float(dt),
+    derived = dict(
+        dt=dt,
         elastic_plastic=friction == "elastic-plastic",
-        overshoot=float(overshoot),
+        overshoot=overshoot,
         k_uu=k[0, 0],
         k_up=k[0, 1],
         k_pp=k[1, 1],
@@ -224,12 +198,13 @@ def _constants(bridge, acceleration, dt, friction, p_delta, vertical, overshoot)
         p_pp=-4.0 * length**2 * on_pier - overturning,
         retardation=bridge.stiffness_damping,
         deck=bridge.deck_weight / GRAVITY,
-        spring=bridge.dampers * np.array(bridge.spring),
+        spring=bridge.dampers * np.array(bridge.spring),  # all dampers of a pier
         relaxation=np.array(bridge.dashpot) / np.array(bridge.spring),
-        **{name: getattr(bridge, name) for name in ("mass", "rotary", "height", "centre", "rubber_length")},
-        **{name: getattr(bridge, name) for name in ("rubber_limit", "slip", "gamma", "beta")},
-        **{name: np.array(getattr(bridge, name)) for name in ("weight", "slow", "rise", "rate", "rubber", "loop")},
     )
+    constants = np.zeros(1, _CONSTANTS)
+    for name in _CONSTANTS.names:
+        constants[name] = derived[name] if name in derived else getattr(bridge, name)
+    return constants
 
 
 def solve(
@@ -265,7 +240,9 @@ def solve(
     overshoot : float
         Relaxation time [s] of the elastic-plastic law; much shorter ones can stall LSODA.
     """
-    constants = _constants(bridge, acceleration, dt, friction, p_delta, vertical, overshoot)
+    motion = np.ascontiguousarray(acceleration, dtype=float)
+    lift = np.zeros_like(motion) if vertical is None else np.ascontiguousarray(vertical, dtype=float)
+    arguments = (_constants(bridge, dt, friction, p_delta, overshoot), motion, lift)
     times = np.arange(len(acceleration)) * dt
     run = solve_ivp(
         _right_hand_side,
@@ -273,7 +250,7 @@ def solve(
         np.zeros(14),
         method=method,
         t_eval=times[::every],
-        args=(constants,),
+        args=arguments,
         rtol=tolerance,
         atol=0.1 * tolerance * SCALE,
         # nothing moves before the record does: without a first step the solvers would stride over its beginning
@@ -281,7 +258,7 @@ def solve(
     )
     if not run.success:
         raise RuntimeError(f"{method} stopped at {run.t[-1]:g} s: {run.message}")
-    return Solution(_outputs(run.t, run.y, constants), run.nfev)
+    return Solution(_outputs(run.t, run.y, *arguments), run.nfev)
 
 
 def peak_errors(response: np.ndarray, reference: np.ndarray) -> np.ndarray:
