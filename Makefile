@@ -39,6 +39,7 @@ format: $(READY) ## let ruff mend what it can
 
 data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_bridge_column_eq1.py
+	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environment and the results
-	rm -rf $(VENV) results
+	rm -rf $(VENV) results results-isolated-bridge
