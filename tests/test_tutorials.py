@@ -29,8 +29,15 @@ def run_tutorial(name: str, *arguments: str) -> str:
 def column(tmp_path_factory) -> Path:
     """Results of the bridge column."""
     out = tmp_path_factory.mktemp("column")
-    assert "REDUCED SETTING" in run_tutorial("02_bridge_column.py", "--out", str(out))
+    assert "REDUCED SETTING" in run_tutorial("02_bridge_column.py", "--classes", "--out", str(out))
     return out
+
+
+def test_bridge_column_compares_classes_of_models(column):
+    """The data were made with the corotational geometry and with softening."""
+    evidence = json.loads((column / "summary.json").read_text())["log_evidence_of_classes"]
+    assert max(evidence, key=evidence.get) == "as updated"
+    assert "as updated" in (column / "classes.txt").read_text()
 
 
 def test_bridge_column_leaves_tables_and_figures(column):
