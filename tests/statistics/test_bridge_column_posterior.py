@@ -109,12 +109,6 @@ def real(record: Record) -> Posterior:
     return problems.bridge_column(record=record)
 
 
-def real_own_mesh(record: Record) -> Posterior:
-    """Measured by the very model that is updated: what is left is the pull of the prior."""
-    own = problems.bridge_column_measurements(record, n_strips=40, substeps=1)
-    return problems.bridge_column(record=record, measurements=own)
-
-
 def real_wide_prior(record: Record) -> Posterior:
     """A prior on a1 ten times as wide: what is left is the pull of the coarser mesh and step."""
     posterior = real(record)
@@ -137,7 +131,7 @@ def run(request) -> Callable[..., Run]:
     return run
 
 
-@pytest.mark.parametrize("make", [real, real_wide_prior, real_own_mesh, bundled, bundled_reduced])
+@pytest.mark.parametrize("make", [real, real_wide_prior, bundled, bundled_reduced])
 def test_smc_agrees_with_importance_sampling(run, make):
     smc, check = run(make).smc, run(make).check
     tolerance = 4.0 * np.hypot(smc.error, check.error)
@@ -162,7 +156,7 @@ def test_the_noise_is_found_in_the_reduced_setting(run):
 DISPLACED = pytest.mark.xfail(strict=True, reason="bundled data: Ec +4.1, Es -5.1, ft +6.2 posterior sd from the truth")
 
 
-@pytest.mark.parametrize("make", [pytest.param(bundled, marks=DISPLACED), real, real_wide_prior, real_own_mesh])
+@pytest.mark.parametrize("make", [pytest.param(bundled, marks=DISPLACED), real, real_wide_prior])
 def test_the_truth_is_found(run, make):
     """All but the damping pair, whose truth lies 6.3 prior sd out."""
     z = distance(run(make).check)
@@ -170,12 +164,10 @@ def test_the_truth_is_found(run, make):
 
 
 def test_the_prior_pulls_the_damping_and_so_does_the_mesh(run):
-    """Each alone pulls a1 down, and neither as far as both."""
-    both, prior, mesh = (run(make).check.mean[3] for make in (real, real_own_mesh, real_wide_prior))
-    print(
-        f"a1: truth {TRUTH[3]}, pulled by the prior to {prior:.3f}, by mesh and step to {mesh:.3f}, by both {both:.3f}"
-    )
-    assert both < min(prior, mesh) < max(prior, mesh) < TRUTH[3]
+    """With a wide prior what is left of the pull is that of the coarser mesh and step; the rest is the prior's."""
+    both, mesh = (run(make).check.mean[3] for make in (real, real_wide_prior))
+    print(f"a1: truth {TRUTH[3]}; {mesh:.3f} with a wide prior: mesh and step pull it; {both:.3f} with the paper's prior")
+    assert both < mesh < TRUTH[3]
 
 
 @pytest.mark.parametrize(
