@@ -7,6 +7,7 @@ are run, counts them, records those that fail, and remembers what came out.
 
 import hashlib
 import logging
+import os
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from .cache import SimulationCache
 from .channels import Measurements
 from .memory import MisfitMemory
-from .models.base import Model, misfit_batch
+from .models.base import Model, misfit_batch, misfit_of_responses, simulate_batch
 from .noise import GaussianNoise
 
 __all__ = ["FELikelihood", "as_points"]
@@ -26,6 +28,9 @@ logger = logging.getLogger(__name__)
 _RECORDED_FAILURES = 1000
 _RECORDED_REASONS = 100
 _OTHER_REASONS = "other reasons"
+_SECONDS_PER_CHUNK = 5.0  # of simulations, before they are stored
+_ROUNDS_PER_CHUNK = 8  # of each worker: those who wait for the last one idle for half a round in the mean
+_RESPONSE_VALUES = 2**23  # responses held at once where they are kept: 64 MiB
 
 
 def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
@@ -79,6 +84,10 @@ class FELikelihood:
         Number of simulations whose misfits are remembered (some 250 bytes each), so that none of them is run again,
         those that failed included; 0 for none. What is remembered does not travel when the likelihood is pickled: every
         process remembers what it simulated itself.
+    cache : SimulationCache or path, optional
+        Simulations on disk, asked after the memory: those of earlier runs and of other processes are not run again, and
+        a killed run loses no more than the last seconds. A batch is then simulated in chunks of some seconds, stored
+        one by one; through a pool whose number of workers cannot be told (``n_workers`` says it), in one piece.
 
     Attributes
     ----------
@@ -90,8 +99,10 @@ class FELikelihood:
         Simulations run by this object in this process.
     cache_hits : int
         Rows whose misfit was remembered instead.
+    disk_hits : int
+        How many of those rows came from the cache on disk.
     failure_count : int
-        How many simulations failed.
+        How many simulations failed, those that the cache on disk told included.
     failures : list of dict
         ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures.
     failure_reasons : dict of str to int
@@ -102,11 +113,19 @@ class FELikelihood:
     Raises
     ------
     ValueError
-        If channels, step or length of model and measurements differ, or parameter names repeat.
+        If channels, step or length of model and measurements differ, parameter names repeat, or the file of the cache
+        cannot be used.
     """
 
     def __init__(
-        self, model: Model, measurements: Measurements, noise: Any = None, pool: Any = None, *, memory: int = 100_000
+        self,
+        model: Model,
+        measurements: Measurements,
+        noise: Any = None,
+        pool: Any = None,
+        *,
+        memory: int = 100_000,
+        cache: SimulationCache | str | os.PathLike | None = None,
     ) -> None:
         if pool is not None and not hasattr(pool, "map"):
             raise ValueError(f"FELikelihood: pool must have a method map(function, items); got {pool!r}")
@@ -120,8 +139,12 @@ class FELikelihood:
         self._n_structural = len(model.parameter_names)
         self.simulation_free = tuple(range(self._n_structural, len(self.parameter_names)))
         self._memory = MisfitMemory(memory)
+        self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
+        self._key = None if cache is None else self.fingerprint
+        self._chunk = 1
         self.simulations = 0
         self.cache_hits = 0
+        self.disk_hits = 0
         self.failure_count = 0
         self.failures: list[dict] = []
         self.failure_reasons: Counter[str] = Counter()
@@ -164,11 +187,12 @@ class FELikelihood:
         distinct = [first.setdefault(row.tobytes(), len(first)) for row in thetas[finite] + 0.0]
         keys = list(first)
         misfit, known = self._memory.look_up(keys, result.shape[1])
-        self.cache_hits += int(known[distinct].sum())
         if not known.all():
-            new = [key for key, remembered in zip(keys, known, strict=True) if not remembered]
-            misfit[~known] = self._simulate(np.frombuffer(b"".join(new), dtype=float).reshape(len(new), -1).copy())
-            self._memory.store(new, misfit[~known])
+            missing = np.flatnonzero(~known)
+            misfit[missing], on_disk = self._obtain([keys[row] for row in missing])
+            known[missing] = on_disk
+            self.disk_hits += int(np.isin(distinct, missing[on_disk]).sum())
+        self.cache_hits += int(known[distinct].sum())
         result[finite] = misfit[distinct]
         return result
 
@@ -203,14 +227,67 @@ class FELikelihood:
             result[possible] = np.where(simulated & usable, values, -np.inf)
         return result if points.ndim == 2 else float(result[0])
 
+    def _obtain(self, keys: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
+        """Misfits of rows that are not in memory, and which of them came from disk; the others are simulated."""
+        thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), -1).copy()
+        shape = len(keys), self.measurements.n_channels
+        misfit, on_disk = np.full(shape, np.nan), np.zeros(len(keys), dtype=bool)
+        if self.cache is not None:
+            misfit, reasons, on_disk = self.cache.look_up(self._key, thetas, shape[1], self.measurements.n_steps)
+            for row in np.flatnonzero(on_disk):
+                if reasons[row]:
+                    self._record(thetas[row], reasons[row])
+            self._memory.store([keys[row] for row in np.flatnonzero(on_disk)], misfit[on_disk])
+        left = np.flatnonzero(~on_disk)
+        least, most = self._chunk_limits(len(left))
+        while len(left):
+            size = max(least, min(most, self._chunk))
+            rows, left = left[:size], left[size:]
+            start = time.perf_counter()
+            misfit[rows] = self._simulate(thetas[rows])
+            # not at once: the first ones may have failed in no time
+            self._chunk = min(4 * size, 1 + int(_SECONDS_PER_CHUNK * len(rows) / (time.perf_counter() - start)))
+            self._memory.store([keys[row] for row in rows], misfit[rows])
+        return misfit, on_disk
+
+    def _chunk_limits(self, n: int) -> tuple[int, int]:
+        """How many of n simulations are run before they are stored, at least (all workers are busy) and at most."""
+        if self.cache is None:
+            return n, n
+        most = max(1, _RESPONSE_VALUES // self.measurements.values.size) if self.cache.responses else n
+        if self.pool is not None:
+            sizes = (getattr(self.pool, name, None) for name in ("n_workers", "_max_workers", "_processes", "size"))
+            workers = next((size for size in sizes if isinstance(size, int)), n)
+        elif hasattr(self.model, "misfit_batch") or hasattr(self.model, "simulate_batch"):
+            workers = os.cpu_count() or 1
+        else:
+            return 1, most
+        return min(_ROUNDS_PER_CHUNK * workers, most), most
+
     def _simulate(self, thetas: np.ndarray) -> np.ndarray:
         start = time.perf_counter()
-        misfit, reasons = misfit_batch(self.model, thetas, self.measurements.values, self.pool)
-        self.seconds += time.perf_counter() - start
+        measured = self.measurements.values
+        batch = None
+        if self.cache is not None and self.cache.responses:
+            batch = simulate_batch(self.model, thetas, self.pool)
+            misfit, reasons = misfit_of_responses(self.model, batch, measured)
+        else:
+            misfit, reasons = misfit_batch(self.model, thetas, measured, self.pool)
+        seconds = time.perf_counter() - start
+        self.seconds += seconds
         self.simulations += len(thetas)
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self._record(theta, reason)
+        if self.cache is not None:
+            if self.fingerprint != self._key:
+                raise ValueError(
+                    "the model has changed since the likelihood was made (its fingerprint is another one), and its "
+                    "simulations cannot be kept with the old ones: make a new likelihood"
+                )
+            self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
+            if batch is not None:
+                self.cache.store_responses(self.model.fingerprint, thetas, batch.response)
         return misfit
 
     def _record(self, theta: np.ndarray, reason: str) -> None:

@@ -140,13 +140,14 @@ class Posterior:
         Returns
         -------
         dict
-            ``simulations``, ``cache_hits`` (rows whose misfit was remembered instead), ``failures`` (list of
-            ``{"parameters", "reason"}``, the first thousand), ``failure_count``, ``failure_reasons`` (count of
-            each), ``seconds`` (wall time in simulations).
+            ``simulations``, ``cache_hits`` (rows whose misfit was remembered instead), ``disk_hits`` (how many of them
+            came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, the first thousand),
+            ``failure_count``, ``failure_reasons`` (count of each), ``seconds`` (wall time in simulations).
         """
         return {
             "simulations": self.likelihood.simulations,
             "cache_hits": self.likelihood.cache_hits,
+            "disk_hits": self.likelihood.disk_hits,
             "failures": list(self.likelihood.failures),
             "failure_count": self.likelihood.failure_count,
             "failure_reasons": dict(self.likelihood.failure_reasons),

@@ -11,12 +11,14 @@ Its data are **synthetic** and most nominal values are **assumed**.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from types import MappingProxyType
 
 import numpy as np
 
+from .cache import SimulationCache
 from .channels import Dataset, Measurements, read_dataset
 from .likelihood import FELikelihood
 from .models.isolated_bridge import CHANNEL_SETS, IsolatedBridge
@@ -112,6 +114,7 @@ def bridge_column(
     every: int = 1,
     duration: float | None = None,
     seed: int = 1,
+    cache: SimulationCache | str | os.PathLike | None = None,
     **changes,
 ) -> Posterior:
     """Posterior of the bridge column: seven parameters, two measured channels, likelihood of the paper's equation (3).
@@ -127,6 +130,8 @@ def bridge_column(
         Keep the first `duration` seconds.
     seed : int
         Of the noise, where measurements are made.
+    cache : SimulationCache or path, optional
+        Where simulations are kept on disk, for later runs too.
     **changes
         Other arguments of `RCColumn.lhpost`.
 
@@ -153,7 +158,7 @@ def bridge_column(
         measurements = measurements.decimate(every)
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
-    return Posterior(FELikelihood(model, measurements), bridge_column_prior())
+    return Posterior(FELikelihood(model, measurements, cache=cache), bridge_column_prior())
 
 
 # ------------------------------------------------------------------ isolated bridge
@@ -263,6 +268,7 @@ def isolated_bridge(
     record: Record | None = None,
     measurements: Measurements | None = None,
     seed: int = 1,
+    cache: str | os.PathLike | SimulationCache | None = None,
     **changes,
 ) -> Posterior:
     """Posterior of the isolated bridge: ten parameters of friction and dampers, and the noise.
@@ -283,6 +289,8 @@ def isolated_bridge(
         (`isolated_bridge_measurements`). Measurements may have a step that is a multiple of the record's.
     seed : int
         Of the noise, where measurements are made.
+    cache : path or SimulationCache, optional
+        Where simulations are kept from run to run (see `FELikelihood`).
     **changes
         Other arguments of `IsolatedBridge`: step, friction, bearings, parameters ...
 
@@ -319,4 +327,4 @@ def isolated_bridge(
     else:
         law, scales = GaussianNoise(measurements.channels), SharedGaussianNoise.of(measurements).scales
     prior = isolated_bridge_prior(model.parameter_names, dict(zip(law.parameter_names, scales, strict=True)))
-    return Posterior(FELikelihood(model, measurements, law), prior)
+    return Posterior(FELikelihood(model, measurements, law, cache=cache), prior)

@@ -128,8 +128,8 @@ def test_plots_and_clients_are_imported_where_used(module):
 
 def test_storage_has_its_places(module):
     everywhere = {m.split(".")[0] for m, _ in imports(module)}
-    assert "h5py" not in everywhere or module.stem in ("backends", "channels", "problems")
-    assert "sqlite3" not in everywhere or module.stem == "cache"
+    assert "h5py" not in everywhere or module.stem in ("backends", "channels", "problems", "cache_exchange")
+    assert "sqlite3" not in everywhere or module.stem in ("cache", "cache_file")
 
 
 def test_kernels_stand_on_numba_alone():

@@ -19,7 +19,15 @@ import numpy as np
 
 from ..channels import Channel
 
-__all__ = ["MisfitBatch", "Model", "SimulationBatch", "SimulationFailed", "misfit_batch", "simulate_batch"]
+__all__ = [
+    "MisfitBatch",
+    "Model",
+    "SimulationBatch",
+    "SimulationFailed",
+    "misfit_batch",
+    "misfit_of_responses",
+    "simulate_batch",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -136,6 +144,14 @@ def misfit_batch(model: Model, thetas: np.ndarray, measured: np.ndarray, pool: A
         if batch is not None:
             return MisfitBatch(*batch)
     return MisfitBatch(*_run_each(partial(_misfit, measured), model, thetas, shape, pool))
+
+
+def misfit_of_responses(model: Model, batch: SimulationBatch, measured: np.ndarray) -> MisfitBatch:
+    """Sums of squared residuals of responses against `measured` (n_channels, n_steps)."""
+    misfit = np.reshape([_squared_residuals(response, measured) for response in batch.response], (-1, len(measured)))
+    reasons = [reason or _not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
+    misfit[[bool(reason) for reason in reasons]] = np.nan
+    return MisfitBatch(misfit, reasons)
 
 
 def _squared_residuals(response: np.ndarray, measured: np.ndarray) -> np.ndarray:
