@@ -146,7 +146,7 @@ class SimulationCache:
         self._set_up(path, int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes), timeout)
         self._file.check()
         if not self._file.writable:
-            logger.warning("%s may only be read: what is simulated now is not stored", self.path)
+            self._warn_that_it_is_only_read()
 
     def _set_up(self, path, max_rows, retry_failures, responses, max_response_bytes, timeout) -> None:
         self._file = CacheFile(path, timeout)
@@ -156,6 +156,7 @@ class SimulationCache:
         self.max_response_bytes = max_response_bytes
         self.hits = self.misses = self.evictions = self.damaged = 0
         self._waiting: list[tuple] = []
+        self._only_read = False  # and has been said to be
         self._pauses: dict[str, float] = {}  # until when what failed is not tried again
 
     def __getstate__(self) -> tuple:
@@ -402,12 +403,18 @@ class SimulationCache:
     def _write(self, statement: str, rows: list[tuple]) -> None:
         with self._file.lock:
             if not self._file.writable:
+                self._warn_that_it_is_only_read()
                 return
             if statement is _STORE:  # responses are no loss
                 rows = self._waiting = (self._waiting + rows)[-MOST_WAITING:]
             if self._try("written", lambda connection: self._insert(connection, statement, rows) or True, False):
                 if statement is _STORE:
                     self._waiting = []
+
+    def _warn_that_it_is_only_read(self) -> None:
+        if not self._only_read:
+            logger.warning("%s may only be read: what is simulated now is not stored", self.path)
+        self._only_read = True
 
     def _drop(self, table: str, keys: list[bytes]) -> None:
         """Delete rows that do not match their checksum."""

@@ -9,18 +9,21 @@ and those of a process are closed before it forks. WAL needs shared memory among
 of the machine, not on a network file system.
 """
 
+import contextlib
 import logging
 import os
 import sqlite3
 import threading
 import time
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
 
 try:
-    from fcntl import LOCK_EX, flock
-except ImportError:  # no such locks on this system: two programs may set aside the same file
-    flock = None
+    from fcntl import LOCK_EX, LOCK_NB
+    from fcntl import flock as lock_file
+except ImportError:  # no such locks on this system: two programs must not find the same damage at once
+    lock_file = None
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
 
@@ -36,7 +39,6 @@ LAYOUT = (
     "size INTEGER NOT NULL, crc INTEGER NOT NULL, response BLOB NOT NULL)",
     "CREATE INDEX response_sizes ON responses (size)",  # their sum without reading the responses
 )
-TABLES = {"simulations", "responses"}
 CHECK_SECONDS = 2.0  # for looking through the file when it is opened; rows have checksums of their own
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -71,6 +73,8 @@ def _code(error: Exception) -> int:
 
 def is_damage(error: Exception) -> bool:
     """Whether an error says that the file itself is broken."""
+    if isinstance(error, UnicodeDecodeError):  # SQLite's message quotes what it has found there
+        return True
     return _code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
@@ -132,7 +136,7 @@ class CacheFile:
         with self.lock:
             try:
                 self._look_through(self.connection())
-            except sqlite3.Error as error:
+            except (sqlite3.Error, UnicodeDecodeError) as error:
                 self.close()
                 if not is_damage(error):
                     raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
@@ -143,7 +147,7 @@ class CacheFile:
                     ) from None
                 self._replace(error)
 
-    def _replace(self, error: sqlite3.Error) -> None:
+    def _replace(self, error: Exception) -> None:
         try:
             self.set_aside(str(error))
             self.connection()
@@ -164,12 +168,13 @@ class CacheFile:
             If it cannot be opened.
         """
         if self._connection is None:
-            self.writable = not self.path.exists() or (
-                os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK | os.X_OK)
-            )
-            self._connection = self._open() if self.writable else self._open_to_read()
-            status = self.path.stat()
-            self._inode = status.st_dev, status.st_ino
+            with self._alone():
+                self._inode = self._inode_now()
+                self.writable = self._inode is None or (
+                    os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK | os.X_OK)
+                )
+                self._connection = self._open() if self.writable else self._open_to_read()
+                self._inode = self._inode_now()
         return self._connection
 
     def close(self) -> None:
@@ -180,32 +185,58 @@ class CacheFile:
                 self._connection = None
 
     def set_aside(self, why: str) -> None:
-        """Rename a damaged file to ``<name>.damaged-<n>``, unless another process has done so, with a warning.
+        """Rename a damaged file to ``<name>.damaged-<n>``, with a warning, unless another process has done so.
 
         Raises
         ------
         OSError
             If it cannot be renamed.
         """
-        with self.lock:
+        with self.lock, self._alone():
             self.close()
-            with open(self.path, "rb") as file:
-                if flock is not None:  # on the damaged file itself: who comes second finds another one in its place
-                    flock(file, LOCK_EX)
-                status, opened = self.path.stat(), os.fstat(file.fileno())
-                now = (status.st_dev, status.st_ino)
-                if now != (opened.st_dev, opened.st_ino) or (self._inode is not None and now != self._inode):
-                    return
-                n = 1
-                while (aside := self.path.with_name(f"{self.path.name}.damaged-{n}")).exists():
-                    n += 1
-                # the log first: beside a new file it would be taken for that one's
-                for suffix in ("-wal", "-shm", ""):
-                    part = self.path.with_name(self.path.name + suffix)
-                    if part.exists():
-                        os.rename(part, aside.with_name(aside.name + suffix))
-            self._inode = None
+            if self._inode is None or self._inode_now() != self._inode:
+                return
+            n = 1
+            while (aside := self.path.with_name(f"{self.path.name}.damaged-{n}")).exists():
+                n += 1
+            # the log first: beside a new file it would be taken for that one's
+            for suffix in ("-wal", "-shm", ""):
+                part = self.path.with_name(self.path.name + suffix)
+                if part.exists():
+                    os.rename(part, aside.with_name(aside.name + suffix))
             logger.warning("%s is damaged (%s): set aside as %s, a new cache is begun", self.path, why, aside.name)
+
+    def _inode_now(self) -> tuple[int, int] | None:
+        try:
+            status = self.path.stat()
+        except FileNotFoundError:
+            return None
+        return status.st_dev, status.st_ino
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """No other process opens the file, or sets it aside, meanwhile: by a lock on the folder.
+
+        SQLite finds the log by its name: who opened a damaged file while it is renamed would write into the log of the
+        new one. A lock on the file itself would not do: to close a file takes all of SQLite's own locks from it.
+        """
+        if lock_file is None:
+            yield
+            return
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            give_up = time.monotonic() + self.timeout
+            while True:
+                try:
+                    lock_file(folder, LOCK_EX | LOCK_NB)
+                    break
+                except OSError as error:  # a file system without such locks is no reason to stop
+                    if not isinstance(error, BlockingIOError) or time.monotonic() > give_up:
+                        break
+                time.sleep(0.002)
+            yield
+        finally:
+            os.close(folder)
 
     def _open(self) -> sqlite3.Connection:
         connection = self._connect("mode=rwc")
@@ -275,19 +306,19 @@ class CacheFile:
     def _identify(self, connection: sqlite3.Connection) -> None:
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
         ((version,),) = connection.execute("PRAGMA user_version").fetchall()
-        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        layout = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall())
         if identity != APPLICATION_ID:
             raise ValueError(
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
-                f"{APPLICATION_ID:#x}; tables {', '.join(sorted(tables)) or 'none'}): give another path"
+                f"{APPLICATION_ID:#x}; tables and indices {', '.join(sorted(layout)) or 'none'}): give another path"
             )
         if version != SCHEMA_VERSION:
             raise ValueError(
                 f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}: give "
                 "another path, or remove the file"
             )
-        if not TABLES <= tables:
-            raise _Damaged(f"it lacks the tables {', '.join(sorted(TABLES - tables))}")
+        if sorted(layout.values()) != sorted(LAYOUT):
+            raise _Damaged("its tables are not those that were made")
 
     @staticmethod
     def _look_through(connection: sqlite3.Connection) -> None:

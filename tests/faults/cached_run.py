@@ -1,0 +1,54 @@
+"""A run with a cache that a test can kill: ``python -m tests.faults.cached_run CACHE SECONDS``.
+
+A simulation takes SECONDS.
+"""
+
+import sys
+import time
+
+import numpy as np
+
+from fe_likelihoods.channels import Measurements
+from fe_likelihoods.likelihood import FELikelihood
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.posterior import Posterior
+from fe_likelihoods.priors import HalfNormal, TruncatedNormal
+from fe_likelihoods.records import Record
+from samplers import SMCSampler
+
+N, STEPS, SEED = 40, 5, 11
+RECORD = Record("beats", 0.05, np.sin(np.arange(120) / 3) * np.cos(np.arange(120) / 20))
+
+
+class Slow(LinearOscillator):
+    """Takes its time for every simulation, and counts them."""
+
+    seconds = 0.0
+    runs = 0
+
+    def simulate(self, theta):
+        self.runs += 1
+        time.sleep(self.seconds)
+        return super().simulate(theta)
+
+
+def make(cache, seconds=0.0):
+    """The sampler and its posterior."""
+    model = Slow(RECORD)
+    model.seconds = seconds
+    measured = LinearOscillator(RECORD).simulate(np.array([1.1, 0.8]))
+    noise = np.array([[0.05], [0.002]]) * np.random.default_rng(1).standard_normal(measured.shape)
+    likelihood = FELikelihood(model, Measurements(model.channels, model.dt, measured + noise), cache=cache)
+    prior = {
+        "stiffness": TruncatedNormal(1.0, 0.3),
+        "damping": TruncatedNormal(1.0, 0.6),
+        "sigma_acceleration": HalfNormal(0.2),
+        "sigma_displacement": HalfNormal(0.01),
+    }
+    posterior = Posterior(likelihood, prior)
+    return SMCSampler(N, posterior.ndim, posterior, vectorize=True, seed=SEED), posterior
+
+
+if __name__ == "__main__":
+    cache, seconds = sys.argv[1:]
+    make(cache, float(seconds))[0].run_mcmc(None, STEPS)

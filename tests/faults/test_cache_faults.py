@@ -1,0 +1,687 @@
+"""Whatever happens to the cache or to those who use it: never a wrong value, never a broken run, nothing lost."""
+
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from fe_likelihoods import cache as cache_module
+from fe_likelihoods.cache import SimulationCache
+from fe_likelihoods.cache_file import APPLICATION_ID, SCHEMA_VERSION, CacheFile
+from fe_likelihoods.channels import Measurements
+from fe_likelihoods.likelihood import FELikelihood
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.records import Record
+
+from . import cached_run
+
+ROOT = Path(__file__).parents[2]
+MODEL = LinearOscillator(Record("sine", 0.02, np.sin(np.arange(20.0))))
+FINGERPRINT = "model and data"
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM: processes are killed here")
+FORK = multiprocessing.get_context("fork") if hasattr(os, "fork") else None
+
+
+def likelihood_of(cache=None, **kwargs):
+    return FELikelihood(MODEL, Measurements(MODEL.channels, MODEL.dt, np.ones((2, 20))), cache=cache, **kwargs)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cache.sqlite"
+
+
+@pytest.fixture
+def thetas(rng):
+    """Some of them fail: the stiffness must be positive."""
+    return np.column_stack([rng.uniform(-0.1, 2.0, size=400), rng.uniform(0.5, 2.0, size=400)])
+
+
+@pytest.fixture
+def expected(thetas):
+    return likelihood_of().misfit(thetas)
+
+
+@pytest.fixture
+def filled(path, thetas):
+    """A cache of all points, closed."""
+    likelihood = likelihood_of(path)
+    likelihood.misfit(thetas)
+    likelihood.cache.close()
+    return path
+
+
+def sums_of(thetas):
+    return np.column_stack([thetas.sum(axis=1), 1.0 / (1.0 + thetas[:, 0] ** 2)])
+
+
+def at_once(function, arguments):
+    """Exit codes of one process for each of the arguments, all let go at the same moment."""
+    barrier = FORK.Barrier(len(arguments))
+
+    def start(*args):
+        barrier.wait(30)
+        function(*args)
+
+    processes = [FORK.Process(target=start, args=args) for args in arguments]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60)
+    return [process.exitcode for process in processes]
+
+
+def integrity(path):
+    with sqlite3.connect(path) as connection:
+        answer = connection.execute("PRAGMA integrity_check").fetchall()
+    connection.close()
+    return answer
+
+
+# killed ---------------------------------------------------------------------------------------------------------------
+
+
+def batch_of(kill, number):
+    rng = np.random.default_rng([kill, number])
+    return rng.normal(size=(int(rng.integers(1, 300)), 3))
+
+
+def write_until_killed(path, kill, max_rows, pipe):
+    cache = SimulationCache(path, max_rows=max_rows)
+    for number in range(10_000):
+        thetas = batch_of(kill, number)
+        cache.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+        pipe.send_bytes(number.to_bytes(4, "little"))
+
+
+@pytest.mark.parametrize(("kills", "max_rows"), [(30, 1_000_000), (10, 1_000)])
+def test_killed_while_writing(path, rng, kills, max_rows):
+    """Kills by -9, each at a moment of chance: what was acknowledged is there, batches are whole, or gone."""
+    acknowledged = []
+    for kill in range(kills):
+        receiver, sender = FORK.Pipe(duplex=False)
+        process = FORK.Process(target=write_until_killed, args=(path, kill, max_rows, sender))
+        process.start()
+        sender.close()
+        assert receiver.poll(30)
+        time.sleep(rng.uniform(0.0, 0.02))
+        process.kill()
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
+        try:
+            while True:
+                acknowledged.append((kill, int.from_bytes(receiver.recv_bytes(), "little")))
+        except EOFError:
+            pass
+        assert integrity(path) == [("ok",)]
+    cache = SimulationCache(path, max_rows=max_rows)
+    known, expected = [], 0
+    for kill, number in acknowledged:
+        thetas = batch_of(kill, number)
+        found = cache.look_up(FINGERPRINT, thetas, 2, 8)
+        np.testing.assert_array_equal(found.misfit[found.known], sums_of(thetas)[found.known])
+        known += found.known.tolist()
+        expected += len(thetas)
+    # the one batch that a killed process may have stored, and not yet told about
+    for kill in range(kills):
+        thetas = batch_of(kill, 1 + max((n for k, n in acknowledged if k == kill), default=-1))
+        share = cache.look_up(FINGERPRINT, thetas, 2, 8).known.mean()
+        assert share in (0.0, 1.0) or max_rows == 1_000
+    assert cache.damaged == 0
+    if max_rows == 1_000:
+        assert cache.info().simulations == 1_000
+        assert expected > 2_000, "hardly anything was evicted"
+    else:
+        assert all(known)
+
+
+def test_a_killed_writer_does_not_keep_others_waiting(path):
+    cache = SimulationCache(path, timeout=20.0)
+    receiver, sender = FORK.Pipe(duplex=False)
+
+    def hold():
+        SimulationCache(path)._file.connection().execute("BEGIN IMMEDIATE")
+        sender.send_bytes(b"held")
+        time.sleep(60)
+
+    process = FORK.Process(target=hold)
+    process.start()
+    assert receiver.recv_bytes() == b"held"
+    process.kill()
+    process.join()
+    thetas = batch_of(0, 0)
+    cache.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+    assert cache.look_up(FINGERPRINT, thetas, 2, 8).known.all()
+
+
+@pytest.mark.parametrize(
+    "share", [pytest.param(0.1, marks=pytest.mark.slow), 0.5, pytest.param(0.9, marks=pytest.mark.slow)]
+)
+def test_a_killed_run_reaches_its_place_without_a_simulation(path, tmp_path, share):
+    whole, reference = cached_run.make(tmp_path / "whole.sqlite")
+    whole.run_mcmc(None, cached_run.STEPS)
+    distinct = reference.likelihood.cache.info().simulations
+    assert reference.likelihood.model.runs == distinct > 300
+
+    command = [sys.executable, "-m", "tests.faults.cached_run", str(path), "0.001"]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        watched = None
+        while watched is None or watched.info().simulations < share * distinct:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.002)
+            if watched is None and path.exists():
+                watched = SimulationCache(path)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    stored = watched.info().simulations
+    assert share * distinct <= stored < distinct
+
+    sampler, posterior = cached_run.make(path)
+    sampler.run_mcmc(None, cached_run.STEPS)
+    assert posterior.likelihood.model.runs == posterior.report()["simulations"] == distinct - stored
+    again, replayed = cached_run.make(path)
+    again.run_mcmc(None, cached_run.STEPS)
+    assert replayed.likelihood.model.runs == 0
+    for other in (sampler, again):
+        np.testing.assert_array_equal(other.get_chain(), whole.get_chain())
+        np.testing.assert_array_equal(other.get_log_prob(), whole.get_log_prob())
+        assert other.log_evidence == whole.log_evidence
+
+
+# several at once ------------------------------------------------------------------------------------------------------
+
+
+def test_programs_that_begin_a_cache_at_once(tmp_path):
+    for attempt in range(5):
+        path = tmp_path / f"{attempt}.sqlite"
+
+        def begin(number, path=path):
+            thetas = batch_of(1, number)
+            SimulationCache(path).store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+
+        assert at_once(begin, [(number,) for number in range(6)]) == [0] * 6
+        assert integrity(path) == [("ok",)]
+        cache = SimulationCache(path)
+        for number in range(6):
+            thetas = batch_of(1, number)
+            np.testing.assert_array_equal(cache.look_up(FINGERPRINT, thetas, 2, 8).misfit, sums_of(thetas))
+
+
+def test_two_programs_on_one_cache(path, thetas, expected):
+    """Both are right, and together they leave every simulation behind; the third one runs none."""
+
+    def run(order):
+        likelihood = likelihood_of(path, memory=0)
+        for start in range(0, len(thetas), 10):
+            rows = order[start : start + 10]
+            np.testing.assert_array_equal(likelihood.misfit(thetas[rows]), expected[rows])
+
+    forward = np.arange(len(thetas))
+    assert at_once(run, [(forward,), (forward[::-1],)]) == [0, 0]
+    third = likelihood_of(path)
+    np.testing.assert_array_equal(third.misfit(thetas), expected)
+    assert third.simulations == 0
+    assert third.cache.info().simulations == len(thetas)
+
+
+def test_another_program_that_keeps_the_file_locked(path, thetas, expected, caplog, monkeypatch):
+    cache = SimulationCache(path, timeout=0.05)
+    blocker = sqlite3.connect(path, isolation_level=None)
+    blocker.execute("BEGIN IMMEDIATE")
+    likelihood = likelihood_of(cache)
+    np.testing.assert_array_equal(likelihood.misfit(thetas[:200]), expected[:200])
+    assert warnings_of(caplog, "cannot be written") == 1
+    blocker.execute("ROLLBACK")
+    blocker.close()
+    cache.close()  # stores what waits
+    assert cache.info().simulations == 200
+
+
+# damaged --------------------------------------------------------------------------------------------------------------
+
+
+def warnings_of(caplog, text):
+    """How many warnings say so, those of failed simulations apart."""
+    return sum(text in record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING)
+
+
+def no_database(path):
+    path.write_bytes(b"what is this?\n" * 500)
+
+
+def zeros(path):
+    path.write_bytes(bytes(4096) + path.read_bytes()[4096:])
+
+
+def cut_off(path):
+    os.truncate(path, path.stat().st_size // 2 // 4096 * 4096)
+
+
+def overwritten_in_the_middle(path):
+    data = bytearray(path.read_bytes())
+    data[8192 : len(data) // 2] = b"\xa5" * (len(data) // 2 - 8192)
+    path.write_bytes(data)
+
+
+def another_column(path):
+    path.write_bytes(path.read_bytes().replace(b"misfit BLOB", b"misfet BLOB"))
+
+
+def without_a_table(path):
+    with sqlite3.connect(path) as connection:
+        connection.execute("DROP TABLE simulations")
+    connection.close()
+
+
+DAMAGES = [no_database, zeros, cut_off, overwritten_in_the_middle, another_column, without_a_table]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("before", [0, 2])
+def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, before):
+    for n in range(1, before + 1):
+        filled.with_name(f"{filled.name}.damaged-{n}").write_text("an earlier one")
+    damage(filled)
+    data = filled.read_bytes()
+    likelihood = likelihood_of(filled)
+    aside = filled.with_name(f"{filled.name}.damaged-{before + 1}")
+    assert aside.read_bytes() == data
+    assert warnings_of(caplog, f"set aside as {aside.name}") == 1
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    assert likelihood.simulations == len(thetas)
+    again = likelihood_of(filled)
+    again.misfit(thetas)
+    assert (again.simulations, again.disk_hits) == (0, len(thetas))
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog, damage):
+    likelihood = likelihood_of(filled)
+    np.testing.assert_array_equal(likelihood.misfit(thetas[:50]), expected[:50])
+    likelihood.cache.close()  # as before a fork
+    damage(filled)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    assert warnings_of(caplog, "set aside as") == 1
+    again = likelihood_of(filled)
+    np.testing.assert_array_equal(again.misfit(thetas), expected)
+    assert again.disk_hits + likelihood.disk_hits >= len(thetas)
+
+
+@pytest.mark.parametrize("attempts", [10, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("how", ["bytes", "page", "cut"])
+def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, how, attempts):
+    """At places of chance, also while the file is open."""
+    data = filled.read_bytes()
+    served = 0
+    for attempt in range(attempts):
+        path = filled.with_name(f"{attempt}.sqlite")
+        path.write_bytes(data)
+        likelihood = likelihood_of(path)
+        if attempt % 2:
+            likelihood.cache.close()
+        damaged = bytearray(data)
+        place = int(rng.integers(100, len(data)))  # the first hundred bytes say whose file it is
+        if how == "bytes":
+            for where in rng.integers(100, len(data), size=20):
+                damaged[where] ^= 1 << rng.integers(8)
+        elif how == "page":
+            damaged[place : place + 3000] = rng.bytes(len(damaged[place : place + 3000]))
+        else:
+            del damaged[place:]
+        with open(path, "r+b") as file:
+            file.write(damaged)
+            file.truncate()
+        np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+        served += likelihood.disk_hits
+        again = likelihood_of(path)
+        np.testing.assert_array_equal(again.misfit(thetas), expected)
+    assert how != "bytes" or served > 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "misfit = (SELECT misfit FROM simulations WHERE id = 9)",
+        "misfit = zeroblob(16)",
+        "misfit = zeroblob(8)",
+        "misfit = 'text'",
+        "misfit = 17",
+        "reason = CAST('it failed' AS BLOB)",
+        "reason = 'text'",
+        "n_steps = 21",
+        "n_steps = 1.5",
+        "seconds = 'soon'",
+        "seconds = seconds + 1",
+        "crc = crc + 1",
+        "crc = 'none'",
+    ],
+)
+def test_a_damaged_row_is_missing(filled, thetas, expected, caplog, change):
+    with sqlite3.connect(filled) as connection:
+        connection.execute(f"UPDATE simulations SET {change} WHERE id = 5")
+    connection.close()
+    likelihood = likelihood_of(filled)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    assert (likelihood.simulations, likelihood.cache.damaged) == (1, 1)
+    assert warnings_of(caplog, "damaged rows") == 1
+    again = likelihood_of(filled)
+    np.testing.assert_array_equal(again.misfit(thetas), expected)
+    assert (again.simulations, again.cache.damaged) == (0, 0)
+    assert not list(filled.parent.glob("*.damaged-*"))
+
+
+def test_rows_under_each_others_key_are_missing(filled, thetas, expected):
+    with sqlite3.connect(filled) as connection:
+        keys = dict(connection.execute("SELECT id, key FROM simulations WHERE id IN (5, 9)").fetchall())
+        for row, key in ((5, b"aside"), (9, keys[5]), (5, keys[9])):
+            connection.execute("UPDATE simulations SET key = ? WHERE id = ?", (key, row))
+    connection.close()
+    likelihood = likelihood_of(filled)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    assert (likelihood.simulations, likelihood.cache.damaged) == (2, 2)
+
+
+def test_a_damaged_response_is_missing(path, thetas):
+    likelihood = likelihood_of(SimulationCache(path, responses=True))
+    likelihood.misfit([[1.0, 1.0]])
+    assert likelihood.cache.response(MODEL.fingerprint, [1.0, 1.0]) is not None
+    likelihood.cache._file.connection().execute("UPDATE responses SET response = zeroblob(160)")
+    assert likelihood.cache.response(MODEL.fingerprint, [1.0, 1.0]) is None
+    assert (likelihood.cache.damaged, likelihood.cache.info().responses) == (1, 0)
+
+
+def test_programs_that_find_a_damaged_file_at_once(filled):
+    """It is set aside once, and the new one is everybody's."""
+    no_database(filled)
+    data = filled.read_bytes()
+
+    def begin(number):
+        thetas = batch_of(2, number)
+        SimulationCache(filled).store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+
+    assert at_once(begin, [(number,) for number in range(6)]) == [0] * 6
+    (aside,) = filled.parent.glob("*.damaged-*")
+    assert aside.read_bytes() == data
+    cache = SimulationCache(filled)
+    assert all(cache.look_up(FINGERPRINT, batch_of(2, n), 2, 8).known.all() for n in range(6))
+
+
+def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
+    """The log goes with the damaged file."""
+    keep = sqlite3.connect(filled)  # so that the log is there
+    keep.execute("SELECT count(*) FROM simulations").fetchall()
+    cache = SimulationCache(filled)
+    cache.store(FINGERPRINT, thetas, 20, sums_of(thetas), [""] * len(thetas), 1.0)
+    log = filled.with_name(filled.name + "-wal")
+    assert log.stat().st_size > 0
+    cache._file.set_aside("for a test")
+    assert not log.exists()
+    assert SimulationCache(filled).info().simulations == 0
+    keep.close()
+
+
+# nothing can be written -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def full(monkeypatch):
+    """A switch: SQLite itself refuses to let the file grow."""
+    switch = {"full": True}
+    normal = CacheFile._open
+
+    def limited(self):
+        connection = normal(self)
+        if switch["full"]:
+            connection.execute("PRAGMA max_page_count = 1")  # not below the size it has
+        return connection
+
+    monkeypatch.setattr(CacheFile, "_open", limited)
+    return switch
+
+
+def test_a_full_disk_does_not_stop_the_run(path, thetas, expected, caplog, full, monkeypatch):
+    likelihood = likelihood_of(path)
+    for start in range(0, 300, 20):
+        rows = slice(start, start + 20)
+        np.testing.assert_array_equal(likelihood.misfit(thetas[rows]), expected[rows])
+    assert warnings_of(caplog, "cannot be written (database or disk is full)") == 1
+    likelihood.misfit(thetas[:300])
+    assert likelihood.simulations == 300
+    stored = likelihood.cache.info().simulations
+    assert stored < 300
+    # somebody makes room: what waited in memory is stored with what comes next
+    full["full"] = False
+    likelihood.cache._file.close()
+    likelihood.misfit(thetas[300:310])
+    assert likelihood.cache.info().simulations == stored  # not tried again so soon
+    monkeypatch.setattr(cache_module, "RETRY_SECONDS", 0.0)
+    likelihood.cache._pauses["written"] = time.monotonic()
+    likelihood.misfit(thetas[310:320])
+    again = likelihood_of(path)
+    np.testing.assert_array_equal(again.misfit(thetas[:320]), expected[:320])
+    assert again.simulations == 0
+    assert integrity(path) == [("ok",)]
+
+
+def test_a_really_full_disk(thetas, expected, caplog):
+    if os.geteuid() != 0:
+        pytest.skip("NO FULL DISK: only root can mount a small one; the test above has SQLite refuse to grow")
+    with tempfile.TemporaryDirectory() as folder:
+        mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", folder], capture_output=True)
+        if mounted.returncode:
+            pytest.skip(f"NO FULL DISK: a small one cannot be mounted here: {mounted.stderr.decode().strip()}")
+        try:
+            likelihood = likelihood_of(Path(folder) / "cache.sqlite")
+            for start in range(0, 400, 50):
+                likelihood.misfit(thetas[start : start + 50])
+            np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+            assert likelihood.simulations == 400
+            assert warnings_of(caplog, "cannot be") >= 1
+            likelihood.cache._file.close()
+            again = likelihood_of(Path(folder) / "cache.sqlite")
+            np.testing.assert_array_equal(again.misfit(thetas), expected)
+            again.cache._file.close()
+        finally:
+            subprocess.run(["umount", folder], check=True)
+
+
+@pytest.fixture
+def open_folder():
+    """A folder that another user can enter: pytest's own are closed."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o755)
+        yield Path(folder)
+        os.chmod(folder, 0o755)
+
+
+def as_somebody(function):
+    """Run it where permissions bind: root may do everything, so as another user then; whatever it raises is raised."""
+    receiver, sender = FORK.Pipe(duplex=False)
+
+    def run():
+        try:
+            if os.geteuid() == 0:
+                os.setgroups([])
+                os.setgid(65534)
+                os.setuid(65534)
+            function()
+            sender.send("")
+        except BaseException:
+            sender.send(traceback.format_exc())
+
+    process = FORK.Process(target=run)
+    process.start()
+    assert receiver.poll(60)
+    problem = receiver.recv()
+    process.join(60)
+    assert not problem, problem
+
+
+@pytest.mark.parametrize("folder_mode", [0o555, 0o777])
+def test_a_file_that_may_only_be_read(open_folder, thetas, expected, caplog, folder_mode):
+    path = open_folder / "cache.sqlite"
+    likelihood = likelihood_of(path)
+    likelihood.misfit(thetas[:300])
+    likelihood.cache.close()  # nothing is left in the log
+    path.chmod(0o444)
+    open_folder.chmod(folder_mode)
+    before = sorted(open_folder.iterdir()), path.read_bytes()
+
+    def run():
+        likelihood = likelihood_of(path)
+        for _ in range(2):
+            np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+        assert (likelihood.simulations, likelihood.disk_hits) == (100, 300)
+        assert warnings_of(caplog, "may only be read") == 1
+        assert warnings_of(caplog, "cannot be") == 0
+        with pytest.raises(OSError, match="cannot be used"):
+            likelihood.cache.clear()
+        np.testing.assert_array_equal(likelihood_of(path).misfit(thetas[:300]), expected[:300])
+        likelihood.cache.close()
+
+    as_somebody(run)
+    assert path.read_bytes() == before[1]
+
+
+def test_a_folder_that_becomes_read_only_during_the_run(open_folder, thetas, expected, caplog):
+    path = open_folder / "cache.sqlite"
+    open_folder.chmod(0o777)
+    go, ready = FORK.Event(), FORK.Event()
+
+    def run():
+        likelihood = likelihood_of(path)
+        np.testing.assert_array_equal(likelihood.misfit(thetas[:200]), expected[:200])
+        likelihood.cache.close()  # as before a fork
+        ready.set()
+        assert go.wait(30)
+        for start in range(200, 400, 50):
+            likelihood.misfit(thetas[start : start + 50])
+        np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+        assert likelihood.simulations == 400
+        assert warnings_of(caplog, "may only be read") == 1
+
+    def forbid():
+        ready.wait(30)
+        path.chmod(0o444)
+        open_folder.chmod(0o555)
+        go.set()
+
+    thread = threading.Thread(target=forbid)
+    thread.start()
+    try:
+        as_somebody(run)
+    finally:
+        thread.join()
+
+
+def test_places_where_nothing_may_be_done(open_folder):
+    closed = open_folder / "closed"
+    closed.mkdir()
+    secret = open_folder / "secret.sqlite"
+    SimulationCache(secret).close()
+    secret.chmod(0o000 if os.geteuid() else 0o600)
+    closed.chmod(0o555)
+
+    def run():
+        with pytest.raises(ValueError, match="nothing may be written to"):
+            SimulationCache(closed / "cache.sqlite")
+        with pytest.raises(ValueError, match="may not be read by this user"):
+            SimulationCache(secret)
+
+    as_somebody(run)
+
+
+# other people's files -------------------------------------------------------------------------------------------------
+
+
+def foreign_tables(path):
+    with sqlite3.connect(path) as connection:
+        connection.execute("CREATE TABLE simulations (id INTEGER PRIMARY KEY, anything TEXT)")
+        connection.execute("INSERT INTO simulations VALUES (1, 'precious')")
+
+
+def foreign_identity(path):
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA application_id = 12345")
+
+
+def foreign_in_wal_mode(path):
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("CREATE TABLE precious (id INTEGER)")
+    connection.close()
+
+
+def later_layout(path):
+    SimulationCache(path).close()
+    with sqlite3.connect(path) as connection:
+        connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
+    connection.close()
+
+
+def hdf5_file(path):
+    with h5py.File(path, "w") as file:
+        file["chain"] = np.arange(3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (foreign_tables, "another program's SQLite file .*indices simulations"),
+        (foreign_identity, "another program's SQLite file .*0x3039"),
+        (foreign_in_wal_mode, "another program's SQLite file .*indices precious"),
+        (later_layout, f"layout {SCHEMA_VERSION + 1}, this release reads and writes {SCHEMA_VERSION}"),
+        (hdf5_file, "HDF5 file, not a cache"),
+        (Path.mkdir, "is a folder"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_other_files_are_refused_and_left_alone(path, make, message):
+    make(path)
+    before = path.read_bytes() if path.is_file() else None
+    for _ in range(2):
+        with pytest.raises(ValueError, match=message):
+            likelihood_of(path)
+    assert before == (path.read_bytes() if path.is_file() else None)
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match="no folder"):
+        SimulationCache(tmp_path / "nowhere" / "cache.sqlite")
+
+
+def test_an_empty_file_becomes_a_cache(path):
+    path.touch()
+    SimulationCache(path).close()
+    with sqlite3.connect(path) as connection:
+        assert connection.execute("PRAGMA application_id").fetchall() == [(APPLICATION_ID,)]
+        assert connection.execute("PRAGMA journal_mode").fetchall() == [("wal",)]
+    connection.close()
+
+
+def test_a_file_out_of_reach_after_unpickling(path, thetas, expected, caplog):
+    """A worker elsewhere goes on without."""
+    likelihood = likelihood_of(path)
+    data = pickle.dumps(likelihood)
+    likelihood.cache.close()
+    path.unlink()
+    path.mkdir()
+    copy = pickle.loads(data)
+    for _ in range(2):
+        np.testing.assert_array_equal(copy.misfit(thetas), expected)
+    assert warnings_of(caplog, "cannot be read") == 1
