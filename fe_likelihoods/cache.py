@@ -98,7 +98,7 @@ class SimulationCache:
     path : path
         The file; made if it is not there. One that may only be read is read from, with a warning.
     max_rows : int
-        The most simulations that are kept, of some 200 bytes each; the oldest are evicted.
+        The most simulations that are kept, of some 200 bytes each; whoever writes evicts the oldest beyond this bound.
     retry_failures : bool
         Run simulations that had failed again: after a change of something that no fingerprint tells (an external
         program, memory, a time limit).
@@ -140,6 +140,8 @@ class SimulationCache:
         max_response_bytes: int = 2**30,
         timeout: float = 30.0,
     ) -> None:
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"SimulationCache: expected the path of a file; got {path!r}")
         for name, value in (("max_rows", max_rows), ("max_response_bytes", max_response_bytes)):
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"SimulationCache: {name} must be a whole number of 1 or more; got {value!r}")

@@ -43,10 +43,12 @@ CHECK_SECONDS = 2.0  # for looking through the file when it is opened; rows have
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
+_files_lock = threading.Lock()
 _held: "list[CacheFile]" = []
 
 
 def _before_fork() -> None:
+    _files_lock.acquire()
     for file in list(_files):
         file.lock.acquire()
         _held.append(file)
@@ -56,11 +58,13 @@ def _before_fork() -> None:
 def _after_fork_in_parent() -> None:
     while _held:
         _held.pop().lock.release()
+    _files_lock.release()
 
 
 def _after_fork_in_child() -> None:
     while _held:
         _held.pop().lock = threading.RLock()
+    _files_lock.release()
 
 
 if hasattr(os, "register_at_fork"):
@@ -97,7 +101,7 @@ class CacheFile:
     Attributes
     ----------
     path : Path
-        Absolute.
+        Absolute, without links.
     lock : RLock
         Of this process's threads.
     writable : bool
@@ -105,13 +109,18 @@ class CacheFile:
     """
 
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
-        self.path = Path(path).absolute()
+        self.path = Path(path).resolve()  # SQLite keeps the log beside the file that a link leads to
         self.timeout = float(timeout)
         self.lock = threading.RLock()
         self.writable = True
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
-        _files.add(self)
+        with _files_lock:
+            _files.add(self)
+
+    def __del__(self) -> None:
+        if getattr(self, "_connection", None) is not None:
+            self._connection.close()
 
     def check(self) -> None:
         """Open the file and look through it, before anything costly is done.
@@ -223,7 +232,11 @@ class CacheFile:
         if lock_file is None:
             yield
             return
-        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            folder = os.open(self.path.parent, os.O_RDONLY)
+        except OSError:  # a folder that may be used, not listed
+            yield
+            return
         try:
             give_up = time.monotonic() + self.timeout
             while True:

@@ -141,6 +141,7 @@ class FELikelihood:
         self._memory = MisfitMemory(memory)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._key = None if cache is None else self.fingerprint
+        self._model_fingerprint = None if cache is None else model.fingerprint
         self._chunk = 1
         self.simulations = 0
         self.cache_hits = 0
@@ -188,10 +189,10 @@ class FELikelihood:
         keys = list(first)
         misfit, known = self._memory.look_up(keys, result.shape[1])
         if not known.all():
-            missing = np.flatnonzero(~known)
-            misfit[missing], on_disk = self._obtain([keys[row] for row in missing])
-            known[missing] = on_disk
-            self.disk_hits += int(np.isin(distinct, missing[on_disk]).sum())
+            new, on_disk = ~known, np.zeros(len(keys), dtype=bool)
+            misfit[new], on_disk[new] = self._obtain([key for key, is_new in zip(keys, new, strict=True) if is_new])
+            self.disk_hits += int(on_disk[distinct].sum())
+            known |= on_disk
         self.cache_hits += int(known[distinct].sum())
         result[finite] = misfit[distinct]
         return result
@@ -239,7 +240,7 @@ class FELikelihood:
                     self._record(thetas[row], reasons[row])
             self._memory.store([keys[row] for row in np.flatnonzero(on_disk)], misfit[on_disk])
         left = np.flatnonzero(~on_disk)
-        least, most = self._chunk_limits(len(left))
+        least, most = self._chunk_limits(len(left)) if len(left) else (0, 0)
         while len(left):
             size = max(least, min(most, self._chunk))
             rows, left = left[:size], left[size:]
@@ -280,14 +281,14 @@ class FELikelihood:
             if reason:
                 self._record(theta, reason)
         if self.cache is not None:
-            if self.fingerprint != self._key:
+            if self.model.fingerprint != self._model_fingerprint:
                 raise ValueError(
                     "the model has changed since the likelihood was made (its fingerprint is another one), and its "
                     "simulations cannot be kept with the old ones: make a new likelihood"
                 )
             self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
             if batch is not None:
-                self.cache.store_responses(self.model.fingerprint, thetas, batch.response)
+                self.cache.store_responses(self._model_fingerprint, thetas, batch.response)
         return misfit
 
     def _record(self, theta: np.ndarray, reason: str) -> None:

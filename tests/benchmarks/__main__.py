@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from . import bridge, column, cost, peers, samplers, startup
+from . import bridge, cache, column, cost, peers, samplers, startup
 from .rows import as_table, machine, write_json
 
 BENCHMARKS = {
@@ -13,6 +13,7 @@ BENCHMARKS = {
     "imports": startup.imports,
     "compilation": startup.compilation,
     "cost": cost.cost,
+    "cache": cache.cache,
     "samplers": samplers.rows,
     "peers": peers.rows,
 }

@@ -665,6 +665,35 @@ def test_a_folder_that_is_not_there(tmp_path):
         SimulationCache(tmp_path / "nowhere" / "cache.sqlite")
 
 
+@pytest.mark.parametrize("path", [17, None, b"cache.sqlite", ["cache.sqlite"]])
+def test_what_is_no_path(path):
+    with pytest.raises(ValueError, match="expected the path of a file"):
+        SimulationCache(path)
+
+
+def test_names_that_mean_something_in_an_address(tmp_path, thetas, expected):
+    path = tmp_path / "a b?mode=memory#c%20d\N{GREEK SMALL LETTER THETA}.sqlite"
+    likelihood_of(path).misfit(thetas)
+    assert path.exists()
+    assert SimulationCache(path).info().simulations == len(thetas)
+
+
+def test_a_link_leads_to_one_cache(tmp_path, thetas):
+    real = tmp_path / "real" / "cache.sqlite"
+    real.parent.mkdir()
+    link = tmp_path / "link.sqlite"
+    link.symlink_to(real)
+    likelihood_of(link).misfit(thetas)
+    assert real.exists()
+    likelihood = likelihood_of(real)
+    likelihood.misfit(thetas)
+    assert likelihood.simulations == 0
+    likelihood.cache.close()
+    no_database(real)
+    SimulationCache(link)
+    assert link.is_symlink() and list(real.parent.glob("*.damaged-1"))
+
+
 def test_an_empty_file_becomes_a_cache(path):
     path.touch()
     SimulationCache(path).close()

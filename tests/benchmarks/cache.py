@@ -1,0 +1,80 @@
+"""What it costs to be told a simulation instead of running it, and to keep it: microseconds a row."""
+
+import pickle
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from fe_likelihoods.cache import SimulationCache
+from fe_likelihoods.likelihood import FELikelihood
+from fe_likelihoods.problems import bridge_column
+
+from .rows import Row
+
+__all__ = ["cache"]
+
+STORED, LIMIT_MEMORY, LIMIT_DISK = 100_000, 10.0, 60.0
+
+
+def _seconds(function: Callable, *arguments) -> float:
+    start = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - start
+
+
+def _fresh(likelihood: FELikelihood, path: Path) -> FELikelihood:
+    """A likelihood that remembers nothing, beside a file that is open."""
+    other = FELikelihood(likelihood.model, likelihood.measurements, cache=path)
+    other.cache.look_up("", np.zeros((1, 5)), 2, 1)
+    return other
+
+
+def cache(repeats: int) -> list[Row]:
+    """Rows of the bridge column, out of a file of a hundred thousand."""
+    rng = np.random.default_rng(1)
+    thetas = rng.uniform(0.5, 1.5, size=(STORED, 5))
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cache.sqlite"
+        likelihood = bridge_column(cache=path).likelihood
+        n_steps, key = likelihood.measurements.n_steps, likelihood.fingerprint
+        misfit = rng.uniform(size=(STORED, 2))
+
+        def store(batch: np.ndarray) -> None:
+            likelihood.cache.store(key, thetas[batch], n_steps, misfit[batch], [""] * len(batch), 1.0)
+
+        for start in range(0, STORED, 1000):
+            store(np.arange(start, start + 1000))
+        for size in (1, 500):
+            memory, disk, stored = [], [], []
+            for _ in range(repeats):
+                other = _fresh(likelihood, path)
+                batches = rng.choice(STORED, size=(20, size), replace=False)
+                disk.append(median(_seconds(other.misfit, thetas[batch]) for batch in batches) / size)
+                memory.append(median(_seconds(other.misfit, thetas[batch]) for batch in batches) / size)
+                if other.simulations or other.disk_hits != 20 * size:
+                    raise RuntimeError(f"expected {20 * size} rows from disk, got {other.disk_hits}")
+                thetas[batches] += 1.0  # not yet known
+                stored.append(median(_seconds(store, batch) for batch in batches) / size)
+            case = f"batches of {size}"
+            rows += [
+                Row(
+                    "cache, wall a row", f"from memory, {case}", 1e6 * median(memory), "us", f"at most {LIMIT_MEMORY:g}"
+                ),
+                Row("cache, wall a row", f"from disk, {case}", 1e6 * median(disk), "us", f"at most {LIMIT_DISK:g}"),
+                Row("cache, wall a row", f"stored, {case}", 1e6 * median(stored), "us"),
+            ]
+        likelihood.cache.close()
+        size = path.stat().st_size
+        opened = median(_seconds(SimulationCache, path) for _ in range(repeats))
+        copies = [pickle.loads(pickle.dumps(likelihood)) for _ in range(repeats)]
+        reopened = median(_seconds(copy.misfit, thetas[:1]) for copy in copies)
+    return [
+        *rows,
+        Row("cache, opened and checked", f"{STORED} rows", 1e3 * opened, "ms", f"{size / STORED:.0f} bytes a row"),
+        Row("cache, first row in another process", f"{STORED} rows", 1e3 * reopened, "ms"),
+    ]
