@@ -154,12 +154,14 @@ def test_a_killed_writer_does_not_keep_others_waiting(path):
     receiver, sender = FORK.Pipe(duplex=False)
 
     def hold():
-        SimulationCache(path)._file.connection().execute("BEGIN IMMEDIATE")
+        other = SimulationCache(path)
+        other._file.connection().execute("BEGIN IMMEDIATE")
         sender.send_bytes(b"held")
         time.sleep(60)
 
     process = FORK.Process(target=hold)
     process.start()
+    sender.close()
     assert receiver.recv_bytes() == b"held"
     process.kill()
     process.join()
@@ -525,6 +527,7 @@ def as_somebody(function):
 
     process = FORK.Process(target=run)
     process.start()
+    sender.close()
     assert receiver.poll(60)
     problem = receiver.recv()
     process.join(60)

@@ -463,6 +463,20 @@ def test_other_processes_share_the_file(path, thetas, method):
     assert likelihood.disk_hits == 100
 
 
+def test_a_connection_does_not_go_through_a_fork(path, thetas):
+    if not hasattr(os, "fork"):
+        pytest.skip("NO fork ON THIS SYSTEM")
+    likelihood = likelihood_of(Line(), path)
+    likelihood.misfit(thetas)
+    assert likelihood.cache._file._connection is not None
+    context = multiprocessing.get_context("fork")
+    process = context.Process(target=lambda: sys.exit(17 if likelihood.cache._file._connection is None else 1))
+    process.start()
+    process.join(60)
+    assert process.exitcode == 17
+    assert likelihood.cache.info().simulations == 300
+
+
 def test_forks_while_threads_write(path, rng):
     """A lock held by another thread, or a connection taken along, would hang or break the child."""
     if not hasattr(os, "fork"):
