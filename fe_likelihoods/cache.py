@@ -335,7 +335,7 @@ class SimulationCache:
         OSError
             If either file cannot be used.
         """
-        if Path(path).absolute() == self.path:
+        if Path(path).resolve() == self.path:
             raise ValueError(f"{path} is the cache itself: export it to another file")
         return write_rows(path, self._pages())
 
@@ -440,7 +440,7 @@ class SimulationCache:
                     result = action(self._file.connection())
                     self._pauses.pop(what, None)
                     return result
-                except (sqlite3.Error, OSError, ValueError) as error:
+                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # damage may ask for any size
                     self._file.close()  # and with it a transaction
                     failure = error
                 except BaseException:

@@ -339,7 +339,7 @@ class CacheFile:
         stop = time.monotonic() + CHECK_SECONDS
         connection.set_progress_handler(lambda: time.monotonic() > stop, 100_000)
         try:
-            ((answer,),) = connection.execute("PRAGMA quick_check(1)").fetchall()
+            (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()
         except sqlite3.OperationalError as error:
             if _code(error) != sqlite3.SQLITE_INTERRUPT:
                 raise

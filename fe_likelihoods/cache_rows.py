@@ -31,7 +31,7 @@ def simulation_keys(fingerprint: str, thetas: np.ndarray) -> list[bytes]:
     """Digests of a fingerprint and each row of `thetas` (n, n_structural); -0.0 and 0.0 are one, by adding zero."""
     start = hashlib.blake2b(_sources() + fingerprint.encode() + b"\0", digest_size=KEY_BYTES)
     keys = []
-    for row in np.asarray(thetas + 0.0, dtype="<f8"):
+    for row in np.asarray(thetas, dtype="<f8") + 0.0:
         digest = start.copy()
         digest.update(row.tobytes())
         keys.append(digest.digest())

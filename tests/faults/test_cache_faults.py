@@ -436,6 +436,24 @@ def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
     keep.close()
 
 
+def test_who_has_the_damaged_file_open_leaves_the_new_one_alone(filled, thetas):
+    """SQLite removes the log when the last one closes, by its name: it must not be the new file's."""
+    first, second = SimulationCache(filled), SimulationCache(filled)
+    second.look_up(FINGERPRINT, thetas, 2, 8)
+    first._file.set_aside("for a test")
+    for number, cache in enumerate((first, second)):
+        batch = batch_of(3, number)
+        cache.store(FINGERPRINT, batch, 8, sums_of(batch), [""] * len(batch), 1.0)
+    second.close()
+    third = SimulationCache(filled)
+    assert third.look_up(FINGERPRINT, batch_of(3, 0), 2, 8).known.all()
+    first.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+    assert third.look_up(FINGERPRINT, thetas, 2, 8).known.all()
+    for cache in (first, third):
+        cache.close()
+    assert integrity(filled) == [("ok",)]
+
+
 # nothing can be written -----------------------------------------------------------------------------------------------
 
 
