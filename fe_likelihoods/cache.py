@@ -98,7 +98,7 @@ class SimulationCache:
     path : path
         The file; made if it is not there. One that may only be read is read from, with a warning.
     max_rows : int
-        The most simulations that are kept, of some 200 bytes each; whoever writes evicts the oldest beyond this bound.
+        The most simulations that are kept, of some 120 bytes each; whoever writes evicts the oldest beyond this bound.
     retry_failures : bool
         Run simulations that had failed again: after a change of something that no fingerprint tells (an external
         program, memory, a time limit).
