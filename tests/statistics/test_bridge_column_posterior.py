@@ -166,7 +166,9 @@ def test_the_truth_is_found(run, make):
 def test_the_prior_pulls_the_damping_and_so_does_the_mesh(run):
     """With a wide prior what is left of the pull is that of the coarser mesh and step; the rest is the prior's."""
     both, mesh = (run(make).check.mean[3] for make in (real, real_wide_prior))
-    print(f"a1: truth {TRUTH[3]}; {mesh:.3f} with a wide prior: mesh and step pull it; {both:.3f} with the paper's prior")
+    print(
+        f"a1: truth {TRUTH[3]}; {mesh:.3f} with a wide prior: mesh and step pull it; {both:.3f} with the paper's prior"
+    )
     assert both < mesh < TRUTH[3]
 
 
