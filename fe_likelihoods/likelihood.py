@@ -15,17 +15,23 @@ from typing import Any
 import numpy as np
 
 from .channels import Measurements
+from .engines import as_engine
 from .memory import MisfitMemory
-from .models.base import Model, misfit_batch
+from .models.base import Model, misfit_batch, split_seconds
 from .noise import GaussianNoise
 
-__all__ = ["FELikelihood", "as_points"]
+__all__ = ["FELikelihood", "TooManyFailures", "as_points"]
 
 logger = logging.getLogger(__name__)
 
 _RECORDED_FAILURES = 1000
 _RECORDED_REASONS = 100
 _OTHER_REASONS = "other reasons"
+_FEW_SIMULATIONS = 20
+
+
+class TooManyFailures(RuntimeError):
+    """More simulations failed than the stated share: what was simulated is kept, no more is."""
 
 
 def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
@@ -72,13 +78,17 @@ class FELikelihood:
     noise : optional
         Anything with ``parameter_names`` and ``log_likelihood(misfit, n_steps, parameters)``; by default
         `GaussianNoise` of the model's channels.
-    pool : object with ``map(function, items)``, optional
-        Runs the simulations of a model without batch methods, as many at once as it has workers. It does not travel
-        when the likelihood is pickled.
+    pool : int, or an object with ``map(function, items)``, optional
+        Runs the simulations of a model without batch methods, as many at once as it has workers: a number of processes
+        of this machine, a client of dask.distributed, an executor or a pool (see `fe_likelihoods.engines`). It does
+        not travel when the likelihood is pickled.
     memory : int
         Number of simulations whose misfits are remembered (some 250 bytes each), so that none of them is run again,
         those that failed included; 0 for none. What is remembered does not travel when the likelihood is pickled: every
         process remembers what it simulated itself.
+    max_failure_share : float
+        Once more than this share of the simulations failed, of 20 or more, no more are run: asking for one raises
+        `TooManyFailures`. 1 for never.
 
     Attributes
     ----------
@@ -93,27 +103,37 @@ class FELikelihood:
     failure_count : int
         How many simulations failed.
     failures : list of dict
-        ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures.
+        ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures, and their duration, "seconds",
+        where it is known.
     failure_reasons : dict of str to int
-        How often each reason occurred.
+        How often each reason occurred, whatever the duration.
     seconds : float
         Wall time spent in simulations [s].
 
     Raises
     ------
     ValueError
-        If channels, step or length of model and measurements differ, or parameter names repeat.
+        If channels, step or length of model and measurements differ, parameter names repeat, the pool is none, or the
+        model cannot be sent to its processes.
     """
 
     def __init__(
-        self, model: Model, measurements: Measurements, noise: Any = None, pool: Any = None, *, memory: int = 100_000
+        self,
+        model: Model,
+        measurements: Measurements,
+        noise: Any = None,
+        pool: Any = None,
+        *,
+        memory: int = 100_000,
+        max_failure_share: float = 1.0,
     ) -> None:
-        if pool is not None and not hasattr(pool, "map"):
-            raise ValueError(f"FELikelihood: pool must have a method map(function, items); got {pool!r}")
+        if not 0.0 <= max_failure_share <= 1.0:
+            raise ValueError(f"FELikelihood: max_failure_share must lie in [0, 1]; got {max_failure_share!r}")
         self.model = model
         self.measurements = _matched(model, measurements)
         self.noise = GaussianNoise(model.channels) if noise is None else noise
-        self.pool = pool
+        self.pool = as_engine(pool, model)
+        self.max_failure_share = max_failure_share
         self.parameter_names = tuple(model.parameter_names) + tuple(self.noise.parameter_names)
         if len(set(self.parameter_names)) != len(self.parameter_names):
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
@@ -204,6 +224,14 @@ class FELikelihood:
         return result if points.ndim == 2 else float(result[0])
 
     def _simulate(self, thetas: np.ndarray) -> np.ndarray:
+        # asked before and not after a batch, so that what was simulated is remembered
+        if self.simulations >= _FEW_SIMULATIONS and self.failure_count > self.max_failure_share * self.simulations:
+            (reason, count), *_ = self.failure_reasons.most_common(1)
+            raise TooManyFailures(
+                f"{self.failure_count} of {self.simulations} simulations failed, {count} because of {reason!r}, where "
+                f"a share of {self.max_failure_share:g} is allowed: see failures and report(). Mend the model, "
+                "narrow the prior, or allow for more with max_failure_share"
+            )
         start = time.perf_counter()
         misfit, reasons = misfit_batch(self.model, thetas, self.measurements.values, self.pool)
         self.seconds += time.perf_counter() - start
@@ -215,6 +243,7 @@ class FELikelihood:
 
     def _record(self, theta: np.ndarray, reason: str) -> None:
         parameters = dict(zip(self.model.parameter_names, theta.tolist(), strict=True))
+        reason, seconds = split_seconds(reason)
         if not self.failure_count:
             logger.warning(
                 "a simulation failed and counts as impossible: %s at %s; further ones are only counted, see report()",
@@ -224,6 +253,8 @@ class FELikelihood:
         self.failure_count += 1
         if len(self.failures) < _RECORDED_FAILURES:
             self.failures.append({"parameters": parameters, "reason": reason})
+            if seconds is not None:
+                self.failures[-1]["seconds"] = seconds
         known = reason in self.failure_reasons or len(self.failure_reasons) < _RECORDED_REASONS
         self.failure_reasons[reason if known else _OTHER_REASONS] += 1
 

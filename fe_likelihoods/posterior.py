@@ -141,8 +141,8 @@ class Posterior:
         -------
         dict
             ``simulations``, ``cache_hits`` (rows whose misfit was remembered instead), ``failures`` (list of
-            ``{"parameters", "reason"}``, the first thousand), ``failure_count``, ``failure_reasons`` (count of
-            each), ``seconds`` (wall time in simulations).
+            ``{"parameters", "reason"}``, and ``"seconds"`` where known, the first thousand), ``failure_count``,
+            ``failure_reasons`` (count of each), ``seconds`` (wall time in simulations).
         """
         return {
             "simulations": self.likelihood.simulations,
