@@ -6,6 +6,7 @@ and classes of its own package that it calls. Of other packages only the name an
 told apart by its value (an open file, a handle of compiled code) is refused, and the user asked for a version.
 """
 
+import enum
 import functools
 import sys
 import types
@@ -119,16 +120,15 @@ class _Digest:
             raise ValueError(f"{function.__qualname__} uses {name}, and {error}") from None
 
     def _code(self, code: types.CodeType) -> list[str | bytes]:
-        python = f"{sys.implementation.cache_tag}"
-        constants = code.co_consts
-        if constants and isinstance(constants[0], str) and code.co_flags & 0x04000000:  # a docstring computes nothing
-            constants = constants[1:]
-        return ["code", python, code.co_code, *map(self.of, (constants, code.co_names, code.co_varnames))]
+        parts = map(self.of, (code.co_consts, code.co_names, code.co_varnames))
+        return ["code", str(sys.implementation.cache_tag), code.co_code, *parts]
 
     def _class(self, thing: type) -> list[str | bytes]:
         parts: list[str | bytes] = ["class", thing.__qualname__]
         if thing.__module__.split(".")[0] != self.package:
             return [*parts, thing.__module__, self._version(thing.__module__)]
+        if issubclass(thing, tuple) and hasattr(thing, "_fields"):
+            return [*parts, *thing._fields]
         skipped = {"__doc__", "__module__", "__dict__", "__weakref__", "__annotations__", "__static_attributes__"}
         skipped |= {"__firstlineno__", "__annotations_cache__", "__annotate_func__", "__dataclass_fields__"}
         skipped |= {"__dataclass_params__", "__match_args__"}
@@ -141,7 +141,9 @@ class _Digest:
         fingerprint = getattr(thing, "fingerprint", None)
         if isinstance(fingerprint, str):
             return ["fingerprint", fingerprint]
-        if is_dataclass(thing):
+        if isinstance(thing, enum.Enum):
+            state = {thing.name: thing.value}
+        elif is_dataclass(thing):
             state = {field.name: getattr(thing, field.name) for field in fields(thing)}
         elif isinstance(thing, tuple):  # named
             state = dict(enumerate(thing))

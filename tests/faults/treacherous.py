@@ -4,19 +4,18 @@ import ctypes
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 
 from fe_likelihoods.channels import Channel, Measurements
-from fe_likelihoods.likelihood import FELikelihood
 from fe_likelihoods.models.base import SimulationFailed
-from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.priors import HalfNormal, Uniform
 
 CHANNELS = (Channel("a", "acceleration", "m/s2"),)
 DT, N_STEPS = 0.1, 20
+LOADED: list[int] = []
 TIME = DT * np.arange(N_STEPS)
 FINE, RAISES, REFUSES, NOT_FINITE, SHAPE, HANGS, HANGS_HARD, CRASHES, KILLED, LEAVES, FLOODS = range(11)
 
@@ -78,8 +77,58 @@ class DiesOnce(Treacherous):
         return line(theta)
 
 
-def posterior_of(model, top: float = 1.0, **options) -> Posterior:
+class Large(Treacherous):
+    """A model of a megabyte, that knows how often it was unpickled in this process and what it is asked for."""
+
+    def __init__(self):
+        self.ballast = np.random.default_rng(1).bytes(2**20)
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        LOADED.append(1)
+
+    def simulate(self, theta):
+        response = super().simulate(np.array([0.1, theta[1]]))
+        response[0, 0] = len(LOADED)
+        return response
+
+
+class Unpicklable(Treacherous):
+    def __init__(self):
+        self.solver = type("Solver", (), {})()
+        self.solver.lock = threading.Lock()
+
+
+class Absent(Treacherous):
+    """Can be pickled here and not be loaded elsewhere."""
+
+    def __reduce__(self):
+        return _absent, (os.getpid(),)
+
+
+def _absent(home):
+    if os.getpid() == home:
+        return Absent()
+    raise ModuleNotFoundError("No module named 'mine'")
+
+
+def speaks(theta: np.ndarray) -> np.ndarray:
+    """Ends its process with some words."""
+    os.write(2, b"solver 7.1\nout of licences\n\n")
+    os._exit(1)
+
+
+def eats(theta: np.ndarray) -> np.ndarray:
+    """Asks for more memory than there is."""
+    return np.ones((1, 10**11))
+
+
+def posterior_of(model, top: float = 1.0, **options):
     """Posterior of a model of two parameters, whose offset is between 0 and `top`."""
+    from fe_likelihoods.likelihood import FELikelihood  # the workers need none of this, and start faster
+    from fe_likelihoods.posterior import Posterior
+    from fe_likelihoods.priors import HalfNormal, Uniform
+
     noise = np.random.default_rng(3).normal(size=(1, N_STEPS))
     measurements = Measurements(CHANNELS, DT, line(np.array([0.4, 0.7])) + 0.3 * noise)
     prior = {"offset": Uniform(0.0, top), "slope": Uniform(-2.0, 2.0), "sigma_a": HalfNormal(0.5)}

@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import pickle
-import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -16,45 +15,10 @@ from fe_likelihoods.engines import DaskEngine, LocalPool, PoolEngine, as_engine
 from fe_likelihoods.models.base import misfit_batch, simulate_batch
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.records import Record
-from tests.faults.treacherous import Treacherous, posterior_of
+from tests.faults import treacherous
+from tests.faults.treacherous import Absent, Large, Treacherous, Unpicklable, posterior_of
 
 SPAWN = multiprocessing.get_context("spawn")
-LOADED = []
-
-
-class Large(Treacherous):
-    """A model of a megabyte, that knows how often it was unpickled in this process and what it is asked for."""
-
-    def __init__(self):
-        self.ballast = np.random.default_rng(1).bytes(2**20)
-
-    def __setstate__(self, state):
-        self.__dict__.update(state)
-        LOADED.append(1)
-
-    def simulate(self, theta):
-        response = super().simulate(np.array([0.1, theta[1]]))
-        response[0, 0] = len(LOADED)
-        return response
-
-
-class Unpicklable(Treacherous):
-    def __init__(self):
-        self.solver = type("Solver", (), {})()
-        self.solver.lock = threading.Lock()
-
-
-class Absent(Treacherous):
-    """Can be pickled here and not be loaded elsewhere."""
-
-    def __reduce__(self):
-        return _absent, (os.getpid(),)
-
-
-def _absent(home):
-    if os.getpid() == home:
-        return Absent()
-    raise ModuleNotFoundError("No module named 'mine'")
 
 
 class Recorder:
@@ -151,14 +115,14 @@ def test_bytes_sent_with_each_item(forget, tmp_path):
     model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
     recorder = Recorder()
     engine = as_engine(recorder)
-    LOADED.clear()
+    treacherous.LOADED.clear()
     if forget:  # as on another machine: there is no file, so the model travels beside items, and is known then
         engine.map(len, [])
         engine._folder.keep = lambda shipment: str(tmp_path / "elsewhere")
     for _ in range(2):
         batch = simulate_batch(model, thetas, engine)
         assert batch.reasons == [""] * 20
-    assert len(LOADED) == 1
+    assert len(treacherous.LOADED) == 1
     large = [size for size in recorder.bytes if size > 2**20]
     assert len(large) == (20 if forget else 0)
     assert max(size for size in recorder.bytes if size <= 2**20) < 500
