@@ -15,6 +15,7 @@ This file imports the standard library only, so that it can be run alone and sta
 import os
 import signal
 import sys
+import time
 from contextlib import suppress
 
 __all__ = ["kill_tree", "main"]
@@ -35,8 +36,7 @@ def kill_tree(group: int, mark: str) -> None:
     if not mark or not os.path.isdir("/proc/self"):
         return
     wanted = mark.encode() + b"="
-    found = True
-    while found:  # one of them may start another while the list is read
+    for _ in range(100):  # one of them may start another while the list is read, and dying takes a moment
         found = False
         for name in filter(str.isdigit, os.listdir("/proc")):
             if int(name) == os.getpid():
@@ -44,10 +44,13 @@ def kill_tree(group: int, mark: str) -> None:
             with suppress(OSError):
                 with open(f"/proc/{name}/environ", "rb") as file:
                     environment = file.read()
-                # the environment of what has been killed already is empty
+                # the environment of what is dead is empty
                 if environment.startswith(wanted) or b"\0" + wanted in environment:
                     os.kill(int(name), signal.SIGKILL)
                     found = True
+        if not found:
+            return
+        time.sleep(0.01)
 
 
 def main() -> None:

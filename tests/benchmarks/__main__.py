@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from . import column, cost, peers, samplers, startup
+from . import column, cost, engines, peers, samplers, startup
 from .rows import as_table, machine, write_json
 
 BENCHMARKS = {
@@ -12,6 +12,7 @@ BENCHMARKS = {
     "imports": startup.imports,
     "compilation": startup.compilation,
     "cost": cost.cost,
+    "engines": engines.engines,
     "samplers": samplers.rows,
     "peers": peers.rows,
 }

@@ -18,7 +18,7 @@ from fe_likelihoods.models.base import simulate_batch
 from fe_likelihoods.models.function import FunctionModel
 from samplers import SMCSampler
 from tests.faults import treacherous as bad
-from tests.faults.pooled_run import NAMES, WORKERS
+from tests.faults.pooled_run import NAMES, WORKERS, at_work
 from tests.faults.treacherous import (
     CHANNELS,
     DT,
@@ -156,17 +156,19 @@ def test_dask_tries_again_and_gives_up_on_the_deadly_item_alone(tmp_path):
 def test_mpi_gives_the_same_bits():
     """mpi4py.futures, two workers of their own ranks."""
     code = (
-        "import numpy as np; from mpi4py.futures import MPICommExecutor;"
+        "from mpi4py.futures import MPICommExecutor; from fe_likelihoods.engines import as_engine;"
+        "from fe_likelihoods.models.base import simulate_batch;"
         "from tests.faults.treacherous import *; x = np.array([[.1 * k, .2, .5] for k in range(1, 9)])\n"
         "with MPICommExecutor() as pool:\n"
-        "    if pool is not None: print(posterior_of(Large(), pool=pool)(x).tolist() == "
-        "posterior_of(Large())(x).tolist())\n"
+        "    if pool is not None:\n"
+        "        print(posterior_of(Treacherous(), pool=pool)(x).tolist() == posterior_of(Treacherous())(x).tolist())\n"
+        "        print(set(simulate_batch(Large(), x[:, :2], as_engine(pool)).response[:, 0, 0].tolist()))\n"
     )
-    command = ["mpiexec", "--allow-run-as-root", "--oversubscribe", "-n", "3", sys.executable, "-c", code]
     mpiexec = Path(sys.executable).with_name("mpiexec")
-    command[0] = str(mpiexec) if mpiexec.exists() else "mpiexec"
-    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert run.stdout.strip() == "True", run.stderr
+    command = [mpiexec if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", "3", sys.executable, "-c", code]
+    environment = os.environ | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    assert run.stdout.split() == ["True", "{1.0}"], run.stderr  # and the model was loaded once in each rank
 
 
 # parents that die ---------------------------------------------------------------------------------------------------
@@ -179,14 +181,13 @@ PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask"
 def test_nothing_outlives_a_parent_that_is_killed(engine, tmp_path):
     command = [sys.executable, "-m", "tests.faults.pooled_run", engine, str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as parent:
-        while len(list(tmp_path.iterdir())) < (1 if engine == "isolated" else WORKERS):
+        while len(at_work(tmp_path)) < (1 if engine == "isolated" else WORKERS):
             assert parent.poll() is None, parent.stdout.read().decode()
             time.sleep(0.02)
         time.sleep(1.0)  # until the innermost processes are there as well
         children = descendants(parent.pid)
         parent.kill()
-        at_work = {int(path.name) for path in tmp_path.iterdir()} - {parent.pid}
-        assert at_work <= set(children)
+        assert at_work(tmp_path) - {parent.pid} <= set(children)
         assert len(children) >= {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 4}.get(engine, WORKERS)
         assert gone(children)
 
@@ -251,7 +252,9 @@ def test_share_must_be_one(share):
 def test_sampler_over_a_deadly_isolated_model(seed):
     """Some of the prior crashes, some hangs: the run ends, and the report knows both."""
     posterior = posterior_of(FunctionModel(bad.deadly, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.3))
-    sampler = SMCSampler(20, posterior.ndim, posterior, vectorize=True, seed=seed, check_draws=0)
+    sampler = SMCSampler(
+        20, posterior.ndim, posterior, vectorize=True, seed=seed, check_draws=0, ess_ratio=0.2, max_moves=2
+    )
     start = posterior.sample_prior(20, seed)
     start[:2, 0] = 0.01, 0.03
     sampler.run_mcmc(start, 1)

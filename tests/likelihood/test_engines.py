@@ -3,10 +3,13 @@
 import multiprocessing
 import os
 import pickle
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
+import emcee
 import numpy as np
 import pytest
 
@@ -200,3 +203,62 @@ def test_likelihood_with_a_pool_of_its_own_pickles_without_it():
     assert copy.likelihood.pool is None
     np.testing.assert_array_equal(copy(x), values)
     posterior.likelihood.pool.close()
+
+
+def test_as_the_pool_of_a_sampler(seed):
+    """The posterior goes to the processes once, and the chain is that of a run without them."""
+    posterior = posterior_of(Treacherous())
+    start = posterior.sample_prior(10, seed)
+    chains = []
+    with LocalPool(2) as pool:
+        for workers in (None, pool):
+            sampler = emcee.EnsembleSampler(10, posterior.ndim, posterior, pool=workers)
+            sampler.random_state = np.random.RandomState(seed).get_state()
+            sampler.run_mcmc(start, 5)
+            chains.append(sampler.get_chain())
+    np.testing.assert_array_equal(*chains)
+
+
+SCRIPT = """
+import numpy as np
+from fe_likelihoods.models.function import FunctionModel
+from tests.faults.treacherous import CHANNELS, line, posterior_of
+
+def mine(theta):
+    return 2.0 * line(theta)
+
+def main():
+    x = np.array([[0.1 * k, 0.2, 0.5] for k in range(1, 9)])
+    for limit in (None, 60.0):
+        model = FunctionModel(mine, ("offset", "slope"), CHANNELS, 0.1, 20, time_limit=limit)
+        print(posterior_of(model, pool=2)(x).tolist() == posterior_of(model)(x).tolist())
+
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "expected"),
+    [
+        ('if __name__ == "__main__":\n    main()\n', "True True"),
+        (
+            "main()\n",
+            'must not start workers of its own then: put what the script does under if __name__ == "__main__"',
+        ),
+    ],
+    ids=["guarded", "not guarded"],
+)
+def test_models_defined_in_a_script(end, expected, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT + end)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    run = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
+    assert expected in (" ".join(run.stdout.split()) or run.stderr)
+
+
+def test_models_of_a_notebook_are_refused():
+    code = "import numpy as np\n" + SCRIPT + "main()\n"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert (
+        "ValueError: with this pool the model must go to other processes. what is defined in a notebook" in run.stderr
+    )

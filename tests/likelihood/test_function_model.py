@@ -2,11 +2,13 @@
 
 import functools
 import math
+import multiprocessing
 import os
 import pickle
 import subprocess
 import sys
 from dataclasses import dataclass
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +75,28 @@ def test_caller_keeps_its_theta():
     theta = THETA.copy()
     model_of(scribbles).simulate(theta)
     np.testing.assert_array_equal(theta, THETA)
+
+
+def _attempt(model, theta):
+    try:
+        return model.simulate(theta).tolist()
+    except SimulationFailed as error:
+        return split_seconds(error.reason)[0]
+
+
+@pytest.mark.parametrize("kind", ["threads", "forks"])
+def test_threads_and_forks_have_processes_of_their_own(kind, guarded):
+    """Also where the model had one before the fork: it belongs to the parent."""
+    guarded.simulate(THETA)
+    thetas = [np.array([0.1 * k, 0.2]) for k in range(6)]
+    thetas[2][0] = bad.CRASHES + 0.5
+    pool = ThreadPool(3) if kind == "threads" else multiprocessing.get_context("fork").Pool(2)
+    with pool:
+        results = pool.map(functools.partial(_attempt, guarded), thetas, chunksize=1)
+    expected = [line(theta).tolist() for theta in thetas]
+    expected[2] = "the worker process died (signal 11)"
+    assert results == expected
+    np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
 
 
 def test_travels_with_its_settings(guarded):
