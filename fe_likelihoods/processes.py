@@ -38,9 +38,10 @@ _BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from fe_likelihoods.processes import serve; serve(int(sys.argv[2]), int(sys.argv[3]))"
 )
+_SCRIPTS = ("__main__", "__mp_main__")  # where a script is itself, and where it was read again in a worker
 _START_LIMIT = 120.0
 _LOOK = 0.1
-_preparing = False
+_reading = False
 
 
 class RunFailed(RuntimeError):
@@ -148,10 +149,11 @@ class Shipment(NamedTuple):
 
     def script(self) -> str | None:
         """The script in which parts of the function are defined, None if there are none; ValueError for a notebook."""
-        if b"__main__" not in self.payload:
+        if not any(name.encode() in self.payload for name in _SCRIPTS):
             return None
-        if all(argument != "__main__" for _, argument, _ in pickletools.genops(self.payload)):
+        if all(argument not in _SCRIPTS for _, argument, _ in pickletools.genops(self.payload)):
             return None
+        _refuse_while_reading()
         path = getattr(sys.modules["__main__"], "__file__", None)
         if path is None or not Path(path).is_file():
             raise ValueError(
@@ -184,11 +186,7 @@ class Worker:
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
-        if _preparing:
-            raise RuntimeError(
-                "a worker process reads this script again to find what is defined in it, and must not start workers of "
-                'its own then: put what the script does under if __name__ == "__main__":'
-            )
+        _refuse_while_reading()
         self.connection, theirs = Pipe()
         with theirs:
             command = [
@@ -297,20 +295,28 @@ def _nothing(item: Any) -> None:
     raise RuntimeError("no function was sent")
 
 
+def _refuse_while_reading() -> None:
+    if _reading:
+        raise RuntimeError(
+            "a worker process reads this script again to find what is defined in it, and must not start workers of its "
+            'own then: put what the script does under if __name__ == "__main__":'
+        )
+
+
 def _read_script(path: str) -> None:
     """Make what is defined in the script that the other process runs known here under the same name."""
     import runpy
     import types
 
-    global _preparing
-    _preparing = True
+    global _reading
+    _reading = True
     try:
         module = types.ModuleType("__main__")
         module.__file__ = path
         module.__dict__.update(runpy.run_path(path, run_name="__mp_main__"))
         sys.modules["__main__"] = sys.modules["__mp_main__"] = module
     finally:
-        _preparing = False
+        _reading = False
 
 
 def _packed(kind: str, value: Any) -> bytes:
