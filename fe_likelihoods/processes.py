@@ -1,23 +1,20 @@
-"""A function in a process of its own.
+"""Processes for simulations, which may hang, crash or eat their memory.
 
-What a simulation may do to its process, hang, crash or eat its memory, it does to a `Worker`: an interpreter that is
-sent a function once and then one item after the other. It is killed with all that it has started, and it does not
-outlive the process that started it (see `fe_likelihoods.minder`). `Isolated` makes a function of it that can be called
-like the one it runs, within limits.
+A `Started` process is killed with all that it has started, and does not outlive the one that started it (see
+`fe_likelihoods.minder`). A `Worker` is such a process, an interpreter that is sent a function once and then one item
+after the other.
 
 Workers are started by `subprocess`, not by `multiprocessing`: they have to work inside the workers of any pool, many
 of which may not have children there. Linux and macOS.
 """
 
 import json
-import math
 import os
 import pickle
 import pickletools
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import uuid
@@ -32,15 +29,13 @@ from typing import Any, NamedTuple
 
 from . import minder
 
-__all__ = ["Isolated", "Reply", "RunFailed", "Shipment", "Started", "Worker", "ending", "last_lines", "serve"]
+__all__ = ["Reply", "RunFailed", "Shipment", "Started", "Worker", "ending", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from fe_likelihoods.processes import serve; serve(int(sys.argv[2]), int(sys.argv[3]))"
 )
 _SCRIPTS = ("__main__", "__mp_main__")  # where a script is itself, and where it was read again in a worker
-_START_LIMIT = 120.0
-_LOOK = 0.1
 _reading = False
 
 
@@ -99,6 +94,8 @@ class Started:
         """Whether the process has ended by itself; it is not waited for, so that its number stays its own."""
         if self.process.returncode is not None:
             return True
+        if not hasattr(os, "waitid"):  # macOS before Python 3.13
+            return self.process.poll() is not None
         with suppress(ChildProcessError):
             return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
         return True
@@ -117,7 +114,7 @@ class Started:
 def _kill(process: subprocess.Popen, mark: str, owner: int) -> None:
     if owner != os.getpid():  # a copy of this object in a forked process
         return
-    if process.returncode is None:
+    if process.returncode is None or not hasattr(os, "waitid"):
         minder.kill_tree(process.pid, mark)
         process.wait()
     _MINDER.tell(f"-{process.pid}")
@@ -328,112 +325,6 @@ def _packed(kind: str, value: Any) -> bytes:
     except Exception as error:
         shown = value if kind == "raised" else error
         return pickle.dumps(("raised", RuntimeError(f"{type(shown).__name__}: {shown}")))
-
-
-class Isolated:
-    """A function that runs in a process of its own.
-
-    The process stays for the next call, and is replaced after one that did not end by itself. Threads that call at the
-    same time have a process each. What the function prints is not shown.
-
-    Parameters
-    ----------
-    function : callable of one argument
-        It, its argument and its result must be picklable.
-    time_limit : float, optional
-        The longest that a call may take [s], without the start of the process.
-    memory_limit : int
-        See `Worker`; 0 for no limit.
-    max_output : int
-        The most that one call may print [bytes].
-
-    Raises
-    ------
-    ValueError
-        If the function cannot be sent to another process.
-    """
-
-    def __init__(
-        self, function: Callable, time_limit: float | None = None, memory_limit: int = 0, max_output: int = 2**24
-    ) -> None:
-        self._settings = function, time_limit, memory_limit, max_output
-        self._function = function
-        self._time_limit = math.inf if time_limit is None else time_limit
-        self._memory_limit, self._max_output = memory_limit, max_output
-        self._shipment = Shipment.of(function)
-        self._shipment.script()  # refused here, not in the first call
-        self._free: list[tuple[Worker, Any]] = []
-
-    def __reduce__(self) -> tuple:
-        return type(self), self._settings
-
-    def __call__(self, item: Any) -> Any:
-        """Result for one item.
-
-        Raises
-        ------
-        RunFailed
-            If the process died, or was killed because it took too long or printed too much.
-        Exception
-            What the function raises.
-        """
-        worker, output = self._take()
-        start = time.monotonic()
-        try:
-            worker.submit(item)
-            reply = self._wait(worker, output, self._time_limit)
-        except RunFailed as error:
-            worker.kill()
-            raise RunFailed(error.reason, time.monotonic() - start) from None
-        except BaseException:
-            worker.kill()
-            raise
-        os.ftruncate(output.fileno(), 0)
-        os.lseek(output.fileno(), 0, os.SEEK_SET)
-        self._free.append((worker, output))
-        if reply.kind == "raised":
-            raise reply.value
-        return reply.value
-
-    def close(self) -> None:
-        """End the processes that wait for calls."""
-        while self._free:
-            self._free.pop()[0].kill()
-
-    def _take(self) -> tuple[Worker, Any]:
-        """A process that waits, or a new one."""
-        with suppress(IndexError):
-            while True:
-                worker, output = self._free.pop()
-                if worker.alive:
-                    return worker, output
-        output = tempfile.TemporaryFile()
-        worker = Worker(memory_limit=self._memory_limit, output=output)
-        try:
-            worker.load(self._shipment)
-            reply = self._wait(worker, output, _START_LIMIT)
-        except BaseException:
-            worker.kill()
-            raise
-        if reply.kind != "loaded":
-            worker.kill()
-            raise ValueError(f"{self._function!r} cannot be loaded in a process of its own: {reply.value}")
-        return worker, output
-
-    def _wait(self, worker: Worker, output: Any, limit: float) -> Reply:
-        stop = time.monotonic() + limit
-        while (left := stop - time.monotonic()) > 0.0:
-            with suppress(OSError):
-                worker.connection.poll(min(left, _LOOK))
-            try:
-                reply = worker.receive()
-            except RunFailed as error:
-                raise RunFailed("; ".join(filter(None, [error.reason, last_lines(output, 1)]))) from None
-            if os.fstat(output.fileno()).st_size > self._max_output:
-                raise RunFailed(f"stopped because it printed more than {self._max_output} bytes")
-            if reply is not None:
-                return reply
-        raise RunFailed(f"stopped at the time limit of {limit:g} s")
 
 
 def last_lines(file: Any, most: int) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..channels import Channel
-from ..processes import Isolated
+from ..isolated import Isolated
 from .checked import CheckedModel, positive
 from .code_digest import code_digest
 
