@@ -224,6 +224,8 @@ class ExecutableModel(CheckedModel):
         if not path.is_file():
             raise SimulationFailed(f"the program ended well and left no file {self.output}")
         text = path.read_text().replace(",", " ").splitlines()
+        if not any(line.partition("#")[0].strip() for line in text):
+            raise SimulationFailed(f"{self.output} is empty")
         try:
             table = np.loadtxt(text, ndmin=2)
         except ValueError as error:

@@ -38,6 +38,8 @@ if what == "silent":
     sys.exit(0)
 if what == "nan":
     rows[3] = (rows[3][0], float("nan"))
+if what == "empty":
+    rows = []
 if what == "short":
     rows = rows[:-1]
 separator = ", " if what == "commas" else " "

@@ -101,6 +101,7 @@ CASES = {
     "nan": "the response of channel 'a' is not finite",
     "short": "the response has shape (1, 19), expected (n_channels, n_steps) = (1, 20)",
     "words": "out.txt is no table of numbers",
+    "empty": "out.txt is empty",
     "one": "out.txt has 1 columns, expected columns 1",
     "hang": "stopped at the time limit of 0.5 s",
     "flood": "stopped because it wrote more than 1000000 bytes",
