@@ -16,12 +16,8 @@ file. After that a task is a digest and the parameters.
 What comes back does not depend on the pool, to the last bit.
 """
 
-import os
 import pickle
-import shutil
-import tempfile
 import threading
-import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -30,7 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .local_pool import LocalPool, Outcome
-from .processes import Shipment
+from .processes import Shipment, TemporaryFolder
 
 __all__ = ["DaskEngine", "LocalPool", "PoolEngine", "as_engine"]
 
@@ -117,7 +113,7 @@ class _Shipped:
     from the file, or from its own payload, which it carries only if told to.
     """
 
-    def __init__(self, function: Callable, folder: "_Folder", carried: bool = False) -> None:
+    def __init__(self, function: Callable, folder: Path, carried: bool = False) -> None:
         self._function, self._folder, self._carried = function, folder, carried
         self._lock = threading.Lock()
         self._parts: tuple | None = None
@@ -129,29 +125,13 @@ class _Shipped:
         with self._lock:  # pools pickle in threads of their own, often once for every item
             if self._parts is None:
                 shipment = Shipment.of(self._function)
-                self._parts = shipment.key, self._folder.keep(shipment), shipment.payload if self._carried else b""
+                path = self._folder / shipment.key.hex()
+                if not self._carried and not path.exists():
+                    part = path.with_suffix(f".{threading.get_ident()}")
+                    part.write_bytes(shipment.payload)
+                    part.replace(path)
+                self._parts = shipment.key, str(path), shipment.payload if self._carried else b""
         return _Arrived, self._parts
-
-
-class _Folder:
-    """A temporary folder with one file for each function, removed with this object."""
-
-    def __init__(self) -> None:
-        self._folder = tempfile.mkdtemp(prefix="fe_likelihoods_")
-        weakref.finalize(self, _remove, self._folder, os.getpid())
-
-    def keep(self, shipment: Shipment) -> str:
-        path = Path(self._folder) / shipment.key.hex()
-        if not path.exists():
-            part = path.with_suffix(f".{threading.get_ident()}")
-            part.write_bytes(shipment.payload)
-            part.replace(path)
-        return str(path)
-
-
-def _remove(folder: str, owner: int) -> None:
-    if owner == os.getpid():  # and not in a fork
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 _functions: OrderedDict[bytes, Callable] = OrderedDict()
@@ -197,7 +177,7 @@ class PoolEngine:
 
     def __init__(self, pool: Any) -> None:
         self.pool = pool
-        self._folder: _Folder | None = None
+        self._folder: TemporaryFolder | None = None
 
     @property
     def other_processes(self) -> bool:
@@ -208,11 +188,13 @@ class PoolEngine:
         """Outcomes for every item, in their order; RuntimeError where the workers cannot load the function."""
         items = list(items)
         if self._folder is None:
-            self._folder = _Folder()
-        outcomes = self._map(_Shipped(function, self._folder), items)
+            self._folder = TemporaryFolder()
+        outcomes = self._map(_Shipped(function, self._folder.path), items)
         missing = [index for index, outcome in enumerate(outcomes) if isinstance(outcome, _Missing)]
         if missing:
-            carried = self._map(_Shipped(function, self._folder, carried=True), [items[index] for index in missing])
+            carried = self._map(
+                _Shipped(function, self._folder.path, carried=True), [items[index] for index in missing]
+            )
             for index, outcome in zip(missing, carried, strict=True):
                 outcomes[index] = outcome
         for outcome in outcomes:

@@ -1,9 +1,10 @@
-"""No process outlives those who wait for it.
+"""No process, and no temporary folder, outlives those who need it.
 
 A process that is killed by -9 cannot clean up, and what it had started goes on for ever. So every process that starts
 others keeps one minder beside it: a small interpreter that runs this file, is told each process group that is started
-and each that has ended, and kills what is left when its pipe closes, whatever the reason. A thread inside the workers
-could do the same only as long as their simulation lets other threads run, which compiled code often does not.
+and each that has ended, and kills what is left when its pipe closes, whatever the reason. With temporary folders it is
+the same. A thread inside the workers could do so only as long as their simulation lets other threads run, which
+compiled code often does not.
 
 What a group has started is found by two marks: its process group, which children inherit, and a variable of the
 environment with a random name, which also those inherit that open a session of their own (a program that puts itself
@@ -12,7 +13,9 @@ into the background). The second needs ``/proc``; on other systems such programs
 This file imports the standard library only, so that it can be run alone and starts in no time.
 """
 
+import json
 import os
+import shutil
 import signal
 import sys
 import time
@@ -54,16 +57,25 @@ def kill_tree(group: int, mark: str) -> None:
 
 
 def main() -> None:
-    """Read lines ``+GROUP MARK`` and ``-GROUP`` until the pipe closes, then kill the groups that have not ended."""
+    """Read lines of JSON until the pipe closes, then kill and remove what is left.
+
+    ``["group", number, mark]`` and ``["folder", path]`` say what there is, ``["gone", number or path]`` what is not.
+    """
     groups: dict[int, str] = {}
+    folders: set[str] = set()
     for line in sys.stdin:
-        sign, (number, *rest) = line[0], line[1:].split()
-        if sign == "+":
-            groups[int(number)] = rest[0]
+        kind, what, *mark = json.loads(line)
+        if kind == "group":
+            groups[what] = mark[0]
+        elif kind == "folder":
+            folders.add(what)
         else:
-            groups.pop(int(number), None)
+            groups.pop(what, None)
+            folders.discard(what)
     for group, mark in groups.items():
         kill_tree(group, mark)
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":

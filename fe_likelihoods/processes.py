@@ -12,9 +12,11 @@ import json
 import os
 import pickle
 import pickletools
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import uuid
@@ -29,12 +31,13 @@ from typing import Any, NamedTuple
 
 from . import minder
 
-__all__ = ["Reply", "RunFailed", "Shipment", "Started", "Worker", "ending", "last_lines", "serve"]
+__all__ = ["Reply", "RunFailed", "Shipment", "Started", "TemporaryFolder", "Worker", "ending", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from fe_likelihoods.processes import serve; serve(int(sys.argv[2]), int(sys.argv[3]))"
 )
+_MARK = "FE_LIKELIHOODS_RUN_"
 _SCRIPTS = ("__main__", "__mp_main__")  # where a script is itself, and where it was read again in a worker
 _reading = False
 
@@ -56,16 +59,23 @@ class _Minder:
         self._process: subprocess.Popen | None = None
         self._owner = 0
 
-    def tell(self, line: str) -> None:
+    def tell(self, *message: Any) -> None:
         with self._lock:
             if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
                 command = [sys.executable, "-I", "-S", minder.__file__]
+                # without the marks: whoever kills this process by its mark must leave its minder to do its work
+                variables = {name: value for name, value in os.environ.items() if not name.startswith(_MARK)}
                 self._process = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True, bufsize=0
+                    command,
+                    env=variables,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    start_new_session=True,
+                    bufsize=0,
                 )
                 self._owner = os.getpid()
             with suppress(BrokenPipeError):
-                self._process.stdin.write(line.encode() + b"\n")
+                self._process.stdin.write(json.dumps(message).encode() + b"\n")
 
 
 _MINDER = _Minder()
@@ -84,10 +94,10 @@ class Started:
     """
 
     def __init__(self, command: list[str], environment: Mapping[str, str] | None = None, **options: Any) -> None:
-        self.mark = f"FE_LIKELIHOODS_{uuid.uuid4().hex}"
+        self.mark = f"{_MARK}{uuid.uuid4().hex}"
         variables = os.environ | dict(environment or {}) | {self.mark: "1"}
         self.process = subprocess.Popen(command, env=variables, start_new_session=True, **options)
-        _MINDER.tell(f"+{self.process.pid} {self.mark}")
+        _MINDER.tell("group", self.process.pid, self.mark)
         self._kill = weakref.finalize(self, _kill, self.process, self.mark, os.getpid())
 
     def ended(self) -> bool:
@@ -117,7 +127,33 @@ def _kill(process: subprocess.Popen, mark: str, owner: int) -> None:
     if process.returncode is None or not hasattr(os, "waitid"):
         minder.kill_tree(process.pid, mark)
         process.wait()
-    _MINDER.tell(f"-{process.pid}")
+    _MINDER.tell("gone", process.pid)
+
+
+class TemporaryFolder:
+    """A temporary folder, removed at the end of a with statement, with this object, or after this process was killed.
+
+    Attributes
+    ----------
+    path : Path
+    """
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="fe_likelihoods_"))
+        _MINDER.tell("folder", str(self.path))
+        self._remove = weakref.finalize(self, _remove, str(self.path), os.getpid())
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *exception: object) -> None:
+        self._remove()
+
+
+def _remove(folder: str, owner: int) -> None:
+    if owner == os.getpid():
+        shutil.rmtree(folder, ignore_errors=True)
+        _MINDER.tell("gone", folder)
 
 
 def ending(exit_code: int, who: str) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..channels import Channel
-from ..processes import RunFailed, Started, ending, last_lines
+from ..processes import RunFailed, Started, TemporaryFolder, ending, last_lines
 from .base import SimulationFailed
 from .checked import CheckedModel, positive
 from .code_digest import code_digest
@@ -163,16 +163,16 @@ class ExecutableModel(CheckedModel):
 
     def _respond(self, theta: np.ndarray) -> Any:
         values = {name: repr(float(value)) for name, value in zip(self.parameter_names, theta, strict=True)}
-        with tempfile.TemporaryDirectory(prefix="fe_likelihoods_run_", ignore_cleanup_errors=True) as place:
-            folder = Path(place) / "run"
+        with TemporaryFolder() as place:
+            folder = place / "run"
             folder.mkdir()
             start = time.monotonic()
             try:
                 self._write(folder, values)
-                self._execute(Path(place), [string.Template(part).substitute(values) for part in self.command[1:]])
+                self._execute(place, [string.Template(part).substitute(values) for part in self.command[1:]])
                 return self._checked(self._read(folder))
             except Exception as error:
-                self._keep(Path(place), values, error, time.monotonic() - start)
+                self._keep(place, values, error, time.monotonic() - start)
                 raise
 
     def _write(self, folder: Path, values: dict[str, str]) -> None:

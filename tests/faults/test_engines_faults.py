@@ -178,12 +178,16 @@ PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask"
 
 @needs_proc
 @pytest.mark.parametrize("engine", PARENTS)
-def test_nothing_outlives_a_parent_that_is_killed(engine, tmp_path):
+def test_nothing_outlives_a_parent_that_is_killed(engine, tmp_path, tmp_path_factory):
     # a minder beside each process that starts others; the program and its child, which are two more
     expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 4, "dask": WORKERS}.get(engine, 1 + WORKERS)
     at_once = 1 if engine == "isolated" else WORKERS
     command = [sys.executable, "-m", "tests.faults.pooled_run", engine, str(tmp_path)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as parent:
+    place = tmp_path_factory.mktemp("place")
+    environment = os.environ | {"TMPDIR": str(place)}
+    with subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    ) as parent:
         try:
             stop = time.monotonic() + 60.0
             while len(at_work(tmp_path)) < at_once or len(descendants(parent.pid)) < expected:
@@ -195,6 +199,7 @@ def test_nothing_outlives_a_parent_that_is_killed(engine, tmp_path):
             parent.kill()
         assert at_work(tmp_path) - {parent.pid} <= set(children)
         assert gone(children)
+    assert list(place.glob("fe_likelihoods_*")) == []
 
 
 # models that fail ---------------------------------------------------------------------------------------------------

@@ -113,15 +113,18 @@ def test_model_travels_once_to_each_process():
             assert set(batch.response[:, 0, 0]) == {1.0}
 
 
+def _absent_file(path):
+    raise FileNotFoundError(path)
+
+
 @pytest.mark.parametrize("forget", [False, True], ids=["file", "no file"])
-def test_bytes_sent_with_each_item(forget, tmp_path):
+def test_bytes_sent_with_each_item(forget, monkeypatch):
     model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
     recorder = Recorder()
     engine = as_engine(recorder)
     treacherous.LOADED.clear()
-    if forget:  # as on another machine: there is no file, so the model travels beside items, and is known then
-        engine.map(len, [])
-        engine._folder.keep = lambda shipment: str(tmp_path / "elsewhere")
+    if forget:  # as on another machine: there is no such folder, so the model travels beside the items
+        monkeypatch.setattr(engines.Path, "read_bytes", _absent_file)
     for _ in range(2):
         batch = simulate_batch(model, thetas, engine)
         assert batch.reasons == [""] * 20
@@ -144,7 +147,7 @@ def test_few_functions_are_kept_in_a_worker():
 def test_temporary_files_go_with_the_engine():
     engine = as_engine(Recorder())
     simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), engine)
-    folder = Path(engine._folder._folder)
+    folder = engine._folder.path
     assert [file.stat().st_size > 0 for file in folder.iterdir()] == [True]
     del engine
     assert not folder.exists()
