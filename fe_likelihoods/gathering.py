@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .engines import as_engine
 from .likelihood import as_points
 from .moments import Kept, Moments
 
@@ -17,10 +18,11 @@ def parts_of(thing: Any, pool: Any) -> tuple[Any, Any, Any]:
     """Model, noise (None for a bare model) and pool."""
     likelihood = getattr(thing, "likelihood", thing)
     if hasattr(likelihood, "measurements") and hasattr(likelihood, "model"):
-        return likelihood.model, likelihood.noise, getattr(likelihood, "pool", None) if pool is None else pool
+        pool = getattr(likelihood, "pool", None) if pool is None else as_engine(pool, likelihood.model)
+        return likelihood.model, likelihood.noise, pool
     if not (hasattr(thing, "simulate") and hasattr(thing, "parameter_names")):
         raise ValueError(f"expected a Posterior, an FELikelihood or a model with simulate(theta); got {thing!r}")
-    return thing, None, pool
+    return thing, None, as_engine(pool, thing)
 
 
 def split_samples(model: Any, noise_model: Any, samples: Any, noise: bool) -> tuple[np.ndarray, np.ndarray | None]:

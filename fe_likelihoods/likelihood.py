@@ -17,11 +17,12 @@ import numpy as np
 
 from .cache import SimulationCache
 from .channels import Measurements
+from .engines import as_engine
 from .memory import MisfitMemory
-from .models.base import Model, misfit_batch, misfit_of_responses, simulate_batch
+from .models.base import Model, misfit_batch, misfit_of_responses, simulate_batch, split_seconds
 from .noise import GaussianNoise
 
-__all__ = ["FELikelihood", "as_points"]
+__all__ = ["FELikelihood", "TooManyFailures", "as_points"]
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +32,11 @@ _OTHER_REASONS = "other reasons"
 _SECONDS_PER_CHUNK = 5.0  # of simulations, before they are stored
 _ROUNDS_PER_CHUNK = 8  # of each worker: those who wait for the last one idle for half a round in the mean
 _RESPONSE_VALUES = 2**23  # responses held at once where they are kept: 64 MiB
+_FEW_SIMULATIONS = 20
+
+
+class TooManyFailures(RuntimeError):
+    """More simulations failed than the stated share: what was simulated is kept, no more is."""
 
 
 def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
@@ -77,9 +83,10 @@ class FELikelihood:
     noise : optional
         Anything with ``parameter_names`` and ``log_likelihood(misfit, n_steps, parameters)``; by default
         `GaussianNoise` of the model's channels.
-    pool : object with ``map(function, items)``, optional
-        Runs the simulations of a model without batch methods, as many at once as it has workers. It does not travel
-        when the likelihood is pickled.
+    pool : int, or an object with ``map(function, items)``, optional
+        Runs the simulations of a model without batch methods, as many at once as it has workers: a number of processes
+        of this machine, a client of dask.distributed, an executor or a pool (see `fe_likelihoods.engines`). It does
+        not travel when the likelihood is pickled.
     memory : int
         Number of simulations whose misfits are remembered (some 250 bytes each), so that none of them is run again,
         those that failed included; 0 for none. What is remembered does not travel when the likelihood is pickled: every
@@ -87,7 +94,10 @@ class FELikelihood:
     cache : SimulationCache or path, optional
         Simulations on disk, asked after the memory: those of earlier runs and of other processes are not run again, and
         a killed run loses no more than the last seconds. A batch is then simulated in chunks of some seconds, stored
-        one by one; through a pool whose number of workers cannot be told (``n_workers`` says it), in one piece.
+        one by one; through a pool whose number of workers cannot be told, in one piece.
+    max_failure_share : float
+        Once more than this share of the simulations failed, of 20 or more, no more are run: asking for one raises
+        `TooManyFailures`. 1 for never.
 
     Attributes
     ----------
@@ -104,17 +114,18 @@ class FELikelihood:
     failure_count : int
         How many simulations failed, those that the cache on disk told included.
     failures : list of dict
-        ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures.
+        ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures, and their duration, "seconds",
+        where it is known.
     failure_reasons : dict of str to int
-        How often each reason occurred.
+        How often each reason occurred, whatever the duration.
     seconds : float
         Wall time spent in simulations [s].
 
     Raises
     ------
     ValueError
-        If channels, step or length of model and measurements differ, parameter names repeat, or the file of the cache
-        cannot be used.
+        If channels, step or length of model and measurements differ, parameter names repeat, the pool is none, the
+        model cannot be sent to its processes, or the file of the cache cannot be used.
     """
 
     def __init__(
@@ -126,13 +137,15 @@ class FELikelihood:
         *,
         memory: int = 100_000,
         cache: SimulationCache | str | os.PathLike | None = None,
+        max_failure_share: float = 1.0,
     ) -> None:
-        if pool is not None and not hasattr(pool, "map"):
-            raise ValueError(f"FELikelihood: pool must have a method map(function, items); got {pool!r}")
+        if not 0.0 <= max_failure_share <= 1.0:
+            raise ValueError(f"FELikelihood: max_failure_share must lie in [0, 1]; got {max_failure_share!r}")
         self.model = model
         self.measurements = _matched(model, measurements)
         self.noise = GaussianNoise(model.channels) if noise is None else noise
-        self.pool = pool
+        self.pool = as_engine(pool, model)
+        self.max_failure_share = max_failure_share
         self.parameter_names = tuple(model.parameter_names) + tuple(self.noise.parameter_names)
         if len(set(self.parameter_names)) != len(self.parameter_names):
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
@@ -257,8 +270,7 @@ class FELikelihood:
             return n, n
         most = max(1, _RESPONSE_VALUES // self.measurements.values.size) if self.cache.responses else n
         if self.pool is not None:
-            sizes = (getattr(self.pool, name, None) for name in ("n_workers", "_max_workers", "_processes", "size"))
-            workers = next((size for size in sizes if isinstance(size, int)), n)
+            workers = self.pool.n_workers or n
         elif hasattr(self.model, "misfit_batch") or hasattr(self.model, "simulate_batch"):
             workers = os.cpu_count() or 1
         else:
@@ -266,6 +278,15 @@ class FELikelihood:
         return min(_ROUNDS_PER_CHUNK * workers, most), most
 
     def _simulate(self, thetas: np.ndarray) -> np.ndarray:
+        # asked before and not after a batch, so that what was simulated is remembered
+        known = self.simulations + self.disk_hits
+        if known >= _FEW_SIMULATIONS and self.failure_count > self.max_failure_share * known:
+            (reason, count), *_ = self.failure_reasons.most_common(1)
+            raise TooManyFailures(
+                f"{self.failure_count} of {known} simulations failed, {count} because of {reason!r}, where "
+                f"a share of {self.max_failure_share:g} is allowed: see failures and report(). Mend the model, "
+                "narrow the prior, or allow for more with max_failure_share"
+            )
         start = time.perf_counter()
         measured = self.measurements.values
         batch = None
@@ -293,6 +314,7 @@ class FELikelihood:
 
     def _record(self, theta: np.ndarray, reason: str) -> None:
         parameters = dict(zip(self.model.parameter_names, theta.tolist(), strict=True))
+        reason, seconds = split_seconds(reason)
         if not self.failure_count:
             logger.warning(
                 "a simulation failed and counts as impossible: %s at %s; further ones are only counted, see report()",
@@ -302,6 +324,8 @@ class FELikelihood:
         self.failure_count += 1
         if len(self.failures) < _RECORDED_FAILURES:
             self.failures.append({"parameters": parameters, "reason": reason})
+            if seconds is not None:
+                self.failures[-1]["seconds"] = seconds
         known = reason in self.failure_reasons or len(self.failure_reasons) < _RECORDED_REASONS
         self.failure_reasons[reason if known else _OTHER_REASONS] += 1
 

@@ -141,8 +141,9 @@ class Posterior:
         -------
         dict
             ``simulations``, ``cache_hits`` (rows whose misfit was remembered instead), ``disk_hits`` (how many of them
-            came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, the first thousand),
-            ``failure_count``, ``failure_reasons`` (count of each), ``seconds`` (wall time in simulations).
+            came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, and ``"seconds"`` where
+            known, the first thousand), ``failure_count``, ``failure_reasons`` (count of each), ``seconds`` (wall time
+            in simulations).
         """
         return {
             "simulations": self.likelihood.simulations,

@@ -197,7 +197,7 @@ def propagate(
         Bound [bytes] of what is kept for quantiles; beside it go some batches. Histories are kept in single precision
         (seven digits) where they do not fit otherwise, and what does not fit even so is left out at random:
         `Prediction.n_quantile` says how much is left. None: no bound. Single numbers are always kept all.
-    pool : object with ``map(function, items)``, optional — as in `FELikelihood`, whose pool is the default.
+    pool : optional — as in `FELikelihood`, whose pool is the default.
     seed : int, optional — of the noise and of the choice of samples for quantiles; the result depends on neither
         `batch` nor `pool`, but for round-off.
     progress : bool — show a progress bar.

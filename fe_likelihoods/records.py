@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from . import readers
 from .units import to_si
@@ -168,6 +167,8 @@ class Record:
             positions = np.arange(n_steps) * down / up  # in old samples; whole where old and new instants coincide
             samples = np.interp(positions, np.arange(self.n_steps), self.acceleration)
         else:
+            from scipy import signal  # a second to import, which every worker process would wait for
+
             samples = signal.resample_poly(self.acceleration, up, down, padtype="antireflect")[:n_steps]
         return replace(self, dt=new_dt, acceleration=samples, source=self._source(f"resampled to dt = {new_dt:g} s"))
 

@@ -144,12 +144,22 @@ def test_kernels_stand_on_numba_alone():
 
 
 def test_models_know_no_likelihood():
-    allowed = {"kernels", "records", "channels", "units", "models"}
+    allowed = {"kernels", "records", "channels", "units", "models", "isolated", "processes"}
     for path in sorted((ROOT / "fe_likelihoods" / "models").glob("*.py")):
         for imported, _ in imports(path):
             parts = imported.split(".")
             if parts[0] == "fe_likelihoods" and len(parts) > 1:
                 assert parts[1] in allowed, f"{name(path)} imports {imported}"
+
+
+def test_processes_stand_on_the_standard_library_alone():
+    """So that a worker starts at once, and waits for what its function imports only."""
+    below = {"minder": set(), "processes": {"minder"}, "isolated": {"processes"}, "local_pool": {"processes"}}
+    for stem, allowed in below.items():
+        path = ROOT / "fe_likelihoods" / f"{stem}.py"
+        for imported, _ in imports(path):
+            top, *rest = imported.split(".")
+            assert (rest[0] in allowed) if top == "fe_likelihoods" else top in sys.stdlib_module_names, imported
 
 
 def test_samplers_stand_in_storeys():

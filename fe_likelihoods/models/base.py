@@ -11,6 +11,7 @@ rows alone.
 """
 
 import logging
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -27,6 +28,7 @@ __all__ = [
     "misfit_batch",
     "misfit_of_responses",
     "simulate_batch",
+    "split_seconds",
 ]
 
 logger = logging.getLogger(__name__)
@@ -35,11 +37,20 @@ _RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is wa
 
 
 class SimulationFailed(RuntimeError):
-    """A simulation that could not be done, for a reason in words (attribute `reason`)."""
+    """A simulation that could not be done, for a reason in words (attribute `reason`).
+
+    A reason may end in how long it took, " after 12.3 s": this is told apart (see `split_seconds`).
+    """
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = str(reason) or "no reason given"
+
+
+def split_seconds(reason: str) -> tuple[str, float | None]:
+    """A reason without its duration at the end, " after 12.3 s", and the duration [s], None where there is none."""
+    found = re.fullmatch(r"(.+) after ([0-9.]+(?:e[-+]?[0-9]+)?) s", reason, re.DOTALL)
+    return (found[1], float(found[2])) if found else (reason, None)
 
 
 class SimulationBatch(NamedTuple):

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from . import bridge, cache, column, cost, peers, samplers, startup
+from . import bridge, cache, column, cost, engines, peers, samplers, startup
 from .rows import as_table, machine, write_json
 
 BENCHMARKS = {
@@ -14,6 +14,7 @@ BENCHMARKS = {
     "compilation": startup.compilation,
     "cost": cost.cost,
     "cache": cache.cache,
+    "engines": engines.engines,
     "samplers": samplers.rows,
     "peers": peers.rows,
 }

@@ -263,7 +263,7 @@ def test_measurements_that_do_not_fit_are_refused(oscillator, measurements):
         with pytest.raises(ValueError, match=advice):
             FELikelihood(oscillator, case)
     with pytest.raises(ValueError, match="map"):
-        FELikelihood(oscillator, measurements, pool=4)
+        FELikelihood(oscillator, measurements, pool="four")
 
 
 def test_fingerprint_knows_model_and_measurements(oscillator, measurements):

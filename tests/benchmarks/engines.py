@@ -1,0 +1,174 @@
+"""What the engines behind ``pool=`` cost a run, and what they do when a worker or the parent is killed.
+
+The model costs next to nothing, so what is measured is the way there and back. Each case has a process of its own,
+``python -m tests.benchmarks.engines WHAT ENGINE REPEATS``, which is killed if it hangs.
+"""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from fe_likelihoods.engines import as_engine
+from fe_likelihoods.models.base import simulate_batch
+from fe_likelihoods.models.executable import ExecutableModel
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.processes import Started
+from tests.faults.pooled_run import NAMES, POOLS, WORKERS, at_work
+from tests.faults.treacherous import CHANNELS, DT, KILLED, N_STEPS, DiesOnce, Treacherous, descendants, gone, line
+
+from .rows import Row
+
+__all__ = ["engines"]
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULES = {"dask": "distributed", "mpi": "mpi4py", "loky": "joblib"}
+ITEMS, LIMIT = 1000, 60.0
+
+
+def engines(repeats: int) -> list[Row]:
+    """One row for each engine and question."""
+    rows = []
+    for name in POOLS:
+        if name in MODULES and importlib.util.find_spec(MODULES[name]) is None:
+            rows.append(Row("engine", name, None, "", f"not installed: {MODULES[name]}"))
+            continue
+        answer = _answer("overhead", name, repeats)
+        case = f"{name}, {WORKERS} workers"
+        rows.append(Row("engine: overhead a run", case, answer.get("microseconds"), "us", answer.get("told", "")))
+        answer = _answer("death", name, repeats)
+        rows.append(Row("engine: a worker is killed by -9", case, answer.get("seconds"), "s", answer["told"]))
+        rows.append(Row("engine: the parent is killed by -9", case, *_left_over(name)))
+    for name in ("isolated function", "program"):
+        answer = _answer("overhead", name, repeats)
+        rows.append(Row("engine: overhead a run", f"{name}, no pool", answer.get("microseconds"), "us"))
+    return rows
+
+
+def _command(module: str, name: str, *arguments: object) -> list[str]:
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    if name != "mpi":
+        return command
+    mpiexec = Path(sys.executable).with_name("mpiexec")
+    first = [str(mpiexec) if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", str(WORKERS + 1)]
+    return [*first, sys.executable, "-m", "mpi4py.futures", *command[1:]]
+
+
+ENVIRONMENT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+
+
+def _answer(what: str, name: str, repeats: int) -> dict:
+    """What the process of one case prints last, or how it ended otherwise."""
+    with tempfile.TemporaryFile("w+") as output:
+        command = _command("tests.benchmarks.engines", name, what, name, repeats)
+        process = Started(command, ENVIRONMENT, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+        stop = time.monotonic() + LIMIT
+        while not process.ended() and time.monotonic() < stop:
+            time.sleep(0.05)
+        hangs = not process.ended()
+        exit_code = process.kill()
+        output.seek(0)
+        found = [row for row in output.read().splitlines() if row.startswith('{"')]
+    if found:
+        return json.loads(found[-1])
+    return {"told": f"hangs: stopped after {LIMIT:g} s" if hangs else f"everything ends (exit code {exit_code})"}
+
+
+def _left_over(name: str) -> tuple[float | None, str, str]:
+    """Processes that are there ten seconds after the one that made the pool was killed."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = _command("tests.faults.pooled_run", name, name, folder)
+        parent = Started(command, ENVIRONMENT, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            stop = time.monotonic() + LIMIT
+            while len(at_work(Path(folder))) < WORKERS:
+                if parent.ended() or time.monotonic() > stop:
+                    return None, "processes left", "did not start"
+                time.sleep(0.05)
+            children = descendants(parent.process.pid)
+            if name == "mpi":  # the first rank, which is the parent of the pool, not that of the processes
+                (first, *_) = sorted(set(_ranks(children)) - at_work(Path(folder)))
+                os.kill(first, 9)
+            else:
+                parent.process.kill()
+            gone(children, 10.0)
+            left = [pid for pid in children if not gone([pid], 0.0)]
+            return len(left), "processes left", f"of {len(children)}"
+        finally:
+            parent.kill()
+
+
+def _ranks(pids: list[int]) -> list[int]:
+    return [pid for pid in pids if b"mpi4py.futures" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def _thetas() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.0, 1.0, size=(ITEMS, 2))
+
+
+def _seconds(model, thetas: np.ndarray, engine, repeats: int) -> float:
+    """Median wall time a run, with workers that are there and know the model."""
+    simulate_batch(model, thetas[:50], engine)
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        batch = simulate_batch(model, thetas, engine)
+        times.append((time.perf_counter() - start) / len(thetas))
+        if any(batch.reasons):
+            raise RuntimeError(f"a run failed: {next(filter(None, batch.reasons))}")
+    return median(times)
+
+
+def _overhead(name: str, repeats: int) -> dict:
+    thetas = _thetas()
+    cheap = _seconds(Treacherous(), thetas, None, repeats)
+    if name == "isolated function":
+        model = FunctionModel(line, NAMES, CHANNELS, DT, N_STEPS, isolated=True)
+        seconds = _seconds(model, thetas, None, repeats)
+    elif name == "program":
+        settings = {"columns": [0], "time_limit": 60.0}
+        command = ["cp", "in.txt", "out.txt"]
+        template = {"in.txt": "1 # $offset $slope\n" * N_STEPS}
+        model = ExecutableModel(command, template, "out.txt", NAMES, CHANNELS, DT, N_STEPS, **settings)
+        seconds = _seconds(model, thetas[:100], None, repeats)
+    else:
+        seconds = _seconds(Treacherous(), thetas, as_engine(POOLS[name]()), repeats)
+    return {"microseconds": 1e6 * (seconds - cheap)}
+
+
+def _death(name: str) -> dict:
+    """Two of twenty items kill their worker, the first time that they are tried."""
+    thetas = _thetas()[:20]
+    thetas[[4, 11], 0] += KILLED
+    engine = as_engine(POOLS[name]())
+    simulate_batch(Treacherous(), _thetas()[:10], engine)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        try:
+            batch = simulate_batch(DiesOnce(Path(folder)), thetas, engine)
+        except Exception as error:
+            return {"seconds": time.perf_counter() - start, "told": f"error: {type(error).__name__}"}
+        seconds = time.perf_counter() - start
+    right = batch.reasons == [""] * 20 and np.array_equal(batch.response, [line(theta) for theta in thetas])
+    return {"seconds": seconds, "told": "goes on, all results right" if right else "goes on, with failures"}
+
+
+def main() -> None:
+    """One case: print its answer as JSON, and end without waiting for the pool."""
+    what, name, repeats = sys.argv[1:]
+    answer = _overhead(name, int(repeats)) if what == "overhead" else _death(name)
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
+    if name != "mpi":
+        os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""A run over processes that a test can kill: ``python -m tests.faults.pooled_run CASE FOLDER``.
+
+Each process that is at work leaves a file with its number in FOLDER. What the simulations do would take an hour.
+"""
+
+import multiprocessing
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from fe_likelihoods.engines import LocalPool
+from fe_likelihoods.models.executable import ExecutableModel
+from fe_likelihoods.models.function import FunctionModel
+from tests.faults.treacherous import (
+    CHANNELS,
+    DT,
+    HANGS,
+    HANGS_HARD,
+    N_STEPS,
+    Announced,
+    Treacherous,
+    posterior_of,
+    treacherous,
+)
+
+NAMES = ("offset", "slope")
+WORKERS = 2
+
+
+def at_work(folder: Path) -> set[int]:
+    """The processes that have told so."""
+    return {int(path.name) for path in folder.iterdir()}
+
+
+def _dask():
+    from dask.distributed import Client, LocalCluster
+
+    return Client(LocalCluster(WORKERS, threads_per_worker=1, processes=True, dashboard_address=None))
+
+
+def _loky():
+    from joblib.externals.loky import get_reusable_executor
+
+    return get_reusable_executor(WORKERS)
+
+
+def _mpi():
+    from mpi4py.futures import MPIPoolExecutor
+
+    return MPIPoolExecutor(WORKERS)
+
+
+def _isolated() -> FunctionModel:
+    return FunctionModel(treacherous, NAMES, CHANNELS, DT, N_STEPS, time_limit=3600.0)
+
+
+def _program() -> ExecutableModel:
+    code = "import subprocess, sys; subprocess.run(['sleep', '3600'], start_new_session=True)"
+    command = [sys.executable, "-c", code, "$offset", "$slope"]
+    return ExecutableModel(command, {}, "out.txt", NAMES, CHANNELS, DT, N_STEPS, time_limit=3600.0)
+
+
+POOLS = {
+    "local": lambda: LocalPool(WORKERS),
+    "executor": lambda: ProcessPoolExecutor(WORKERS, mp_context=multiprocessing.get_context("spawn")),
+    "multiprocessing": lambda: multiprocessing.get_context("spawn").Pool(WORKERS),
+    "loky": _loky,
+    "dask": _dask,
+    "mpi": _mpi,
+}
+# model, pool, and how it hangs
+CASES = {name: (Treacherous, pool, HANGS) for name, pool in POOLS.items()} | {
+    "deaf": (Treacherous, POOLS["local"], HANGS_HARD),
+    "nested": (_isolated, POOLS["local"], HANGS_HARD),
+    "isolated": (_isolated, lambda: None, HANGS_HARD),
+    "program": (_program, POOLS["local"], HANGS),
+}
+
+
+def main() -> None:
+    """Run until killed."""
+    model, pool, hangs = CASES[sys.argv[1]]
+    posterior = posterior_of(Announced(Path(sys.argv[2]), model()), top=20.0, pool=pool())
+    posterior(np.array([[hangs + 0.1 * k, 0.1, 0.5] for k in range(1, 9)]))
+    time.sleep(3600)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Models that do to their process what real ones do, where their first parameter tells them to."""
+
+import ctypes
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from fe_likelihoods.channels import Channel, Measurements
+from fe_likelihoods.models.base import SimulationFailed
+
+CHANNELS = (Channel("a", "acceleration", "m/s2"),)
+DT, N_STEPS = 0.1, 20
+LOADED: list[int] = []
+TIME = DT * np.arange(N_STEPS)
+FINE, RAISES, REFUSES, NOT_FINITE, SHAPE, HANGS, HANGS_HARD, CRASHES, KILLED, LEAVES, FLOODS = range(11)
+
+
+def line(theta: np.ndarray) -> np.ndarray:
+    """What it should do: (1, 20)."""
+    return (theta[0] + theta[1] * TIME)[None]
+
+
+def treacherous(theta: np.ndarray) -> np.ndarray:
+    """A line, unless the whole part of theta[0] is one of the names above."""
+    what = int(theta[0])
+    if what == RAISES:
+        raise ZeroDivisionError("float division by zero")
+    if what == REFUSES:
+        raise SimulationFailed("no convergence at step 3")
+    if what == SHAPE:
+        return line(theta)[:, 1:]
+    if what == HANGS:
+        time.sleep(3600)
+    if what == HANGS_HARD:
+        ctypes.PyDLL(None).sleep(3600)  # in compiled code that lets no other thread run
+    if what == CRASHES:
+        ctypes.string_at(0)
+    if what == KILLED:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if what == LEAVES:
+        os._exit(3)
+    if what == FLOODS:
+        while True:
+            os.write(1, b"all is well\n" * 1000)
+    return line(theta) * (np.nan if what == NOT_FINITE else 1.0)
+
+
+class Treacherous:
+    """The same, as a model without any protection of its own."""
+
+    parameter_names = ("offset", "slope")
+    channels = CHANNELS
+    dt = DT
+    n_steps = N_STEPS
+    fingerprint = "treacherous"
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        return treacherous(theta)
+
+
+class Announced(Treacherous):
+    """A model that tells where it is at work."""
+
+    def __init__(self, folder: Path, model) -> None:
+        self.folder, self.model = folder, model
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        (self.folder / f"{os.getpid()}").touch()
+        return self.model.simulate(theta)
+
+
+class DiesOnce(Treacherous):
+    """Kills its process the first time that it gets to a file that is not there, and makes the file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        mark = self.folder / f"{theta[0]!r}"
+        if int(theta[0]) == KILLED and not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return line(theta)
+
+
+class Large(Treacherous):
+    """A model of a megabyte, that knows how often it was unpickled in this process and what it is asked for."""
+
+    def __init__(self):
+        self.ballast = np.random.default_rng(1).bytes(2**20)
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        LOADED.append(1)
+
+    def simulate(self, theta):
+        response = super().simulate(np.array([0.1, theta[1]]))
+        response[0, 0] = len(LOADED)
+        return response
+
+
+class Unpicklable(Treacherous):
+    def __init__(self):
+        self.solver = type("Solver", (), {})()
+        self.solver.lock = threading.Lock()
+
+
+class Absent(Treacherous):
+    """Can be pickled here and not be loaded elsewhere."""
+
+    def __reduce__(self):
+        return _absent, (os.getpid(),)
+
+
+def _absent(home):
+    if os.getpid() == home:
+        return Absent()
+    raise ModuleNotFoundError("No module named 'mine'")
+
+
+def speaks(theta: np.ndarray) -> np.ndarray:
+    """Ends its process with some words."""
+    os.write(2, b"solver 7.1\nout of licences\n\n")
+    os._exit(1)
+
+
+def eats(theta: np.ndarray) -> np.ndarray:
+    """Asks for more memory than there is."""
+    return np.ones((1, 10**11))
+
+
+def third(theta: np.ndarray) -> np.ndarray:
+    """NaN in a third of the prior, an exception in a little of it."""
+    if theta[0] > 0.98:
+        raise ValueError("too stiff")
+    return line(theta) * (np.nan if theta[0] < 1.0 / 3.0 else 1.0)
+
+
+def deadly(theta: np.ndarray) -> np.ndarray:
+    """Crashes below 0.02, hangs up to 0.04."""
+    if theta[0] < 0.02:
+        return treacherous(np.array([CRASHES + 0.5, 0.0]))
+    if theta[0] < 0.04:
+        return treacherous(np.array([HANGS + 0.5, 0.0]))
+    return line(theta)
+
+
+def posterior_of(model, top: float = 1.0, **options):
+    """Posterior of a model of two parameters, whose offset is between 0 and `top`."""
+    from fe_likelihoods.likelihood import FELikelihood  # the workers need none of this, and start faster
+    from fe_likelihoods.posterior import Posterior
+    from fe_likelihoods.priors import HalfNormal, Uniform
+
+    noise = np.random.default_rng(3).normal(size=(1, N_STEPS))
+    measurements = Measurements(CHANNELS, DT, line(np.array([0.4, 0.7])) + 0.3 * noise)
+    prior = {"offset": Uniform(0.0, top), "slope": Uniform(-2.0, 2.0), "sigma_a": HalfNormal(0.5)}
+    return Posterior(FELikelihood(model, measurements, **options), prior)
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes that this one started, and those they started, from /proc."""
+    parents = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                status = (entry / "stat").read_text()
+            except OSError:
+                continue
+            state, parent = status.rpartition(")")[2].split()[:2]
+            if state != "Z":
+                parents[int(entry.name)] = int(parent)
+    found, new = [], [pid]
+    while new:
+        new = [child for child, parent in parents.items() if parent in new]
+        found += new
+    return found
+
+
+def gone(pids, seconds: float = 20.0) -> bool:
+    """Whether all of these processes end within the time."""
+    stop = time.monotonic() + seconds
+    while any(_runs(pid) for pid in pids):
+        if time.monotonic() > stop:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
