@@ -101,3 +101,36 @@ def test_isolated_bridge_is_found_and_predicts(bridge):
     probability = dict(zip(summary["fragility"]["intensity"], summary["fragility"]["probability"], strict=True))
     assert probability[min(probability)] <= probability[max(probability)]
     assert summary["failures"] == 0
+
+
+@pytest.mark.parametrize("pool", ["local", "dask"])
+def test_own_models_agree_and_are_simulated_once(pool, tmp_path):
+    if pool == "dask":
+        pytest.importorskip("distributed", reason="NO DISTRIBUTED: install it to test this engine")
+    results = []
+    for _ in range(2):
+        run_tutorial("05_your_own_model.py", "--pool", pool, "--out", str(tmp_path))
+        results.append(json.loads((tmp_path / "summary.json").read_text()))
+    first, second = results
+    assert set(first) >= {"function", "program"}
+    assert first["program"]["mean"] == first["function"]["mean"], "the program prints all digits"
+    for name, run in first.items():
+        assert run["simulations"] > 100 and not run["failures"]
+        assert second[name]["simulations"] == 0, "a second run finds all in the cache"
+        assert second[name]["mean"] == run["mean"]
+        assert run["mean"][0] == pytest.approx(1.15, abs=0.02)
+        assert run["mean"][1] == pytest.approx(0.85, abs=0.02)
+    for name in ("corner.png", "loops.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_comparison_run_twice_simulates_once(tmp_path):
+    arguments = ("--problem", "bridge", "--problem", "means", "--cache", str(tmp_path / "simulations.db"))
+    outputs = [run_tutorial("04_compare_samplers.py", *arguments, "--out", str(tmp_path)) for _ in range(2)]
+    assert "WARNS: the points remember" in outputs[0]
+    assert "0 simulations in all" not in outputs[0]
+    assert "\n0 simulations in all" in outputs[1]
+    results = json.loads((tmp_path / "comparison.json").read_text())
+    assert results["bridge"]["SMC"]["mean"][0] == pytest.approx(1.15, abs=0.03)
+    for problem in ("bridge", "means"):
+        assert (tmp_path / f"corner_{problem}.png").stat().st_size > 1000

@@ -1,0 +1,100 @@
+"""Models of a user's own, for tutorial 05: one structure as a Python function, as OpenSees commands, and as a program.
+
+A mass on a bilinear spring under a base motion. The parameters are multiples of a nominal stiffness and of a nominal
+yield strength. Functions that go to other processes stand in a module like this one, not in the script itself.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from fe_likelihoods.data.make_isolated_bridge import table_motion
+
+from fe_likelihoods.channels import Channel
+
+NAMES = ("stiffness", "strength")
+CHANNELS = (
+    Channel("acceleration", "absolute acceleration", "g"),
+    Channel("displacement", "relative displacement", "mm"),
+)
+STIFFNESS = (2.0 * np.pi / 0.8) ** 2  # of a unit mass [1/s2]: a period of .8 s
+STRENGTH = 0.02 * STIFFNESS  # [m/s2]: yields at 20 mm
+HARDENING = 0.05  # share of the stiffness left after yielding
+DAMPING = 2.0 * 0.03 * np.sqrt(STIFFNESS)  # [1/s]: 3 % of critical
+RECORD = table_motion().trim(0.0, 8.0).resample(0.01)
+
+PROGRAM = Path(__file__).with_name("own_program.py")
+INPUT = """# multiples, then nominal values: stiffness [1/s2], strength [m/s2], hardening, damping [1/s], step [s]
+$stiffness $strength {stiffness!r} {strength!r} {hardening!r} {damping!r} {dt!r}
+"""
+
+
+def bilinear(theta: np.ndarray) -> np.ndarray:
+    """Response (2, n_steps): Newmark's average acceleration, a return map for the spring."""
+    stiffness, strength = STIFFNESS * theta[0], STRENGTH * theta[1]
+    kinematic = HARDENING * stiffness / (1.0 - HARDENING)  # hardening modulus of the plastic part
+    dt, ground = RECORD.dt, RECORD.acceleration.tolist()
+    u = v = plastic = 0.0
+    a = -ground[0]
+    rows = [(a + ground[0], u)]
+    for g in ground[1:]:
+        predicted, free = u + dt * v + 0.25 * dt * dt * a, v + 0.5 * dt * a
+        new, slip = u, plastic
+        for _ in range(50):
+            trial = stiffness * (new - plastic) - kinematic * plastic
+            excess = abs(trial) - strength
+            slip, force, tangent = plastic, stiffness * (new - plastic), stiffness
+            if excess > 0.0:
+                slip = plastic + (1.0 if trial > 0.0 else -1.0) * excess / (stiffness + kinematic)
+                force, tangent = stiffness * (new - slip), stiffness * kinematic / (stiffness + kinematic)
+            acceleration = 4.0 * (new - predicted) / (dt * dt)
+            residual = acceleration + DAMPING * (free + 0.5 * dt * acceleration) + force + g
+            correction = residual / (4.0 / (dt * dt) + 2.0 * DAMPING / dt + tangent)
+            new -= correction
+            if abs(correction) < 1e-12:
+                break
+        a = 4.0 * (new - predicted) / (dt * dt)
+        v = free + 0.5 * dt * a
+        u, plastic = new, slip
+        rows.append((a + g, u))
+    return np.array(rows).T
+
+
+def bilinear_in_opensees(ops, theta: np.ndarray) -> np.ndarray:
+    """The same in OpenSees: a zero-length element of Steel01 beside a dashpot."""
+    ops.model("basic", "-ndm", 1, "-ndf", 1)
+    ops.node(1, 0.0)
+    ops.node(2, 0.0)
+    ops.fix(1, 1)
+    ops.mass(2, 1.0)
+    ops.uniaxialMaterial("Steel01", 1, STRENGTH * float(theta[1]), STIFFNESS * float(theta[0]), HARDENING)
+    ops.uniaxialMaterial("Elastic", 2, 0.0, DAMPING)
+    ops.uniaxialMaterial("Parallel", 3, 1, 2)
+    ops.element("zeroLength", 1, 1, 2, "-mat", 3, "-dir", 1)
+    ops.timeSeries("Path", 1, "-dt", RECORD.dt, "-values", *RECORD.acceleration.tolist(), 0.0)
+    ops.pattern("UniformExcitation", 1, 1, "-accel", 1)
+    ops.constraints("Plain")
+    ops.numberer("Plain")
+    ops.system("BandGeneral")
+    ops.test("NormDispIncr", 1e-10, 50)
+    ops.algorithm("Newton")
+    ops.integrator("Newmark", 0.5, 0.25)
+    ops.analysis("Transient")
+    response = np.zeros((2, RECORD.n_steps))
+    for step in range(1, RECORD.n_steps):
+        if ops.analyze(1, RECORD.dt):
+            raise RuntimeError(f"OpenSees did not converge at step {step}")
+        response[:, step] = ops.nodeAccel(2, 1) + RECORD.acceleration[step], ops.nodeDisp(2, 1)
+    return response
+
+
+def write_motion(path: Path) -> Path:
+    """The base motion as the program reads it."""
+    path.write_text("\n".join(repr(value) for value in RECORD.acceleration.tolist()) + "\n")
+    return path
+
+
+def input_template() -> str:
+    """Input file of the program: placeholders for the parameters, numbers for what is fixed."""
+    return INPUT.format(
+        stiffness=float(STIFFNESS), strength=float(STRENGTH), hardening=HARDENING, damping=float(DAMPING), dt=RECORD.dt
+    )
