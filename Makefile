@@ -42,4 +42,4 @@ data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environment and the results
-	rm -rf $(VENV) results results-isolated-bridge
+	rm -rf $(VENV) results results-*

@@ -84,9 +84,9 @@ class FELikelihood:
         Anything with ``parameter_names`` and ``log_likelihood(misfit, n_steps, parameters)``; by default
         `GaussianNoise` of the model's channels.
     pool : int, or an object with ``map(function, items)``, optional
-        Runs the simulations of a model without batch methods, as many at once as it has workers: a number of processes
-        of this machine, a client of dask.distributed, an executor or a pool (see `fe_likelihoods.engines`). It does
-        not travel when the likelihood is pickled.
+        Runs the simulations, as many at once as it has workers: a number of processes of this machine, a client of
+        dask.distributed, an executor or a pool (see `fe_likelihoods.engines`). Without it they run in this process:
+        the compiled models on threads, others one after the other. It does not travel when the likelihood is pickled.
     memory : int
         Number of simulations whose misfits are remembered (some 250 bytes each), so that none of them is run again,
         those that failed included; 0 for none. What is remembered does not travel when the likelihood is pickled: every

@@ -4,10 +4,10 @@ A model is any object with named parameters, named channels and a method `simula
 into one response. It says that a simulation cannot be done by raising `SimulationFailed`. Nothing has to be inherited.
 
 Samplers ask for many parameter sets at once. `simulate_batch` and `misfit_batch` answer with the model's own batch
-methods where it has them (compiled kernels that share work or threads), else set by set, through a pool if there is
-one. They never raise for a simulation that goes wrong: whatever happens to one set of parameters (an exception, a
-response that is not finite or has a wrong shape) becomes a reason in words beside a row of NaN, and leaves the other
-rows alone.
+methods where it has them (compiled kernels that share work or threads), else set by set; through a pool, if there is
+one, always set by set. They never raise for a simulation that goes wrong: whatever happens to one set of parameters (an
+exception, a response that is not finite or has a wrong shape) becomes a reason in words beside a row of NaN, and leaves
+the other rows alone.
 """
 
 import logging
@@ -115,14 +115,15 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     model : Model
     thetas : (n, n_parameters) float
     pool : object with ``map(function, items)``, optional
-        Runs the simulations of a model that has no batch method; the results do not depend on it.
+        Runs the simulations one by one, also where the model has a batch method (which stays in this process); the
+        results do not depend on it.
 
     Returns
     -------
     SimulationBatch
     """
     shape = (len(model.channels), model.n_steps)
-    whole = getattr(model, "simulate_batch", None)
+    whole = getattr(model, "simulate_batch", None) if pool is None else None
     if whole is not None:
         batch = _run_whole(model, partial(whole, thetas), (len(thetas), *shape))
         if batch is not None:
@@ -140,15 +141,16 @@ def misfit_batch(model: Model, thetas: np.ndarray, measured: np.ndarray, pool: A
     measured : (n_channels, n_steps) float
         Measured response [SI].
     pool : object with ``map(function, items)``, optional
-        Runs the simulations of a model that has no batch method; the results do not depend on it.
+        Runs the simulations one by one, also where the model has a batch method (which stays in this process); the
+        results do not depend on it.
 
     Returns
     -------
     MisfitBatch
     """
     shape = (len(model.channels),)
-    whole = getattr(model, "misfit_batch", None)
-    if whole is None and hasattr(model, "simulate_batch"):
+    whole = getattr(model, "misfit_batch", None) if pool is None else None
+    if whole is None and pool is None and hasattr(model, "simulate_batch"):
         whole = partial(_misfit_from_responses, model)
     if whole is not None:
         batch = _run_whole(model, partial(whole, thetas, measured), (len(thetas), *shape))

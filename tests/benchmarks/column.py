@@ -1,11 +1,16 @@
 """The bridge column beside OpenSees: 50 s at 1/256 s, 88 fibers in each of six sections."""
 
+import importlib.util
 import time
+from collections.abc import Callable, Iterator
 from statistics import median
+from typing import Any
 
 import numba
 import numpy as np
 
+from fe_likelihoods.engines import LocalPool, as_engine
+from fe_likelihoods.models.base import misfit_batch
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
 from tests.opensees_column import INCH, KIP, peer_of, shake
@@ -60,7 +65,7 @@ def simulation(repeats: int) -> list[Row]:
 
 
 def batch(repeats: int) -> list[Row]:
-    """Wall time of sixteen draws of the prior on one thread and on more."""
+    """Wall time of sixteen draws of the prior on one thread and on more, then on two processes."""
     model = RCColumn.lhpost(bridge_column_data().record)
     thetas = bridge_column_prior().rvs(16, 1)[:, :5]
     model.simulate(thetas[0])
@@ -73,11 +78,35 @@ def batch(repeats: int) -> list[Row]:
             start = time.perf_counter()
             model.misfit_batch(thetas, np.zeros((2, model.n_steps)))
             seconds[n].append(time.perf_counter() - start)
-    numba.set_num_threads(before)
-    return [
+    rows = [
         Row("batch of 16, wall time", f"{n} thread" + "s" * (n > 1), median(times), "s", _speedup(seconds, n))
         for n, times in seconds.items()
     ]
+    numba.set_num_threads(1)
+    for name, pool, close in _pools():
+        engine, times = as_engine(pool, model), {1: [], 2: []}
+        misfit_batch(model, thetas, np.zeros((2, model.n_steps)), engine)  # workers start and compile nothing
+        for _ in range(repeats):
+            for n, used in ((1, None), (2, engine)):
+                start = time.perf_counter()
+                misfit_batch(model, thetas, np.zeros((2, model.n_steps)), used)
+                times[n].append(time.perf_counter() - start)
+        rows.append(Row("batch of 16, wall time", name, median(times[2]), "s", _speedup(times, 2)))
+        close()
+    numba.set_num_threads(before)
+    return rows
+
+
+def _pools() -> Iterator[tuple[str, Any, Callable[[], None]]]:
+    """Engines of two processes, and how to end them."""
+    local = LocalPool(2)
+    yield "2 processes, local pool", local, local.close
+    if importlib.util.find_spec("distributed"):
+        from distributed import Client, LocalCluster
+
+        cluster = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+        client = Client(cluster)
+        yield "2 processes, dask", client, lambda: (client.close(), cluster.close())
 
 
 def _speedup(seconds: dict[int, list[float]], n: int) -> str:

@@ -31,6 +31,7 @@ __all__ = ["engines"]
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = {"dask": "distributed", "mpi": "mpi4py", "loky": "joblib"}
 ITEMS, LIMIT = 1000, 60.0
+THREADS = 64
 
 
 def engines(repeats: int) -> list[Row]:
@@ -49,6 +50,12 @@ def engines(repeats: int) -> list[Row]:
     for name in ("isolated function", "program"):
         answer = _answer("overhead", name, repeats)
         rows.append(Row("engine: overhead a run", f"{name}, no pool", answer.get("microseconds"), "us"))
+    if importlib.util.find_spec("distributed"):
+        answer = _answer("cluster", "dask", repeats)
+        case = f"dask, {THREADS} sleeping threads in {WORKERS} processes"
+        rows.append(
+            Row("engine: overhead of a run of 1 s", case, answer.get("microseconds"), "us", answer.get("told", ""))
+        )
     return rows
 
 
@@ -143,6 +150,33 @@ def _overhead(name: str, repeats: int) -> dict:
     return {"microseconds": 1e6 * (seconds - cheap)}
 
 
+class Sleeper(Treacherous):
+    """A model that takes a second of somebody else's time."""
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        """A straight line, later."""
+        time.sleep(1.0)
+        return line(theta)
+
+
+def _cluster() -> dict:
+    """Four rounds of a model that sleeps for a second on a cluster of many threads, as far as two cores carry it."""
+    from distributed import Client, LocalCluster
+
+    cluster = LocalCluster(n_workers=WORKERS, threads_per_worker=THREADS // WORKERS, dashboard_address=None)
+    engine = as_engine(Client(cluster))
+    thetas = _thetas()[: 4 * THREADS]
+    simulate_batch(Treacherous(), thetas[:THREADS], engine)
+    start = time.perf_counter()
+    batch = simulate_batch(Sleeper(), thetas, engine)
+    seconds = time.perf_counter() - start
+    if any(batch.reasons):
+        return {"told": f"a run failed: {next(filter(None, batch.reasons))}"}
+    efficiency = len(thetas) / THREADS / seconds
+    told = f"{len(thetas)} runs in {seconds:.2f} s, {100 * efficiency:.0f} % of {THREADS} threads used"
+    return {"microseconds": 1e6 * (seconds - len(thetas) / THREADS) / len(thetas), "told": told}
+
+
 def _death(name: str) -> dict:
     """Two of twenty items kill their worker, the first time that they are tried."""
     thetas = _thetas()[:20]
@@ -163,7 +197,9 @@ def _death(name: str) -> dict:
 def main() -> None:
     """One case: print its answer as JSON, and end without waiting for the pool."""
     what, name, repeats = sys.argv[1:]
-    answer = _overhead(name, int(repeats)) if what == "overhead" else _death(name)
+    answer = {"overhead": lambda: _overhead(name, int(repeats)), "death": lambda: _death(name), "cluster": _cluster}[
+        what
+    ]()
     sys.stdout.write(json.dumps(answer) + "\n")
     sys.stdout.flush()
     if name != "mpi":

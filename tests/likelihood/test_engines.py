@@ -13,8 +13,9 @@ import emcee
 import numpy as np
 import pytest
 
-from fe_likelihoods import engines
+from fe_likelihoods import engines, problems
 from fe_likelihoods.engines import DaskEngine, LocalPool, PoolEngine, as_engine
+from fe_likelihoods.likelihood import FELikelihood
 from fe_likelihoods.models.base import misfit_batch, simulate_batch
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.records import Record
@@ -269,3 +270,20 @@ def test_models_of_a_notebook_are_refused():
     assert (
         "ValueError: with this pool the model must go to other processes. what is defined in a notebook" in run.stderr
     )
+
+
+@pytest.mark.parametrize("system", ["column", "bridge"])
+def test_compiled_models_go_through_a_pool_to_the_same_bits(system):
+    """Without a pool a batch runs on threads of this process, with one set by set in the workers."""
+    if system == "column":
+        posterior = problems.bridge_column(duration=2.0)
+        thetas = posterior.sample_prior(6, 1)[:, :5]
+    else:
+        record = problems.isolated_bridge_data().record.trim(0.0, 2.0)
+        posterior = problems.isolated_bridge(record=record, step=1e-3)
+        thetas = posterior.sample_prior(6, 1)[:, :10]
+    likelihood = posterior.likelihood
+    with LocalPool(2) as pool:
+        pooled = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, pool=pool)
+        np.testing.assert_array_equal(pooled.misfit(thetas), likelihood.misfit(thetas))
+        assert pooled.simulations == 6
