@@ -47,7 +47,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Update a model of your own; figures into a folder.")
     parser.add_argument("--pool", choices=("local", "dask", "none"), default="local")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--walkers", type=int, default=40 if os.environ.get("FAST") else 200)
+    parser.add_argument("--walkers", type=int, default=24 if os.environ.get("FAST") else 200)
     parser.add_argument("--cache", type=Path, help="file of simulations (default: in OUT)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results-own-model"))
