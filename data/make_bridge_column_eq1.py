@@ -17,7 +17,8 @@ from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, BRIDGE_COLUMN_NOISE, br
 from fe_likelihoods.records import Record
 from fe_likelihoods.units import G0
 
-SEED = 1989
+SEED = 17
+"""One of the draws in which stiffness and strength can be told from the damping (see README.md)."""
 DT = 1.0 / 256.0  # s
 DURATION = 50.0  # s
 PEAK = 0.20 * G0  # m/s2

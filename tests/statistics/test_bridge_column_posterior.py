@@ -145,18 +145,7 @@ def distance(estimate: Estimate) -> np.ndarray:
     return (estimate.mean - TRUTH) / estimate.sd
 
 
-def test_the_noise_is_found_in_the_reduced_setting(run):
-    """Noise levels within 3 sd; the others are shifted by the long steps of the reduced setting."""
-    z = distance(run(bundled_reduced).check)
-    assert np.all(np.abs(z[5:]) < 3.0), z
-
-
-# the bars stay elastic under the bundled motion, a1 is weakly known, and where it is pulled Ec, Es and ft go along;
-# not yet shown: how much of it is the prior's pull and how much the coarser mesh's
-DISPLACED = pytest.mark.xfail(strict=True, reason="bundled data: Ec +4.1, Es -5.1, ft +6.2 posterior sd from the truth")
-
-
-@pytest.mark.parametrize("make", [pytest.param(bundled, marks=DISPLACED), real, real_wide_prior])
+@pytest.mark.parametrize("make", [bundled, bundled_reduced, real, real_wide_prior])
 def test_the_truth_is_found(run, make):
     """All but the damping pair, whose truth lies 6.3 prior sd out."""
     z = distance(run(make).check)
@@ -174,7 +163,7 @@ def test_the_prior_pulls_the_damping_and_so_does_the_mesh(run):
 
 @pytest.mark.parametrize(
     ("make", "before", "after"),
-    [(bundled, [1.0, 1.0], [0.30, 0.15]), (real, [0.8, 0.8], [0.25, 0.08])],
+    [(bundled, [0.95, 0.85], [0.35, 0.22]), (real, [0.8, 0.8], [0.25, 0.08])],
 )
 def test_updating_explains_the_response(run, make, before, after):
     posterior, samples = run(make).posterior, run(make).samples

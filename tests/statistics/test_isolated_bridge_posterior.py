@@ -88,7 +88,7 @@ def twin(name: str) -> Run:
     if name == "emcee":
         # from a ball at the truth: from the prior it does not arrive within this many steps
         ball = truth("twin") * (1.0 + 0.005 * np.random.default_rng(SEED).standard_normal((64, 11)))
-        return ensemble("twin", SEED, ball, 3500, 1000)
+        return ensemble("twin", SEED, ball, 2500, 800)
     Sampler, settings = {
         "smc": (SMCSampler, {}),
         "tmcmc": (TMCMCSampler, {}),
