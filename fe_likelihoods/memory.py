@@ -12,6 +12,8 @@ import numpy as np
 
 __all__ = ["MisfitMemory"]
 
+_NAN = np.array([np.nan]).tobytes()
+
 
 class MisfitMemory:
     """Misfits by the bytes of their structural parameters; the ones not asked for longest are forgotten first.
@@ -45,7 +47,7 @@ class MisfitMemory:
     def __len__(self) -> int:
         return len(self._misfits)
 
-    def look_up(self, keys: Sequence[bytes], n_channels: int) -> tuple[np.ndarray, np.ndarray]:
+    def look_up(self, keys: Sequence[bytes], n_channels: int) -> tuple[np.ndarray, list[bool]]:
         """What is known of distinct keys.
 
         Parameters
@@ -56,7 +58,7 @@ class MisfitMemory:
         Returns
         -------
         misfit : (n, n_channels) float — NaN where the simulation had failed, and where nothing is known.
-        known : (n,) bool
+        known : list of n bool
         """
         found = []
         with self._lock:
@@ -65,10 +67,10 @@ class MisfitMemory:
                 if misfit is not None:
                     self._misfits.move_to_end(key)
                 found.append(misfit)
-        unknown = np.full(n_channels, np.nan).tobytes()
-        filled = b"".join([unknown if misfit is None else misfit for misfit in found])
-        misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), n_channels).copy()
-        return misfits, np.array([misfit is not None for misfit in found], dtype=bool)
+        unknown = _NAN * n_channels
+        filled = bytearray().join([unknown if misfit is None else misfit for misfit in found])  # can be written to
+        misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), n_channels)
+        return misfits, [misfit is not None for misfit in found]
 
     def store(self, keys: Sequence[bytes], misfits: np.ndarray) -> None:
         """Remember the misfits (n, n_channels) of distinct keys."""
