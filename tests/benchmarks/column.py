@@ -65,9 +65,9 @@ def simulation(repeats: int) -> list[Row]:
 
 
 def batch(repeats: int) -> list[Row]:
-    """Wall time of sixteen draws of the prior on one thread and on more, then on two processes."""
+    """Wall time of 64 draws of the prior on one thread and on more, then on two processes."""
     model = RCColumn.lhpost(bridge_column_data().record)
-    thetas = bridge_column_prior().rvs(16, 1)[:, :5]
+    thetas = bridge_column_prior().rvs(64, 1)[:, :5]
     model.simulate(thetas[0])
     before = numba.get_num_threads()
     counts = [n for n in (1, 2, 4, 8, 16) if n <= numba.config.NUMBA_NUM_THREADS]
@@ -79,7 +79,7 @@ def batch(repeats: int) -> list[Row]:
             model.misfit_batch(thetas, np.zeros((2, model.n_steps)))
             seconds[n].append(time.perf_counter() - start)
     rows = [
-        Row("batch of 16, wall time", f"{n} thread" + "s" * (n > 1), median(times), "s", _speedup(seconds, n))
+        Row("batch of 64, wall time", f"{n} thread" + "s" * (n > 1), median(times), "s", _speedup(seconds, n))
         for n, times in seconds.items()
     ]
     numba.set_num_threads(1)
@@ -91,7 +91,7 @@ def batch(repeats: int) -> list[Row]:
                 start = time.perf_counter()
                 misfit_batch(model, thetas, np.zeros((2, model.n_steps)), used)
                 times[n].append(time.perf_counter() - start)
-        rows.append(Row("batch of 16, wall time", name, median(times[2]), "s", _speedup(times, 2)))
+        rows.append(Row("batch of 64, wall time", name, median(times[2]), "s", _speedup(times, 2)))
         close()
     numba.set_num_threads(before)
     return rows
