@@ -9,6 +9,7 @@ import numpy as np
 
 from .engines import as_engine
 from .likelihood import as_points
+from .memory import distinct_keys
 from .moments import Kept, Moments
 
 __all__ = ["Gathered", "distinct_rows", "members_of", "parts_of", "split_samples"]
@@ -176,10 +177,8 @@ class Gathered:
 
 def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct rows in the order of their first appearance, and which of them each row is."""
-    first: dict[bytes, int] = {}  # adding zero makes -0.0 and 0.0 one key
-    result = np.array([first.setdefault(row.tobytes(), len(first)) for row in thetas + 0.0])
-    rows = np.frombuffer(b"".join(first), dtype=float).reshape(len(first), -1)
-    return rows.copy(), result
+    keys, result = distinct_keys(thetas)
+    return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), -1).copy(), np.array(result)
 
 
 def members_of(result_of_theta: np.ndarray, n_results: int) -> list[np.ndarray]:

@@ -18,7 +18,7 @@ import numpy as np
 from .cache import SimulationCache
 from .channels import Measurements
 from .engines import as_engine
-from .memory import MisfitMemory
+from .memory import MisfitMemory, distinct_keys
 from .models.base import Model, misfit_batch, misfit_of_responses, simulate_batch, split_seconds
 from .noise import GaussianNoise
 
@@ -204,20 +204,17 @@ class FELikelihood:
 
     def _misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Of finite rows. A single row that is remembered must not cost ten microseconds: few calls of numpy."""
-        rows = thetas + 0.0  # makes -0.0 and 0.0 one key
-        first: dict[bytes, int] = {}  # in order of appearance
-        distinct = [first.setdefault(row.tobytes(), len(first)) for row in rows]
-        keys = list(first)
+        keys, distinct = distinct_keys(thetas)
         misfit, known = self._memory.look_up(keys, self.measurements.n_channels)
         if all(known):
-            self.cache_hits += len(rows)
+            self.cache_hits += len(thetas)
         else:
             known = np.array(known)
             new, on_disk = ~known, np.zeros(len(keys), dtype=bool)
             misfit[new], on_disk[new] = self._obtain([key for key, is_new in zip(keys, new, strict=True) if is_new])
             self.disk_hits += int(on_disk[distinct].sum())
             self.cache_hits += int((known | on_disk)[distinct].sum())
-        return misfit if len(keys) == len(rows) else misfit[distinct]
+        return misfit if len(keys) == len(thetas) else misfit[distinct]
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
         """Log-likelihood of structural parameters followed by the noise's.

@@ -10,9 +10,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["MisfitMemory"]
+__all__ = ["MisfitMemory", "distinct_keys"]
 
 _NAN = np.array([np.nan]).tobytes()
+
+
+def distinct_keys(rows: np.ndarray) -> tuple[list[bytes], list[int]]:
+    """Bytes of the distinct rows of a float array, in the order of their first appearance, and which each row is."""
+    first: dict[bytes, int] = {}
+    which = [first.setdefault(row.tobytes(), len(first)) for row in rows + 0.0]  # -0.0 and 0.0 are one
+    return list(first), which
 
 
 class MisfitMemory:

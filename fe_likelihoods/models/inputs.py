@@ -10,7 +10,7 @@ import numpy as np
 
 from ..channels import Channel
 
-__all__ = ["channel_rows", "number", "refuse", "theta_rows", "whole_number"]
+__all__ = ["channel_rows", "number", "refuse", "theta_row", "theta_rows", "whole_number"]
 
 
 def refuse(expected: str, got: object, advice: str) -> None:
@@ -30,6 +30,14 @@ def whole_number(name: str, value: object, low: int, high: int) -> None:
     """Refuse a `value` that is not a whole number from `low` to `high`."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not low <= value <= high:
         refuse(f"{name} between {low} and {high}, a whole number", value, "see the documentation of the model")
+
+
+def theta_row(theta: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Parameters of one run as floats (n_parameters,); ValueError for another shape."""
+    theta = np.asarray(theta, dtype=float)
+    if theta.shape != (len(names),):
+        raise ValueError(f"expected one value for each of {tuple(names)}, shape ({len(names)},); got {theta.shape}")
+    return theta
 
 
 def theta_rows(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:

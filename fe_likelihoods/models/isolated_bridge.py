@@ -36,7 +36,7 @@ from ..kernels.jit import KERNEL_HASH
 from ..records import Record
 from .base import MisfitBatch, SimulationBatch, SimulationFailed
 from .bridge_inputs import Bearing, Damper, Pier, Rubber
-from .inputs import channel_rows, number, refuse, theta_rows, whole_number
+from .inputs import channel_rows, number, refuse, theta_row, theta_rows, whole_number
 from .threads import map_threads
 
 __all__ = ["CHANNEL_SETS", "Bearing", "BridgeHistory", "Damper", "IsolatedBridge", "Pier", "Rubber"]
@@ -53,12 +53,15 @@ _OF_A_PIER = {
     "shear": ("shear force", "kN"),
     "acc_p": ("absolute acceleration", "g"),
 }
+
+
+def _at_pier(name: str, i: int) -> str:
+    """Name of a channel of pier `i`."""
+    return f"{name}{i}" if name == "acc_p" else f"{name}_{i}"
+
+
 _CHANNELS = {
-    **{
-        f"{name}{'' if name == 'acc_p' else '_'}{i}": Channel(f"{name}{'' if name == 'acc_p' else '_'}{i}", *what)
-        for name, what in _OF_A_PIER.items()
-        for i in (1, 2)
-    },
+    **{_at_pier(name, i): Channel(_at_pier(name, i), *what) for name, what in _OF_A_PIER.items() for i in (1, 2)},
     "Ud": Channel("Ud", "deck displacement", "mm"),
     "acc_d": Channel("acc_d", "absolute acceleration", "g"),
     **{f"mean_{name}": Channel(f"mean_{name}", *what) for name, what in _OF_A_PIER.items()},
@@ -210,11 +213,11 @@ class IsolatedBridge:
         SimulationFailed
             For negative friction, stiffness or damping, and where a step does not converge.
         """
-        return self._runner()(self._one(theta))
+        return self._runner()(theta_row(theta, self.parameters))
 
     def history(self, theta: np.ndarray) -> BridgeHistory:
         """States, hysteretic variables and all channels; same errors as `simulate`."""
-        values, iterations = self._integrate(self._one(theta))
+        values, iterations = self._integrate(theta_row(theta, self.parameters))
         beyond = np.abs(self._kinematics() @ values[:5]).max(axis=1) / (self.rubber.limit * self.rubber.scale)
         rows = self._channel_matrix(ALL_CHANNELS) @ self._drivers(values)
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
@@ -305,14 +308,6 @@ class IsolatedBridge:
 
     # ------------------------------------------------------------------ a run
 
-    def _one(self, theta: np.ndarray) -> np.ndarray:
-        theta = np.asarray(theta, dtype=float)
-        if theta.shape != (len(self.parameters),):
-            raise ValueError(
-                f"expected one value for each of {self.parameters}, shape ({len(self.parameters)},); got {theta.shape}"
-            )
-        return theta
-
     def _values(self, theta: np.ndarray) -> dict[str, float]:
         """Physical values [SI] of all parameters."""
         values = self.nominal
@@ -385,7 +380,7 @@ class IsolatedBridge:
             rows[f"shear_{i}"] = pier.stiffness[0] @ q[u : phi + 1]
             rows[f"acc_p{i}"] = acceleration[u] + pier.height * acceleration[phi] + ground
         for name in _OF_A_PIER:
-            pair = [rows[f"{name}{'' if name == 'acc_p' else '_'}{i}"] for i in (1, 2)]
+            pair = [rows[_at_pier(name, i)] for i in (1, 2)]
             rows[f"mean_{name}"] = 0.5 * (pair[0] + pair[1])
         return np.array([rows[name] for name in names])
 

@@ -47,7 +47,7 @@ from .circular_section import (
     mander_confinement,
 )
 from .column_inputs import Bars, Concrete, Hoops, Patches, Steel
-from .inputs import channel_rows, number, refuse, theta_rows, whole_number
+from .inputs import channel_rows, number, refuse, theta_row, theta_rows, whole_number
 from .threads import map_threads
 
 __all__ = ["Bars", "ColumnHistory", "Concrete", "Hoops", "Patches", "RCColumn", "Steel"]
@@ -285,12 +285,7 @@ class RCColumn:
 
     def history(self, theta: np.ndarray) -> ColumnHistory:
         """All that the kernels record: displacements, energies, forces (rows named), same errors as `simulate`."""
-        theta = np.asarray(theta, dtype=float)
-        if theta.shape != (len(self.parameters),):
-            raise ValueError(
-                f"expected one value for each of {self.parameters}, shape ({len(self.parameters)},); got {theta.shape}"
-            )
-        return self._runner()(theta)
+        return self._runner()(theta_row(theta, self.parameters))
 
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses at `thetas` (n, n_parameters), on numba's number of threads."""
