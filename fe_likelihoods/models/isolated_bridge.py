@@ -27,10 +27,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.sparse import csr_array
 
 from ..channels import Channel
 from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC
+from ..kernels.exponential import matrix_exponential
 from ..kernels.isolated import N_OUT, N_STATES, step_isolated
 from ..kernels.jit import KERNEL_HASH
 from ..records import Record
@@ -219,7 +220,7 @@ class IsolatedBridge:
         """States, hysteretic variables and all channels; same errors as `simulate`."""
         values, iterations = self._integrate(theta_row(theta, self.parameters))
         beyond = np.abs(self._kinematics() @ values[:5]).max(axis=1) / (self.rubber.limit * self.rubber.scale)
-        rows = self._channel_matrix(ALL_CHANNELS) @ self._drivers(values)
+        rows = csr_array(self._channel_matrix(ALL_CHANNELS)) @ self._drivers(values)
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
         kept = np.concatenate([values[:N_STATES], values[14:16], rows])[:, :: self.every]
         return BridgeHistory(names, kept, beyond, iterations)
@@ -295,7 +296,13 @@ class IsolatedBridge:
         augmented = np.zeros((n + 2 * m, n + 2 * m))
         augmented[:n, :n], augmented[:n, n : n + m] = a * self.step, inputs * self.step
         augmented[n : n + m, n + m :] = np.eye(m)
-        exponential = expm(augmented)
+        # velocities per step and forces as displacements, by powers of two, so exactly: large entries cost digits
+        units = np.ones(n + 2 * m)
+        units[5:n] = [1.0 / self.step] * 5 + [d.count * v[f"Kd_{i}"] for i, d in enumerate(self.dampers, 1)]
+        units = 2.0 ** np.round(np.log2(units))
+        exponential = np.empty_like(augmented)
+        matrix_exponential(augmented / units[:, None] * units, exponential, np.empty((2, *augmented.shape)))
+        exponential *= units[:, None] / units
         phi, whole, second = exponential[:n, :n], exponential[:n, n : n + m], exponential[:n, n + m :]
         first = whole - second
         if self.friction == "coulomb":  # a set-valued force that is a straight line would swing about rest for ever
@@ -386,7 +393,8 @@ class IsolatedBridge:
 
     def _runner(self):
         """A function of theta that gives its response: what is the same for every theta is done once."""
-        to_channels = self._channel_matrix(self.outputs)
+        # sparse, as a dense product is BLAS's, whose last bit depends on its number of threads, so on the engine
+        to_channels = csr_array(self._channel_matrix(self.outputs))
         b, end_of_law = self._kinematics(), self.rubber.limit * self.rubber.scale
 
         def run(theta: np.ndarray) -> np.ndarray:

@@ -1,0 +1,69 @@
+"""The matrix exponential beside closed forms and scipy's, and its bits on any number of BLAS threads."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from fe_likelihoods.kernels.exponential import matrix_exponential
+
+
+def exponential(a):
+    out = np.empty_like(a)
+    matrix_exponential(a, out, np.empty((2, *a.shape)))
+    return out
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.3, 4.0, 60.0])
+def test_rotation_and_decay(size):
+    turn = exponential(np.array([[0.0, size], [-size, 0.0]]))
+    closed = np.array([[np.cos(size), np.sin(size)], [-np.sin(size), np.cos(size)]])
+    np.testing.assert_allclose(turn, closed, atol=1e-15 * max(1.0, size))
+    decay = np.array([[-size, 0.0], [0.0, -2.0 * size]])
+    np.testing.assert_allclose(np.diag(exponential(decay)), np.exp([-size, -2.0 * size]), rtol=1e-15 * max(1.0, size))
+
+
+def test_nilpotent_is_a_polynomial():
+    a = np.diag(np.arange(1.0, 6.0), 1)
+    closed = sum(np.linalg.matrix_power(a, k) / float(np.prod(np.arange(1, k + 1))) for k in range(6))
+    np.testing.assert_allclose(exponential(a), closed, rtol=1e-14, atol=1e-13)
+
+
+@pytest.mark.parametrize("norm", [1e-3, 0.4, 3.0, 40.0])
+def test_beside_scipy(norm, rng):
+    a = rng.normal(size=(18, 18))
+    a *= norm / np.abs(a).sum(axis=1).max()
+    both = exponential(a), expm(a)
+    assert np.abs(both[0] - both[1]).max() < 1e-14 * max(1.0, norm) * np.abs(both[1]).max()
+    np.testing.assert_allclose(both[0] @ exponential(-a), np.eye(18), atol=1e-14 * np.exp(norm / 2) ** 2)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
+def test_no_number_gives_nan_and_ends(bad):
+    a = np.eye(3)
+    a[1, 2] = bad
+    assert np.isnan(exponential(a)).all()
+
+
+def test_response_of_the_bridge_has_the_same_bits_on_any_number_of_blas_threads():
+    """Engines limit their workers' threads; scipy's expm failed here by 1e-15 of the state matrices."""
+    code = (
+        "import hashlib, numpy as np; from fe_likelihoods import problems\n"
+        "model = problems.isolated_bridge(step=1e-3).likelihood.model\n"
+        "print(hashlib.sha256(model.simulate(np.full(10, 1.05)).tobytes()).hexdigest())"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"OPENBLAS_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+        ).stdout
+        for threads in ("1", "2", "4")
+    }
+    assert len(found) == 1, found
