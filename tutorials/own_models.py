@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from fe_likelihoods.data.make_isolated_bridge import table_motion
+from own_program import solve
 
 from fe_likelihoods.channels import Channel
 
@@ -29,34 +30,9 @@ $stiffness $strength {stiffness!r} {strength!r} {hardening!r} {damping!r} {dt!r}
 
 
 def bilinear(theta: np.ndarray) -> np.ndarray:
-    """Response (2, n_steps): Newmark's average acceleration, a return map for the spring."""
+    """Response (2, n_steps), by the same solver that the program has."""
     stiffness, strength = STIFFNESS * theta[0], STRENGTH * theta[1]
-    kinematic = HARDENING * stiffness / (1.0 - HARDENING)  # hardening modulus of the plastic part
-    dt, ground = RECORD.dt, RECORD.acceleration.tolist()
-    u = v = plastic = 0.0
-    a = -ground[0]
-    rows = [(a + ground[0], u)]
-    for g in ground[1:]:
-        predicted, free = u + dt * v + 0.25 * dt * dt * a, v + 0.5 * dt * a
-        new, slip = u, plastic
-        for _ in range(50):
-            trial = stiffness * (new - plastic) - kinematic * plastic
-            excess = abs(trial) - strength
-            slip, force, tangent = plastic, stiffness * (new - plastic), stiffness
-            if excess > 0.0:
-                slip = plastic + (1.0 if trial > 0.0 else -1.0) * excess / (stiffness + kinematic)
-                force, tangent = stiffness * (new - slip), stiffness * kinematic / (stiffness + kinematic)
-            acceleration = 4.0 * (new - predicted) / (dt * dt)
-            residual = acceleration + DAMPING * (free + 0.5 * dt * acceleration) + force + g
-            correction = residual / (4.0 / (dt * dt) + 2.0 * DAMPING / dt + tangent)
-            new -= correction
-            if abs(correction) < 1e-12:
-                break
-        a = 4.0 * (new - predicted) / (dt * dt)
-        v = free + 0.5 * dt * a
-        u, plastic = new, slip
-        rows.append((a + g, u))
-    return np.array(rows).T
+    return np.array(solve(stiffness, strength, HARDENING, DAMPING, RECORD.dt, RECORD.acceleration.tolist())).T
 
 
 def bilinear_in_opensees(ops, theta: np.ndarray) -> np.ndarray:

@@ -1,20 +1,18 @@
 """A program as others have it: ``python own_program.py INPUT`` reads text, solves, writes ``response.txt``.
 
-The bilinear oscillator of `own_models`, standard library alone; stands for any executable.
+A mass on a bilinear spring under a base motion, with the standard library alone; stands for any executable.
 """
 
 import sys
 
-numbers = [line.split() for line in open(sys.argv[1]) if not line.startswith("#")]
-of_stiffness, of_strength, stiffness, strength, hardening, damping, dt = (float(word) for word in numbers[0])
-stiffness, strength = stiffness * of_stiffness, strength * of_strength
-kinematic = hardening * stiffness / (1.0 - hardening)
-ground = [float(line) for line in open("motion.txt")]
-with open("response.txt", "w") as out:
+
+def solve(stiffness: float, strength: float, hardening: float, damping: float, dt: float, ground: list) -> list:
+    """(absolute acceleration, displacement) at each sample: Newmark's average acceleration, a return map."""
+    kinematic = hardening * stiffness / (1.0 - hardening)  # hardening modulus of the plastic part
     u = v = plastic = 0.0
     a = -ground[0]
-    out.write(f"0 {a + ground[0]!r} {u!r}\n")
-    for k in range(1, len(ground)):
+    rows = [(a + ground[0], u)]
+    for g in ground[1:]:
         predicted, free = u + dt * v + 0.25 * dt * dt * a, v + 0.5 * dt * a
         new, slip = u, plastic
         for _ in range(50):
@@ -25,7 +23,7 @@ with open("response.txt", "w") as out:
                 slip = plastic + (1.0 if trial > 0.0 else -1.0) * excess / (stiffness + kinematic)
                 force, tangent = stiffness * (new - slip), stiffness * kinematic / (stiffness + kinematic)
             acceleration = 4.0 * (new - predicted) / (dt * dt)
-            residual = acceleration + damping * (free + 0.5 * dt * acceleration) + force + ground[k]
+            residual = acceleration + damping * (free + 0.5 * dt * acceleration) + force + g
             correction = residual / (4.0 / (dt * dt) + 2.0 * damping / dt + tangent)
             new -= correction
             if abs(correction) < 1e-12:
@@ -33,4 +31,14 @@ with open("response.txt", "w") as out:
         a = 4.0 * (new - predicted) / (dt * dt)
         v = free + 0.5 * dt * a
         u, plastic = new, slip
-        out.write(f"{k} {a + ground[k]!r} {u!r}\n")
+        rows.append((a + g, u))
+    return rows
+
+
+if __name__ == "__main__":
+    numbers = [line.split() for line in open(sys.argv[1]) if not line.startswith("#")]
+    of_stiffness, of_strength, stiffness, strength, hardening, damping, dt = (float(word) for word in numbers[0])
+    motion = [float(line) for line in open("motion.txt")]
+    response = solve(stiffness * of_stiffness, strength * of_strength, hardening, damping, dt, motion)
+    with open("response.txt", "w") as out:
+        out.writelines(f"{k} {a!r} {u!r}\n" for k, (a, u) in enumerate(response))

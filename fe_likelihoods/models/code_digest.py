@@ -1,24 +1,34 @@
 """What a Python function computes, as a digest that is the same in every process.
 
 A result that is kept belongs to the code that made it. The digest goes through all that a function uses: its bytecode
-and constants, its defaults, the values it closes over, the global names it mentions, and in the same way the functions
-and classes of its own package that it calls. Of other packages only the name and the version enter. What cannot be
-told apart by its value (an open file, a handle of compiled code) is refused, and the user asked for a version.
+and constants, its defaults, the values it closes over, the global names it mentions, what it imports as it runs, and in
+the same way the functions and classes that it calls, in its own package and in any file that is not installed (beside
+it, say). Of the standard library and of installed packages the name and the version enter, of this library its sources.
+What cannot be told apart by its value (an open file, a handle of compiled code) is refused, and the user asked for a
+version.
 """
 
+import dis
 import enum
 import functools
+import importlib
+import importlib.metadata
+import importlib.util
+import logging
 import sys
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from hashlib import blake2b
-from pathlib import PurePath
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 
 __all__ = ["code_digest"]
+
+_LIBRARY = __name__.split(".")[0]
 
 
 def code_digest(function: Callable) -> str:
@@ -46,13 +56,22 @@ def _package(thing: Any) -> str:
 class _Digest:
     def __init__(self, package: str) -> None:
         self.package = package
-        self.seen: dict[int, tuple[int, Any]] = {}  # the order of appearance, and the thing so that it keeps its id
+        self.open: dict[int, int] = {}  # what is being digested, and how deep: where it is met again, a circle closes
+        self.done: dict[int, tuple[bytes, Any]] = {}  # with the thing, so that its id is not used again
 
     def of(self, thing: Any) -> bytes:
-        if id(thing) in self.seen and not isinstance(thing, int | float | str | bytes | bool | None):
-            return self._joined(["again", str(self.seen[id(thing)][0])])
-        self.seen[id(thing)] = len(self.seen), thing
-        return self._joined(self._parts(thing))
+        key = id(thing)
+        if key in self.done:
+            return self.done[key][0]
+        if key in self.open:
+            return self._joined(["circle", str(self.open[key])])
+        self.open[key] = len(self.open)
+        try:
+            digest = self._joined(self._parts(thing))
+        finally:
+            del self.open[key]
+        self.done[key] = digest, thing
+        return digest
 
     @staticmethod
     def _joined(parts: list[str | bytes]) -> bytes:
@@ -79,7 +98,9 @@ class _Digest:
         if isinstance(thing, PurePath):
             return ["path", str(thing)]
         if isinstance(thing, types.ModuleType):
-            return ["module", thing.__name__, self._version(thing.__name__)]
+            return ["module", thing.__name__, _version(thing.__name__)]
+        if isinstance(thing, logging.Logger):
+            return ["logger", thing.name]
         if isinstance(thing, types.CodeType):
             return self._code(thing)
         if isinstance(thing, functools.partial):
@@ -93,31 +114,45 @@ class _Digest:
         if isinstance(thing, types.FunctionType):
             return self._function(thing)
         if isinstance(getattr(thing, "py_func", None), types.FunctionType):  # compiled by numba
-            return ["compiled", self._version("numba"), self.of(thing.py_func)]
+            return ["compiled", _version("numba"), self.of(thing.py_func)]
         if isinstance(thing, types.BuiltinFunctionType | np.ufunc | type(len)):
             owner = getattr(thing, "__module__", None) or type(thing).__module__
-            return ["builtin", owner, thing.__name__, self._version(owner)]
+            return ["builtin", owner, thing.__name__, _version(owner)]
         if isinstance(thing, type):
             return self._class(thing)
         return self._object(thing)
 
     def _function(self, function: types.FunctionType) -> list[str | bytes]:
         parts: list[str | bytes] = ["function", function.__qualname__]
-        if function.__module__.split(".")[0] != self.package:
-            return [*parts, function.__module__, self._version(function.__module__)]
+        if self._known_by_version(function.__module__):
+            return [*parts, function.__module__, _version(function.__module__)]
         closed_over = [_contents(cell) for cell in function.__closure__ or ()]
         parts += [self._joined(self._code(function.__code__))]
         parts += map(self.of, (function.__defaults__, function.__kwdefaults__, closed_over))
-        for name in sorted(set(_names(function.__code__))):
+        names = sorted(set(_names(function.__code__)))
+        for name in names:
             if name in function.__globals__:
-                parts += [name, self._told(name, function.__globals__[name], function)]
+                parts += self._told(name, function.__globals__[name], names, function)
+        for name in sorted(set(_imports(function))):
+            module = name if self._known_by_version(name) else importlib.import_module(name)
+            if isinstance(module, str):
+                parts += [name, _version(name)]
+            else:
+                parts += self._told(name, module, names, function)
         return parts
 
-    def _told(self, name: str, value: Any, function: types.FunctionType) -> bytes:
+    def _told(self, name: str, value: Any, names: list[str], function: types.FunctionType) -> list[str | bytes]:
+        """Digest of a name that a function uses, and of what it may use of it behind a dot, if it is a module."""
         try:
-            return self.of(value)
+            parts = [name, self.of(value)]
         except ValueError as error:
             raise ValueError(f"{function.__qualname__} uses {name}, and {error}") from None
+        if isinstance(value, types.ModuleType) and not self._known_by_version(value.__name__):
+            members = [member for member in names if member in vars(value) and vars(value)[member] is not value]
+            for member in members:
+                inner = [other for other in names if other != member]
+                parts += self._told(member, vars(value)[member], inner, function)
+        return parts
 
     def _code(self, code: types.CodeType) -> list[str | bytes]:
         parts = map(self.of, (code.co_consts, code.co_names, code.co_varnames))
@@ -125,8 +160,8 @@ class _Digest:
 
     def _class(self, thing: type) -> list[str | bytes]:
         parts: list[str | bytes] = ["class", thing.__qualname__]
-        if thing.__module__.split(".")[0] != self.package:
-            return [*parts, thing.__module__, self._version(thing.__module__)]
+        if self._known_by_version(thing.__module__):
+            return [*parts, thing.__module__, _version(thing.__module__)]
         if issubclass(thing, tuple) and hasattr(thing, "_fields"):
             return [*parts, *thing._fields]
         skipped = {"__doc__", "__module__", "__dict__", "__weakref__", "__annotations__", "__static_attributes__"}
@@ -161,11 +196,60 @@ class _Digest:
             )
         return ["object", self.of(type(thing)), *(self.of(part) for item in state.items() for part in item)]
 
-    @staticmethod
-    def _version(module: str) -> str:
-        top = sys.modules.get(module.split(".")[0])
-        version = getattr(top, "__version__", "")
+    def _known_by_version(self, module: str) -> bool:
+        """Whether a module is told by name and version: neither the function's package nor a file of the user's own."""
+        top = module.split(".")[0]
+        return top != self.package and (top == _LIBRARY or not _is_own(top))
+
+
+@functools.cache
+def _is_own(top: str) -> bool:
+    """Whether a module is a file neither installed nor of the standard library: it changes without a version."""
+    if top in sys.stdlib_module_names:
+        return False
+    module = sys.modules.get(top)
+    try:
+        spec = module.__spec__ if module else importlib.util.find_spec(top)
+    except (ValueError, ImportError):
+        spec = None
+    found = getattr(module, "__file__", None) or getattr(spec, "origin", None)
+    places = [found] if found else list(getattr(spec, "submodule_search_locations", None) or [])
+    return any(not {"site-packages", "dist-packages"} & set(PurePath(place).parts) for place in places)
+
+
+@functools.cache
+def _version(module: str) -> str:
+    """Version of a package; of this library and of a compiled module without version a digest; empty elsewhere."""
+    top = module.split(".")[0]
+    if top == _LIBRARY:
+        sources = sorted(Path(__file__).parents[1].rglob("*.py"))
+        return blake2b(b"".join(source.read_bytes() for source in sources), digest_size=16).hexdigest()
+    try:
+        return importlib.metadata.version(top)
+    except importlib.metadata.PackageNotFoundError:
+        file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
+        if file.name.endswith(tuple(EXTENSION_SUFFIXES)):
+            return blake2b(file.read_bytes(), digest_size=16).hexdigest()
+        version = getattr(sys.modules.get(top), "__version__", "")
         return version if isinstance(version, str) else ""
+
+
+def _imports(function: types.FunctionType) -> Iterator[str]:
+    """Full names of the modules that a function imports as it runs."""
+    codes = [function.__code__]
+    while codes:
+        code = codes.pop()
+        codes += [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+        before: list[Any] = []
+        for step in dis.get_instructions(code):
+            if step.opname == "IMPORT_NAME":
+                level = next((value for value in before[-2:] if isinstance(value, int)), 0)
+                name, package = "." * level + step.argval, function.__globals__.get("__package__") or ""
+                try:
+                    yield importlib.util.resolve_name(name, package)
+                except ImportError:
+                    raise ValueError(f"{function.__qualname__} imports {name}, but stands in no package") from None
+            before.append(step.argval)
 
 
 def _contents(cell: types.CellType) -> Any:

@@ -1,6 +1,7 @@
 """A Python function as a model: the same bits wherever it runs, a fingerprint of its code, and what goes wrong told."""
 
 import functools
+import json
 import math
 import multiprocessing
 import os
@@ -301,3 +302,65 @@ def test_fingerprint_is_the_same_in_another_process(hash_seed):
     environment = os.environ | {"PYTHONHASHSEED": hash_seed, "PYTHONPATH": str(ROOT)}
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert run.stdout.strip() == model_of().fingerprint, run.stderr
+
+
+CALLS = {
+    "name": "from aside import shift\ndef f(x):\n    return shift(x)",
+    "module": "import aside\ndef f(x):\n    return aside.shift(x)",
+    "submodule": "import pack.deep\ndef f(x):\n    return pack.deep.shift(x)",
+    "late": "def f(x):\n    from aside import shift\n    return shift(x)",
+    "late submodule": "def f(x):\n    import pack.deep as deep\n    return deep.shift(x)",
+    "relative": "def f(x):\n    import pack\n    return pack.late(x)",
+    "two steps": "import between\ndef f(x):\n    return between.shift(x)",
+    "class": "from aside import Spring\ndef f(x):\n    return Spring().shift(x)",
+    "constant": "import aside\ndef f(x):\n    return x + aside.NUMBER",
+}
+ASIDE = """
+NUMBER = {number}
+def shift(x):
+    return x + NUMBER
+class Spring:
+    def shift(self, x):
+        return x + {number}
+"""
+
+
+def test_a_change_in_a_file_beside_the_function_is_another_model(tmp_path):
+    """Files of the user's own that the function imports: an old simulation must not be served for their new state."""
+    for name, call in CALLS.items():
+        (tmp_path / f"own_{name.replace(' ', '_')}.py").write_text(call + "\n")
+    (tmp_path / "between.py").write_text("import aside\ndef shift(x):\n    return aside.shift(x)\n")
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("def late(x):\n    from .deep import shift\n    return shift(x)\n")
+    code = (
+        "import importlib, json; from fe_likelihoods.models.code_digest import code_digest\n"
+        f"names = {list(CALLS)!r}\n"
+        "own = {name: importlib.import_module('own_' + name.replace(' ', '_')).f for name in names}\n"
+        "print(json.dumps({name: code_digest(f) for name, f in own.items()}))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    found = []
+    for number in (1.0, 2.0, 1.0):
+        for file in ("aside.py", "pack/deep.py"):
+            (tmp_path / file).write_text(ASIDE.format(number=number))
+        run = subprocess.run(
+            [sys.executable, "-B", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert run.returncode == 0, run.stderr
+        found.append(json.loads(run.stdout))
+    assert found[0] == found[2]
+    assert [name for name in CALLS if found[0][name] == found[1][name]] == []
+
+
+def test_equal_values_need_not_be_the_same_objects():
+    """Whether two equal things are one object is an accident of the process, so it may not enter."""
+    one = (1.5, [2.5])
+    assert code_digest(scaled((one, one))) == code_digest(scaled(((1.5, [2.5]), (1.5, [2.5]))))
+
+
+def test_things_that_contain_themselves_end():
+    circle = [1.0]
+    circle.append(circle)
+    other = [2.0]
+    other.append(other)
+    assert code_digest(scaled(circle)) != code_digest(scaled(other))
