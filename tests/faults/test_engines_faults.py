@@ -150,6 +150,16 @@ def test_dask_tries_again_and_gives_up_on_the_deadly_item_alone(tmp_path):
         assert np.isneginf(values[3])
         assert np.isfinite(values[4:]).all()
         assert posterior.report()["failure_reasons"] == {"the worker process died each time that dask tried": 1}
+        # short runs travel in groups once their time is known: the one that kills is still told from its neighbours
+        many = np.column_stack([theta(bad.FINE, 40), np.full(40, 0.5)])
+        expected = posterior_of(Treacherous(), top=20.0)(many)
+        np.testing.assert_array_equal(posterior(many), expected)
+        many[:, 1] *= 0.5
+        expected = posterior_of(Treacherous(), top=20.0)(many)
+        many[3, 0] += bad.KILLED
+        values = posterior(many)
+        assert np.isneginf(values[3])
+        np.testing.assert_array_equal(np.delete(values, 3), np.delete(expected, 3))
 
 
 @needs("mpi4py")

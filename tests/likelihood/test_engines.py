@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -99,6 +100,42 @@ def test_kind_of_engine():
     assert as_engine(3).workers == as_engine(np.int64(3)).workers == 3
     assert type(as_engine(Client())) is DaskEngine
     assert type(as_engine(Recorder())) is PoolEngine
+
+
+def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
+    """A client that does the work itself, and notes what each task was."""
+
+    class Client:
+        def __init__(self):
+            self.tasks = []
+
+        def nthreads(self):
+            return {"one": 1, "other": 1}
+
+        def map(self, function, groups, pure):
+            assert not pure
+            self.tasks.append([len(group) for group in groups])
+            return [function(group) for group in groups]
+
+        def gather(self, futures):
+            return futures
+
+    def slow(item):
+        time.sleep(0.35)
+        return item, ""
+
+    monkeypatch.setattr(engines, "_settle", lambda: None)
+    client = Client()
+    engine = as_engine(client)
+    items = list(range(64))
+    for _ in range(2):
+        assert engine.map(lambda item: (item, ""), items) == [(item, "") for item in items]
+    assert engine.map(slow, items[:3]) == [(item, "") for item in items[:3]]
+    assert engine.map(slow, items[:12]) == [(item, "") for item in items[:12]]
+    assert client.tasks[0] == [1] * 64  # nothing is known yet
+    assert client.tasks[1][0] == 16 and client.tasks[1][-1] == 1 and sum(client.tasks[1]) == 64
+    assert len(client.tasks[1]) < 20
+    assert client.tasks[3] == [2, 2, 2, 1, 1, 1, 1, 1, 1]  # .35 s each, so two to a second
 
 
 @pytest.mark.parametrize(
