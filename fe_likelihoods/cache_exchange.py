@@ -9,7 +9,6 @@ import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 __all__ = ["read_rows", "write_rows"]
@@ -42,6 +41,8 @@ def write_rows(path: str | os.PathLike, pages: Iterable[list[Row]]) -> int:
     OSError
         If the file cannot be written.
     """
+    import h5py  # takes longer to start than the whole cache
+
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}; make it first")
@@ -78,6 +79,8 @@ def read_rows(path: str | os.PathLike) -> list[Row]:
     ValueError
         If the file is not there, is something else, of another version, or damaged.
     """
+    import h5py
+
     try:
         with h5py.File(path, "r") as file:
             schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -303,6 +302,8 @@ def write_dataset(path: str | Path, record: Record, measurements: Measurements, 
     ValueError
         If the attributes are not of that kind, or the folder does not exist.
     """
+    import h5py  # takes longer to start than this package
+
     path = Path(path)
     text = _attributes_text(attributes or {})
     if not path.parent.is_dir():
@@ -335,6 +336,8 @@ def read_dataset(path: str | Path) -> Dataset:
         If the file is not there, is not such a data set, is of another version, lacks a part, or its contents do not
         have the checksum that was written with them.
     """
+    import h5py
+
     try:
         with h5py.File(path, "r") as file:
             schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")

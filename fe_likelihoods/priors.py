@@ -16,7 +16,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import erf, erfinv, ndtr, ndtri
 
 __all__ = ["Distribution", "HalfNormal", "LogNormal", "Prior", "RandomState", "TruncatedNormal", "Uniform"]
 
@@ -123,6 +122,8 @@ def _set_positive(distribution: Distribution, **values: float) -> None:
 
 def _standard_truncated_normal(a: float, b: float) -> tuple[float, float, float]:
     """Mass of a standard normal on [a, b]; mean and variance of the normal truncated there."""
+    from scipy.special import erf, ndtr  # scipy starts slowly, and whoever only evaluates densities needs none of it
+
     if (b - a) * max(abs(a), abs(b), 1.0) < 1.0:
         # differences of tail probabilities cancel on a narrow interval; the density is smooth there, so integrate it
         half = 0.5 * (b - a)
@@ -210,6 +211,8 @@ class TruncatedNormal(Distribution):
         return self._log_constant - 0.5 * z * z
 
     def _quantile(self, u: np.ndarray) -> np.ndarray:
+        from scipy.special import ndtr, ndtri
+
         a, b = self._standard_bounds
         below = ndtr(a) + u * self._mass
         above = ndtr(-b) + (1.0 - u) * self._mass
@@ -248,6 +251,8 @@ class HalfNormal(Distribution):
         return self._log_constant - 0.5 * z * z
 
     def _quantile(self, u: np.ndarray) -> np.ndarray:
+        from scipy.special import erfinv
+
         return self.sd * math.sqrt(2.0) * erfinv(u)
 
 
@@ -323,6 +328,8 @@ class LogNormal(Distribution):
         )
 
     def _quantile(self, u: np.ndarray) -> np.ndarray:
+        from scipy.special import ndtri
+
         return self.median * np.exp(self.log_sd * ndtri(u))
 
 

@@ -7,6 +7,8 @@ responses of the paper could not be had; the bundled data are **synthetic** (see
 
 `isolated_bridge` is the isolated bridge of the paper on TMCMC: ten multiples of nominal values of friction and dampers.
 Its data are **synthetic** and most nominal values are **assumed**.
+
+The models are imported by the functions that make them: numba takes longer to start than the rest together.
 """
 
 from __future__ import annotations
@@ -21,8 +23,7 @@ import numpy as np
 from .cache import SimulationCache
 from .channels import Dataset, Measurements, read_dataset
 from .likelihood import FELikelihood
-from .models.isolated_bridge import CHANNEL_SETS, IsolatedBridge
-from .models.rc_column import RCColumn
+from .models.bridge_inputs import CHANNEL_SETS
 from .noise import GaussianNoise, SharedGaussianNoise
 from .posterior import Posterior
 from .priors import HalfNormal, Prior, TruncatedNormal
@@ -82,6 +83,8 @@ def bridge_column_measurements(
     **changes
         Other arguments of `RCColumn.lhpost`.
     """
+    from .models.rc_column import RCColumn
+
     model = RCColumn.lhpost(record, mesh=n_strips, substeps=substeps, **changes)
     values = model.simulate([BRIDGE_COLUMN_MEANS[name] for name in model.parameter_names])
     if noise:
@@ -145,6 +148,8 @@ def bridge_column(
     ValueError
         For measurements without a record, or that do not fit it.
     """
+    from .models.rc_column import RCColumn
+
     if record is None:
         if measurements is not None:
             raise ValueError("measurements came without the record that caused them: give record= too")
@@ -233,6 +238,8 @@ def isolated_bridge_measurements(
     **changes
         Other arguments of `IsolatedBridge`.
     """
+    from .models.isolated_bridge import IsolatedBridge
+
     model = IsolatedBridge(record, outputs=outputs, step=step, every=every, **changes)
     values = model.simulate([theta[name] for name in model.parameter_names])
     rms = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
@@ -303,6 +310,8 @@ def isolated_bridge(
     ValueError
         For unknown names, for measurements without a record, or that do not fit it.
     """
+    from .models.isolated_bridge import IsolatedBridge
+
     if noise not in ("shared", "per channel"):
         raise ValueError(f'expected noise="shared" or "per channel"; got {noise!r}')
     if record is None:

@@ -1,4 +1,4 @@
-"""What an isolated bridge is made of: piers and devices, each checked when it is made.
+"""What an isolated bridge is made of: piers and devices, each checked when it is made; and its sets of channels.
 
 The defaults are the quarter-scale bridge of NCEER 94-0002 as far as it could be reconstructed; most values are
 **assumed** or recalled from sister reports (specs/isolated_bridge.md, section 4, says which).
@@ -12,7 +12,12 @@ import numpy as np
 
 from .inputs import number, refuse, whole_number
 
-__all__ = ["Bearing", "Damper", "Pier", "Rubber"]
+__all__ = ["CHANNEL_SETS", "Bearing", "Damper", "Pier", "Rubber"]
+
+_PIER_1 = ("Ub_1", "Fb_1", "drift_1", "shear_1", "acc_p1")
+_PIER_2 = ("Ub_2", "Fb_2", "drift_2", "shear_2", "acc_p2")
+CHANNEL_SETS = {5: _PIER_1, 6: (*_PIER_1, "Ub_2"), 10: _PIER_1 + _PIER_2}
+"""The sets of measured channels: the paper's five of pier 1, six (its figure of the fit), and both piers."""
 
 
 @dataclass(frozen=True)

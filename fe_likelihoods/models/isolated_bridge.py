@@ -36,7 +36,7 @@ from ..kernels.isolated import N_OUT, N_STATES, step_isolated
 from ..kernels.jit import KERNEL_HASH
 from ..records import Record
 from .base import MisfitBatch, SimulationBatch, SimulationFailed
-from .bridge_inputs import Bearing, Damper, Pier, Rubber
+from .bridge_inputs import CHANNEL_SETS, Bearing, Damper, Pier, Rubber
 from .inputs import channel_rows, number, refuse, theta_row, theta_rows, whole_number
 from .threads import map_threads
 
@@ -68,11 +68,6 @@ _CHANNELS = {
     **{f"mean_{name}": Channel(f"mean_{name}", *what) for name, what in _OF_A_PIER.items()},
 }
 ALL_CHANNELS = tuple(name for name in _CHANNELS if not name.startswith("mean_"))
-
-_PIER_1 = ("Ub_1", "Fb_1", "drift_1", "shear_1", "acc_p1")
-_PIER_2 = ("Ub_2", "Fb_2", "drift_2", "shear_2", "acc_p2")
-CHANNEL_SETS = {5: _PIER_1, 6: (*_PIER_1, "Ub_2"), 10: _PIER_1 + _PIER_2}
-"""The sets of measured channels: the paper's five of pier 1, six (its figure of the fit), and both piers."""
 
 _FORMS = {"bouc-wen": BOUC_WEN, "elastic-plastic": ELASTIC_PLASTIC, "coulomb": COULOMB}
 _STATE_ROWS = (

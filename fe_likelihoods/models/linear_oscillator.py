@@ -19,7 +19,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from ..channels import Channel
 from ..records import Record
@@ -81,6 +80,8 @@ def respond(
     N. C. Nigam, P. C. Jennings, Calculation of response spectra from strong-motion earthquake records, Bulletin of the
     Seismological Society of America 59(2), 1969, 909-922.
     """
+    from scipy.signal import lfilter  # takes longer to start than all else here
+
     damped_frequency = angular_frequency * math.sqrt(1.0 - damping_ratio**2)
     eigenvalue = complex(-damping_ratio * angular_frequency, damped_frequency)
     decay = cmath.exp(eigenvalue * dt)

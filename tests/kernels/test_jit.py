@@ -120,6 +120,34 @@ def test_decorating_leaves_the_setting_of_others_alone():
     assert before == numba.config.CACHE_DIR
 
 
+FIRST_EVALUATIONS = """
+import json
+import numba
+import numpy as np
+from numba.core.event import install_recorder
+from fe_likelihoods import problems
+with install_recorder("numba:compile") as compiled:
+    column = problems.bridge_column(duration=0.25)
+    data = problems.isolated_bridge_data()
+    short = {"record": data.record.trim(0.0, 0.25), "measurements": data.measurements.trim(0.0, 0.25)}
+    bridge = problems.isolated_bridge(channels=6, **short)
+    values = [posterior(posterior.sample_prior(1, 1)[0]) for posterior in (column, bridge)]
+    events = len(compiled.buffer)
+    numba.njit(lambda x: x)(1.0)  # control: a compilation is seen
+    print(json.dumps([bool(np.isfinite(values).all()), events, len(compiled.buffer) - events]))
+"""
+
+
+@golden.compiled_only
+def test_second_start_compiles_nothing():
+    """First likelihoods of both posteriors in a new interpreter, once the machine code is on disk."""
+    python(FIRST_EVALUATIONS)  # compiles what earlier tests have not
+    finite, events, control = json.loads(python(FIRST_EVALUATIONS))
+    assert finite
+    assert events == 0
+    assert control > 0
+
+
 # --- compiled against pure Python ---
 
 

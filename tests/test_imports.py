@@ -1,0 +1,81 @@
+"""An import brings no more along than it needs, and every name is there as if it did."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fe_likelihoods
+import samplers
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = {
+    *("arviz", "corner", "distributed", "emcee", "h5py", "matplotlib", "numba", "pandas", "xarray"),
+    *("scipy.signal", "scipy.special", "scipy.stats"),
+}
+
+
+def fresh(code: str) -> str:
+    """What `code` prints in a new interpreter that finds the packages under test."""
+    paths = filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+@pytest.mark.parametrize(
+    ("code", "allowed"),
+    [
+        ("import fe_likelihoods, samplers", set()),
+        ("import fe_likelihoods.problems, fe_likelihoods.priors, fe_likelihoods.models.base", set()),
+        ("import fe_likelihoods.cache, fe_likelihoods.likelihood, fe_likelihoods.records", set()),
+        ("import fe_likelihoods.models.linear_oscillator, fe_likelihoods.models.function", set()),
+        ("import fe_likelihoods.models.rc_column", {"numba"}),
+        ("import fe_likelihoods; fe_likelihoods.problems.bridge_column()", {"h5py", "numba", "scipy.special"}),
+        # emcee brings all of scipy.stats
+        ("from samplers import SMCSampler", {"emcee", "h5py", "scipy.special", "scipy.stats"}),
+    ],
+)
+def test_import_brings_what_it_needs(code, allowed):
+    brought = set(json.loads(fresh(f"import json, sys; {code}; print(json.dumps(sorted(sys.modules)))"))) & HEAVY
+    assert brought <= allowed
+    assert brought or not allowed  # where something is allowed it is there: what is looked for can be found
+
+
+@pytest.mark.parametrize("package", ["fe_likelihoods", "samplers"])
+def test_every_module_is_there_after_the_package(package):
+    names = sorted(path.stem for path in (ROOT / package).glob("*.py") if path.stem != "__init__")
+    assert len(names) > 10
+    code = (
+        f"import {package} as package; names = {names}; "
+        "assert set(names) <= set(dir(package)); print([getattr(package, name).__name__ for name in names])"
+    )
+    assert fresh(code).strip() == str([f"{package}.{name}" for name in names])
+
+
+def test_every_public_name_of_the_samplers_is_there():
+    code = "import samplers; print([getattr(samplers, name) is not None for name in samplers.__all__])"
+    assert fresh(code).strip() == str([True] * len(samplers.__all__))
+    assert fresh("from samplers import *; print(SMCSampler.__name__)").strip() == "SMCSampler"
+    assert set(samplers._HOME) == set(samplers.__all__) <= set(dir(samplers))
+
+
+@pytest.mark.parametrize("package", [fe_likelihoods, samplers])
+def test_unknown_name_is_an_attribute_error(package):
+    assert not hasattr(package, "absent")
+    with pytest.raises(AttributeError, match="no attribute and no module 'absent'"):
+        package.absent  # noqa: B018
+
+
+@pytest.mark.parametrize("name", ["SMCSampler", "smc"])
+def test_what_a_module_misses_itself_is_named(name):
+    """Not hidden behind an AttributeError: the message says that emcee is not there."""
+    code = (
+        "import sys; sys.modules['emcee'] = None; import samplers\n"
+        f"try:\n    samplers.{name}\nexcept ModuleNotFoundError as error:\n    print(error.name)"
+    )
+    assert fresh(code).strip() == "emcee"
