@@ -25,6 +25,7 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -75,6 +76,17 @@ _STATE_ROWS = (
     *("deck velocity", "pier_1 velocity", "rotation_1 velocity", "pier_2 velocity", "rotation_2 velocity"),
     *("damper_1", "damper_2"),
 )
+
+
+class _Fixed(NamedTuple):
+    """What is the same for every theta: x' = A x + [b, B_F] [a_g, F], and what else the kernel is given."""
+
+    system: np.ndarray  # A (12, 12), the dampers' rows zero
+    inputs: np.ndarray  # b and B_F (12, 3)
+    kinematics: np.ndarray  # B (2, 5)
+    weights: np.ndarray  # load on the bearings at the samples of the record (n_steps, 2) [N]
+    law: np.ndarray  # of the rubber (10,)
+    tolerance: float  # of a correction of F [N]
 
 
 @dataclass(frozen=True)
@@ -213,7 +225,7 @@ class IsolatedBridge:
 
     def history(self, theta: np.ndarray) -> BridgeHistory:
         """States, hysteretic variables and all channels; same errors as `simulate`."""
-        values, iterations = self._integrate(theta_row(theta, self.parameters))
+        values, iterations = self._integrate(theta_row(theta, self.parameters), self._fixed())
         beyond = np.abs(self._kinematics() @ values[:5]).max(axis=1) / (self.rubber.limit * self.rubber.scale)
         rows = csr_array(self._channel_matrix(ALL_CHANNELS)) @ self._drivers(values)
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
@@ -267,8 +279,8 @@ class IsolatedBridge:
     def _linear_rubber(self) -> float:
         return self.rubber.skeleton[0] / self.rubber.scale
 
-    def _system(self, v: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-        """A (12, 12), and what a_g and F give, (12, 3): x' = A x + [b, B_F] [a_g, F]."""
+    def _fixed(self) -> _Fixed:
+        """What is the same for every theta."""
         mass, damping, stiffness = self._structure()
         b = self._kinematics()
         inverse = np.linalg.inv(mass)
@@ -277,16 +289,25 @@ class IsolatedBridge:
         a[5:10, :5] = -inverse @ (stiffness + self._linear_rubber() * b.T @ b)
         a[5:10, 5:10] = -inverse @ damping
         a[5:10, 10:] = -inverse @ b.T
-        for i, damper in enumerate(self.dampers):
-            a[10 + i, 5:10] = damper.count * v[f"Kd_{i + 1}"] * b[i]
-            a[10 + i, 10 + i] = -v[f"Kd_{i + 1}"] / v[f"C0_{i + 1}"]
         inputs[5:10, 0] = [-1.0, -1.0, 0.0, -1.0, 0.0]
         inputs[5:10, 1:] = -inverse @ b.T
-        return a, inputs
+        load = np.array([bearing.load for bearing in self.bearings])
+        lift = np.zeros(self.record.n_steps) if self.vertical is None else self.vertical.acceleration / self.gravity
+        rubber = self.rubber
+        law = np.array([*rubber.skeleton[1:], *rubber.half_loop, rubber.scale, rubber.limit])
+        return _Fixed(a, inputs, b, np.maximum(0.0, 1.0 + lift)[:, None] * load, law, self.tolerance * load.min())
 
-    def _step_matrices(self, v: dict[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _system(self, v: dict[str, float], fixed: _Fixed) -> np.ndarray:
+        """A (12, 12), with the dampers."""
+        a = fixed.system.copy()
+        for i, damper in enumerate(self.dampers):
+            a[10 + i, 5:10] = damper.count * v[f"Kd_{i + 1}"] * fixed.kinematics[i]
+            a[10 + i, 10 + i] = -v[f"Kd_{i + 1}"] / v[f"C0_{i + 1}"]
+        return a
+
+    def _step_matrices(self, v: dict[str, float], fixed: _Fixed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """T transposed, H1, Q H1 of `kernels.isolated.step_isolated`."""
-        a, inputs = self._system(v)
+        a, inputs = self._system(v, fixed), fixed.inputs
         n, m = inputs.shape
         augmented = np.zeros((n + 2 * m, n + 2 * m))
         augmented[:n, :n], augmented[:n, n : n + m] = a * self.step, inputs * self.step
@@ -305,7 +326,7 @@ class IsolatedBridge:
         ends = second[:, 1:]
         advance = np.column_stack([phi, first[:, 0], second[:, 0], phi @ ends + first[:, 1:]])
         q = np.zeros((4, n))
-        q[:2, :5] = q[2:, 5:10] = self._kinematics()
+        q[:2, :5] = q[2:, 5:10] = fixed.kinematics
         return np.ascontiguousarray(np.vstack([advance, q @ advance]).T), np.ascontiguousarray(ends), q @ ends
 
     # ------------------------------------------------------------------ a run
@@ -321,13 +342,10 @@ class IsolatedBridge:
                 raise SimulationFailed(f"{name} = {value:.4g} makes no device: it must be positive")
         return values
 
-    def _integrate(self, theta: np.ndarray) -> tuple[np.ndarray, float]:
+    def _integrate(self, theta: np.ndarray, fixed: _Fixed) -> tuple[np.ndarray, float]:
         """Output of the kernel (16, n_steps of the record), and Newton iterations per step."""
         v = self._values(theta)
-        matrix, ends, compliance = self._step_matrices(v)
-        load = np.array([bearing.load for bearing in self.bearings])
-        lift = np.zeros(self.record.n_steps) if self.vertical is None else self.vertical.acceleration / self.gravity
-        weights = np.maximum(0.0, 1.0 + lift)[:, None] * load
+        matrix, ends, compliance = self._step_matrices(v, fixed)
         bearing = np.array(
             [
                 [v[f"fmin_{i}"], v[f"df_{i}"], v[f"a_{i}"], b.yield_displacement]
@@ -335,8 +353,6 @@ class IsolatedBridge:
                 for i, b in enumerate(self.bearings, 1)
             ]
         )
-        rubber = self.rubber
-        law = np.array([*rubber.skeleton[1:], *rubber.half_loop, rubber.scale, rubber.limit])
         out = np.zeros((self.record.n_steps, N_OUT))
         n_sub = round(self.record.dt / self.step)
         status, iterations = step_isolated(
@@ -344,13 +360,13 @@ class IsolatedBridge:
             ends,
             compliance,
             self.record.acceleration,
-            weights,
+            fixed.weights,
             n_sub,
             bearing,
             math.sqrt(2.0 * self.bearings[0].gamma - 1.0),
-            law,
+            fixed.law,
             _FORMS[self.friction],
-            self.tolerance * load.min(),
+            fixed.tolerance,
             self.max_iterations,
             np.zeros((2, 16)),
             out,
@@ -390,11 +406,11 @@ class IsolatedBridge:
         """A function of theta that gives its response: what is the same for every theta is done once."""
         # sparse, as a dense product is BLAS's, whose last bit depends on its number of threads, so on the engine
         to_channels = csr_array(self._channel_matrix(self.outputs))
-        b, end_of_law = self._kinematics(), self.rubber.limit * self.rubber.scale
+        fixed, end_of_law = self._fixed(), self.rubber.limit * self.rubber.scale
 
         def run(theta: np.ndarray) -> np.ndarray:
-            values, _ = self._integrate(theta)
-            largest = np.abs(b @ values[:5]).max()
+            values, _ = self._integrate(theta, fixed)
+            largest = np.abs(fixed.kinematics @ values[:5]).max()
             if largest > end_of_law and self not in _WARNED:
                 _WARNED.add(self)
                 logger.warning(
