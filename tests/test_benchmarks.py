@@ -2,12 +2,17 @@
 
 import json
 
+import emcee
 import numpy as np
 import pytest
 
-from tests.benchmarks import peers
+from samplers import SMCSampler
+from tests.benchmarks import job, peers
+from tests.benchmarks.comparison import compare
+from tests.benchmarks.growth import exponent
 from tests.benchmarks.rows import Row, as_table, machine, write_json
 from tests.benchmarks.targets import as_row, errors, target_named
+from tests.contract.targets import Gaussian
 
 ANSWER = {
     "evaluations": 100,
@@ -62,3 +67,59 @@ def test_target_counts_every_point_of_the_likelihood_and_none_outside_the_prior(
     assert target.evaluations == 1
     target.log_likelihood(np.zeros((5, 4)))
     assert target.evaluations == 6
+
+
+def test_table_parts_its_groups_and_shows_whole_numbers_in_full():
+    table = as_table([Row("runs", "a", 234567.0, "", "x")], [Row("time", "b", 0.0012345, "s")]).splitlines()
+    assert [line.split() for line in table[2:]] == [["runs", "a", "234567", "x"], [], ["time", "b", "0.00123", "s"]]
+
+
+def test_two_files_side_by_side(tmp_path):
+    before = [Row("time", "a", 2.0, "s"), Row("time", "b", 1.0, "s"), Row("time", "gone", 1.0, "s")]
+    after = [Row("time", "a", 1.0, "s"), Row("time", "b", 1.05, "s"), Row("time", "c", None, "s", "stopped")]
+    for name, rows, cpu in (("before", before, "one"), ("after", after, "another")):
+        write_json(tmp_path / name, rows, [machine() | {"cpu": cpu}])
+    lines = compare(tmp_path / "before", tmp_path / "after").splitlines()
+    assert "the processors differ" in lines[2]
+    assert [line.split() for line in lines[5:]] == [
+        ["time", "a", "2", "1", "s", "0.5", "*"],
+        ["time", "b", "1", "1.05", "s", "1.05"],
+        ["time", "c", "-", "-", "s", "-"],
+        ["time", "gone", "1", "-", "s", "-"],
+    ]
+
+
+@pytest.mark.parametrize("content", [None, "not JSON", "[]", '{"rows": []}'])
+def test_file_that_cannot_be_compared_is_named(tmp_path, content):
+    if content is not None:
+        (tmp_path / "other").write_text(content)
+    with pytest.raises(ValueError, match="other: expected a file that"):
+        compare(tmp_path / "other", tmp_path / "other")
+
+
+def test_exponent_of_a_power_law():
+    sizes = np.array([10.0, 20.0, 40.0])
+    assert exponent(sizes, 3.0 * sizes**1.5) == pytest.approx(1.5)
+
+
+def test_run_over_its_limit_is_stopped_and_has_a_row():
+    rows = job.job(1, limit=0.2)  # less than the imports take
+    assert [row.value for row in rows] == [None, None]
+    assert all(row.note == "stopped at 0.2 s, before its first stage was done" for row in rows)
+
+
+def test_stopped_run_tells_how_far_it_came(tmp_path):
+    target = Gaussian(2)
+    backend = emcee.backends.HDFBackend(tmp_path / "chain.h5")
+    sampler = SMCSampler(50, 2, target, vectorize=True, seed=1, backend=backend)
+    sampler.run_mcmc(None, 1)
+    evaluations = sum(stage.evaluations for stage in sampler.ladder)
+    assert job._how_far(tmp_path / "chain.h5") == (
+        f"after {len(sampler.ladder)} stages and {evaluations} evaluations, at beta = 1"
+    )
+
+
+def test_two_settings_are_told_apart_by_cost_and_answer():
+    default = {"simulations": 10, "seconds": 2.0, "cpu": 2.0, "mean": [1.0, 5.0], "sd": [1.0, 2.0]}
+    paper = {"simulations": 40, "seconds": 6.0, "cpu": 4.0, "mean": [1.5, 4.0], "sd": [1.1, 1.0]}
+    assert [row.value for row in job._beside(default, paper, "")] == pytest.approx([4.0, 3.0, 2.0, 0.5, 50.0])

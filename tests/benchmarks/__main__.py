@@ -1,9 +1,11 @@
-"""``python -m tests.benchmarks [names] [--repeats 3] [--out results/benchmarks.json]``."""
+"""``python -m tests.benchmarks [names] [--repeats 3] [--out FILE]``, or ``--compare BEFORE AFTER``: see --help."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 
-from . import bridge, cache, column, cost, engines, peers, samplers, startup
+from . import bridge, cache, column, cost, engines, growth, job, peers, samplers, startup, storage
+from .comparison import compare
 from .rows import as_table, machine, write_json
 
 BENCHMARKS = {
@@ -13,10 +15,14 @@ BENCHMARKS = {
     "imports": startup.imports,
     "compilation": startup.compilation,
     "cost": cost.cost,
+    "growth": growth.growth,
     "cache": cache.cache,
+    "storage": storage.storage,
     "engines": engines.engines,
     "samplers": samplers.rows,
     "peers": peers.rows,
+    "memory": job.memory,
+    "job": job.job,
 }
 
 
@@ -26,18 +32,32 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help=f"some of {', '.join(BENCHMARKS)}; all by default")
     parser.add_argument("--repeats", type=int, default=3, help="of which the median is taken (default 3)")
     parser.add_argument("--out", type=Path, default=Path("results") / "benchmarks.json")
+    parser.add_argument(
+        "--compare", nargs=2, type=Path, metavar=("BEFORE", "AFTER"), help="two such files; runs nothing"
+    )
+    parser.add_argument("--every", type=int, default=job.EVERY, help="of job: one sample in so many; 1: full record")
+    parser.add_argument("--limit", type=float, default=job.LIMIT, help="of job: seconds for each run; 0: none")
     arguments = parser.parse_args()
+    if arguments.compare:
+        try:
+            print(compare(*arguments.compare))
+        except ValueError as error:
+            parser.error(str(error))
+        return
     if unknown := set(arguments.names) - set(BENCHMARKS):
         parser.error(f"expected names out of {', '.join(BENCHMARKS)}; got {', '.join(unknown)}")
     if arguments.repeats < 1:
         parser.error(f"expected one repeat or more; got {arguments.repeats}")
+    if arguments.every < 1 or arguments.limit < 0:
+        parser.error(f"expected --every of 1 or more, --limit not below 0; got {arguments.every}, {arguments.limit:g}")
+    benchmarks = BENCHMARKS | {"job": partial(job.job, every=arguments.every, limit=arguments.limit)}
     machines = [machine()]
-    rows = [row for name in arguments.names or BENCHMARKS for row in BENCHMARKS[name](arguments.repeats)]
+    groups = [benchmarks[name](arguments.repeats) for name in arguments.names or benchmarks]
     machines.append(machine())
     print(f"{machines[0]['cpu']}, {machines[0]['cores']} cores; load average of the last minute", end=" ")
     print(" before and ".join(str(m["load_average"][:1]) for m in machines), "after")
-    print(as_table(rows))
-    write_json(arguments.out, rows, machines)
+    print(as_table(*groups))
+    write_json(arguments.out, [row for rows in groups for row in rows], machines)
     print(f"kept in {arguments.out}")
 
 

@@ -4,12 +4,13 @@ import datetime
 import json
 import os
 import platform
+import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Row", "as_table", "machine", "write_json"]
+__all__ = ["Row", "aligned", "as_table", "machine", "number", "write_json"]
 
 
 class Row(NamedTuple):
@@ -20,6 +21,17 @@ class Row(NamedTuple):
     value: float | None
     unit: str
     note: str = ""
+
+
+def _commit() -> str:
+    """Of the working tree, with a plus if it was edited since; empty where there is none."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+        edited = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return commit.stdout.strip() + "+" * bool(edited.stdout.strip())
 
 
 def machine() -> dict[str, str | int | list[float]]:
@@ -37,27 +49,40 @@ def machine() -> dict[str, str | int | list[float]]:
         "cpu": cpu,
         "cores": os.cpu_count() or 1,
         "python": platform.python_version(),
+        "commit": _commit(),
         **versions,
         "load_average": [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else [],
     }
 
 
-def as_table(rows: Sequence[Row]) -> str:
-    """The rows as aligned text, the value with three significant digits, a dash for none."""
-    cells = [("what", "case", "value", "unit", "note")]
-    cells += [
-        (row.what, row.case, "-" if row.value is None else f"{row.value:.3g}", row.unit, row.note) for row in rows
-    ]
-    widths = [max(len(line[i]) for line in cells) for i in range(5)]
-    lines = []
-    for line in cells:
+def number(value: float | None) -> str:
+    """Three significant digits, whole numbers in full, a dash for none."""
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if 1000.0 <= abs(value) < 1e9 else f"{value:.3g}"
+
+
+def aligned(lines: Sequence[Sequence[str]], right: Sequence[int]) -> str:
+    """Cells below one another, the first line as the head, the columns `right` flush right."""
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    out = []
+    for line in lines:
         padded = [
-            text.rjust(width) if i == 2 else text.ljust(width)
+            text.rjust(width) if i in right else text.ljust(width)
             for i, (text, width) in enumerate(zip(line, widths, strict=True))
         ]
-        lines.append("  ".join(padded).rstrip())
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(lines)
+        out.append("  ".join(padded).rstrip())
+    out.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(out)
+
+
+def as_table(*groups: Sequence[Row]) -> str:
+    """The rows as aligned text, an empty line between groups."""
+    cells = [("what", "case", "value", "unit", "note")]
+    for i, rows in enumerate(groups):
+        cells += [("",) * 5] * (i > 0)
+        cells += [(row.what, row.case, number(row.value), row.unit, row.note) for row in rows]
+    return aligned(cells, right=(2,))
 
 
 def write_json(path: Path, rows: Sequence[Row], machines: Sequence[dict]) -> None:
