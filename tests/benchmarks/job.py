@@ -31,7 +31,10 @@ BATCH = 500
 
 
 def _peak() -> float:
-    """Most memory that this process ever held [MiB]."""
+    """Most memory that this program ever held [MiB]."""
+    status = Path("/proc/self/status")
+    if status.exists():  # ru_maxrss includes that of the process which started this one
+        return int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**10
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
