@@ -20,6 +20,8 @@ from .priors import Distribution, Prior, RandomState
 
 __all__ = ["Posterior"]
 
+_ALMOST_INFINITE = 1e100  # less likely than anything, and far from overflow when differences of it are squared
+
 
 def _description(thing: Any) -> str:
     """The ``repr`` of something, complete and the same in every process, or ValueError."""
@@ -126,6 +128,14 @@ class Posterior:
         points, _, log_likelihood = self._evaluate(x)
         return log_likelihood if points.ndim == 2 else float(log_likelihood[0])
 
+    def finite_log_likelihood(self, x: Any) -> np.ndarray | float:
+        """`log_likelihood` with -1e100 for -inf, for clients that refuse infinities (ultranest)."""
+        return np.maximum(self.log_likelihood(x), -_ALMOST_INFINITE)[()]
+
+    def negative_log_prob(self, x: Any) -> np.ndarray | float:
+        """Minus `log_prob` with 1e100 for inf, for minimisers, whose differences of two infinities are NaN."""
+        return np.minimum(-self.log_prob(x), _ALMOST_INFINITE)[()]
+
     def prior_transform(self, u: np.ndarray) -> np.ndarray:
         """From the unit cube to the parameters, (ndim,) or (n, ndim), as nested samplers ask."""
         return self.prior.transform(u)
@@ -133,6 +143,28 @@ class Posterior:
     def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
         """Draws of the prior, (n, ndim); `rng` is a seed, a generator, or None for NumPy's global stream."""
         return self.prior.rvs(n, rng)
+
+    def sample_start(self, n: int, rng: RandomState = None) -> np.ndarray:
+        """Draws of the prior where the posterior is not zero, (n, ndim): where walkers can start.
+
+        Several clients refuse a start of probability zero, which a draw of the prior is where its simulation fails.
+
+        Raises
+        ------
+        ValueError
+            If hardly any simulation succeeds: fewer than n of 100 n, or of 10 000 where these are more.
+        """
+        rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
+        found = np.empty((0, self.ndim))
+        for _ in range(max(100, -(-10_000 // n))):
+            points = self.sample_prior(n, rng)
+            found = np.concatenate([found, points[np.isfinite(self.log_prob(points))]])
+            if len(found) >= n:
+                return found[:n]
+        raise ValueError(
+            f"sample_start: the posterior is zero at nearly all draws of the prior ({len(found)} points found of {n} "
+            "asked for); report() has the reasons: mend the model or narrow the prior"
+        )
 
     def report(self) -> dict:
         """What was simulated so far, by this object in this process.

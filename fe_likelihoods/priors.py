@@ -95,6 +95,10 @@ class Distribution(ABC):
         with np.errstate(all="ignore"):
             return np.clip(self._quantile(u), low, high)[()]
 
+    def isf(self, q: np.ndarray | float) -> np.ndarray | float:
+        """Inverse of the survival function, ``ppf(1 - q)``: what a `nautilus.Prior` asks of a distribution."""
+        return self.ppf(1.0 - np.asarray(q, dtype=float))
+
     def rvs(self, size: int | tuple[int, ...] = 1, rng: RandomState = None) -> np.ndarray:
         """Independent draws of shape `size`.
 

@@ -10,7 +10,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("fe_likelihoods", "samplers")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PLOTTING = {"arviz", "corner", "matplotlib"}
-CLIENTS = {"bilby", "pymc", "pints", "nautilus", "dask", "mpi4py", "openseespy"}
+CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "mpi4py", "openseespy"}
+ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}, "pints": {"pints"}, "nautilus": {"nautilus"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
 # in samplers, from the bottom up: a module imports only what its line names
 SAMPLERS = {
@@ -124,6 +125,17 @@ def test_plots_and_clients_are_imported_where_used(module):
     everywhere = {m.split(".")[0] for m, _ in imports(module)}
     if everywhere & PLOTTING:
         assert module.stem in ("report", "figures", "predictive"), "what is shown belongs into these"
+
+
+def test_every_adapter_knows_its_client_and_the_posterior_alone(module):
+    adapts = module.parent == ROOT / "fe_likelihoods" / "adapters"
+    own = ADAPTED.get(module.stem, set()) if adapts else set()
+    everywhere = {m for m, _ in imports(module)}
+    adapted = {m.split(".")[0] for m in everywhere} & set().union(*ADAPTED.values())
+    assert adapted == own
+    if adapts and own:
+        below = {m.split(".")[1] for m in everywhere if m.startswith("fe_likelihoods.")}
+        assert below <= {"posterior", "priors"}, below
 
 
 def test_storage_has_its_places(module):

@@ -1,0 +1,103 @@
+"""A posterior as a `pymc.Model`: PyMC's distributions for the priors, the log-likelihood as a black box.
+
+A finite-element model has no gradients, so of PyMC's samplers those that need none apply: `pymc.sample_smc`, which
+gives the evidence, and `pymc.sample` with a step of `pymc.DEMetropolisZ`, `pymc.Metropolis` or `pymc.Slice`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..posterior import Posterior
+from ..priors import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+
+if TYPE_CHECKING:
+    import pymc
+
+__all__ = ["to_pymc"]
+
+
+def to_pymc(posterior: Posterior) -> pymc.Model:
+    """The posterior as a model of PyMC, with one free variable for each parameter, under its name.
+
+    The log-likelihood is a Potential named ``log_likelihood``. PyMC evaluates point by point: vectorised and compiled
+    models gain nothing of their batches there.
+
+    Parameters
+    ----------
+    posterior : Posterior
+
+    Returns
+    -------
+    pymc.Model
+
+    Raises
+    ------
+    ValueError
+        If a prior is none of `fe_likelihoods.priors`, or a parameter is named ``log_likelihood``.
+
+    Examples
+    --------
+    >>> with to_pymc(posterior):
+    ...     trace = pymc.sample_smc(2000)  # or pymc.sample(step=pymc.DEMetropolisZ())
+    """
+    import pymc
+    import pytensor.tensor
+
+    if "log_likelihood" in posterior.parameter_names:
+        raise ValueError("to_pymc: a parameter cannot be named 'log_likelihood', which is the name of the likelihood")
+    with pymc.Model() as model:
+        parameters = [_translated(name, d) for name, d in posterior.prior.distributions.items()]
+        pymc.Potential("log_likelihood", _op_class()(posterior)(pytensor.tensor.stack(parameters)))
+    return model
+
+
+def _make_op(posterior: Posterior) -> object:
+    """What a pickle calls: the class is made at run time, so its instances are too."""
+    return _op_class()(posterior)
+
+
+@functools.cache
+def _op_class() -> type:
+    import pytensor.tensor
+    from pytensor.graph.op import Op
+
+    class LogLikelihood(Op):
+        itypes = (pytensor.tensor.dvector,)
+        otypes = (pytensor.tensor.dscalar,)
+
+        def __init__(self, posterior: Posterior) -> None:
+            self.posterior = posterior
+
+        def __reduce__(self) -> tuple:
+            return _make_op, (self.posterior,)
+
+        def perform(self, node, inputs, outputs) -> None:
+            outputs[0][0] = np.array(self.posterior.log_likelihood(inputs[0]))
+
+    return LogLikelihood
+
+
+def _translated(name: str, distribution: Distribution) -> object:
+    """PyMC's variable with this prior, in the model whose context is open."""
+    import pymc
+
+    # the type itself: a class derived from one of these is another distribution
+    kind = type(distribution)
+    if kind is TruncatedNormal:
+        low, high = (bound if math.isfinite(bound) else None for bound in distribution.bounds)
+        return pymc.TruncatedNormal(name, distribution.mean, distribution.sd, lower=low, upper=high)
+    if kind is HalfNormal:
+        return pymc.HalfNormal(name, distribution.sd)
+    if kind is Uniform:
+        return pymc.Uniform(name, *distribution.bounds)
+    if kind is LogNormal:
+        return pymc.LogNormal(name, math.log(distribution.median), distribution.log_sd)
+    raise ValueError(
+        f"to_pymc knows TruncatedNormal, HalfNormal, Uniform and LogNormal; {name!r} is a {kind.__name__}: "
+        "replace it by one of them"
+    )

@@ -1,0 +1,41 @@
+"""What the tests of clients share: the exact answer, and a client or a skip that says how to get it."""
+
+import importlib.util
+import logging
+import os
+
+import pytest
+
+from .problem import Exact, exact
+from .runs import CLIENTS, Client
+
+
+@pytest.fixture(scope="session")
+def answer() -> Exact:
+    """Moments and evidence by quadrature."""
+    return exact()
+
+
+@pytest.fixture(autouse=True)
+def quiet(caplog):
+    """The failures of the oscillator are meant to be."""
+    caplog.set_level(logging.ERROR, logger="fe_likelihoods")
+
+
+@pytest.fixture
+def client_named():
+    """Function from a name of `runs.CLIENTS` to the client; skips the test where it is not installed.
+
+    ``REQUIRED_CLIENTS``, modules separated by commas, makes a failure of what would be a skip.
+    """
+
+    def find(name: str) -> Client:
+        client = CLIENTS[name]
+        if importlib.util.find_spec(client.module) is None:
+            reason = f"{client.module.upper()} IS NOT INSTALLED: {client.install}"
+            if client.module in os.environ.get("REQUIRED_CLIENTS", "").split(","):
+                pytest.fail(reason)
+            pytest.skip(reason)
+        return client
+
+    return find

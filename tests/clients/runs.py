@@ -1,0 +1,208 @@
+"""Every client on the posterior of `problem`, as its user would write it: what the README's table promises, in code.
+
+Settings are small, so that a run takes seconds; starts are drawn where the posterior is not zero, because several
+clients refuse others. Clients are imported by the runs alone.
+"""
+
+import logging
+import random
+import tempfile
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
+from fe_likelihoods.posterior import Posterior
+
+from .scoring import Found, chains, weighted
+
+__all__ = ["CLIENTS", "Client"]
+
+
+def _emcee(posterior: Posterior, seed: int) -> Found:
+    import emcee
+
+    np.random.seed(seed)  # noqa: NPY002 - emcee draws from the global stream
+    sampler = emcee.EnsembleSampler(48, posterior.ndim, posterior, vectorize=True)
+    sampler.run_mcmc(posterior.sample_start(48), 500)
+    return chains(sampler.get_chain(discard=100).swapaxes(0, 1))
+
+
+def _zeus(posterior: Posterior, seed: int) -> Found:
+    import zeus
+
+    np.random.seed(seed)  # noqa: NPY002 - zeus draws from the global streams of numpy and of Python
+    random.seed(seed)
+    sampler = zeus.EnsembleSampler(16, posterior.ndim, posterior, vectorize=True, verbose=False)
+    sampler.run_mcmc(posterior.sample_start(16), 250, progress=False)
+    return chains(sampler.get_chain(discard=50).swapaxes(0, 1))
+
+
+def _dynesty(posterior: Posterior, seed: int) -> Found:
+    import dynesty
+
+    sampler = dynesty.NestedSampler(
+        posterior.log_likelihood,
+        posterior.prior_transform,
+        posterior.ndim,
+        nlive=150,
+        rstate=np.random.default_rng(seed),
+    )
+    sampler.run_nested(print_progress=False)
+    found = sampler.results
+    return weighted(found.samples, found.importance_weights(), found.logz[-1], found.logzerr[-1])
+
+
+def _nautilus(posterior: Posterior, seed: int) -> Found:
+    import nautilus
+
+    sampler = nautilus.Sampler(
+        nautilus_prior(posterior), posterior.log_likelihood, vectorized=True, n_live=300, n_networks=1, seed=seed
+    )
+    sampler.run(n_eff=1500)
+    samples, log_weights, _ = sampler.posterior()
+    return weighted(samples, np.exp(log_weights), sampler.log_z, 1.0 / np.sqrt(sampler.n_eff))
+
+
+def _pints(posterior: Posterior, seed: int) -> Found:
+    import pints
+
+    np.random.seed(seed)  # noqa: NPY002 - pints draws from the global stream
+    starts = list(posterior.sample_start(8))
+    controller = pints.MCMCController(to_pints(posterior), 8, starts, method=pints.DifferentialEvolutionMCMC)
+    controller.set_max_iterations(1200)
+    controller.set_log_to_screen(False)
+    return chains(controller.run()[:, 400:])
+
+
+def _bilby(posterior: Posterior, seed: int) -> Found:
+    import bilby
+
+    logging.getLogger("bilby").setLevel(logging.ERROR)
+    bilby.core.utils.random.seed(seed)
+    likelihood, priors = to_bilby(posterior)
+    with tempfile.TemporaryDirectory() as folder:
+        result = bilby.run_sampler(
+            likelihood,
+            priors,
+            sampler="dynesty",
+            nlive=150,
+            sample="unif",
+            bound="multi",
+            outdir=folder,
+            save=False,
+            resume=False,
+            check_point=False,
+            check_point_plot=False,
+            print_progress=False,
+        )
+    found = result.nested_samples
+    return weighted(
+        found[posterior.parameter_names].to_numpy(),
+        found["weights"].to_numpy(),
+        result.log_evidence,
+        result.log_evidence_err,
+    )
+
+
+def _ultranest(posterior: Posterior, seed: int) -> Found:
+    import ultranest
+
+    logging.getLogger("ultranest").setLevel(logging.WARNING)
+    np.random.seed(seed)  # noqa: NPY002 - ultranest draws from the global stream
+    sampler = ultranest.ReactiveNestedSampler(
+        posterior.parameter_names, posterior.finite_log_likelihood, posterior.prior_transform, vectorized=True
+    )
+    result = sampler.run(min_num_live_points=150, show_status=False, viz_callback=False)
+    found = result["weighted_samples"]
+    return weighted(np.array(found["points"]), np.array(found["weights"]), result["logz"], result["logzerr"])
+
+
+def _pocomc(posterior: Posterior, seed: int) -> Found:
+    import pocomc
+
+    np.random.seed(seed)  # noqa: NPY002 - the prior is drawn from the global stream
+    sampler = pocomc.Sampler(
+        posterior.prior,
+        posterior.finite_log_likelihood,
+        vectorize=True,
+        random_state=seed,
+        n_active=64,
+        n_effective=128,
+        precondition=False,  # no normalising flow: minutes for its training, and nothing to gain in four dimensions
+    )
+    sampler.run(n_total=1024, progress=False)
+    samples, weights, _, _ = sampler.posterior()
+    return weighted(samples, weights, *sampler.evidence())
+
+
+def _pymc_smc(posterior: Posterior, seed: int) -> Found:
+    import pymc
+
+    with to_pymc(posterior):
+        trace = pymc.sample_smc(
+            300, chains=8, cores=1, random_seed=seed, progressbar=False, compute_convergence_checks=False
+        )
+    found = chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
+    # PyMC gives no error of its own: that of the mean of its chains
+    evidences = np.array([values[-1] for values in trace.sample_stats["log_marginal_likelihood"].values], dtype=float)
+    return found._replace(log_evidence=evidences.mean(), log_evidence_error=evidences.std(ddof=1) / np.sqrt(8))
+
+
+def _pymc_mcmc(posterior: Posterior, seed: int) -> Found:
+    import pymc
+
+    starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in posterior.sample_start(6, seed)]
+    with to_pymc(posterior):
+        trace = pymc.sample(
+            2500,
+            tune=1000,
+            step=pymc.DEMetropolisZ(),
+            initvals=starts,
+            chains=6,
+            cores=1,
+            random_seed=seed,
+            progressbar=False,
+            compute_convergence_checks=False,
+        )
+    return chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
+
+
+def _uqpy(posterior: Posterior, seed: int) -> Found:
+    from UQpy.sampling.mcmc import Stretch
+
+    sampler = Stretch(
+        log_pdf_target=posterior.log_prob,
+        seed=posterior.sample_start(24, seed).tolist(),
+        burn_length=100,
+        concatenate_chains=False,
+        random_state=seed,
+    )
+    sampler.run(nsamples_per_chain=700)
+    return chains(sampler.samples.swapaxes(0, 1))
+
+
+class Client(NamedTuple):
+    """What to import, what distribution it comes from, how to install it, and how it is run."""
+
+    module: str
+    distribution: str
+    install: str
+    run: Callable[[Posterior, int], Found]
+
+
+_TEST, _CLIENTS, _MAKE = "pip install '.[test]'", "pip install '.[clients]'", "make clients"
+CLIENTS = {
+    "emcee": Client("emcee", "emcee", "pip install .", _emcee),
+    "zeus": Client("zeus", "zeus-mcmc", _TEST, _zeus),
+    "dynesty": Client("dynesty", "dynesty", _TEST, _dynesty),
+    "nautilus": Client("nautilus", "nautilus-sampler", _TEST, _nautilus),
+    "pints": Client("pints", "pints", _TEST, _pints),
+    "bilby": Client("bilby", "bilby", _TEST, _bilby),
+    "ultranest": Client("ultranest", "ultranest", _CLIENTS, _ultranest),
+    "pymc-smc": Client("pymc", "pymc", _CLIENTS, _pymc_smc),
+    "pymc-mcmc": Client("pymc", "pymc", _CLIENTS, _pymc_mcmc),
+    "pocomc": Client("pocomc", "pocomc", _MAKE, _pocomc),
+    "uqpy": Client("UQpy", "UQpy", _MAKE, _uqpy),
+}

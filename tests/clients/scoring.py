@@ -1,0 +1,93 @@
+"""What a client found, held against the exact answer with tolerances from its own errors."""
+
+from typing import NamedTuple
+
+import arviz
+import numpy as np
+
+from .problem import Exact
+
+__all__ = ["Found", "Score", "chains", "check", "score", "weighted"]
+
+STANDARD_ERRORS = 4.0
+
+
+class Found(NamedTuple):
+    """What a client found: moments and their standard errors (4,), in the parameters' units, and maybe an evidence."""
+
+    mean: np.ndarray
+    mean_error: np.ndarray
+    sd: np.ndarray
+    sd_error: np.ndarray
+    log_evidence: float | None = None
+    log_evidence_error: float | None = None
+
+
+class Score(NamedTuple):
+    """Errors: of means in sd and in standard errors, of sd as ratios and in standard errors, of the evidence."""
+
+    mean: np.ndarray
+    mean_z: np.ndarray
+    sd_ratio: np.ndarray
+    sd_z: np.ndarray
+    log_evidence: float | None
+    log_evidence_z: float | None
+
+
+def _found(samples, weights, mean_size, square_size, log_evidence=None, log_evidence_error=None) -> Found:
+    mean = weights @ samples
+    squares = (samples - mean) ** 2
+    variance = weights @ squares
+    sd = np.sqrt(variance)
+    spread = np.sqrt(weights @ (squares - variance) ** 2)
+    return Found(
+        mean,
+        sd / np.sqrt(mean_size),
+        sd,
+        0.5 * spread / sd / np.sqrt(square_size),
+        log_evidence,
+        log_evidence_error,
+    )
+
+
+def chains(samples: np.ndarray) -> Found:
+    """From chains (n_chains, n_draws, 4): sizes by arviz, of the values and of the squares."""
+    mean = samples.mean(axis=(0, 1))
+    sizes = [
+        np.array([arviz.ess(values[:, :, i], method="mean") for i in range(samples.shape[2])])
+        for values in (samples, (samples - mean) ** 2)
+    ]
+    flat = samples.reshape(-1, samples.shape[2])
+    return _found(flat, np.full(len(flat), 1.0 / len(flat)), *sizes)
+
+
+def weighted(samples: np.ndarray, weights: np.ndarray, log_evidence: float, log_evidence_error: float) -> Found:
+    """From draws (n, 4) with weights (n,), otherwise independent: their size is that of Kish."""
+    weights = weights / weights.sum()
+    size = 1.0 / (weights @ weights)
+    return _found(samples, weights, size, size, float(log_evidence), float(log_evidence_error))
+
+
+def score(found: Found, exact: Exact) -> Score:
+    """How far `found` is from `exact`."""
+    evidence = None if found.log_evidence is None else float(found.log_evidence - exact.log_evidence)
+    return Score(
+        (found.mean - exact.mean) / exact.sd,
+        (found.mean - exact.mean) / found.mean_error,
+        found.sd / exact.sd,
+        (found.sd - exact.sd) / found.sd_error,
+        evidence,
+        None if evidence is None else evidence / found.log_evidence_error,
+    )
+
+
+def check(found: Found, exact: Exact) -> None:
+    """AssertionError unless all is within four standard errors, and these are small enough to tell."""
+    result = score(found, exact)
+    assert np.all(found.mean_error < 0.15 * exact.sd), f"too few draws to tell: {found}"
+    assert np.all(np.abs(result.mean_z) < STANDARD_ERRORS), f"means: {result}"
+    assert np.all(np.abs(result.sd_z) < STANDARD_ERRORS), f"standard deviations: {result}"
+    if found.log_evidence is not None:
+        # an evidence that forgets the points of probability zero is too large by 0.9: more than four errors
+        assert 0.0 < found.log_evidence_error < 0.22, f"an evidence without a usable error: {found}"
+        assert abs(result.log_evidence_z) < STANDARD_ERRORS, f"evidence: {result}"

@@ -1,0 +1,64 @@
+"""Every client samples a posterior of this library and finds the moments and the evidence that quadrature has."""
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from fe_likelihoods.priors import TruncatedNormal
+
+from .problem import CRITICAL, PRIOR, exact, make_posterior, reference_log_prob
+from .runs import CLIENTS
+from .scoring import Found, check
+
+SLOW = {"pymc-smc", "pymc-mcmc", "pocomc", "uqpy"}
+
+
+def test_quadrature_has_converged_and_is_of_this_posterior(answer):
+    for ours, coarser in zip(answer, exact(50), strict=True):
+        np.testing.assert_allclose(ours, coarser, rtol=1e-4)
+    posterior = make_posterior()
+    points = np.concatenate([posterior.sample_start(20, 1), posterior.sample_prior(20, 2)])
+    expected = [reference_log_prob(point) for point in points]
+    np.testing.assert_allclose(posterior(points), expected, rtol=1e-10)
+    assert np.isinf(expected).any()
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in CLIENTS])
+def test_client_agrees_with_quadrature(name, client_named, answer, seed):
+    check(client_named(name).run(make_posterior(), seed), answer)
+
+
+@pytest.mark.parametrize(("name", "complaint"), [("emcee", "means"), ("dynesty", "means")])
+def test_wrong_prior_is_caught(name, complaint, client_named, answer, seed):
+    """Control: had an adapter lost the mean and the upper bound of one prior, the check would tell."""
+    wrong = make_posterior(PRIOR | {"damping": TruncatedNormal(1.0, 0.8, lower=0.7)})
+    with pytest.raises(AssertionError, match=complaint):
+        check(client_named(name).run(wrong, seed), answer)
+
+
+def test_evidence_without_the_failed_runs_is_caught(answer):
+    """Control: failures are three fifths of the prior; who leaves them out is caught at the largest error."""
+    shares = make_posterior().prior.distributions["damping"].ppf(np.linspace(0.0, 1.0, 10_001)) < CRITICAL
+    small = 0.01 * answer.sd
+    forgetful = Found(answer.mean, small, answer.sd, small, answer.log_evidence - np.log(shares.mean()), 0.21)
+    with pytest.raises(AssertionError, match="evidence"):
+        check(forgetful, answer)
+    check(forgetful._replace(log_evidence=answer.log_evidence), answer)
+
+
+@pytest.mark.parametrize("method", ["Nelder-Mead", "Powell", "L-BFGS-B"])
+def test_scipy_finds_the_mode(method):
+    posterior = make_posterior()
+    start = posterior.sample_start(1, 3)[0]
+    found = optimize.minimize(
+        posterior.negative_log_prob, start, method=method, bounds=posterior.prior.bounds, options={"maxiter": 2000}
+    )
+    reference = optimize.differential_evolution(
+        lambda x: min(-reference_log_prob(x), 1e100),
+        [(0.4, 2.4), (0.7, 2.0), (0.2, 3.0), (0.005, 0.03)],
+        seed=1,
+        tol=1e-8,
+        maxiter=60,
+        popsize=8,
+    )
+    assert found.fun == pytest.approx(reference.fun, abs=1e-3), found
