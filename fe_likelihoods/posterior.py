@@ -129,7 +129,11 @@ class Posterior:
         return log_likelihood if points.ndim == 2 else float(log_likelihood[0])
 
     def finite_log_likelihood(self, x: Any) -> np.ndarray | float:
-        """`log_likelihood` with -1e100 for -inf, for clients that refuse infinities (ultranest)."""
+        """`log_likelihood` with -1e100 for -inf: for clients that refuse infinities, or leave such points out.
+
+        ultranest stops at an infinite value; bilby and pocomc draw such a point of the prior again, so that their
+        evidence is too large by the share of the prior in which simulations fail.
+        """
         return np.maximum(self.log_likelihood(x), -_ALMOST_INFINITE)[()]
 
     def negative_log_prob(self, x: Any) -> np.ndarray | float:

@@ -43,7 +43,13 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
     Examples
     --------
     >>> with to_pymc(posterior):
-    ...     trace = pymc.sample_smc(2000)  # or pymc.sample(step=pymc.DEMetropolisZ())
+    ...     trace = pymc.sample_smc(2000)
+
+    Chains start where the posterior is not zero, which PyMC's own starting point need not be:
+
+    >>> starts = [dict(zip(posterior.parameter_names, x)) for x in posterior.sample_start(4)]
+    >>> with to_pymc(posterior):
+    ...     trace = pymc.sample(3000, tune=3000, step=pymc.DEMetropolisZ(), initvals=starts, chains=4)
     """
     import pymc
     import pytensor.tensor

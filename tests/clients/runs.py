@@ -15,7 +15,7 @@ import numpy as np
 from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
 from fe_likelihoods.posterior import Posterior
 
-from .scoring import Found, chains, weighted
+from .scoring import Found, chains, replicates, weighted
 
 __all__ = ["CLIENTS", "Client"]
 
@@ -46,7 +46,8 @@ def _dynesty(posterior: Posterior, seed: int) -> Found:
         posterior.log_likelihood,
         posterior.prior_transform,
         posterior.ndim,
-        nlive=150,
+        nlive=250,
+        bound="single",
         rstate=np.random.default_rng(seed),
     )
     sampler.run_nested(print_progress=False)
@@ -58,9 +59,9 @@ def _nautilus(posterior: Posterior, seed: int) -> Found:
     import nautilus
 
     sampler = nautilus.Sampler(
-        nautilus_prior(posterior), posterior.log_likelihood, vectorized=True, n_live=300, n_networks=1, seed=seed
+        nautilus_prior(posterior), posterior.log_likelihood, vectorized=True, n_live=250, n_networks=1, seed=seed
     )
-    sampler.run(n_eff=1500)
+    sampler.run(n_eff=1000)
     samples, log_weights, _ = sampler.posterior()
     return weighted(samples, np.exp(log_weights), sampler.log_z, 1.0 / np.sqrt(sampler.n_eff))
 
@@ -87,9 +88,9 @@ def _bilby(posterior: Posterior, seed: int) -> Found:
             likelihood,
             priors,
             sampler="dynesty",
-            nlive=150,
+            nlive=250,
             sample="unif",
-            bound="multi",
+            bound="single",
             outdir=folder,
             save=False,
             resume=False,
@@ -114,7 +115,7 @@ def _ultranest(posterior: Posterior, seed: int) -> Found:
     sampler = ultranest.ReactiveNestedSampler(
         posterior.parameter_names, posterior.finite_log_likelihood, posterior.prior_transform, vectorized=True
     )
-    result = sampler.run(min_num_live_points=150, show_status=False, viz_callback=False)
+    result = sampler.run(min_num_live_points=250, show_status=False, viz_callback=False)
     found = result["weighted_samples"]
     return weighted(np.array(found["points"]), np.array(found["weights"]), result["logz"], result["logzerr"])
 
@@ -142,25 +143,25 @@ def _pymc_smc(posterior: Posterior, seed: int) -> Found:
 
     with to_pymc(posterior):
         trace = pymc.sample_smc(
-            300, chains=8, cores=1, random_seed=seed, progressbar=False, compute_convergence_checks=False
+            500, chains=8, cores=1, random_seed=seed, progressbar=False, compute_convergence_checks=False
         )
-    found = chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
-    # PyMC gives no error of its own: that of the mean of its chains
-    evidences = np.array([values[-1] for values in trace.sample_stats["log_marginal_likelihood"].values], dtype=float)
-    return found._replace(log_evidence=evidences.mean(), log_evidence_error=evidences.std(ddof=1) / np.sqrt(8))
+    samples = np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1)
+    # one value for each stage, and NaN behind the last where another chain has more stages
+    stages = np.array(trace.sample_stats["log_marginal_likelihood"].values, dtype=float)
+    return replicates(samples, np.array([values[np.isfinite(values)][-1] for values in stages]))
 
 
 def _pymc_mcmc(posterior: Posterior, seed: int) -> Found:
     import pymc
 
-    starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in posterior.sample_start(6, seed)]
+    starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in posterior.sample_start(4, seed)]
     with to_pymc(posterior):
         trace = pymc.sample(
-            2500,
-            tune=1000,
+            4000,
+            tune=3000,
             step=pymc.DEMetropolisZ(),
             initvals=starts,
-            chains=6,
+            chains=4,
             cores=1,
             random_seed=seed,
             progressbar=False,
