@@ -156,11 +156,11 @@ class Posterior:
         Raises
         ------
         ValueError
-            If hardly any simulation succeeds: fewer than n of 100 n, or of 10 000 where these are more.
+            If hardly any simulation succeeds: fewer than n of 100 n, or of 1000 where these are more.
         """
         rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
         found = np.empty((0, self.ndim))
-        for _ in range(max(100, -(-10_000 // n))):
+        for _ in range(max(100, -(-1000 // n))):
             points = self.sample_prior(n, rng)
             found = np.concatenate([found, points[np.isfinite(self.log_prob(points))]])
             if len(found) >= n:
