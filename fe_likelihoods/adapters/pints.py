@@ -16,10 +16,12 @@ __all__ = ["to_pints"]
 
 
 def to_pints(posterior: Posterior) -> pints.LogPosterior:
-    """The posterior for pints: its samplers, its optimisers, its nested sampling.
+    """The posterior for the Markov chains and the optimisers of pints.
 
     Priors are those of the posterior itself, not translated. No gradients: the methods of pints that need
-    ``evaluateS1`` (MALA, Hamiltonian) refuse it.
+    ``evaluateS1`` (MALA, Hamiltonian) refuse it. For an evidence take another client: the ellipsoidal nested sampling
+    of pints 0.6.1 draws uniformly in parameter space, whatever the prior, and its evidence is wrong unless they are
+    all uniform.
 
     Parameters
     ----------
@@ -28,12 +30,12 @@ def to_pints(posterior: Posterior) -> pints.LogPosterior:
     Returns
     -------
     pints.LogPosterior
-        Its ``log_likelihood()`` and ``log_prior()`` are what `pints.NestedController` asks for. It pickles.
+        It pickles, and so do its ``log_likelihood()`` and its ``log_prior()``.
 
     Examples
     --------
-    >>> starts = posterior.sample_prior(4)  # points where the posterior is not zero
-    >>> controller = pints.MCMCController(to_pints(posterior), 4, starts, method=pints.DifferentialEvolutionMCMC)
+    >>> starts = posterior.sample_start(4)
+    >>> controller = pints.MCMCController(to_pints(posterior), 4, list(starts), method=pints.DifferentialEvolutionMCMC)
     >>> chains = controller.run()
     """
     return _classes()["LogPosterior"](posterior)

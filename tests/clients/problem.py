@@ -23,7 +23,7 @@ from fe_likelihoods.posterior import Posterior
 from fe_likelihoods.priors import HalfNormal, LogNormal, Prior, TruncatedNormal, Uniform
 from fe_likelihoods.records import Record
 
-__all__ = ["Exact", "exact", "make_posterior", "reference_log_prob"]
+__all__ = ["CRITICAL", "PRIOR", "Exact", "exact", "make_posterior", "reference_log_prob"]
 
 PERIOD, DAMPING_RATIO, DT, N_STEPS = 0.8, 0.5, 0.05, 30
 CRITICAL = 1.0 / DAMPING_RATIO  # multiple of the nominal damping from which no simulation succeeds

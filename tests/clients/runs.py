@@ -123,19 +123,22 @@ def _ultranest(posterior: Posterior, seed: int) -> Found:
 def _pocomc(posterior: Posterior, seed: int) -> Found:
     import pocomc
 
-    np.random.seed(seed)  # noqa: NPY002 - the prior is drawn from the global stream
-    sampler = pocomc.Sampler(
-        posterior.prior,
-        posterior.finite_log_likelihood,
-        vectorize=True,
-        random_state=seed,
-        n_active=64,
-        n_effective=128,
-        precondition=False,  # no normalising flow: minutes for its training, and nothing to gain in four dimensions
-    )
-    sampler.run(n_total=1024, progress=False)
-    samples, weights, _, _ = sampler.posterior()
-    return weighted(samples, weights, *sampler.evidence())
+    runs = []
+    for repetition in range(6):  # without its flow pocomc gives no error of the evidence: that of what runs differ by
+        np.random.seed(10 * seed + repetition)  # noqa: NPY002 - the prior is drawn from the global stream
+        sampler = pocomc.Sampler(
+            posterior.prior,
+            posterior.finite_log_likelihood,
+            vectorize=True,
+            random_state=10 * seed + repetition,
+            n_active=64,
+            n_effective=256,
+            precondition=False,  # the training of a flow takes minutes, and gains nothing in four dimensions
+        )
+        sampler.run(n_total=1024, progress=False)
+        samples, weights, _, _ = sampler.posterior()
+        runs.append(weighted(samples, weights, sampler.evidence()[0], np.nan))
+    return replicates(runs)
 
 
 def _pymc_smc(posterior: Posterior, seed: int) -> Found:
@@ -146,9 +149,12 @@ def _pymc_smc(posterior: Posterior, seed: int) -> Found:
             500, chains=8, cores=1, random_seed=seed, progressbar=False, compute_convergence_checks=False
         )
     samples = np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1)
-    # one value for each stage, and NaN behind the last where another chain has more stages
-    stages = np.array(trace.sample_stats["log_marginal_likelihood"].values, dtype=float)
-    return replicates(samples, np.array([values[np.isfinite(values)][-1] for values in stages]))
+    runs = []
+    for draws, stages in zip(samples, trace.sample_stats["log_marginal_likelihood"].values, strict=True):
+        # one value for each stage, and NaN behind the last where another chain has more of them
+        stages = np.array(stages, dtype=float)
+        runs.append(weighted(draws, np.ones(len(draws)), stages[np.isfinite(stages)][-1], np.nan))
+    return replicates(runs)
 
 
 def _pymc_mcmc(posterior: Posterior, seed: int) -> Found:

@@ -69,18 +69,17 @@ def weighted(samples: np.ndarray, weights: np.ndarray, log_evidence: float, log_
     return _found(samples, weights, size, size, float(log_evidence), float(log_evidence_error))
 
 
-def replicates(samples: np.ndarray, log_evidences: np.ndarray) -> Found:
-    """From independent runs (n_runs, n_draws, 4) whose draws are not: errors from what the runs differ by."""
-    n_runs = len(samples)
-    means, sds = samples.mean(axis=1), samples.std(axis=1)
-    flat = samples.reshape(-1, samples.shape[2])
+def replicates(runs: list[Found]) -> Found:
+    """From independent runs whose own errors are not to be trusted: errors from what the runs differ by."""
+    mean, sd, log_evidence = (np.array([getattr(run, name) for run in runs]) for name in ("mean", "sd", "log_evidence"))
+    root = np.sqrt(len(runs))
     return Found(
-        flat.mean(axis=0),
-        means.std(axis=0, ddof=1) / np.sqrt(n_runs),
-        flat.std(axis=0),
-        sds.std(axis=0, ddof=1) / np.sqrt(n_runs),
-        float(log_evidences.mean()),
-        float(log_evidences.std(ddof=1) / np.sqrt(n_runs)),
+        mean.mean(axis=0),
+        mean.std(axis=0, ddof=1) / root,
+        sd.mean(axis=0),
+        sd.std(axis=0, ddof=1) / root,
+        float(log_evidence.mean()),
+        float(log_evidence.std(ddof=1) / root),
     )
 
 
