@@ -110,11 +110,11 @@ def _bilby(posterior: Posterior, seed: int) -> Found:
 def _ultranest(posterior: Posterior, seed: int) -> Found:
     import ultranest
 
-    logging.getLogger("ultranest").setLevel(logging.WARNING)
     np.random.seed(seed)  # noqa: NPY002 - ultranest draws from the global stream
     sampler = ultranest.ReactiveNestedSampler(
         posterior.parameter_names, posterior.finite_log_likelihood, posterior.prior_transform, vectorized=True
     )
+    logging.getLogger("ultranest").setLevel(logging.WARNING)  # its constructor has set it to all there is
     result = sampler.run(min_num_live_points=250, show_status=False, viz_callback=False)
     found = result["weighted_samples"]
     return weighted(np.array(found["points"]), np.array(found["weights"]), result["logz"], result["logzerr"])
@@ -151,8 +151,8 @@ def _pymc_smc(posterior: Posterior, seed: int) -> Found:
     samples = np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1)
     runs = []
     for draws, stages in zip(samples, trace.sample_stats["log_marginal_likelihood"].values, strict=True):
-        # one value for each stage, and NaN behind the last where another chain has more of them
-        stages = np.array(stages, dtype=float)
+        # of each stage, in pieces, and NaN behind the last where another chain has more stages
+        stages = np.hstack([np.ravel(np.asarray(piece, dtype=float)) for piece in stages])
         runs.append(weighted(draws, np.ones(len(draws)), stages[np.isfinite(stages)][-1], np.nan))
     return replicates(runs)
 
