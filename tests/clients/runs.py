@@ -150,9 +150,9 @@ def _pymc_smc(posterior: Posterior, seed: int) -> Found:
         )
     samples = np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1)
     runs = []
-    for draws, stages in zip(samples, trace.sample_stats["log_marginal_likelihood"].values, strict=True):
-        # of each stage, in pieces, and NaN behind the last where another chain has more stages
-        stages = np.hstack([np.ravel(np.asarray(piece, dtype=float)) for piece in stages])
+    evidences = trace.sample_stats["log_marginal_likelihood"].values.ravel()  # a list of its stages for each chain
+    for draws, stages in zip(samples, evidences, strict=True):
+        stages = np.array(stages, dtype=float)  # NaN before the last
         runs.append(weighted(draws, np.ones(len(draws)), stages[np.isfinite(stages)][-1], np.nan))
     return replicates(runs)
 
