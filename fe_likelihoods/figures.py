@@ -1,19 +1,21 @@
-"""Figures of predictions, in the units of the channels. matplotlib is imported where used."""
+"""Figures of predictions and residuals, in the units of the channels. matplotlib is imported where used."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import stats
 
 from .channels import Channel, Measurements
 from .predictive import Prediction
 from .reliability import Fragility
+from .residuals import autocorrelation, residual_checks
 from .units import from_si
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["plot_bands", "plot_fragility"]
+__all__ = ["plot_bands", "plot_fragility", "plot_residuals"]
 
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 
@@ -106,6 +108,58 @@ def plot_fragility(
     axes.set_ylim(-0.02, 1.02)
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize="small")
+    return figure
+
+
+def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float) -> "Figure":
+    """Residuals of each channel in time, their autocorrelation, and their quantiles against those of a normal.
+
+    White residuals keep to the band of the autocorrelation (95 % of the lags, of independent samples), normal ones to
+    the straight line.
+
+    Parameters
+    ----------
+    residuals : (n_channels, n_steps) float
+        Measured less simulated [SI], as `fe_likelihoods.likelihood.FELikelihood.residuals` gives.
+    channels : sequence of Channel
+    dt : float
+        Time step [s].
+
+    Raises
+    ------
+    ValueError
+        If there is not one channel for each row, and as `fe_likelihoods.residuals.residual_checks`.
+    """
+    import matplotlib.pyplot as plt
+
+    checks, correlation = residual_checks(residuals), autocorrelation(residuals)
+    n_channels, n = correlation.shape
+    if len(channels) != n_channels:
+        raise ValueError(f"expected one channel for each row of residuals; got {len(channels)} and {n_channels} rows")
+    figure, rows = plt.subplots(
+        n_channels,
+        3,
+        squeeze=False,
+        figsize=(11.0, 1.0 + 2.0 * n_channels),
+        layout="constrained",
+        width_ratios=(2, 1, 1),
+    )
+    normal = stats.norm.ppf((np.arange(n) + 0.5) / n)
+    for k, (history, lags, quantiles) in enumerate(rows):
+        values = from_si(np.asarray(residuals[k], dtype=float), channels[k].unit)
+        history.plot(np.arange(n) * dt, values, color=BLUE, linewidth=0.7)
+        history.set_ylabel(_label(channels[k]))
+        # as far as it says something: some correlation times
+        shown = min(n, 20 + int(10.0 * n / checks.n_effective[k]))
+        lags.fill_between([0.0, (shown - 1) * dt], *(s * 1.96 / np.sqrt(n) for s in (-1, 1)), color=GREY, alpha=0.3)
+        lags.plot(np.arange(shown) * dt, correlation[k, :shown], color=BLUE, linewidth=0.9)
+        lags.set_title(f"lag one {checks.lag_one[k]:.2f}, worth {checks.n_effective[k]:.0f} of {n}", fontsize="small")
+        quantiles.plot(normal, values.mean() + values.std() * normal, color=GREY, linewidth=0.9)
+        quantiles.plot(normal, np.sort(values), ".", color=BLUE, markersize=2)
+        for axes in (history, lags, quantiles):
+            axes.grid(alpha=0.25)
+    for axes, text in zip(rows[-1], ("time [s]", "lag [s]", "quantile of a standard normal [-]"), strict=True):
+        axes.set_xlabel(text)
     return figure
 
 

@@ -3,9 +3,10 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from .engines import as_engine
 from .likelihood import as_points
@@ -26,8 +27,26 @@ def parts_of(thing: Any, pool: Any) -> tuple[Any, Any, Any]:
     return thing, None, as_engine(pool, thing)
 
 
-def split_samples(model: Any, noise_model: Any, samples: Any, noise: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Structural parameters (n, n_structural), and standard deviations of the noise (n, n_channels) if it is wanted."""
+class SampleNoise(NamedTuple):
+    """The noise of every sample: `deviations` (n, n_channels) [SI], and the correlation of successive errors, `lag_one`
+    (n, n_channels), None for white noise."""
+
+    deviations: np.ndarray
+    lag_one: np.ndarray | None
+
+    def draw(self, sample: int, n_steps: int, stream: np.random.Generator) -> np.ndarray:
+        """Errors (n_channels, n_steps) [SI] of one sample."""
+        errors = stream.standard_normal((self.deviations.shape[1], n_steps))
+        if self.lag_one is not None:
+            for row, rho in zip(errors, self.lag_one[sample], strict=True):
+                # e_t = rho e_{t-1} + sqrt(1 - rho^2) z_t, with the first one as large as all others
+                row[1:] *= np.sqrt((1.0 - rho) * (1.0 + rho))
+                row[:] = lfilter([1.0], [1.0, -rho], row)
+        return self.deviations[sample][:, None] * errors
+
+
+def split_samples(model: Any, noise_model: Any, samples: Any, noise: bool) -> tuple[np.ndarray, SampleNoise | None]:
+    """Structural parameters (n, n_structural), and the noise of each sample if it is wanted."""
     structural = tuple(model.parameter_names)
     names = structural + (() if noise_model is None else tuple(noise_model.parameter_names))
     if noise and noise_model is None:
@@ -62,7 +81,15 @@ def split_samples(model: Any, noise_model: Any, samples: Any, noise: bool) -> tu
             f"the noise needs a positive standard deviation for each of {len(points)} samples and "
             f"{len(model.channels)} channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
         )
-    return thetas, deviations
+    if not hasattr(noise_model, "lag_one_correlations"):
+        return thetas, SampleNoise(deviations, None)
+    lag_one = np.asarray(noise_model.lag_one_correlations(points[:, len(structural) :]), dtype=float)
+    if lag_one.shape != deviations.shape or not np.all(np.abs(lag_one) < 1.0):
+        raise ValueError(
+            f"the noise needs a correlation between -1 and 1 for each of {len(points)} samples and "
+            f"{len(model.channels)} channels; got shape {lag_one.shape}, largest {np.abs(lag_one).max(initial=0.0)}"
+        )
+    return thetas, SampleNoise(deviations, lag_one)
 
 
 @dataclass(eq=False)
@@ -73,7 +100,7 @@ class Gathered:
     """
 
     members: list[np.ndarray]  # indices of the samples of each distinct theta
-    deviations: np.ndarray | None  # of the noise, (n, n_channels)
+    noise: SampleNoise | None
     evaluate: Callable[[np.ndarray], np.ndarray]
     rows: list[int] | None  # channels whose histories are wanted
     result_of_sample: np.ndarray
@@ -118,31 +145,31 @@ class Gathered:
         if self.rows is not None:
             every = len(usable) == len(responses) and self.rows == list(range(responses.shape[1]))
             self._add_histories(start, responses if every else responses[np.ix_(usable, self.rows)], usable, members)
-        elif self.deviations is None:
+        elif self.noise is None:
             values = [self._value(responses[j]) for j in usable]
             self._add_values(values, [start + j for j in usable], [members[j] for j in usable])
         else:
             for j in usable:
-                values = [self._value(responses[j] + self._noise(i, responses[j].shape)) for i in members[j]]
+                values = [self._value(responses[j] + self._noise(i, responses.shape[2])) for i in members[j]]
                 self._add_values(values, list(members[j]), [np.array([i]) for i in members[j]])
 
     def _add_histories(
         self, start: int, histories: np.ndarray, usable: list[int], members: Sequence[np.ndarray]
     ) -> None:
         self.moments.add(histories, np.array([len(members[j]) for j in usable]))
-        if self.deviations is None:
+        if self.noise is None:
             if self.kept is not None:
                 self.kept.add(start + np.array(usable), histories)
             return
         everyone = np.concatenate([members[j] for j in usable])
-        self.noise_variance.add(np.square(self.deviations[everyone][:, self.rows]), np.ones(len(everyone)))
+        self.noise_variance.add(np.square(self.noise.deviations[everyone][:, self.rows]), np.ones(len(everyone)))
         if self.kept is None:
             return
         for history, j in zip(histories, usable, strict=True):
             for i in members[j]:
                 if i in self.kept:
                     # drawn for all channels: what one of them reads does not depend on which others are asked for
-                    noise = self._noise(i, (self.deviations.shape[1], history.shape[1]))
+                    noise = self._noise(i, history.shape[1])
                     self.kept.add(np.array([i]), (history + noise[self.rows])[None])
 
     def _add_values(self, values: list[np.ndarray], results: list[int], members: list[np.ndarray]) -> None:
@@ -165,10 +192,10 @@ class Gathered:
             raise ValueError(f"quantity must return one shape for every response; got {self.shape}, then {value.shape}")
         return value
 
-    def _noise(self, sample: int, shape: tuple[int, int]) -> np.ndarray:
+    def _noise(self, sample: int, n_steps: int) -> np.ndarray:
         # a stream a sample: neither batches nor failures change what it gets
         stream = np.random.default_rng(np.random.SeedSequence(self.seeds.entropy, spawn_key=(1, int(sample))))
-        return self.deviations[sample][:, None] * stream.standard_normal(shape)
+        return self.noise.draw(int(sample), n_steps, stream)
 
     def _leave_out(self, members: np.ndarray, reason: str) -> None:
         self.failed.append(members)

@@ -1,8 +1,9 @@
 """The log-likelihood of a model's parameters and of the noise, given measurements.
 
-Parameters go to the model, its response to sums of squared residuals J, J and the noise's parameters to a number. The
-middle of this chain, `FELikelihood.misfit`, is the only place where simulations are asked for: it decides which rows
-are run, counts them, records those that fail, and remembers what came out.
+Parameters go to the model, its response to sums of squared residuals J, J and the noise's parameters to a number. (A
+noise may need some numbers more than J: its statistic of the residuals, see `fe_likelihoods.noise`.) The middle of
+this chain, `FELikelihood.statistics`, is the only place where simulations are asked for: it decides which rows are run,
+counts them, records those that fail, and remembers what came out.
 """
 
 import hashlib
@@ -19,7 +20,14 @@ from .cache import SimulationCache
 from .channels import Measurements
 from .engines import as_engine
 from .memory import MisfitMemory, distinct_keys
-from .models.base import Model, misfit_batch, misfit_of_responses, simulate_batch, split_seconds
+from .models.base import (
+    Model,
+    SimulationFailed,
+    misfit_batch,
+    misfit_of_responses,
+    simulate_batch,
+    split_seconds,
+)
 from .noise import GaussianNoise
 
 __all__ = ["FELikelihood", "TooManyFailures", "as_points"]
@@ -81,8 +89,9 @@ class FELikelihood:
     measurements : Measurements
         The model's channels (matched by name, in any order) at the model's step and length.
     noise : optional
-        Anything with ``parameter_names`` and ``log_likelihood(misfit, n_steps, parameters)``; by default
-        `GaussianNoise` of the model's channels.
+        A noise of `fe_likelihoods.noise`, or anything with ``parameter_names`` and ``log_likelihood(misfit, n_steps,
+        parameters)``; by default `GaussianNoise` of the model's channels. One that needs more of the residuals than
+        their sums of squares has a ``statistic`` too (`fe_likelihoods.models.base.Statistic`).
     pool : int, or an object with ``map(function, items)``, optional
         Runs the simulations, as many at once as it has workers: a number of processes of this machine, a client of
         dask.distributed, an executor or a pool (see `fe_likelihoods.engines`). Without it they run in this process:
@@ -124,8 +133,8 @@ class FELikelihood:
     Raises
     ------
     ValueError
-        If channels, step or length of model and measurements differ, parameter names repeat, the pool is none, the
-        model cannot be sent to its processes, or the file of the cache cannot be used.
+        If channels, step or length of model and measurements or the noise's channels differ, parameter names repeat,
+        the pool is none, the model cannot be sent to its processes, or the file of the cache cannot be used.
     """
 
     def __init__(
@@ -144,6 +153,10 @@ class FELikelihood:
         self.model = model
         self.measurements = _matched(model, measurements)
         self.noise = GaussianNoise(model.channels) if noise is None else noise
+        _check_channels(model, self.noise)
+        self._statistic = getattr(self.noise, "statistic", None)
+        n_channels = self.measurements.n_channels
+        self._width = n_channels if self._statistic is None else len(self._statistic(self.measurements.values))
         self.pool = as_engine(pool, model)
         self.max_failure_share = max_failure_share
         self.parameter_names = tuple(model.parameter_names) + tuple(self.noise.parameter_names)
@@ -174,14 +187,14 @@ class FELikelihood:
 
     @property
     def fingerprint(self) -> str:
-        """Digest of the model's and the measurements' fingerprints: what the misfit depends on."""
+        """Digest of all that is kept of a simulation depends on: model, measurements, the noise's statistic."""
         text = f"{self.model.fingerprint} {self.measurements.fingerprint}"
+        if self._statistic is not None:
+            text += f" {self._statistic.__module__}.{self._statistic.__qualname__}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals.
-
-        Equal rows are simulated once, remembered ones not again, and rows that are not finite not at all.
+        """Sums of squared residuals: the first columns of `statistics`.
 
         Parameters
         ----------
@@ -192,20 +205,66 @@ class FELikelihood:
         -------
         (n, n_channels) float : [SI unit of the channel, squared]; NaN where there is no usable simulation.
         """
+        return self.statistics(thetas)[:, : self.measurements.n_channels]
+
+    def statistics(self, thetas: np.ndarray) -> np.ndarray:
+        """What the noise needs of the residuals: for white noise their sums of squares.
+
+        Equal rows are simulated once, remembered ones not again, and rows that are not finite not at all.
+
+        Parameters
+        ----------
+        thetas : (n, n_structural) float
+            Structural parameters only.
+
+        Returns
+        -------
+        (n, n_numbers) float : NaN where there is no usable simulation.
+        """
         thetas = as_points(thetas, self.model.parameter_names)
         thetas = thetas if thetas.ndim == 2 else thetas[None]
         if np.isfinite(thetas).all():
-            return self._misfit(thetas)
-        result = np.full((len(thetas), self.measurements.n_channels), np.nan)
+            return self._statistics(thetas)
+        result = np.full((len(thetas), self._width), np.nan)
         finite = np.isfinite(thetas).all(axis=1)
         if finite.any():
-            result[finite] = self._misfit(thetas[finite])
+            result[finite] = self._statistics(thetas[finite])
         return result
 
-    def _misfit(self, thetas: np.ndarray) -> np.ndarray:
+    def residuals(self, theta: np.ndarray) -> np.ndarray:
+        """Measured less simulated response at one set of parameters: one simulation, neither counted nor kept.
+
+        Parameters
+        ----------
+        theta : (n_structural,) or (ndim,) float
+            Structural parameters; those of the noise may follow.
+
+        Returns
+        -------
+        (n_channels, n_steps) float : [SI], in the order of the model's channels.
+
+        Raises
+        ------
+        ValueError
+            For another number of parameters.
+        SimulationFailed
+            If the simulation fails.
+        """
+        theta = np.asarray(theta, dtype=float)
+        if theta.shape not in ((self._n_structural,), (self.ndim,)):
+            raise ValueError(
+                f"residuals are those of one set of parameters, of shape ({self._n_structural},) or ({self.ndim},) "
+                f"with the noise's; got shape {theta.shape}"
+            )
+        response, (reason,) = simulate_batch(self.model, theta[None, : self._n_structural])
+        if reason:
+            raise SimulationFailed(reason)
+        return self.measurements.values - response[0]
+
+    def _statistics(self, thetas: np.ndarray) -> np.ndarray:
         """Of finite rows. A single row that is remembered must not cost ten microseconds: few calls of numpy."""
         keys, distinct = distinct_keys(thetas)
-        misfit, known = self._memory.look_up(keys, self.measurements.n_channels)
+        misfit, known = self._memory.look_up(keys, self._width)
         if all(known):
             self.cache_hits += len(thetas)
         else:
@@ -232,13 +291,13 @@ class FELikelihood:
         rows = np.atleast_2d(points)
         thetas, noise = np.split(rows, [self._n_structural], axis=1)
         # a perfect fit tells which noise parameters are possible at all, before anything is simulated
-        perfect = np.zeros((len(rows), self.measurements.n_channels))
+        perfect = np.zeros((len(rows), self._width))
         n_steps = self.measurements.n_steps
         impossible = np.isneginf(self.noise.log_likelihood(perfect, n_steps, noise))
         possible = np.isfinite(rows).all(axis=1) & ~impossible
         result = np.full(len(rows), -np.inf)
         if possible.any():
-            misfit = self.misfit(thetas[possible])
+            misfit = self.statistics(thetas[possible])
             values = self.noise.log_likelihood(misfit, n_steps, noise[possible])
             usable = values < np.inf  # neither NaN nor infinite
             simulated = np.isfinite(misfit).all(axis=1)
@@ -248,9 +307,9 @@ class FELikelihood:
         return result if points.ndim == 2 else float(result[0])
 
     def _obtain(self, keys: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-        """Misfits of rows that are not in memory, and which of them came from disk; the others are simulated."""
+        """Statistics of rows that are not in memory, and which of them came from disk; the others are simulated."""
         thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), -1).copy()
-        shape = len(keys), self.measurements.n_channels
+        shape = len(keys), self._width
         misfit, on_disk = np.full(shape, np.nan), np.zeros(len(keys), dtype=bool)
         if self.cache is not None:
             misfit, reasons, on_disk = self.cache.look_up(self._key, thetas, shape[1], self.measurements.n_steps)
@@ -298,9 +357,9 @@ class FELikelihood:
         batch = None
         if self.cache is not None and self.cache.responses:
             batch = simulate_batch(self.model, thetas, self.pool)
-            misfit, reasons = misfit_of_responses(self.model, batch, measured)
+            misfit, reasons = misfit_of_responses(self.model, batch, measured, self._statistic)
         else:
-            misfit, reasons = misfit_batch(self.model, thetas, measured, self.pool)
+            misfit, reasons = misfit_batch(self.model, thetas, measured, self.pool, self._statistic)
         seconds = time.perf_counter() - start
         self.seconds += seconds
         self.simulations += len(thetas)
@@ -334,6 +393,18 @@ class FELikelihood:
                 self.failures[-1]["seconds"] = seconds
         known = reason in self.failure_reasons or len(self.failure_reasons) < _RECORDED_REASONS
         self.failure_reasons[reason if known else _OTHER_REASONS] += 1
+
+
+def _check_channels(model: Model, noise: Any) -> None:
+    """ValueError where a noise is of other channels than the model's."""
+    ours, theirs = (
+        [c.name for c in channels] for channels in (model.channels, getattr(noise, "channels", model.channels))
+    )
+    if ours != theirs:
+        raise ValueError(
+            f"the noise is of the channels {', '.join(theirs)}, the model's are {', '.join(ours)}: make the noise with "
+            "model.channels"
+        )
 
 
 def _matched(model: Model, measurements: Measurements) -> Measurements:

@@ -1,7 +1,7 @@
 """Misfits of the structural parameters simulated lately.
 
-The misfit does not depend on the noise. So whoever changes the noise's parameters alone, comes back to a point, or
-evaluates a chain again is served from memory, as long as it is not too long ago.
+The misfit, and what else a noise needs of the residuals, does not depend on the noise's parameters. So whoever changes
+these alone, comes back to a point, or evaluates a chain again is served from memory, as long as it is not too long ago.
 """
 
 import threading
@@ -54,17 +54,17 @@ class MisfitMemory:
     def __len__(self) -> int:
         return len(self._misfits)
 
-    def look_up(self, keys: Sequence[bytes], n_channels: int) -> tuple[np.ndarray, list[bool]]:
+    def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
         """What is known of distinct keys.
 
         Parameters
         ----------
         keys : sequence of n bytes
-        n_channels : int
+        width : int — numbers of one simulation, such as n_channels
 
         Returns
         -------
-        misfit : (n, n_channels) float — NaN where the simulation had failed, and where nothing is known.
+        misfit : (n, width) float — NaN where the simulation had failed, and where nothing is known.
         known : list of n bool
         """
         found = []
@@ -74,13 +74,13 @@ class MisfitMemory:
                 if misfit is not None:
                     self._misfits.move_to_end(key)
                 found.append(misfit)
-        unknown = _NAN * n_channels
+        unknown = _NAN * width
         filled = bytearray().join([unknown if misfit is None else misfit for misfit in found])  # can be written to
-        misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), n_channels)
+        misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), width)
         return misfits, [misfit is not None for misfit in found]
 
     def store(self, keys: Sequence[bytes], misfits: np.ndarray) -> None:
-        """Remember the misfits (n, n_channels) of distinct keys."""
+        """Remember the misfits (n, width) of distinct keys."""
         with self._lock:
             self._misfits.update(zip(keys, map(np.ndarray.tobytes, misfits), strict=True))
             while len(self._misfits) > self.rows:

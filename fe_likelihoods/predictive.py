@@ -184,7 +184,8 @@ def propagate(
     record : optional
         Another excitation: that of ``model.with_record(record)``.
     noise : bool
-        Predict what a sensor would read: the response plus the noise of each sample. Of histories, mean and variance
+        Predict what a sensor would read: the response plus the noise of each sample, with the correlation in time that
+        the noise has. Of histories, mean and variance
         are exact in the noise (the law of total variance adds the mean of its variance) and quantiles use one draw a
         sample; for any other quantity one draw a sample is added to the response.
     quantiles : sequence of float in (0, 1) — () for none.
@@ -216,7 +217,7 @@ def propagate(
         If every simulation fails.
     """
     model, noise_model, pool = parts_of(posterior_or_model, pool)
-    thetas, deviations = split_samples(model, noise_model, samples, noise)
+    thetas, sample_noise = split_samples(model, noise_model, samples, noise)
     n = len(thetas)
     probabilities = _probabilities(quantiles)
     if effective_sample_size is None:
@@ -243,7 +244,7 @@ def propagate(
         raise ValueError(f"seed must be a whole number, zero or more, or None; got {seed!r}") from error
     gathered = Gathered(
         members=members_of(result_of_theta, len(distinct)),
-        deviations=deviations,
+        noise=sample_noise,
         evaluate=evaluate.function,
         rows=evaluate.rows,
         result_of_sample=np.arange(n) if noise else result_of_theta,
@@ -275,7 +276,7 @@ def _prediction(gathered: Gathered, n: int, effective: float, channels: tuple[Ch
         logger.warning("%d of %d samples failed and are left out of the prediction (%s)", len(failed), n, worst)
     used = np.setdiff1d(np.arange(n), failed, assume_unique=True)
     effective = effective * len(used) / n
-    histories, noise, kept = gathered.rows is not None, gathered.deviations is not None, gathered.kept
+    histories, noise, kept = gathered.rows is not None, gathered.noise is not None, gathered.kept
     variance = gathered.moments.variance
     error = np.sqrt(variance / effective)
     if histories and noise:

@@ -17,16 +17,17 @@ import os
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from .cache import SimulationCache
-from .channels import Dataset, Measurements, read_dataset
+from .channels import Channel, Dataset, Measurements, read_dataset
 from .likelihood import FELikelihood
 from .models.bridge_inputs import CHANNEL_SETS
-from .noise import GaussianNoise, SharedGaussianNoise
+from .noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
 from .posterior import Posterior
-from .priors import HalfNormal, Prior, TruncatedNormal
+from .priors import HalfNormal, Prior, TruncatedNormal, Uniform
 from .records import Record
 from .units import to_si
 
@@ -98,15 +99,58 @@ def bridge_column_measurements(
     return Measurements(model.channels, record.dt, values, description)
 
 
-def bridge_column_prior() -> Prior:
-    """The paper's prior: normal, truncated at zero, CV .30 .20 .60 .60 .40; half-normal of .1 g and 1.2 in."""
+def bridge_column_prior(
+    noise_parameters: Sequence[str] = ("sigma_acceleration", "sigma_displacement"),
+) -> Prior:
+    """The paper's prior: normal, truncated at zero, CV .30 .20 .60 .60 .40; half-normal of .1 g and 1.2 in.
+
+    Parameters
+    ----------
+    noise_parameters : sequence of str
+        Those of another noise: a shared ``sigma`` in root mean squares of the measured channels is half-normal of .3,
+        correlations ``rho_...`` are uniform between -1 and 1; both assumed.
+
+    Raises
+    ------
+    ValueError
+        For a parameter that is none of these.
+    """
     structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
+    scales = {
+        "sigma_acceleration": to_si(0.1, "g").item(),
+        "sigma_displacement": to_si(1.2, "in").item(),
+        "sigma": 0.3,
+    }
+    noise = {name: HalfNormal(scales[name]) for name in noise_parameters if name in scales}
     return Prior(
-        {name: TruncatedNormal(1.0, cv) for name, cv in structural.items()}
-        | {
-            "sigma_acceleration": HalfNormal(to_si(0.1, "g").item()),
-            "sigma_displacement": HalfNormal(to_si(1.2, "in").item()),
-        }
+        {name: TruncatedNormal(1.0, cv) for name, cv in structural.items()} | noise | _rest(noise_parameters, scales)
+    )
+
+
+def _rest(noise_parameters: Sequence[str], scales: Mapping[str, float]) -> dict[str, Uniform]:
+    """Priors of the parameters of a noise that are no standard deviations, hence not in `scales`."""
+    rest = [name for name in noise_parameters if name not in scales]
+    unknown = [name for name in rest if not name.startswith("rho_")]
+    if unknown:
+        raise ValueError(
+            f"no default prior for {', '.join(unknown)} of this noise: make Posterior(FELikelihood(...), prior) with "
+            "your own"
+        )
+    return {name: Uniform(-1.0, 1.0) for name in rest}
+
+
+def _noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) -> Any:
+    """The noise of a name, or the one that was given; ValueError for another name."""
+    if not isinstance(noise, str):
+        return noise
+    if noise == "per channel":
+        return GaussianNoise(channels)
+    if noise == "shared":
+        return SharedGaussianNoise.of(measurements.select([channel.name for channel in channels]))
+    if noise == "autoregressive":
+        return AutoregressiveNoise(channels)
+    raise ValueError(
+        f'expected noise="per channel", "shared" or "autoregressive", or a noise of fe_likelihoods.noise; got {noise!r}'
     )
 
 
@@ -116,6 +160,7 @@ def bridge_column(
     measurements: Measurements | None = None,
     every: int = 1,
     duration: float | None = None,
+    noise: Any = "per channel",
     seed: int = 1,
     cache: SimulationCache | str | os.PathLike | None = None,
     **changes,
@@ -131,6 +176,9 @@ def bridge_column(
         Keep one sample in `every`: record resampled (anti-aliased), measurements decimated. 2 costs about half.
     duration : float
         Keep the first `duration` seconds.
+    noise : {"per channel", "shared", "autoregressive"}, or a noise of `fe_likelihoods.noise`
+        White, one sigma for each channel as in the paper, or one for both; or an error that lasts, with a correlation
+        ``rho_...`` per channel too. Priors are in `bridge_column_prior`.
     seed : int
         Of the noise, where measurements are made.
     cache : SimulationCache or path, optional
@@ -141,12 +189,13 @@ def bridge_column(
     Returns
     -------
     Posterior
-        Parameters Ec, Es, a0, a1, ft (multiples of nominal), sigma_acceleration [m/s2], sigma_displacement [m].
+        Parameters Ec, Es, a0, a1, ft (multiples of nominal), sigma_acceleration [m/s2], sigma_displacement [m], or
+        those of another noise.
 
     Raises
     ------
     ValueError
-        For measurements without a record, or that do not fit it.
+        For measurements without a record, or that do not fit it; for an unknown noise.
     """
     from .models.rc_column import RCColumn
 
@@ -163,7 +212,8 @@ def bridge_column(
         measurements = measurements.decimate(every)
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
-    return Posterior(FELikelihood(model, measurements, cache=cache), bridge_column_prior())
+    law = _noise(noise, model.channels, measurements)
+    return Posterior(FELikelihood(model, measurements, law, cache=cache), bridge_column_prior(law.parameter_names))
 
 
 # ------------------------------------------------------------------ isolated bridge
@@ -271,7 +321,7 @@ def isolated_bridge(
     *,
     data: str = "twin",
     channels: tuple[str, ...] | int | None = None,
-    noise: str = "shared",
+    noise: Any = "shared",
     record: Record | None = None,
     measurements: Measurements | None = None,
     seed: int = 1,
@@ -288,9 +338,10 @@ def isolated_bridge(
         (`IsolatedBridge.exchanged`).
     channels : tuple of str, 5, 6 or 10, optional
         Measured channels that are used. Default: six of "twin", as in the paper's figure of the fit; all of any other.
-    noise : {"shared", "per channel"}
-        One sigma for all channels, in root mean squares of the measured channel, as in the paper's results, or one for
-        each channel [SI], its general formulation.
+    noise : {"shared", "per channel", "autoregressive"}, or a noise of `fe_likelihoods.noise`
+        White, one sigma for all channels, in root mean squares of the measured channel, as in the paper's results, or
+        one for each channel [SI], its general formulation; or an error that lasts, with a correlation ``rho_...`` per
+        channel too (uniform between -1 and 1).
     record, measurements : optional
         Table motion and responses of your own. With a record alone, synthetic measurements are made for it
         (`isolated_bridge_measurements`). Measurements may have a step that is a multiple of the record's.
@@ -312,8 +363,6 @@ def isolated_bridge(
     """
     from .models.isolated_bridge import IsolatedBridge
 
-    if noise not in ("shared", "per channel"):
-        raise ValueError(f'expected noise="shared" or "per channel"; got {noise!r}')
     if record is None:
         if measurements is not None:
             raise ValueError("measurements came without the record that caused them: give record= too")
@@ -331,9 +380,9 @@ def isolated_bridge(
     model = IsolatedBridge(
         record, outputs=tuple(c.name for c in measurements.channels), **({"every": max(1, every)} | changes)
     )
-    if noise == "shared":
-        law, scales = SharedGaussianNoise.of(measurements), [1.0]
-    else:
-        law, scales = GaussianNoise(measurements.channels), SharedGaussianNoise.of(measurements).scales
-    prior = isolated_bridge_prior(model.parameter_names, dict(zip(law.parameter_names, scales, strict=True)))
+    law = _noise(noise, model.channels, measurements)
+    rms = SharedGaussianNoise.of(measurements).scales
+    scales = {"sigma": 1.0} | {f"sigma_{c.name}": scale for c, scale in zip(measurements.channels, rms, strict=True)}
+    sigmas = {name: scales[name] for name in law.parameter_names if name in scales}
+    prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | _rest(law.parameter_names, scales)
     return Posterior(FELikelihood(model, measurements, law, cache=cache), prior)

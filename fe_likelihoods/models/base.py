@@ -14,6 +14,7 @@ import logging
 import re
 from collections.abc import Callable
 from functools import partial
+from itertools import cycle
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -25,6 +26,7 @@ __all__ = [
     "Model",
     "SimulationBatch",
     "SimulationFailed",
+    "Statistic",
     "misfit_batch",
     "misfit_of_responses",
     "simulate_batch",
@@ -32,6 +34,12 @@ __all__ = [
 ]
 
 logger = logging.getLogger(__name__)
+
+Statistic = Callable[[np.ndarray], np.ndarray]
+"""Residuals (n_channels, n_steps) to numbers (n_numbers,), the first n_channels of them the sums of squares.
+
+A function of a module, so that it can be sent to workers.
+"""
 
 _RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is wanted: 64 MiB
 
@@ -67,7 +75,8 @@ class SimulationBatch(NamedTuple):
 class MisfitBatch(NamedTuple):
     """Misfits of a batch of parameter sets.
 
-    misfit : (n, n_channels) float, sums of squared residuals [SI unit of the channel, squared]; rows of failures NaN
+    misfit : (n, n_channels) float, sums of squared residuals [SI unit of the channel, squared]; (n, n_numbers) where
+        another statistic of the residuals was asked for; rows of failures NaN
     reasons : n strings, empty where the simulation succeeded
     """
 
@@ -131,8 +140,10 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     return SimulationBatch(*_run_each(_response, model, thetas, shape, pool))
 
 
-def misfit_batch(model: Model, thetas: np.ndarray, measured: np.ndarray, pool: Any = None) -> MisfitBatch:
-    """Sums of squared residuals at many parameter sets; no response is kept.
+def misfit_batch(
+    model: Model, thetas: np.ndarray, measured: np.ndarray, pool: Any = None, statistic: Statistic | None = None
+) -> MisfitBatch:
+    """Sums of squared residuals, or another statistic of them, at many parameter sets; no response is kept.
 
     Parameters
     ----------
@@ -143,45 +154,58 @@ def misfit_batch(model: Model, thetas: np.ndarray, measured: np.ndarray, pool: A
     pool : object with ``map(function, items)``, optional
         Runs the simulations one by one, also where the model has a batch method (which stays in this process); the
         results do not depend on it.
+    statistic : Statistic, optional
+        What is taken of the residuals instead; a model's own ``misfit_batch`` cannot give it and is passed by.
 
     Returns
     -------
     MisfitBatch
     """
-    shape = (len(model.channels),)
-    whole = getattr(model, "misfit_batch", None) if pool is None else None
-    if whole is None and pool is None and hasattr(model, "simulate_batch"):
-        whole = partial(_misfit_from_responses, model)
+    reduce = _sums_of_squares if statistic is None else statistic
+    shape = (len(reduce(measured)),)
+    whole = getattr(model, "misfit_batch", None) if pool is None and statistic is None else None
     if whole is not None:
-        batch = _run_whole(model, partial(whole, thetas, measured), (len(thetas), *shape))
+        whole = partial(whole, thetas, measured)
+    elif pool is None and hasattr(model, "simulate_batch"):
+        whole = partial(_misfit_from_responses, model, thetas, measured, reduce)
+    if whole is not None:
+        batch = _run_whole(model, whole, (len(thetas), *shape))
         if batch is not None:
             return MisfitBatch(*batch)
-    return MisfitBatch(*_run_each(partial(_misfit, measured), model, thetas, shape, pool))
+    return MisfitBatch(*_run_each(partial(_misfit, measured, reduce), model, thetas, shape, pool))
 
 
-def misfit_of_responses(model: Model, batch: SimulationBatch, measured: np.ndarray) -> MisfitBatch:
-    """Sums of squared residuals of responses against `measured` (n_channels, n_steps)."""
-    misfit = np.reshape([_squared_residuals(response, measured) for response in batch.response], (-1, len(measured)))
+def misfit_of_responses(
+    model: Model, batch: SimulationBatch, measured: np.ndarray, statistic: Statistic | None = None
+) -> MisfitBatch:
+    """Sums of squared residuals, or another statistic, of responses against `measured` (n_channels, n_steps)."""
+    reduce = _sums_of_squares if statistic is None else statistic
+    rows = [_reduced(response, measured, reduce) for response in batch.response]
+    misfit = np.reshape(rows, (len(rows), len(reduce(measured))))
     reasons = [reason or _not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
     misfit[[bool(reason) for reason in reasons]] = np.nan
     return MisfitBatch(misfit, reasons)
 
 
-def _squared_residuals(response: np.ndarray, measured: np.ndarray) -> np.ndarray:
+def _sums_of_squares(residuals: np.ndarray) -> np.ndarray:
+    return np.square(residuals).sum(axis=-1)
+
+
+def _reduced(response: np.ndarray, measured: np.ndarray, reduce: Statistic) -> np.ndarray:
     # contiguous rows: the order of summation, hence the last bit, must not depend on who made the array
     residuals = np.ascontiguousarray(response - measured)
-    with np.errstate(over="ignore"):
-        return np.square(residuals).sum(axis=-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return reduce(residuals)
 
 
-def _misfit_from_responses(model: Model, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
+def _misfit_from_responses(model: Model, thetas: np.ndarray, measured: np.ndarray, reduce: Statistic) -> MisfitBatch:
     misfits, reasons = [], []
     rows = max(1, _RESPONSE_VALUES // measured.size)
     for start in range(0, len(thetas), rows):
         batch = simulate_batch(model, thetas[start : start + rows])
-        misfits += [_squared_residuals(response, measured) for response in batch.response]
+        misfits += [_reduced(response, measured, reduce) for response in batch.response]
         reasons += batch.reasons
-    return MisfitBatch(np.reshape(misfits, (len(thetas), len(measured))), reasons)
+    return MisfitBatch(np.reshape(misfits, (len(thetas), len(reduce(measured)))), reasons)
 
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
@@ -192,13 +216,13 @@ def _response(model: Model, theta: np.ndarray) -> np.ndarray:
     return response
 
 
-def _misfit(measured: np.ndarray, model: Model, theta: np.ndarray) -> np.ndarray:
-    return _squared_residuals(_response(model, theta), measured)
+def _misfit(measured: np.ndarray, reduce: Statistic, model: Model, theta: np.ndarray) -> np.ndarray:
+    return _reduced(_response(model, theta), measured, reduce)
 
 
 def _not_finite(model: Model, values: np.ndarray) -> str:
     """Reason why one row of responses or misfits is not usable, or an empty string."""
-    for channel, value in zip(model.channels, values, strict=True):
+    for channel, value in zip(cycle(model.channels), values, strict=False):  # several numbers a channel go round
         if not np.isfinite(value).all():
             what = "response" if value.ndim else "misfit"
             return f"the {what} of channel {channel.name!r} is not finite"
