@@ -17,11 +17,11 @@ __all__ = ["Gathered", "distinct_rows", "members_of", "parts_of", "split_samples
 
 
 def parts_of(thing: Any, pool: Any) -> tuple[Any, Any, Any]:
-    """Model, noise (None for a bare model) and pool."""
+    """Model, noise (None for a bare model; with its parameters, where they were integrated out) and pool."""
     likelihood = getattr(thing, "likelihood", thing)
     if hasattr(likelihood, "measurements") and hasattr(likelihood, "model"):
         pool = getattr(likelihood, "pool", None) if pool is None else as_engine(pool, likelihood.model)
-        return likelihood.model, likelihood.noise, pool
+        return likelihood.model, getattr(likelihood.noise, "noise", likelihood.noise), pool
     if not (hasattr(thing, "simulate") and hasattr(thing, "parameter_names")):
         raise ValueError(f"expected a Posterior, an FELikelihood or a model with simulate(theta); got {thing!r}")
     return thing, None, as_engine(pool, thing)

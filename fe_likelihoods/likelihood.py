@@ -290,11 +290,12 @@ class FELikelihood:
         points = as_points(x, self.parameter_names)
         rows = np.atleast_2d(points)
         thetas, noise = np.split(rows, [self._n_structural], axis=1)
-        # a perfect fit tells which noise parameters are possible at all, before anything is simulated
-        perfect = np.zeros((len(rows), self._width))
         n_steps = self.measurements.n_steps
-        impossible = np.isneginf(self.noise.log_likelihood(perfect, n_steps, noise))
-        possible = np.isfinite(rows).all(axis=1) & ~impossible
+        possible = np.isfinite(rows).all(axis=1)
+        if self.simulation_free:
+            # a perfect fit tells which noise parameters are possible at all, before anything is simulated
+            perfect = np.zeros((len(rows), self._width))
+            possible &= ~np.isneginf(self.noise.log_likelihood(perfect, n_steps, noise))
         result = np.full(len(rows), -np.inf)
         if possible.any():
             misfit = self.statistics(thetas[possible])
@@ -305,6 +306,19 @@ class FELikelihood:
                 self._record(thetas[possible][row], f"the log-likelihood of the noise is {values[row]}")
             result[possible] = np.where(simulated & usable, values, -np.inf)
         return result if points.ndim == 2 else float(result[0])
+
+    def with_noise(self, noise: Any) -> "FELikelihood":
+        """The same with another noise: model, measurements, pool, cache and bounds stay; counts and memory are new."""
+        other = FELikelihood(
+            self.model,
+            self.measurements,
+            noise,
+            memory=self._memory.rows,
+            cache=self.cache,
+            max_failure_share=self.max_failure_share,
+        )
+        other.pool = self.pool
+        return other
 
     def _obtain(self, keys: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
         """Statistics of rows that are not in memory, and which of them came from disk; the others are simulated."""

@@ -176,7 +176,8 @@ def propagate(
     posterior_or_model : Posterior, FELikelihood or Model
     samples : (n, ndim) float, or named values (n,)
         Equally weighted samples: all parameters of the posterior (``sampler.get_chain(flat=True)``), or, without
-        noise, the structural ones alone.
+        noise, the structural ones alone. Of a posterior whose noise is integrated out: what `Posterior.draw_noise`
+        returns.
     quantity : optional
         None: the histories of all channels. A channel's name, or several: their histories. ``peak(name)`` and its like
         (`fe_likelihoods.quantities`), or several. Or any function of the response (n_channels, n_steps) [SI] that
@@ -336,7 +337,8 @@ def fit_measures(posterior: Any, samples: Any) -> np.ndarray:
     if not hasattr(likelihood, "measurements"):
         raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")
     power = _power(likelihood.measurements.values, likelihood.measurements.channels)
-    thetas, _ = split_samples(likelihood.model, likelihood.noise, samples, False)
+    model, noise, _ = parts_of(posterior, None)
+    thetas, _ = split_samples(model, noise, samples, False)
     return likelihood.misfit(thetas) / power
 
 

@@ -141,7 +141,7 @@ def _rest(noise_parameters: Sequence[str], scales: Mapping[str, float]) -> dict[
 
 def _noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) -> Any:
     """The noise of a name, or the one that was given; ValueError for another name."""
-    if not isinstance(noise, str):
+    if hasattr(noise, "log_likelihood"):
         return noise
     if noise == "per channel":
         return GaussianNoise(channels)
@@ -150,7 +150,8 @@ def _noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) 
     if noise == "autoregressive":
         return AutoregressiveNoise(channels)
     raise ValueError(
-        f'expected noise="per channel", "shared" or "autoregressive", or a noise of fe_likelihoods.noise; got {noise!r}'
+        'expected noise="per channel", "shared", "autoregressive" or "marginal", or a noise of fe_likelihoods.noise; '
+        f"got {noise!r}"
     )
 
 
@@ -176,9 +177,10 @@ def bridge_column(
         Keep one sample in `every`: record resampled (anti-aliased), measurements decimated. 2 costs about half.
     duration : float
         Keep the first `duration` seconds.
-    noise : {"per channel", "shared", "autoregressive"}, or a noise of `fe_likelihoods.noise`
+    noise : {"per channel", "shared", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.noise`
         White, one sigma for each channel as in the paper, or one for both; or an error that lasts, with a correlation
-        ``rho_...`` per channel too. Priors are in `bridge_column_prior`.
+        ``rho_...`` per channel too. Priors are in `bridge_column_prior`. "marginal" is "per channel" with the sigmas
+        integrated out (`Posterior.marginal`): five parameters.
     seed : int
         Of the noise, where measurements are made.
     cache : SimulationCache or path, optional
@@ -212,8 +214,9 @@ def bridge_column(
         measurements = measurements.decimate(every)
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
-    law = _noise(noise, model.channels, measurements)
-    return Posterior(FELikelihood(model, measurements, law, cache=cache), bridge_column_prior(law.parameter_names))
+    law = _noise("per channel" if noise == "marginal" else noise, model.channels, measurements)
+    posterior = Posterior(FELikelihood(model, measurements, law, cache=cache), bridge_column_prior(law.parameter_names))
+    return posterior.marginal() if noise == "marginal" else posterior
 
 
 # ------------------------------------------------------------------ isolated bridge
@@ -338,10 +341,11 @@ def isolated_bridge(
         (`IsolatedBridge.exchanged`).
     channels : tuple of str, 5, 6 or 10, optional
         Measured channels that are used. Default: six of "twin", as in the paper's figure of the fit; all of any other.
-    noise : {"shared", "per channel", "autoregressive"}, or a noise of `fe_likelihoods.noise`
+    noise : {"shared", "per channel", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.noise`
         White, one sigma for all channels, in root mean squares of the measured channel, as in the paper's results, or
         one for each channel [SI], its general formulation; or an error that lasts, with a correlation ``rho_...`` per
-        channel too (uniform between -1 and 1).
+        channel too (uniform between -1 and 1). "marginal" is "shared" with sigma integrated out
+        (`Posterior.marginal`): ten parameters.
     record, measurements : optional
         Table motion and responses of your own. With a record alone, synthetic measurements are made for it
         (`isolated_bridge_measurements`). Measurements may have a step that is a multiple of the record's.
@@ -380,9 +384,10 @@ def isolated_bridge(
     model = IsolatedBridge(
         record, outputs=tuple(c.name for c in measurements.channels), **({"every": max(1, every)} | changes)
     )
-    law = _noise(noise, model.channels, measurements)
+    law = _noise("shared" if noise == "marginal" else noise, model.channels, measurements)
     rms = SharedGaussianNoise.of(measurements).scales
     scales = {"sigma": 1.0} | {f"sigma_{c.name}": scale for c, scale in zip(measurements.channels, rms, strict=True)}
     sigmas = {name: scales[name] for name in law.parameter_names if name in scales}
     prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | _rest(law.parameter_names, scales)
-    return Posterior(FELikelihood(model, measurements, law, cache=cache), prior)
+    posterior = Posterior(FELikelihood(model, measurements, law, cache=cache), prior)
+    return posterior.marginal() if noise == "marginal" else posterior

@@ -365,7 +365,7 @@ def test_problems_take_another_noise():
     given = isolated_bridge(channels=("acc_p1", "Ub_2"), noise=noise, step=1e-3)
     assert given.likelihood.noise is noise and given.ndim == 11
     assert given.fingerprint != isolated_bridge(channels=("acc_p1", "Ub_2"), step=1e-3).fingerprint
-    with pytest.raises(ValueError, match='"per channel", "shared" or "autoregressive"'):
+    with pytest.raises(ValueError, match='"per channel", "shared", "autoregressive" or "marginal"'):
         isolated_bridge(noise="pink")
     names = AutoregressiveNoise((CHANNELS[0],)).parameter_names
     with pytest.raises(ValueError, match="no default prior for nu_top"):
