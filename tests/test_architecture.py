@@ -164,6 +164,18 @@ def test_models_know_no_likelihood():
                 assert parts[1] in allowed, f"{name(path)} imports {imported}"
 
 
+def test_noise_knows_neither_model_nor_likelihood():
+    below = {
+        "residuals": set(),
+        "noise": {"channels", "residuals"},
+        "noise_marginal": {"noise", "priors"},
+    }
+    for stem, allowed in below.items():
+        path = ROOT / "fe_likelihoods" / f"{stem}.py"
+        own = {m.split(".")[1] for m, _ in imports(path) if m.split(".")[0] == "fe_likelihoods"}
+        assert own <= allowed, f"{name(path)} imports {own - allowed}"
+
+
 def test_processes_stand_on_the_standard_library_alone():
     """So that a worker starts at once, and waits for what its function imports only."""
     below = {"minder": set(), "processes": {"minder"}, "isolated": {"processes"}, "local_pool": {"processes"}}
