@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri
 
 from .channels import Channel, Measurements
 from .predictive import Prediction
@@ -144,7 +144,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
         layout="constrained",
         width_ratios=(2, 1, 1),
     )
-    normal = stats.norm.ppf((np.arange(n) + 0.5) / n)
+    normal = ndtri((np.arange(n) + 0.5) / n)
     for k, (history, lags, quantiles) in enumerate(rows):
         values = from_si(np.asarray(residuals[k], dtype=float), channels[k].unit)
         history.plot(np.arange(n) * dt, values, color=BLUE, linewidth=0.7)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from .engines import as_engine
 from .likelihood import as_points
@@ -38,6 +37,8 @@ class SampleNoise(NamedTuple):
         """Errors (n_channels, n_steps) [SI] of one sample."""
         errors = stream.standard_normal((self.deviations.shape[1], n_steps))
         if self.lag_one is not None:
+            from scipy.signal import lfilter  # where used: slow to import, and rarely needed
+
             for row, rho in zip(errors, self.lag_one[sample], strict=True):
                 # e_t = rho e_{t-1} + sqrt(1 - rho^2) z_t, with the first one as large as all others
                 row[1:] *= np.sqrt((1.0 - rho) * (1.0 + rho))

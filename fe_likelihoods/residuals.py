@@ -14,7 +14,6 @@ to `fe_likelihoods.noise.GaussianNoise`, and `innovations` whether one lag of co
 from typing import NamedTuple
 
 import numpy as np
-from scipy import fft, stats
 
 __all__ = [
     "ResidualChecks",
@@ -81,9 +80,9 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
     """
     residuals = _checked(residuals)
     n = residuals.shape[1]
-    size = fft.next_fast_len(2 * n, real=True)
-    spectrum = fft.rfft(residuals / np.abs(residuals).max(axis=1, keepdims=True), size, axis=1)
-    products = fft.irfft(spectrum * spectrum.conj(), size, axis=1)[:, :n]
+    size = 2 ** (2 * n - 1).bit_length()  # room for all lags, without wrapping round
+    spectrum = np.fft.rfft(residuals / np.abs(residuals).max(axis=1, keepdims=True), size, axis=1)
+    products = np.fft.irfft(spectrum * spectrum.conj(), size, axis=1)[:, :n]
     return products / products[:, :1]
 
 
@@ -181,6 +180,8 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     another question, and takes none of its significance. Probabilities below a hundredth are worth a look at
     `fe_likelihoods.figures.plot_residuals`.
     """
+    from scipy import stats  # where used: half a second, and whoever has a noise imports this module
+
     residuals = _checked(residuals)
     n_effective = effective_samples(residuals)
     lag_one = autocorrelation(residuals)[:, 1]
