@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: help update test test-slow tutorials bench lint format data clean
+.PHONY: help update test test-slow clients tutorials bench docs figures lint format data clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/'
@@ -23,11 +23,21 @@ test: $(READY)   ## the quick tests
 test-slow: $(READY) ## the slow tests
 	$(BIN)/python -m pytest -m slow
 
+clients:         ## every client on one posterior, against quadrature (two environments of their own, 3 GB)
+	PYTHON=$(PYTHON) .ci/clients
+
 tutorials: $(READY) ## every tutorial from top to bottom, with all data
 	for t in tutorials/[0-9]*.py; do $(BIN)/python $$t || exit 1; done
 
 bench: $(READY)  ## speed beside the peers, one table
 	$(BIN)/python -m tests.benchmarks
+
+docs: $(READY)   ## the pages of docs/ with the API reference, into docs/_build/html; a warning is an error
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/python -m sphinx -b html -W --keep-going -q docs docs/_build/html
+
+figures: $(READY) ## the pictures of README and docs/, by tutorial 01 and the models themselves
+	$(BIN)/python docs/make_figures.py
 
 lint: $(READY)   ## ruff, format and rules
 	$(BIN)/ruff format --check .
@@ -42,4 +52,4 @@ data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environment and the results
-	rm -rf $(VENV) results results-*
+	rm -rf $(VENV) .venv-clients .venv-uqpy docs/_build results results-*
