@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from . import readers
 from .records import DisplacementHistory, Record, check_step, sample_window
 from .units import DIMENSIONS, find_unit, to_si
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     "Channel",
@@ -188,6 +191,14 @@ class Measurements:
         if not isinstance(factor, (int, np.integer)) or not 1 <= factor <= self.n_steps:
             raise ValueError(f"factor must be a whole number from 1 to {self.n_steps}, got {factor!r}")
         return replace(self, dt=self.dt * factor, values=self.values[:, ::factor])
+
+    def plot(
+        self, response: "Measurements | None" = None, channels: Sequence[str] | None = None, **options
+    ) -> "Figure":
+        """Histories of the channels, and what a model answers; see `fe_likelihoods.figures.plot_histories`."""
+        from .figures import plot_histories
+
+        return plot_histories(self, response, channels, **options)
 
     def _row(self, name: str) -> int:
         names = [channel.name for channel in self.channels]

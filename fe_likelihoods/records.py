@@ -12,16 +12,22 @@ The readers state the unit they found or refuse: PEER's AT2, CSMIP's and COSMOS'
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import readers
 from .units import to_si
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from .spectra import ResponseSpectrum
 
 __all__ = [
     "DisplacementHistory",
@@ -195,6 +201,44 @@ class Record:
             raise ValueError(f"scale factor of {self.name!r} must be a finite number, got {factor!r}")
         note = f"scaled by {factor:g}"
         return replace(self, acceleration=factor * self.acceleration, source=self._source(note))
+
+    def spectrum(
+        self, periods: Sequence[float] | NDArray[np.float64] | None = None, damping_ratio: float = 0.05
+    ) -> "ResponseSpectrum":
+        """Elastic response spectrum; arguments and errors are those of `fe_likelihoods.spectra.response_spectrum`."""
+        from .spectra import response_spectrum
+
+        return response_spectrum(self, periods, damping_ratio)
+
+    def plot(self, axes: "Axes | None" = None, unit: str = "g") -> "Axes":
+        """Acceleration against time; arguments and errors are those of `fe_likelihoods.figures.plot_record`."""
+        from .figures import plot_record
+
+        return plot_record(self, axes, unit)
+
+    def plot_spectrum(
+        self,
+        periods: Sequence[float] | NDArray[np.float64] | None = None,
+        damping_ratios: Sequence[float] = (0.02, 0.05, 0.1),
+        axes: "Axes | None" = None,
+        quantity: str = "pseudo_acceleration",
+        unit: str | None = None,
+    ) -> "Axes":
+        """Response spectra for one damping ratio or several; errors are those of `spectrum` and `plot_spectra`.
+
+        Parameters
+        ----------
+        periods : (n_periods,) array_like, optional
+            Undamped periods [s]; see `fe_likelihoods.spectra.response_spectrum`.
+        damping_ratios : sequence of float
+            Fractions of critical damping, one line each.
+        axes, quantity, unit
+            See `fe_likelihoods.figures.plot_spectra`.
+        """
+        from .figures import plot_spectra
+
+        spectra = [self.spectrum(periods, ratio) for ratio in damping_ratios]
+        return plot_spectra(spectra, axes, quantity, unit, self.name)
 
     def _source(self, note: str) -> str:
         return f"{self.source}; {note}" if self.source else note

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 
+from .beam_column import HEAD
 from .frame import assemble, commit_sections, release_sections
 from .jit import kernel
 from .linear_solve import copy_matrix, solve_banded
@@ -38,7 +39,22 @@ HISTORY_ROWS = (
     "damped energy",
     "absorbed energy",
     "input energy",
+    "force",
+    "base axial strain",
+    "base curvature",
+    "base axial force",
+    "base moment",
 )
+
+
+@kernel(inline=True)
+def _record_forces(column, force, out):
+    """Restoring force of the top, and e0, kappa, N, M of the base section, into `out` (5,)."""
+    out[0] = force
+    out[1] = column.element_state[0, HEAD]
+    out[2] = column.element_state[0, HEAD + 1]
+    out[3] = column.element_state[0, HEAD + 5]
+    out[4] = column.element_state[0, HEAD + 6]
 
 
 @kernel
@@ -48,7 +64,7 @@ def newmark(
     """Gravity, then base acceleration `ground` (n,) at steps of `dt` along x.
 
     gravity, mass : (n_dof,) static load and diagonal mass. every : one sample in `every` steps is kept.
-    initial_velocity : of the top, along x. history : (7, n_kept) out, rows as HISTORY_ROWS.
+    initial_velocity : of the top, along x. history : (12, n_kept) out, rows as HISTORY_ROWS.
     Returns (status, retries, iterations): status 0 when all went well, -1 when gravity failed, k when step k failed.
     """
     n = gravity.shape[0]
@@ -84,6 +100,7 @@ def newmark(
     history[4, 0] = 0.0
     history[5, 0] = 0.0
     history[6, 0] = supplied
+    _record_forces(column, force[top], history[7:, 0])
 
     for step in range(1, ground.shape[0]):
         done, part, loose, releases = 0.0, 1.0, False, 0
@@ -176,4 +193,5 @@ def newmark(
             history[4, m] = damped
             history[5, m] = absorbed
             history[6, m] = supplied
+            _record_forces(column, force[top], history[7:, m])
     return 0, retries, total_iterations

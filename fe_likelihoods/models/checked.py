@@ -9,12 +9,17 @@ import math
 import time
 from collections.abc import Sequence
 from hashlib import blake2b
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..channels import Channel
 from .base import SimulationFailed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..channels import Measurements
 
 __all__ = ["CheckedModel", "positive"]
 
@@ -111,6 +116,12 @@ class CheckedModel:
             seconds = time.perf_counter() - start if seconds is None else seconds
             raise SimulationFailed(f"{reason} after {seconds:.3g} s") from error
         return response
+
+    def plot_response(self, theta: np.ndarray, measurements: "Measurements | None" = None) -> "Figure":
+        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
+        from .figures import plot_response
+
+        return plot_response(self, theta, measurements)
 
     def _checked(self, response: Any) -> np.ndarray:
         expected = (len(self.channels), self.n_steps)

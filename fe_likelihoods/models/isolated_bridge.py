@@ -25,7 +25,7 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -40,6 +40,11 @@ from .base import MisfitBatch, SimulationBatch, SimulationFailed
 from .bridge_inputs import CHANNEL_SETS, Bearing, Damper, Pier, Rubber
 from .inputs import channel_rows, number, refuse, theta_row, theta_rows, whole_number
 from .threads import map_threads
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..channels import Measurements
 
 __all__ = ["CHANNEL_SETS", "Bearing", "BridgeHistory", "Damper", "IsolatedBridge", "Pier", "Rubber"]
 
@@ -257,6 +262,18 @@ class IsolatedBridge:
         nominal = np.array(list(self.nominal.values()))
         physical = np.asarray(thetas, dtype=float) * nominal
         return physical[..., [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]] / nominal
+
+    def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
+        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
+        from .figures import plot_response
+
+        return plot_response(self, theta, measurements)
+
+    def plot_hysteresis(self, theta: np.ndarray) -> Figure:
+        """Isolator force against bearing displacement of both piers (`models.figures.plot_bearing_loops`)."""
+        from .figures import plot_bearing_loops
+
+        return plot_bearing_loops(replace(self, every=1).history(theta))
 
     # ------------------------------------------------------------------ the linear part
 

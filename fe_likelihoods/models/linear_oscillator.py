@@ -16,13 +16,18 @@ One simulation costs tens of microseconds: the model for first steps, for tests 
 import cmath
 import hashlib
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..channels import Channel
 from ..records import Record
 from .base import SimulationFailed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..channels import Measurements
 
 __all__ = ["LinearOscillator", "OscillatorResponse", "respond"]
 
@@ -157,6 +162,12 @@ class LinearOscillator:
         if not isinstance(record, Record):
             raise ValueError(f"LinearOscillator: expected a Record as excitation; got {type(record).__name__}")
         return type(self)(record, self.period, self.damping_ratio)
+
+    def plot_response(self, theta: np.ndarray, measurements: "Measurements | None" = None) -> "Figure":
+        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
+        from .figures import plot_response
+
+        return plot_response(self, theta, measurements)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response at one set of parameters.

@@ -26,6 +26,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Integral
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -49,6 +50,12 @@ from .circular_section import (
 from .column_inputs import Bars, Concrete, Hoops, Patches, Steel
 from .inputs import channel_rows, number, refuse, theta_row, theta_rows, whole_number
 from .threads import map_threads
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from ..channels import Measurements
 
 __all__ = ["Bars", "ColumnHistory", "Concrete", "Hoops", "Patches", "RCColumn", "Steel"]
 
@@ -302,6 +309,24 @@ class RCColumn:
             return ((run(theta).values[rows] - measured) ** 2).sum(axis=1)
 
         return MisfitBatch(*map_threads(misfit, theta_rows(thetas, self.parameters), (len(rows),)))
+
+    def plot_section(self, axes: Axes | None = None) -> Axes:
+        """Cover, core, mesh and bars of the section (`models.figures.plot_section`)."""
+        from .figures import plot_section
+
+        return plot_section(self, axes)
+
+    def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
+        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
+        from .figures import plot_response
+
+        return plot_response(self, theta, measurements)
+
+    def plot_hysteresis(self, theta: np.ndarray) -> Figure:
+        """Base moment against curvature, force against displacement of the top (`models.figures.plot_column_loops`)."""
+        from .figures import plot_column_loops
+
+        return plot_column_loops(self, self.history(theta))
 
     def _rows(self) -> list[int]:
         return [_CHANNEL_ROWS[c.name] for c in self.channels]

@@ -14,7 +14,7 @@ from scipy import optimize, stats
 from fe_likelihoods.channels import Measurements
 from fe_likelihoods.kernels import concrete04, reinforcing_steel
 from fe_likelihoods.kernels.frame import allocate
-from fe_likelihoods.kernels.newmark import newmark
+from fe_likelihoods.kernels.newmark import HISTORY_ROWS, newmark
 from fe_likelihoods.likelihood import FELikelihood
 from fe_likelihoods.models.base import SimulationFailed
 from fe_likelihoods.models.circular_section import gauss_lobatto
@@ -177,7 +177,7 @@ def test_units_do_not_matter(strong, theta):
     reinforcing_steel.constants(*peer.steel, kernels.steel)
     gravity = np.array([0.0, 0.0, 0.0, 0.0, -peer.axial_load, 0.0])
     mass = np.array([0.0, 0.0, 0.0, *peer.mass])
-    history = np.zeros((7, strong.n_steps))
+    history = np.zeros((len(HISTORY_ROWS), strong.n_steps))
     ground = strong.acceleration / INCH
     newmark(kernels, gravity, mass, peer.a0, peer.a1, ground, strong.dt, 1e-10, 20, 10, 1, 0.0, history)
     assert rrmse(history[1::-1] * INCH, model.simulate(theta)).max() < 1e-8
@@ -209,6 +209,19 @@ def test_history_holds_the_response(column):
     np.testing.assert_array_equal(response, [history["absolute acceleration"], history["relative displacement"]])
     np.testing.assert_allclose(response[:, 0], [column.loading.acceleration[0], 0.0], rtol=0, atol=1e-15)
     assert isinstance(history.retries, int)
+
+
+def test_forces_in_the_history_are_in_equilibrium(strong):
+    """Without damping or vertical inertia: F = -m a at the top, and F and the weight make the moment at the base."""
+    tight = dict(TIGHT, a0=0.0, a1=0.0, vertical_mass=False, parameters=("Ec",))
+    model = RCColumn.lhpost(strong.trim(0.0, 2.0), **tight)
+    history = model.history([0.6])
+    force, weight = history["force"], model.mass * G0
+    np.testing.assert_allclose(force, -model.mass * history["absolute acceleration"], rtol=0, atol=1e-6 * np.ptp(force))
+    moment = force * (model.height + history["vertical displacement"]) + weight * history["relative displacement"]
+    np.testing.assert_allclose(-history["base moment"], moment, rtol=0, atol=1e-6 * np.ptp(moment))
+    np.testing.assert_allclose(history["base axial force"], -weight, rtol=1e-3)  # it leans by a hundredth
+    assert np.corrcoef(history["base curvature"], history["base moment"])[0, 1] > 0.9
 
 
 # --- arguments and parameters ----------------------------------------------------------------------------------------
