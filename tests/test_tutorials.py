@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -23,6 +24,35 @@ def run_tutorial(name: str, *arguments: str) -> str:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
+
+
+@pytest.fixture(scope="module")
+def oscillator(tmp_path_factory) -> Path:
+    """Results of the ten-minute introduction."""
+    out = tmp_path_factory.mktemp("oscillator")
+    run_tutorial("01_linear_oscillator.py", "--out", str(out))
+    return out
+
+
+def test_three_samplers_agree_with_integrals_on_a_grid(oscillator):
+    result = json.loads((oscillator / "summary.json").read_text())
+    assert set(result["samplers"]) == {"emcee", "SMC", "TMCMC"}
+    grid, truth = np.array(result["grid"]), np.array(result["truth"])
+    for name, run in result["samplers"].items():
+        mean, sd, error = (np.array(run[key]) for key in ("mean", "sd", "mean_error"))
+        assert np.all(error < 0.1 * sd), f"{name}: a larger error would not say much"
+        assert np.all(np.abs(mean - grid) < 4.0 * error), name
+        assert np.all(np.abs(grid - truth) < 4.0 * sd)
+    for name in ("SMC", "TMCMC"):
+        run = result["samplers"][name]
+        assert 0.0 < run["log_evidence_error"] < 0.1
+        assert abs(run["log_evidence"] - result["log_evidence_grid"]) < 4.0 * run["log_evidence_error"], name
+    assert result["coverage"] == pytest.approx([0.9, 0.9], abs=0.04)  # of 800 samples: 4 standard errors
+
+
+def test_introduction_leaves_its_figures(oscillator):
+    for name in ("record", "measurements", "corner", "fit", "prediction"):
+        assert (oscillator / f"{name}.png").stat().st_size > 10_000, name
 
 
 @pytest.fixture(scope="module")
