@@ -49,6 +49,8 @@ _STORE_RESPONSE = (
 class Remembered(NamedTuple):
     """What a cache knows of n simulations.
 
+    Attributes
+    ----------
     misfit : (n, n_channels) float — NaN where the simulation failed, and where nothing is known
     reasons : n strings, empty where the simulation succeeded or nothing is known
     known : (n,) bool

@@ -22,7 +22,7 @@ class Summary(NamedTuple):
     ----------
     names : tuple of str
     mean, sd : (ndim,) float — in the parameters' units.
-    cv : (ndim,) float — sd / |mean| [-]; inf where the mean is zero and the sd is not.
+    cv : (ndim,) float — ``sd / |mean|`` [-]; inf where the mean is zero and the sd is not.
     mean_error : (ndim,) float, or None — Monte-Carlo standard error of `mean`, in the parameters' units.
     """
 

@@ -127,7 +127,7 @@ print(f"log-probability of the nominal values {posterior(nominal):.1f}, of the t
 
 # %%
 WALKERS = {emcee.EnsembleSampler: 48, SMCSampler: 500, TMCMCSampler: 500}
-SWEEPS = {emcee.EnsembleSampler: 900 if FAST else 1500, SMCSampler: 4, TMCMCSampler: 4}
+SWEEPS = {emcee.EnsembleSampler: 1000, SMCSampler: 4, TMCMCSampler: 4}
 discard = SWEEPS[emcee.EnsembleSampler] // 3
 prior_draws = posterior.sample_prior(500, args.seed)
 best = prior_draws[np.argmax(posterior(prior_draws))]
@@ -225,6 +225,9 @@ for name, x in samples.items():
         labelpad=0.08,
         smooth=1.0,
     )
+for i in range(posterior.ndim):  # corner makes room for the last histogram alone
+    diagonal = figure.axes[i * (posterior.ndim + 1)]
+    diagonal.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in diagonal.patches))
 handles = [Line2D([], [], color=COLOURS[name], label=name) for name in samples]
 handles.append(Line2D([], [], color=GREY, marker="s", label="truth (synthetic)"))
 figure.legend(handles=handles, loc="upper right", fontsize=13, frameon=False, bbox_to_anchor=(0.97, 0.95))

@@ -165,10 +165,8 @@ def show_what_goes_wrong(name: str, problem: Problem, posterior: Posterior, runs
             other = other_mode(posterior, problem.truth)
             axes.plot(other[i], other[j], "x", color="k", markersize=8, label="piers exchanged: as likely")
             text += f"\n{100 * np.mean(x[:, i] < x[:, j]):.0f} % in the mode of the truth (+)"
-        if alarms[label]:
-            text += "\nit WARNS: " + alarms[label][0].split(":")[0].split(",")[0]
-        axes.set_title(f"{label}\n", fontsize="medium", color=COLOURS[label])
-        axes.text(0.5, 1.01, text, transform=axes.transAxes, ha="center", va="bottom", fontsize="x-small", wrap=True)
+        text += "\nit WARNS (see the output)" if alarms[label] else "\nno warning"
+        axes.set_title(f"{label}\n{text}", fontsize="small", color=COLOURS[label])
         axes.set(xlabel=f"{problem.pair[0]} [x nominal]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.grid(alpha=0.25)
     panels[0].set_ylabel(f"{problem.pair[1]} [x nominal]")
@@ -241,6 +239,8 @@ for name in args.problem or PROBLEMS:
             levels=(0.5, 0.9),
             truths=problem.truth,
             truth_color="0.6",
+            label_kwargs={"fontsize": 16},
+            max_n_ticks=3,
         )
     handles = [Line2D([], [], color=COLOURS[label], label=label) for label in shown]
     figure.legend(handles=handles, loc="upper right", fontsize=22, frameon=False)

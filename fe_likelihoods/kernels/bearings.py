@@ -14,8 +14,8 @@ returns. Exact (Coulomb), Z is the sign of v, or any value in [-1, 1] at rest. E
 of stiffness f_min W / Y that slides at mu(v) W.
 
 Rubber.  An odd polynomial F(s) of s = U / s_u is the skeleton, an even one D(s) half the distance between the branches
-of loading and unloading; the force is F(s) + D(s) Z. Beyond |s| = s_max the skeleton goes on along its tangent and D
-keeps its value.
+of loading and unloading; the force is F(s) + D(s) Z. Beyond ``|s|`` = s_max the skeleton goes on along its tangent and
+D keeps its value.
 
 Source: specs/isolated_bridge.md, section 3; equations (14) and (16) to (18) of the paper on TMCMC.
 """
@@ -43,7 +43,7 @@ COULOMB = 2
 
 @kernel(inline=True)
 def friction(velocity, f_min, df, a):
-    """mu(v) = f_min + df (1 - exp(-a |v|)): the coefficient and its derivative to v [s/m]."""
+    """``mu(v) = f_min + df (1 - exp(-a |v|))``: the coefficient and its derivative to v [s/m]."""
     rest = df * math.exp(-a * abs(velocity))
     slope = a * rest
     return f_min + df - rest, slope if velocity >= 0.0 else -slope
@@ -53,7 +53,7 @@ def friction(velocity, f_min, df, a):
 def bouc_wen(increment, z, yield_displacement, c):
     """Z after a monotone `increment` of displacement, and dZ/dU; c = sqrt(gamma - beta).
 
-    In the direction of motion Z obeys dZ/dx = 1 + c^2 Z^2 below zero and 1 - Z^2 above, with x = |U|/Y.
+    In the direction of motion Z obeys dZ/dx = 1 + c^2 Z^2 below zero and 1 - Z^2 above, with x = ``|U|``/Y.
     """
     sign = 1.0 if increment >= 0.0 else -1.0
     x = abs(increment) / yield_displacement

@@ -6,7 +6,7 @@ committed step::
     M A + C V + p(U) = P - M r ag(t),       gamma = 1/2, beta = 1/4
 
 From the committed (U, V, A) a step of size h starts with U unchanged, V <- -V, A <- -A - 4 V/h, and each iteration
-solves (K + 2/h C + 4/h^2 M) dU = residual, then U += dU, V += 2 dU/h, A += 4 dU/h^2, until |dU| < tolerance.
+solves (K + 2/h C + 4/h^2 M) dU = residual, then U += dU, V += 2 dU/h, A += 4 dU/h^2, until ``|dU|`` < tolerance.
 
 A step that fails is retried with a tolerance a hundred times looser, then halved (ground acceleration linear within the
 step), again and again down to h / 2^halvings. Where that fails too, fibers on the verge of a jump of their stress are

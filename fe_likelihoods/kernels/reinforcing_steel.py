@@ -113,7 +113,7 @@ def backbone(x, c):
 def virgin_stress_tangent(eps, e0, ep, f0):
     """Engineering stress and tangent well below yield, where no reversal has left a trace: the backbone as series.
 
-    For |eps| < VIRGIN_LIMIT the truncated series of ln(1+eps) and (1+q^10)^-.1 are exact to round-off; they need
+    For ``|eps| < VIRGIN_LIMIT`` the truncated series of ln(1+eps) and (1+q^10)^-.1 are exact to round-off; they need
     neither a logarithm nor a power, so that a section evaluates its bars side by side.
     """
     x = -0.125

@@ -86,7 +86,7 @@ class Pier:
 
 @dataclass(frozen=True)
 class Bearing:
-    """A flat sliding bearing: mu(v) = f_min + df (1 - exp(-a |v|)).
+    """A flat sliding bearing: ``mu(v) = f_min + df (1 - exp(-a |v|))``.
 
     Attributes
     ----------
