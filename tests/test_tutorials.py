@@ -158,7 +158,7 @@ def test_comparison_run_twice_simulates_once(tmp_path):
     arguments = ("--problem", "bridge", "--cache", str(tmp_path / "simulations.db"))
     outputs = [run_tutorial("04_compare_samplers.py", *arguments, "--out", str(tmp_path)) for _ in range(2)]
     assert "WARNS: the points remember" in outputs[0]
-    assert "0 simulations in all" not in outputs[0]
+    assert "\n0 simulations in all" not in outputs[0]
     assert "\n0 simulations in all" in outputs[1]
     results = json.loads((tmp_path / "comparison.json").read_text())
     assert results["bridge"]["SMC"]["mean"][0] == pytest.approx(1.15, abs=0.03)
