@@ -1,8 +1,8 @@
 """Figures of records, measurements, responses, residuals and predictions, in the units of their channels.
 
 What is drawn is told by what is handed over: nothing here runs a simulation, and nothing of the library is imported
-but units, so that records, measurements and models can draw themselves. matplotlib is imported where used. Figures of
-a model's own kind (sections, hysteresis) are in `fe_likelihoods.models.figures`.
+but units and the checks of residuals, so that records, measurements and models can draw themselves. matplotlib is
+imported where used. Figures of a model's own kind (sections, hysteresis) are in `fe_likelihoods.models.figures`.
 """
 
 from collections.abc import Sequence
