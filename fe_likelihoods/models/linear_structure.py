@@ -27,7 +27,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from ..channels import Channel
-from ..records import Record
+from ..records import Record, sample_window
 from .base import SimulationFailed
 from .checked import CheckedModel
 from .linear_oscillator import respond_first_order
@@ -162,11 +162,15 @@ class LinearStructure(CheckedModel):
         Absolute accelerations of the supports, of one step and length; in the order that `parts` states.
     unit : str
         Display unit of the channels.
+    lead : float
+        Time [s] before the first sample of the channels: the supports' motion in it only brings the structure into the
+        state that it has there. So a part of a record can be measured, without starting it from rest.
 
     Raises
     ------
     ValueError
-        If there are no supports, they differ in step or length, or `parts` has no place for so many.
+        If there are no supports, they differ in step or length, `parts` has no place for so many, or the lead leaves
+        fewer than two samples.
 
     Examples
     --------
@@ -174,7 +178,7 @@ class LinearStructure(CheckedModel):
     >>> (acceleration,) = model.simulate([3.7, 0.09, 0.8])
     """
 
-    def __init__(self, parts: Parts, supports: Record | Sequence[Record], unit: str = "g") -> None:
+    def __init__(self, parts: Parts, supports: Record | Sequence[Record], unit: str = "g", lead: float = 0.0) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
         if not supports or not all(isinstance(support, Record) for support in supports):
             raise ValueError(f"LinearStructure: expected the Records of the supports' accelerations; got {supports!r}")
@@ -192,20 +196,23 @@ class LinearStructure(CheckedModel):
                 f"got {len(supports)} records"
             )
         channels = tuple(Channel(name, "absolute acceleration", unit) for name in parts.channel_names)
-        super().__init__(parts.parameter_names, channels, first.dt, first.n_steps)
+        self._window = sample_window("the supports", first.n_steps, first.dt, lead, None)
+        super().__init__(parts.parameter_names, channels, first.dt, first.n_steps - self._window.start)
         self.parts = parts
         self.supports = supports
         self.unit = unit
+        self.lead = float(lead)
         self._acceleration = np.stack([support.acceleration for support in supports])
-        self.fingerprint = self._digest(repr(parts), [support.fingerprint for support in supports])
+        self.fingerprint = self._digest(repr(parts), self._window.start, [s.fingerprint for s in supports])
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """The same structure under other accelerations of its supports; ValueError as for a new one."""
-        return type(self)(self.parts, record, self.unit)
+        return type(self)(self.parts, record, self.unit, self.lead)
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         system = self.parts.assemble(theta)
         response = respond_structure(system, self._acceleration, self.dt)
-        return np.einsum("cn,nt->ct", system.shape, response.acceleration) + np.einsum(
-            "cs,st->ct", system.direct, self._acceleration
+        window = self._window
+        return np.einsum("cn,nt->ct", system.shape, response.acceleration[:, window]) + np.einsum(
+            "cs,st->ct", system.direct, self._acceleration[:, window]
         )

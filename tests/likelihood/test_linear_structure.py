@@ -133,6 +133,17 @@ def test_stiff_structure_moves_with_its_supports():
     np.testing.assert_allclose(middle[2:], carried[2:], atol=2e-3)
 
 
+def test_a_lead_brings_the_structure_into_its_state(three):
+    theta = [3.0, 0.02, 0.7, 0.6]
+    whole = LinearStructure(BridgeDeck("m", "s"), three).simulate(theta)
+    late = LinearStructure(BridgeDeck("m", "s"), three, lead=1.0)
+    assert late.n_steps == 350
+    np.testing.assert_array_equal(late.simulate(theta), whole[:, 50:])
+    assert late.with_record(three[::-1]).lead == 1.0
+    from_rest = LinearStructure(BridgeDeck("m", "s"), [record.trim(1.0) for record in three]).simulate(theta)
+    assert np.abs(from_rest - whole[:, 50:]).max() > 0.1 * np.abs(whole).max(), "control: the state matters"
+
+
 def test_impossible_parameters_fail_alone_and_say_why(three):
     model = LinearStructure(BridgeDeck("m"), three)
     thetas = np.array([[3, 0.1, 0.5], [-3, 0.1, 0.5], [3, 0.1, 1.5], [3, 0.0, 0.5], [3, 1.0, 0.5], [3, 1.1, 0.5]])
@@ -153,11 +164,12 @@ def test_fingerprint_knows_parts_and_supports(three):
         LinearStructure(BridgeDeck("n"), three),
         LinearStructure(BridgeDeck("m", share=0.5), three),
         LinearStructure(BridgeDeck("m"), three[::-1]),
+        LinearStructure(BridgeDeck("m"), three, lead=1.0),
         model.with_record([three[0].scale(2.0), *three[1:]]),
         LinearStructure(ShearFrame({"m": 1}, [1], [1]), three[0]),
         LinearStructure(ShearFrame({"m": 1}, [1], [2]), three[0]),
     ]
-    assert len({model.fingerprint, *(other.fingerprint for other in others)}) == 7
+    assert len({model.fingerprint, *(other.fingerprint for other in others)}) == 8
 
 
 @pytest.mark.parametrize(
@@ -168,6 +180,8 @@ def test_fingerprint_knows_parts_and_supports(three):
         (lambda r: LinearStructure(BridgeDeck("m"), [r[0], r[1], r[2].resample(0.01)]), "one step and length"),
         (lambda r: LinearStructure(BridgeDeck("m"), []), "expected the Records"),
         (lambda r: LinearStructure(BridgeDeck("m"), [r[0].acceleration] * 3), "expected the Records"),
+        (lambda r: LinearStructure(BridgeDeck("m"), r, lead=8.0), "stop"),
+        (lambda r: LinearStructure(BridgeDeck("m"), r, lead=-1.0), "start = -1"),
         (lambda r: BridgeDeck(""), "name of a channel"),
         (lambda r: BridgeDeck("m", share=1.1), "share must be a number from 0 to 1"),
         (lambda r: BridgeDeck("m", "s", shape=math.nan), "shape must be a number from 0 to 1"),

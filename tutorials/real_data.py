@@ -1,0 +1,113 @@
+"""What the tutorials on real measurements share: where the data are, three noises for one model, honest tables."""
+
+import argparse
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fe_likelihoods.channels import Measurements
+from fe_likelihoods.likelihood import FELikelihood
+from fe_likelihoods.models.base import Model
+from fe_likelihoods.noise import AutoregressiveNoise, GaussianNoise
+from fe_likelihoods.posterior import Posterior
+from fe_likelihoods.predictive import Prediction
+from fe_likelihoods.priors import Distribution, Prior, Uniform
+from samplers import SMCSampler
+from samplers.report import summary
+
+FAST = bool(os.environ.get("FAST"))
+NOISES = ("white", "AR(1)", "n_eff")
+COLOURS = {"white": "#8a8f98", "AR(1)": "#d9822b", "n_eff": "#1f5a8c"}
+
+
+class Run(NamedTuple):
+    """A posterior and its draws."""
+
+    posterior: Posterior
+    sampler: SMCSampler
+    draws: np.ndarray
+
+
+def arguments(description: str, out: str) -> argparse.ArgumentParser:
+    """Options that these tutorials have in common."""
+    beside = Path(os.environ.get("FE_SHARED", Path(__file__).resolve().parents[2] / "shared")) / "measured"
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument(
+        "--data", type=Path, default=beside, help="folder that holds the downloaded files, at any depth"
+    )
+    parser.add_argument("--walkers", type=int, default=60 if FAST else 400)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path(out))
+    return parser
+
+
+def find(folder: Path, pattern: str, source: str) -> Path:
+    """The one file of this kind in a folder; the message says where it comes from."""
+    found = sorted(folder.rglob(pattern)) if folder.is_dir() else []
+    if not found:
+        raise SystemExit(f"no file {pattern} in {folder}: get it from {source}, and name its folder with --data")
+    return found[0]
+
+
+def sampled(
+    model: Model,
+    measured: Measurements,
+    prior: Mapping[str, Distribution],
+    scale: Mapping[str, Distribution],
+    noise: str,
+    effective: Sequence[float] | None,
+    args: argparse.Namespace,
+) -> Run:
+    """Draws of the posterior of one model under one of the `NOISES`; `scale` are the priors of the sigmas."""
+    if noise == "AR(1)":
+        kind, more = AutoregressiveNoise(model.channels), {f"rho_{c.name}": Uniform(0.0, 1.0) for c in model.channels}
+    else:
+        kind, more = GaussianNoise(model.channels, effective_samples=effective if noise == "n_eff" else None), {}
+    posterior = Posterior(FELikelihood(model, measured, kind), Prior({**prior, **scale, **more}))
+    settings = {"max_moves": 4} if args.walkers < 250 else {}
+    sampler = SMCSampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=args.seed, **settings)
+    sampler.run_mcmc(None, 4, progress=False)
+    return Run(posterior, sampler, sampler.get_chain(flat=True))
+
+
+def residuals(run: Run) -> np.ndarray:
+    """Measured less simulated at the posterior mean, (n_channels, n_steps) [SI]."""
+    likelihood = run.posterior.likelihood
+    theta = run.draws.mean(axis=0)[: len(likelihood.model.parameter_names)]
+    return likelihood.measurements.values - likelihood.model.simulate(theta)
+
+
+def posterior_table(runs: Mapping[str, Run]) -> str:
+    """Mean and standard deviation of every parameter under every noise."""
+    names = list(dict.fromkeys(name for run in runs.values() for name in run.posterior.parameter_names))
+    rows = [f"{'parameter':<14}" + "".join(f"{label:>22}" for label in runs)]
+    for name in names:
+        cells = []
+        for run in runs.values():
+            own = run.posterior.parameter_names
+            if name in own:
+                moments = summary(run.draws, own)
+                i = own.index(name)
+                cells.append(f"{moments.mean[i]:.4f} +- {moments.sd[i]:.4f}")
+            else:
+                cells.append("-")
+        rows.append(f"{name:<14}" + "".join(f"{cell:>22}" for cell in cells))
+    return "\n".join(rows)
+
+
+def shares(prediction: Prediction, measured: Measurements, window: slice = slice(None)) -> tuple:
+    """RRMSE of the mean, and share of the samples in the 90 % band, per channel, over a window of samples."""
+    values = measured.select([channel.name for channel in prediction.channels]).values[:, window]
+    error = np.square(prediction.mean[:, window] - values).sum(axis=1)
+    low, high = prediction.quantile(0.05)[:, window], prediction.quantile(0.95)[:, window]
+    inside = ((low <= values) & (values <= high)).mean(axis=1)
+    return np.sqrt(error / np.square(values).sum(axis=1)), inside
+
+
+def strong_motion(history: np.ndarray) -> slice:
+    """From 5 to 95 % of the sum of squares."""
+    share = np.cumsum(history**2) / np.sum(history**2)
+    return slice(int(np.searchsorted(share, 0.05)), int(np.searchsorted(share, 0.95)) + 1)
