@@ -20,7 +20,7 @@ R. W. Clough, J. Penzien, Dynamics of Structures, 3rd edition (revised), Compute
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -124,6 +124,27 @@ def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt
         If two complex modes coincide (a mode with exactly critical damping, or without stiffness): they do not come
         apart then; and if the mass is singular.
     """
+    response = np.zeros((3, len(system.mass), support_acceleration.shape[1]))
+    for shapes, history in _modes(system, support_acceleration, dt):
+        response += shapes.real[..., None] * history.real - shapes.imag[..., None] * history.imag
+    return StructureResponse(*response)
+
+
+def _channels(system: LinearSystem, support_acceleration: np.ndarray, dt: float) -> np.ndarray:
+    """What the sensors measure, (n_channels, n_steps)."""
+    # row by row and mode by mode: products of long matrices are divided among threads, which shows in the last bit
+    response = np.einsum("cs,st->ct", system.direct, support_acceleration)
+    for shapes, history in _modes(system, support_acceleration, dt):
+        seen = system.shape @ shapes[2]
+        response += seen.real[:, None] * history.real - seen.imag[:, None] * history.imag
+    return response
+
+
+def _modes(
+    system: LinearSystem, support_acceleration: np.ndarray, dt: float
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Shapes (3, n) of each complex mode in displacement, velocity and absolute acceleration, and its history
+    (n_steps,): the response is the real part of the sum of their products."""
     n = len(system.mass)
     try:
         lower = -np.linalg.solve(system.mass, np.hstack([system.stiffness, system.damping]))
@@ -138,17 +159,13 @@ def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt
             f"two complex modes coincide (condition {condition:.1e}): is a damping critical, or a stiffness zero?"
         )
     forcing = np.linalg.solve(vectors, np.vstack([np.zeros_like(system.influence), -system.influence]))
-    # mode by mode: products of long matrices would be divided among threads, whose number then shows in the last bit
-    response = np.zeros((3, n, support_acceleration.shape[1]))
     for k, eigenvalue in enumerate(eigenvalues):
         if eigenvalue.imag < 0.0:
             continue  # the conjugate of another one
-        mode = respond_first_order(complex(eigenvalue), np.einsum("s,st->t", forcing[k], support_acceleration), dt)
+        history = respond_first_order(complex(eigenvalue), np.einsum("s,st->t", forcing[k], support_acceleration), dt)
         # displacement phi, velocity lam phi; absolute acceleration lam^2 phi, as that is what M^-1 K and C leave
-        shape = np.stack([vectors[:n, k], vectors[n:, k], eigenvalue * vectors[n:, k]])
-        shape = shape * (2.0 if eigenvalue.imag > 0.0 else 1.0)
-        response += shape.real[..., None] * mode.real - shape.imag[..., None] * mode.imag
-    return StructureResponse(*response)
+        shapes = np.stack([vectors[:n, k], vectors[n:, k], eigenvalue * vectors[n:, k]])
+        yield shapes * (2.0 if eigenvalue.imag > 0.0 else 1.0), history
 
 
 class LinearStructure(CheckedModel):
@@ -211,8 +228,4 @@ class LinearStructure(CheckedModel):
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         system = self.parts.assemble(theta)
-        response = respond_structure(system, self._acceleration, self.dt)
-        window = self._window
-        return np.einsum("cn,nt->ct", system.shape, response.acceleration[:, window]) + np.einsum(
-            "cs,st->ct", system.direct, self._acceleration[:, window]
-        )
+        return _channels(system, self._acceleration, self.dt)[:, self._window]
