@@ -38,7 +38,7 @@ def arguments(description: str, out: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--data", type=Path, default=beside, help="folder that holds the downloaded files, at any depth"
     )
-    parser.add_argument("--walkers", type=int, default=60 if FAST else 400)
+    parser.add_argument("--walkers", type=int, default=40 if FAST else 300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(out))
     return parser
@@ -95,6 +95,8 @@ def posterior_table(runs: Mapping[str, Run]) -> str:
             else:
                 cells.append("-")
         rows.append(f"{name:<14}" + "".join(f"{cell:>22}" for cell in cells))
+    simulations = [run.posterior.report()["simulations"] for run in runs.values()]
+    rows.append(f"{'simulations':<14}" + "".join(f"{number:>22}" for number in simulations))
     return "\n".join(rows)
 
 

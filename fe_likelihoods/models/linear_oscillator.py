@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from ..channels import Measurements
 
-__all__ = ["LinearOscillator", "OscillatorResponse", "respond", "respond_first_order"]
+__all__ = ["LinearOscillator", "OscillatorResponse", "hold_integrals", "respond"]
 
 
 class OscillatorResponse(NamedTuple):
@@ -41,7 +41,7 @@ class OscillatorResponse(NamedTuple):
     acceleration: np.ndarray
 
 
-def _hold_integrals(z: complex) -> tuple[complex, complex]:
+def hold_integrals(z: complex) -> tuple[complex, complex]:
     """(e^z - 1) / z and (e^z - 1 - z) / z^2: one step of q' = z q + 1 and of q' = z q + t, from q = 0 to t = 1."""
     if abs(z) >= 1.0:
         constant = (cmath.exp(z) - 1.0) / z
@@ -51,28 +51,6 @@ def _hold_integrals(z: complex) -> tuple[complex, complex]:
     for k in range(20, 2, -1):
         series = 1.0 + z / k * series
     return 1.0 + z * (0.5 * series), 0.5 * series
-
-
-def respond_first_order(eigenvalue: complex, forcing: np.ndarray, dt: float, first: complex = 0.0) -> np.ndarray:
-    """Exact solution of q' = eigenvalue q + forcing(t), with a forcing that is linear between its samples.
-
-    Parameters
-    ----------
-    eigenvalue : complex — [1/s]
-    forcing : (n_steps,) float or complex
-    dt : float — step of the samples [s].
-    first : complex — q at the first sample.
-
-    Returns
-    -------
-    (n_steps,) complex : q at the samples.
-    """
-    decay = cmath.exp(eigenvalue * dt)
-    constant, slope = _hold_integrals(eigenvalue * dt)
-    # q_{k+1} = decay q_k + dt (constant - slope) f_k + dt slope f_{k+1}
-    numerator = [dt * slope, dt * (constant - slope)]
-    state, _ = lfilter(numerator, [1.0, -decay], forcing, zi=[first - numerator[0] * forcing[0]])
-    return state
 
 
 def respond(
@@ -111,8 +89,12 @@ def respond(
 
     damped_frequency = angular_frequency * math.sqrt(1.0 - damping_ratio**2)
     eigenvalue = complex(-damping_ratio * angular_frequency, damped_frequency)
+    decay = cmath.exp(eigenvalue * dt)
+    constant, slope = hold_integrals(eigenvalue * dt)
+    # q_{k+1} = decay q_k - dt (constant - slope) a_k - dt slope a_{k+1}
+    numerator = [-dt * slope, -dt * (constant - slope)]
     first = velocity - eigenvalue.conjugate() * displacement
-    state = respond_first_order(eigenvalue, -base_acceleration, dt, first)
+    state, _ = lfilter(numerator, [1.0, -decay], base_acceleration, zi=[first - numerator[0] * base_acceleration[0]])
     relative_displacement = state.imag / damped_frequency
     relative_velocity = (eigenvalue * state).imag / damped_frequency
     return OscillatorResponse(

@@ -20,17 +20,19 @@ R. W. Clough, J. Penzien, Dynamics of Structures, 3rd edition (revised), Compute
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import eigh
 
 from ..channels import Channel
+from ..kernels.complex_modes import superpose_modes
+from ..kernels.jit import KERNEL_HASH
 from ..records import Record, sample_window
 from .base import SimulationFailed
 from .checked import CheckedModel
-from .linear_oscillator import respond_first_order
+from .linear_oscillator import hold_integrals
 
 __all__ = [
     "LinearStructure",
@@ -124,27 +126,27 @@ def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt
         If two complex modes coincide (a mode with exactly critical damping, or without stiffness): they do not come
         apart then; and if the mass is singular.
     """
-    response = np.zeros((3, len(system.mass), support_acceleration.shape[1]))
-    for shapes, history in _modes(system, support_acceleration, dt):
-        response += shapes.real[..., None] * history.real - shapes.imag[..., None] * history.imag
-    return StructureResponse(*response)
+    modes = _modes(system)
+    n, n_steps = len(system.mass), support_acceleration.shape[1]
+    response = np.zeros((3 * n, n_steps))
+    _superpose(modes, modes.shapes.reshape(-1, 3 * n), support_acceleration, dt, response)
+    return StructureResponse(*response.reshape(3, n, n_steps))
 
 
-def _channels(system: LinearSystem, support_acceleration: np.ndarray, dt: float) -> np.ndarray:
-    """What the sensors measure, (n_channels, n_steps)."""
-    # row by row and mode by mode: products of long matrices are divided among threads, which shows in the last bit
-    response = np.einsum("cs,st->ct", system.direct, support_acceleration)
-    for shapes, history in _modes(system, support_acceleration, dt):
-        seen = system.shape @ shapes[2]
-        response += seen.real[:, None] * history.real - seen.imag[:, None] * history.imag
-    return response
+class _Modes(NamedTuple):
+    """Complex modes, of conjugate ones only one, which counts twice.
+
+    eigenvalues : (m,) complex [1/s]
+    participation : (m, n_supports) complex — forcing of the mode under unit accelerations of the supports.
+    shapes : (m, 3, n) complex — in displacement, velocity and absolute acceleration.
+    """
+
+    eigenvalues: np.ndarray
+    participation: np.ndarray
+    shapes: np.ndarray
 
 
-def _modes(
-    system: LinearSystem, support_acceleration: np.ndarray, dt: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Shapes (3, n) of each complex mode in displacement, velocity and absolute acceleration, and its history
-    (n_steps,): the response is the real part of the sum of their products."""
+def _modes(system: LinearSystem) -> _Modes:
     n = len(system.mass)
     try:
         lower = -np.linalg.solve(system.mass, np.hstack([system.stiffness, system.damping]))
@@ -158,14 +160,27 @@ def _modes(
         raise SimulationFailed(
             f"two complex modes coincide (condition {condition:.1e}): is a damping critical, or a stiffness zero?"
         )
-    forcing = np.linalg.solve(vectors, np.vstack([np.zeros_like(system.influence), -system.influence]))
-    for k, eigenvalue in enumerate(eigenvalues):
-        if eigenvalue.imag < 0.0:
-            continue  # the conjugate of another one
-        history = respond_first_order(complex(eigenvalue), np.einsum("s,st->t", forcing[k], support_acceleration), dt)
-        # displacement phi, velocity lam phi; absolute acceleration lam^2 phi, as that is what M^-1 K and C leave
-        shapes = np.stack([vectors[:n, k], vectors[n:, k], eigenvalue * vectors[n:, k]])
-        yield shapes * (2.0 if eigenvalue.imag > 0.0 else 1.0), history
+    participation = np.linalg.solve(vectors, np.vstack([np.zeros_like(system.influence), -system.influence]))
+    # displacement phi, velocity lam phi; absolute acceleration lam^2 phi, as that is what M^-1 K and C leave
+    shapes = np.stack([vectors[:n], vectors[n:], eigenvalues * vectors[n:]]).transpose(2, 0, 1)
+    kept = eigenvalues.imag >= 0.0
+    twice = np.where(eigenvalues.imag > 0.0, 2.0, 1.0)[:, None, None]
+    return _Modes(eigenvalues[kept].astype(complex), participation[kept].astype(complex), (twice * shapes)[kept] + 0j)
+
+
+def _superpose(modes: _Modes, shapes: np.ndarray, support_acceleration: np.ndarray, dt: float, out: np.ndarray) -> None:
+    """Add the response with these shapes (m, n_rows) of the modes to `out` (n_rows, n_steps)."""
+    decay = np.exp(modes.eigenvalues * dt)
+    constant, slope = np.array([hold_integrals(complex(z)) for z in modes.eigenvalues * dt]).T
+    superpose_modes(
+        decay,
+        dt * (constant - slope),
+        dt * slope,
+        modes.participation,
+        np.ascontiguousarray(shapes),
+        np.ascontiguousarray(support_acceleration, dtype=float),
+        out,
+    )
 
 
 class LinearStructure(CheckedModel):
@@ -220,7 +235,7 @@ class LinearStructure(CheckedModel):
         self.unit = unit
         self.lead = float(lead)
         self._acceleration = np.stack([support.acceleration for support in supports])
-        self.fingerprint = self._digest(repr(parts), self._window.start, [s.fingerprint for s in supports])
+        self.fingerprint = self._digest(KERNEL_HASH, repr(parts), self._window.start, [s.fingerprint for s in supports])
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """The same structure under other accelerations of its supports; ValueError as for a new one."""
@@ -228,4 +243,7 @@ class LinearStructure(CheckedModel):
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         system = self.parts.assemble(theta)
-        return _channels(system, self._acceleration, self.dt)[:, self._window]
+        modes = _modes(system)
+        out = np.einsum("cs,st->ct", system.direct, self._acceleration)
+        _superpose(modes, modes.shapes[:, 2] @ system.shape.T, self._acceleration, self.dt, out)
+        return out[:, self._window]

@@ -7,6 +7,7 @@ import pytest
 from scipy import signal
 from scipy.linalg import eigh
 
+from fe_likelihoods.kernels.complex_modes import superpose_modes
 from fe_likelihoods.models.base import SimulationFailed, simulate_batch
 from fe_likelihoods.models.linear_oscillator import respond
 from fe_likelihoods.models.linear_parts import BridgeDeck, ShearFrame
@@ -55,6 +56,33 @@ def test_equals_state_space_solution_where_damping_couples_the_modes(three, stre
     response = respond_structure(system(mass, damping, stiffness, influence), a, DT)
     for ours, theirs in zip(response, (state[:, :2], state[:, 2:], state @ matrix[2:].T), strict=True):
         np.testing.assert_allclose(ours, theirs.T, rtol=0, atol=1e-10 * np.abs(theirs).max())
+
+
+def test_the_kernel_is_the_same_compiled_and_not(rng):
+    n_modes, n_inputs, n_rows, n_steps = 3, 2, 4, 50
+
+    def numbers(*shape):
+        return 0.5 * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
+
+    decay = 0.5 * np.exp(1j * rng.uniform(0, 2, n_modes))
+    before, after, participation, shapes = (
+        numbers(n_modes),
+        numbers(n_modes),
+        numbers(n_modes, n_inputs),
+        numbers(n_modes, n_rows),
+    )
+    excitation, start = rng.normal(size=(n_inputs, n_steps)), rng.normal(size=(n_rows, n_steps))
+    results = [start.copy(), start.copy()]
+    for function, out in zip((superpose_modes, superpose_modes.py_func), results, strict=True):
+        function(decay, before, after, participation, shapes, excitation, out)
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-12)
+    forcing = participation @ excitation
+    expected = start.copy()
+    for k in range(n_modes):  # the same recursion by scipy
+        initial = [-after[k] * forcing[k, 0]]
+        state, _ = signal.lfilter([after[k], before[k]], [1.0, -decay[k]], forcing[k], zi=initial)
+        expected += (shapes[k][:, None] * state).real
+    np.testing.assert_allclose(results[0], expected, rtol=1e-12, atol=1e-12)
 
 
 def test_two_storeys_under_a_step_follow_their_modes():
