@@ -163,3 +163,52 @@ def test_comparison_run_twice_simulates_once(tmp_path):
     results = json.loads((tmp_path / "comparison.json").read_text())
     assert results["bridge"]["SMC"]["mean"][0] == pytest.approx(1.15, abs=0.03)
     assert (tmp_path / "corner_bridge.png").stat().st_size > 1000
+
+
+def test_real_bridge_predicts_and_its_errors_are_not_white(shared, tmp_path):
+    """Meloland: the two supports win, the channels that were not used come out, white noise is three times too sure."""
+    output = run_tutorial(
+        "06_real_bridges.py", "--bridge", "meloland", "--data", str(shared / "measured"), "--out", str(tmp_path)
+    )
+    assert "two supports" in output
+    result = json.loads((tmp_path / "summary.json").read_text())["meloland"]
+    assert result["posterior_mean"]["white"]["frequency"] == pytest.approx(3.72, abs=0.05)
+    assert result["posterior_mean"]["white"]["share"] == pytest.approx(0.815, abs=0.03)
+    assert result["lag_one"] == pytest.approx(0.90, abs=0.02)
+    assert 100 < result["n_effective"] < 180 and result["n_steps"] == 1138
+    assert 1.8 < result["posterior_sd"]["n_eff"]["frequency"] / result["posterior_sd"]["white"]["frequency"] < 5.0
+    for evidence in result["log_evidence"].values():
+        assert max(evidence, key=evidence.get) == "two supports"
+    white, corrected = (result["log_evidence"][noise] for noise in ("white", "n_eff"))
+    assert white["two supports"] - white["ends only"] > 60.0, "far too sure"
+    assert 5.0 < corrected["two supports"] - corrected["ends only"] < 30.0
+    rows = {(row["case"], row["channel"]): row for row in result["predictions"] if row["noise"] == "n_eff"}
+    assert rows["calibrated", "ch7"]["rrmse"] == pytest.approx(0.150, abs=0.01)
+    unused = rows["unused channels", "ch9"]
+    assert unused["rrmse"] == pytest.approx(0.114, abs=0.015) and unused["rrmse"] < 0.7 * unused["rrmse_of_the_end"]
+    assert 0.85 < unused["coverage"] <= 1.0
+    for figure in ("data", "corner", "residuals", "prediction"):
+        assert (tmp_path / f"meloland_{figure}.png").stat().st_size > 10_000
+
+
+def test_real_frame_predicts_other_shakings(shared, tmp_path):
+    run_tutorial("07_shake_table_frame.py", "--data", str(shared / "measured"), "--out", str(tmp_path))
+    result = json.loads((tmp_path / "summary.json").read_text())
+    assert max(result["n_effective"]) < 0.1 * result["n_steps"], "lightly damped residuals last"
+    rows = {(row["shaking"], row["channel"]): row for row in result["predictions"] if row["noise"] == "n_eff"}
+    assert rows["shaking 1", "floor2"]["kind"] == "prediction"
+    assert all(rows[f"shaking {k}", "floor2"]["rrmse"] < 0.2 for k in (1, 2, 3))
+    assert rows["shaking 3", "floor2"]["coverage"] > 0.8
+    for name in ("data", "corner", "residuals", "calibration", "prediction"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("name", ["06_real_bridges.py", "07_shake_table_frame.py"])
+def test_real_data_say_where_they_come_from(name, tmp_path):
+    done = subprocess.run(
+        [sys.executable, ROOT / "tutorials" / name, "--data", str(tmp_path), "--out", str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode != 0 and "--data" in done.stderr and "get it from" in done.stderr

@@ -19,7 +19,7 @@ from samplers import SMCSampler
 from samplers.report import summary
 
 FAST = bool(os.environ.get("FAST"))
-NOISES = ("white", "AR(1)", "n_eff")
+NOISES = ("white", "n_eff") if FAST else ("white", "AR(1)", "n_eff")
 COLOURS = {"white": "#8a8f98", "AR(1)": "#d9822b", "n_eff": "#1f5a8c"}
 
 
@@ -75,9 +75,7 @@ def sampled(
 
 def residuals(run: Run) -> np.ndarray:
     """Measured less simulated at the posterior mean, (n_channels, n_steps) [SI]."""
-    likelihood = run.posterior.likelihood
-    theta = run.draws.mean(axis=0)[: len(likelihood.model.parameter_names)]
-    return likelihood.measurements.values - likelihood.model.simulate(theta)
+    return run.posterior.likelihood.residuals(run.draws.mean(axis=0))
 
 
 def posterior_table(runs: Mapping[str, Run]) -> str:
