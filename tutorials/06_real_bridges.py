@@ -440,7 +440,8 @@ def plot_predictions(bridge: Bridge, predictions: dict[str, tuple], out: Path, n
 # * **Prediction.** Meloland's ch9 comes out with an RRMSE of 11 % (the nearest end alone: 19 %), 95 % of its samples in
 #   the 90 % band; ch5 with 20 % (28 %) and 85 %. Of what is wrong at ch5 much is time: it runs 16 ms ahead of the
 #   prediction, and 10 and 17 ms ahead of *both* its neighbours, which no wave along the deck does. A shift on the film
-#   or in its reading would explain it (12 ms later, the neighbours give ch5 within 5 %, not 14 %); it is left as it is. Painter Street's rest of the record: 21 % (37 %).
+#   or in its reading would explain it (12 ms later, the neighbours give ch5 within 5 %, not 14 %); it is left as it is.
+#   Painter Street's rest of the record: 21 % (37 %).
 # * **Coverage.** One standard deviation for all times is wrong: in the strong motion the band holds 73 to 76 % of
 #   Meloland's ch7, and at rest too much (100 % of Painter Street after 12 s). No correlation in time mends that. The
 #   band of the response alone holds 6 % with white noise and 18 to 28 % with n_eff: neither is a band for measurements.
