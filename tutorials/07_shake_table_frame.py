@@ -100,6 +100,9 @@ plt.close(figure)
 # logarithmic standard deviation of .5; damping ratios about 1 % with a factor of e; the roof's mass about the floors'
 # with .3; standard deviations of the noise half-normal with 3 m/s². The rival has a roof as heavy as the floors.
 #
+# With the second floor unseen, a heavy roof on stiff lower storeys and a light one on a soft second storey look alike:
+# the posterior has two modes where the noise is not tiny. Three times as many walkers are taken there.
+#
 # The model starts from rest long before the shaking (`lead`), so that it comes into it with the motion that is there.
 
 
@@ -124,7 +127,8 @@ def calibrated(noise: str, effective=None, roof: bool = True, shaking: str = "sh
     prior |= {f"damping_{i}": LogNormal(0.01, 1.0) for i in (1, 2, 3)}
     prior |= {"mass_3": LogNormal(1.0, 0.3)} if roof else {}
     scale = {f"sigma_{name}": HalfNormal(3.0) for name in USED}
-    return real_data.sampled(model, measured_in(shaking, USED), prior, scale, noise, effective, args)
+    walkers = 3 * args.walkers if roof and noise == "n_eff" and not FAST else args.walkers
+    return real_data.sampled(model, measured_in(shaking, USED), prior, scale, noise, effective, args, walkers)
 
 
 white = calibrated("white")
@@ -186,15 +190,19 @@ plt.close(figure)
 # %% [markdown]
 # ## Evidence: is the roof as heavy as the floors?
 #
-# White noise is far surer than it has a right to be. That the ranking stays is the part to believe.
+# White noise has no doubt at all. With the number of samples that the residuals are worth there is no answer: the one
+# mode explains the data better, the other more easily.
 
 # %%
-evidence = {}
+evidence, rivals = {}, {}
 for noise in ("n_eff",) if FAST else ("white", "n_eff"):
-    rival = calibrated(noise, effective, roof=False)
-    comparison = compare_models({"roof unknown": runs[noise].sampler, "roof as floors": rival.sampler})
+    rivals[noise] = calibrated(noise, effective, roof=False)
+    comparison = compare_models({"roof unknown": runs[noise].sampler, "roof as floors": rivals[noise].sampler})
     evidence[noise] = dict(zip(comparison.names, comparison.log_evidence.tolist(), strict=True))
     print(f"evidence, noise {noise}:\n{comparison.table()}")
+if not FAST:
+    heavy = float((runs["n_eff"].draws[:, names.index("mass_3")] > 1.15).mean())
+    print(f"noise n_eff: the mode with a heavy roof (more than 1.15 times a floor) has the probability {heavy:.2f}")
 
 # %% [markdown]
 # ## Do three shakings tell the same?
@@ -202,14 +210,14 @@ for noise in ("n_eff",) if FAST else ("white", "n_eff"):
 # The same frame, three times the same motion: three posteriors that should agree within their standard deviations. The
 # number is the root mean square, over the parameters and the three pairs of shakings, of the difference over the root
 # of the sum of variances: one if the posteriors are as wide as they should be. (A frame that changes from shaking to
-# shaking, with bolts that work loose, would raise it too.)
+# shaking, with bolts that work loose, would raise it too.) The roof is as heavy as the floors here, for one mode.
 
 # %%
 agreement = {}
 if not FAST:
     for noise in ("white", "n_eff"):
-        three = [runs[noise], *(calibrated(noise, effective, shaking=shaking) for shaking in list(SHAKINGS)[1:])]
-        structural = np.array([run.draws[:, : len(names)] for run in three])
+        later = [calibrated(noise, effective, roof=False, shaking=shaking) for shaking in list(SHAKINGS)[1:]]
+        structural = np.array([run.draws[:, : len(names) - 1] for run in (rivals[noise], *later)])
         mean, sd = structural.mean(axis=1), structural.std(axis=1)
         scores = np.array([(mean[i] - mean[j]) / np.hypot(sd[i], sd[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
         agreement[noise] = float(np.sqrt(np.mean(scores**2)))
@@ -226,9 +234,9 @@ if not FAST:
 
 # %%
 rows, shown = [], {}
-few = np.random.default_rng(args.seed).choice(len(white.draws), min(len(white.draws), 40 if FAST else 400), False)
 for noise, run in runs.items():
-    draws, n = run.draws[few], len(names)
+    chosen = np.random.default_rng(args.seed).choice(len(run.draws), 40 if FAST else 400, replace=False)
+    draws, n = run.draws[chosen], len(names)
     first, third = draws[:, n::2], draws[:, n + 1 :: 2]  # sigma, then rho where there is one
     second = 0.5 * (first + third)
     samples = np.hstack([draws[:, :n], np.stack([first, second, third], axis=2).reshape(len(draws), -1)])

@@ -60,15 +60,17 @@ def sampled(
     noise: str,
     effective: Sequence[float] | None,
     args: argparse.Namespace,
+    walkers: int | None = None,
 ) -> Run:
     """Draws of the posterior of one model under one of the `NOISES`; `scale` are the priors of the sigmas."""
+    walkers = args.walkers if walkers is None else walkers
     if noise == "AR(1)":
         kind, more = AutoregressiveNoise(model.channels), {f"rho_{c.name}": Uniform(0.0, 1.0) for c in model.channels}
     else:
         kind, more = GaussianNoise(model.channels, effective_samples=effective if noise == "n_eff" else None), {}
     posterior = Posterior(FELikelihood(model, measured, kind), Prior({**prior, **scale, **more}))
-    settings = {"max_moves": 4} if args.walkers < 250 else {}
-    sampler = SMCSampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=args.seed, **settings)
+    settings = {"max_moves": 4} if walkers < 250 else {}
+    sampler = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=args.seed, **settings)
     sampler.run_mcmc(None, 4, progress=False)
     return Run(posterior, sampler, sampler.get_chain(flat=True))
 
