@@ -98,7 +98,7 @@ BRIDGES = {
 
 
 # %%
-def read(bridge: Bridge, folder: Path) -> dict[int, Record]:
+def read(bridge: Bridge, folder: Path | None) -> dict[int, Record]:
     """The transverse channels by number, m/s²."""
     path = real_data.find(folder, bridge.file, SOURCE)
     numbers = (bridge.column, *bridge.ends, bridge.middle, *(bridge.spans or ()))

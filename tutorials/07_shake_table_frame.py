@@ -160,31 +160,29 @@ figure.savefig(args.out / "residuals.png", dpi=130)
 plt.close(figure)
 
 names = white.posterior.likelihood.model.parameter_names
+drawn = [names.index(name) for name in ("stiffness_1", "stiffness_2", "stiffness_3", "damping_1", "mass_3")]
+together = np.concatenate([run.draws for run in runs.values()])
 figure = None
-limits = [
-    (min(run.draws[:, i].min() for run in runs.values()), max(run.draws[:, i].max() for run in runs.values()))
-    for i in range(len(names))
-]
 for noise, run in runs.items():
     figure = corner.corner(
-        run.draws[:, : len(names)],
+        run.draws[:, drawn],
         fig=figure,
-        range=limits,
-        labels=[name.replace("_", " ") for name in names],
+        range=[(together[:, i].min(), together[:, i].max()) for i in drawn],
+        labels=[names[i].replace("_", " ") for i in drawn],
         color=COLOURS[noise],
         plot_datapoints=False,
         plot_density=False,
         levels=(0.5, 0.9),
         smooth=1.0,
-        bins=30,
+        bins=40,
         hist_kwargs={"density": True},
     )
-for axis in np.reshape(figure.axes, (len(names),) * 2).diagonal():
+for axis in np.reshape(figure.axes, (len(drawn),) * 2).diagonal():
     axis.relim()
     axis.autoscale(axis="y")
 for k, noise in enumerate(runs):
     figure.text(0.62, 0.9 - 0.03 * k, f"noise: {noise}", color=COLOURS[noise], fontsize="x-large")
-figure.savefig(args.out / "corner.png", dpi=70)
+figure.savefig(args.out / "corner.png", dpi=90)
 plt.close(figure)
 
 # %% [markdown]
