@@ -36,7 +36,7 @@ def arguments(description: str, out: str) -> argparse.ArgumentParser:
     """Options that these tutorials have in common."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument(
-        "--data", type=Path, default=beside, help="folder that holds the downloaded files, at any depth"
+        "--data", type=Path, help=f"folder that holds the downloaded files, at any depth (default: {BESIDE})"
     )
     parser.add_argument("--walkers", type=int, default=40 if FAST else 300)
     parser.add_argument("--seed", type=int, default=1)
