@@ -1,6 +1,7 @@
 """Every tutorial runs from top to bottom (`FAST=1`) and leaves what it promises."""
 
 import csv
+import importlib
 import json
 import os
 import subprocess
@@ -203,17 +204,16 @@ def test_real_frame_predicts_other_shakings(shared, tmp_path):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
-def test_real_data_say_where_they_come_from(tmp_path):
-    script, out = ROOT / "tutorials" / "07_shake_table_frame.py", str(tmp_path / "out")
-    asked, unasked = (
-        subprocess.run(
-            [sys.executable, script, "--out", out, *data],
-            env=os.environ | {"FE_SHARED": str(tmp_path / "nowhere")},
-            capture_output=True,
-            text=True,
-            timeout=200,
-        )
-        for data in (["--data", str(tmp_path)], [])
-    )
-    assert asked.returncode == 1 and "NO DATA" in asked.stderr and "get it from" in asked.stderr
-    assert unasked.returncode == 0 and "NO DATA" in unasked.stdout, "all tutorials in a row must go on"
+def test_real_data_say_where_they_come_from(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(ROOT / "tutorials"))
+    real_data = importlib.import_module("real_data")
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "records_ce01336p.zip").touch()
+    assert real_data.find(tmp_path, "*ce01336p.zip", "CESMD").name == "records_ce01336p.zip"
+    with pytest.raises(SystemExit, match="NO DATA.*get it from CESMD.*--data"):
+        real_data.find(tmp_path, "*ce89324p.zip", "CESMD")
+    monkeypatch.setattr(real_data, "BESIDE", tmp_path / "nowhere")
+    with pytest.raises(SystemExit) as ended:  # nobody asked for that folder: all tutorials in a row must go on
+        real_data.find(None, "*ce01336p.zip", "CESMD")
+    assert ended.value.code == 0
+    assert "NO DATA" in capsys.readouterr().out

@@ -423,7 +423,7 @@ def plot_predictions(bridge: Bridge, predictions: dict[str, tuple], out: Path, n
 # %% [markdown]
 # ## What came out, and what does not follow
 #
-# With 300 walkers and seed 1. Numbers are white / AR(1) / n_eff.
+# With `--walkers 400`, seed 1. Numbers are white / AR(1) / n_eff.
 #
 # * **Posterior.** Meloland: 3.72 +- .015 / 3.69 +- .015 / 3.73 +- .047 Hz, damping .090 / .103 / .093, share .82.
 #   Painter Street: 4.25 +- .04 / 4.18 +- .04 / 4.26 +- .12 Hz, damping .24 / .20 / .25, share .79. Residuals count
