@@ -1,6 +1,7 @@
 """Structures on several supports against closed forms, scipy's state-space solver, and the oscillator."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -183,6 +184,13 @@ def test_impossible_parameters_fail_alone_and_say_why(three):
     frame = LinearStructure(ShearFrame({"top": 2}, [1, 1], [1, 1]), three[0])
     with pytest.raises(SimulationFailed, match="damping_2 are not"):
         frame.simulate([1.0, 1.0, 0.1, -0.1])
+
+
+def test_travels_to_other_processes(three):
+    model = LinearStructure(BridgeDeck("m", "s"), three, lead=0.5)
+    twin = pickle.loads(pickle.dumps(model))
+    assert twin.fingerprint == model.fingerprint
+    np.testing.assert_array_equal(twin.simulate([3.0, 0.1, 0.5, 0.6]), model.simulate([3.0, 0.1, 0.5, 0.6]))
 
 
 def test_fingerprint_knows_parts_and_supports(three):
