@@ -5,7 +5,7 @@ support displacements g that grow slowly, with the influence matrix R. What is l
 
     M u'' + C u' + K u = -M R a(t),        x'' = u'' + R a = -M^-1 (C u' + K u)
 
-with the accelerations a of the supports (Clough & Penzien 2003, section 26; damping forces of the slow part are left
+with the accelerations a of the supports (Chopra 2012, section 9.7; damping forces of the slow part are left
 out, as usual). C need not have the modes of M and K. Of first order, in the state (u, u'), the equations come apart in
 the complex modes, each q' = lam q + f(t), and with accelerations that are straight lines between their samples each has
 a closed form: no time-stepping error, as in `linear_oscillator`.
@@ -15,7 +15,7 @@ and a frame.
 
 References
 ----------
-R. W. Clough, J. Penzien, Dynamics of Structures, 3rd edition (revised), Computers & Structures, 2003.
+A. K. Chopra, Dynamics of Structures, 4th edition, Prentice Hall, 2012.
 """
 
 from __future__ import annotations
