@@ -161,13 +161,13 @@ plt.close(figure)
 
 names = white.posterior.likelihood.model.parameter_names
 drawn = [names.index(name) for name in ("stiffness_1", "stiffness_2", "stiffness_3", "damping_1", "mass_3")]
-together = np.concatenate([run.draws for run in runs.values()])
+together = np.concatenate([run.draws[:, : len(names)] for run in runs.values()])
 figure = None
 for noise, run in runs.items():
     figure = corner.corner(
         run.draws[:, drawn],
         fig=figure,
-        range=[(together[:, i].min(), together[:, i].max()) for i in drawn],
+        range=[tuple(np.quantile(together[:, i], [0.001, 0.999])) for i in drawn],
         labels=[names[i].replace("_", " ") for i in drawn],
         color=COLOURS[noise],
         plot_datapoints=False,
