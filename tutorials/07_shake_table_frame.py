@@ -284,16 +284,15 @@ for shaking, stem in (("shaking 1", "calibration"), ("shaking 3", "prediction"))
 #   the two models are as good as each other (e^(.3 +- .7)). AR(1) changes hardly anything, as for the bridges: the
 #   residuals swing at the frame's own frequencies. The sampler warns that some evidences are rough; it is right.
 # * **Too sharp?** Three posteriors from three shakings lie 6.7 standard deviations apart with white noise (the damping
-#   of the second mode 20), and .9 with n_eff. This is the test that needs no belief: the samples that n_eff leaves are
-#   about as many as there are.
+#   of the second mode 20), and .9 with n_eff, in the model of one mode. That is a test of the width of the posterior, by
+#   data; it is no test of the model, which may be wrong in the same way three times.
 # * **Prediction.** The second floor, never shown, comes out with an RRMSE of 9 to 16 %, in shakings that were not shown
 #   as well as in the one that was. The first floor in the third shaking is worst: 27 to 30 %.
 # * **Coverage of the 90 % bands.** In what is predicted: 71 to 99 % with white noise, 73 to 99 % with AR(1), 82 to 99 %
-#   with n_eff. Most of a band is sigma, which all noises find alike. What parameters alone leave open is the rest: it
-#   holds 3 to 15 % of the samples with white noise, 36 to 65 % with n_eff, which therefore tells more of what a
-#   smooth quantity (a peak, a drift) may be.
+#   with n_eff. Most of a band is sigma, which all noises find nearly alike. The band of the response alone, which the
+#   parameters leave open, holds 3 to 15 % of the samples with white noise and 36 to 65 % with n_eff.
 # * **What does not follow.** The frame is not linear: it rings at 3.80 Hz when it moves little and at 3.68 Hz when it
-#   moves much, and no damping ratio fits both. Three shakings with one motion say nothing about another motion.
+#   moves much, and the model has one frequency. Three shakings with one motion say nothing about another motion.
 
 # %%
 result = {
