@@ -284,7 +284,7 @@ for shaking, stem in (("shaking 1", "calibration"), ("shaking 3", "prediction"))
 #   the two models are as good as each other (e^(.3 +- .7)). AR(1) changes hardly anything, as for the bridges: the
 #   residuals swing at the frame's own frequencies. The sampler warns that some evidences are rough; it is right.
 # * **Too sharp?** Three posteriors from three shakings lie 6.7 standard deviations apart with white noise (the damping
-#   of the second mode 20), and .9 with n_eff, in the model of one mode. That is a test of the width of the posterior, by
+#   of the second mode 20), and .9 with n_eff, in the model of one mode. That is a test of the posterior's width, by
 #   data; it is no test of the model, which may be wrong in the same way three times.
 # * **Prediction.** The second floor, never shown, comes out with an RRMSE of 9 to 16 %, in shakings that were not shown
 #   as well as in the one that was. The first floor in the third shaking is worst: 27 to 30 %.
