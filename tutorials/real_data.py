@@ -49,6 +49,8 @@ def find(folder: Path | None, pattern: str, source: str) -> Path:
     looked_in = BESIDE if folder is None else folder
     found = sorted(looked_in.rglob(pattern)) if looked_in.is_dir() else []
     if found:
+        if FAST:
+            print("REDUCED SETTING (FAST): few walkers; expect a rough posterior, or one mode where there are two")
         return found[0]
     message = f"NO DATA: no file {pattern} in {looked_in}; get it from {source}, and name its folder with --data"
     if folder is not None:
