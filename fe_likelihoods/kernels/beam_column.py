@@ -57,16 +57,17 @@ def _invert(f11, f12, f13, f22, f23, f33):
 
 
 @kernel
-def initialise(state, points, weights, length, initial_flexibility):
+def initialise(state, points, tributary, initial_flexibility):
     """Unloaded elastic state of one element into `state` (HEAD + PER_SECTION n_points,).
 
-    points, weights : (n_points,) Gauss-Lobatto rule on [0, 1]. initial_flexibility : (3,) f11, f12, f22.
+    points : (n_points,) of the Gauss-Lobatto rule on [0, 1]. tributary : (n_points,) length that each stands for, its
+    weight times that of the element. initial_flexibility : (3,) f11, f12, f22.
     """
     state[:] = 0.0
     a, b, c = initial_flexibility
     f11 = f12 = f13 = f22 = f23 = f33 = 0.0
     for m in range(points.shape[0]):
-        xi, w = points[m], weights[m] * length
+        xi, w = points[m], tributary[m]
         k = HEAD + PER_SECTION * m
         state[k + 2], state[k + 3], state[k + 4] = a, b, c
         f11 += a * w
@@ -87,8 +88,7 @@ def advance(
     state,
     work,
     points,
-    weights,
-    length,
+    tributary,
     initial_flexibility,
     tolerance,
     core_count,
@@ -136,7 +136,7 @@ def advance(
         f11 = f12 = f13 = f22 = f23 = f33 = 0.0
         r1, r2, r3 = target1, target2, target3
         for m in range(n_points):
-            xi, w = points[m], weights[m] * length
+            xi, w = points[m], tributary[element, m]
             k = HEAD + PER_SECTION * m
             a, b, c = work[1, k + 2], work[1, k + 3], work[1, k + 4]
             if use_initial:

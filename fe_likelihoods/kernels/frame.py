@@ -29,7 +29,7 @@ class Column(NamedTuple):
     corotational: bool
     element_tolerance: float  # work of the last compatibility correction [force x length]
     points: np.ndarray  # (n_points,) Gauss-Lobatto points on [0, 1]
-    weights: np.ndarray  # (n_points,)
+    tributary: np.ndarray  # (n_elements, n_points) length that each section stands for
     core_count: int  # the first fibers are of the core
     y: np.ndarray  # (n_concrete,), filled up with empty fibers
     area: np.ndarray  # (n_concrete,)
@@ -60,21 +60,27 @@ def allocate(
     core: np.ndarray,
     cover: np.ndarray,
     bars: np.ndarray,
+    penetration: float = 0.0,
 ) -> Column:
     """A `Column` with its memory allocated and its materials still to be set.
 
-    core, cover, bars : (n, 2) position y and area of the fibers. Other arguments as in `Column`.
+    points, weights : (n_points,) Gauss-Lobatto rule on [0, 1]. core, cover, bars : (n, 2) position y and area of the
+    fibers. penetration : length below the base over which the deformations of the base section go on (strain of the
+    bars in the foundation). Other arguments as in `Column`.
     """
     concrete = _fill_up(np.concatenate([core, cover]), 16)
     padded_bars = _fill_up(bars, 8)
     n_sections = n_elements * len(points)
     n_state = HEAD + PER_SECTION * len(points)
+    length = height / n_elements
+    tributary = np.tile(np.asarray(weights, dtype=float) * length, (n_elements, 1))
+    tributary[0, 0] += penetration
     return Column(
-        length=height / n_elements,
+        length=length,
         corotational=bool(corotational),
         element_tolerance=float(element_tolerance),
         points=np.ascontiguousarray(points, dtype=float),
-        weights=np.ascontiguousarray(weights, dtype=float),
+        tributary=tributary,
         core_count=len(core),
         y=np.ascontiguousarray(concrete[:, 0], dtype=float),
         area=np.ascontiguousarray(concrete[:, 1], dtype=float),
@@ -120,7 +126,7 @@ def initialise_column(column):
     column.initial_flexibility[1] = -k_coupling / d
     column.initial_flexibility[2] = k_axial / d
     for e in range(column.element_state.shape[0]):
-        initialise(column.element_state[e], column.points, column.weights, column.length, column.initial_flexibility)
+        initialise(column.element_state[e], column.points, column.tributary[e], column.initial_flexibility)
 
 
 @kernel(inline=True)
@@ -154,8 +160,7 @@ def assemble(u, column, force, stiffness):
             column.element_state,
             column.work,
             column.points,
-            column.weights,
-            column.length,
+            column.tributary,
             column.initial_flexibility,
             column.element_tolerance,
             column.core_count,

@@ -69,7 +69,7 @@ def basic_forces_by_hand(column, v, scheme):
     for number in range(100 if scheme == 1 else 10):
         from_start = scheme == 1 or (scheme == 2 and number == 0)
         residual, compliance = v.copy(), np.zeros((3, 3))
-        for m, (xi, weight) in enumerate(zip(column.points, column.weights * column.length, strict=True)):
+        for m, (xi, weight) in enumerate(zip(column.points, column.tributary[0], strict=True)):
             along = section_matrix(xi)
             used = initial if from_start else flexibility[m]
             deformation[m] += used @ (along @ q - resisting[m])
@@ -186,7 +186,7 @@ def test_sections_are_in_equilibrium_and_compatible_when_converged(rng):
             assert abs(unbalanced[0]) < 1e-3  # kip, of thousands
             assert abs(unbalanced[1]) < 1e-2  # kip in, of tens of thousands
             flexibility = np.array([[section[2], section[3]], [section[3], section[4]]])
-            weight = column.weights[m] * column.length
+            weight = column.tributary[0, m]
             integral += weight * along.T @ (section[:2] + flexibility @ unbalanced)
         np.testing.assert_allclose(integral, v, rtol=0, atol=1e-8 * MILD.max())
         seen += 1

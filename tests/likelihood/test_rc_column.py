@@ -274,6 +274,7 @@ CHANGED = dict(  # for every argument another value; `loading`, `units` and `out
     element_tolerance=1e-9,
     max_iterations=30,
     halvings=8,
+    penetration=0.3,
 )
 NUMERICAL = {"max_increment", "tolerance", "element_tolerance", "max_iterations", "halvings"}
 ONE_LOADING = {"mass", "rotational_inertia", "vertical_mass", "a0", "a1", "substeps"}  # inertia and damping
@@ -332,6 +333,7 @@ def test_parameters_are_multiples_of_nominal_values(strong, pushed, name):
     places = {"Ec": ("concrete", "ec"), "ft": ("concrete", "ft"), "fc": ("concrete", "fc"), "Es": ("steel", "es")}
     places |= {"fy": ("steel", "fy"), "fu": ("steel", "fu"), "Esh": ("steel", "esh")}
     base = RCColumn.lhpost(strong) if name in ("a0", "a1", "mass") else replace(pushed, loading=cycles(0.05, 0.3))
+    base = replace(base, penetration=0.2)
     if name in places:
         group, key = places[name]
         other = varied(base, group, {key: factor * getattr(getattr(base, group), key)})
@@ -458,6 +460,29 @@ def test_finer_increments_change_little(pushed):
     assert rrmse(forces[1], forces[2]) < rrmse(forces[0], forces[2])
 
 
+@pytest.mark.parametrize("n_elements", [1, 2, 5])
+def test_strain_that_penetrates_the_foundation_turns_the_base(pushed, n_elements):
+    """Uncracked, 1/k = H^3/(3 EI) + H (M/EI) l/M: the base turns by its curvature times the length l."""
+    small = DisplacementHistory("small", [0.0, 1e-7 * pushed.height, -1e-7 * pushed.height])
+    rigid = replace(pushed, loading=small, geometry="linear", axial_load=0.0, n_elements=n_elements)
+    for share in (0.05, 0.4):
+        slipping = replace(rigid, penetration=share * pushed.height)
+        forces = [model.simulate(np.ones(3))[0] for model in (rigid, slipping)]
+        np.testing.assert_allclose(forces[0][1:] / forces[1][1:], 1.0 + 3.0 * share, rtol=1e-5)
+
+
+def test_penetration_changes_what_cycles_dissipate_but_not_the_strength(pushed):
+    """After yielding the same displacement asks for less curvature; what the base section can carry is the same."""
+    model = replace(pushed, loading=cycles(0.1, 0.3), geometry="linear")
+    rigid, slipping = (
+        replace(model, penetration=length).history(np.ones(3)) for length in (0.0, 0.022 * 518.0 * 0.0358)
+    )
+    assert np.abs(slipping["base curvature"]).max() < 0.8 * np.abs(rigid["base curvature"]).max()
+    strengths = [np.abs(history["force"]).max() for history in (rigid, slipping)]
+    assert 0.9 * strengths[0] < strengths[1] < strengths[0]
+    np.testing.assert_array_equal(replace(model, penetration=0.0).simulate(np.ones(3))[0], rigid["force"])
+
+
 def test_a_cyclic_test_is_updated_end_to_end(rng):
     """Synthetic force, noise included: the most probable parameters lie where linear theory says."""
     model = RCColumn.lhpost(cycles(0.01, 0.03, 0.06), parameters=PUSHED, outputs=("force",))
@@ -578,6 +603,7 @@ REFUSED = [
     (dict(substeps=0), "substeps"),
     (dict(substeps=1.5), "substeps"),
     (dict(max_increment=0.0), "max_increment"),
+    (dict(penetration=-0.1), "penetration"),
     (dict(max_iterations=0), "max_iterations"),
     (dict(halvings=-1), "halvings"),
     (dict(tolerance=0.0), "tolerance"),
