@@ -40,6 +40,7 @@ __all__ = [
     "monotonic_stress_tangent",
     "stress_tangent",
     "switch_backbone",
+    "stress_history",
     "update",
 ]
 
@@ -460,3 +461,10 @@ def switch_backbone(state, c):
     state[BRANCH] = _mirror_branch(b)
     state[SC] = s
     return 1
+
+
+@kernel
+def stress_history(strain, state, c, stress):
+    """Engineering `stress` (n,) out of one bar taken through `strain` (n,), its memory carried on in place."""
+    for i in range(strain.shape[0]):
+        stress[i], _ = update(strain[i], state, c)
