@@ -4,6 +4,7 @@ import csv
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -217,3 +218,48 @@ def test_real_data_say_where_they_come_from(tmp_path, monkeypatch, capsys):
         real_data.find(None, "*ce01336p.zip", "CESMD")
     assert ended.value.code == 0
     assert "NO DATA" in capsys.readouterr().out
+
+
+def test_real_column_is_calibrated_and_predicts(shared, tmp_path):
+    """Lehman 415 on its first half, then its second half and another column; the data stay where they are."""
+    data = shared / "measured" / "rc_column_cyclic"
+    output = run_tutorial("08_cyclic_column.py", "--data", str(data), "--out", str(tmp_path))
+    # the table of nominal values: the slip of the bars explains half of the error, and the force is without P-Delta
+    lehman, hose = (re.search(rf"{name} .*?((?: +[0-9.]+ %){{4}})", output) for name in ("Lehman 415", "Hose SRPH1"))
+    lehman, hose = ([float(value) for value in re.findall("[0-9.]+", found[1])] for found in (lehman, hose))
+    assert lehman == pytest.approx([20.3, 10.6, 19.9, 12.1], abs=0.3)
+    assert hose == pytest.approx([11.6, 8.7, 21.1, 22.4], abs=0.3)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    parts = summary["predictions"]
+    assert parts["Lehman 415, first half"]["white"]["rrmse"] < 0.095 < parts["Lehman 415, first half"]["nominal"]
+    assert parts["Hose SRPH1, second half, to failure"]["white"]["rrmse"] < 0.15
+    assert parts["Lehman 415, after failure"]["white"]["rrmse"] > 1.0, "bars do not break in this model"
+    assert summary["sigma"]["white"] > 10.0 * summary["sensor"], "the error is the model's, not the sensor's"
+    for name in ("data", "corner", "residuals_white", "residuals_ar1", "loops_white", "loops_ar1"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000, name
+
+
+def test_real_steel_is_calibrated_and_predicts(shared, tmp_path):
+    """White noise makes too narrow bands, errors that last wider ones; the innovations of the latter are white."""
+    data = shared / "measured" / "steel_coupon"
+    run_tutorial("09_steel_coupon.py", "--data", str(data), "--out", str(tmp_path))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["lag_one"]["white"] > 0.7 and abs(summary["lag_one"]["AR(1)"]) < 3.0 / 170**0.5
+    assert summary["n_effective"] < 0.2 * summary["samples"] == 0.2 * 171
+    half, rest = summary["predictions"]["first half"], summary["predictions"]["second half"]
+    assert half["white"]["rrmse"] < 0.065 < half["nominal"] and rest["AR(1)"]["rrmse"] < 0.085 < rest["nominal"]
+    assert rest["white"]["coverage"] < 0.8 < rest["AR(1)"]["coverage"] < 0.97
+    assert summary["sd"]["AR(1)"]["Esh"] > 1.5 * summary["sd"]["white"]["Esh"]
+    for name in ("corner", "residuals_white", "residuals_ar1", "loops"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000, name
+
+
+def test_a_tutorial_without_its_data_says_where_to_get_them(tmp_path):
+    done = subprocess.run(
+        [sys.executable, ROOT / "tutorials" / "09_steel_coupon.py", "--data", tmp_path, "--out", tmp_path / "out"],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 1 and not (tmp_path / "out").exists()
+    assert "give their folder with --data" in done.stderr and "GitHub" in done.stderr and "Traceback" not in done.stderr
