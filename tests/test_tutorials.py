@@ -262,4 +262,4 @@ def test_a_tutorial_without_its_data_says_where_to_get_them(tmp_path):
         timeout=100,
     )
     assert done.returncode == 1 and not (tmp_path / "out").exists()
-    assert "give their folder with --data" in done.stderr and "GitHub" in done.stderr and "Traceback" not in done.stderr
+    assert "NO DATA" in done.stderr and "GitHub" in done.stderr and "Traceback" not in done.stderr

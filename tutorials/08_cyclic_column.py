@@ -53,10 +53,7 @@ from fe_likelihoods.priors import TruncatedNormal
 from fe_likelihoods.records import DisplacementHistory
 from fe_likelihoods.units import from_si, to_si
 
-SOURCE = (
-    "The histories (columns disp_in, force_kip) and the properties of the specimens come from the repository\n"
-    "kuanshi/ductile-fracture on GitHub (MIT licence), which took them from the PEER structural performance database."
-)
+SOURCE = "kuanshi/ductile-fracture on GitHub (MIT licence; from the PEER structural performance database)"
 FILES = ("2017_Lehman_415.csv", "2013_Hose_SRPH1.csv", "properties_circular_columns.csv")
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 KIP = to_si(1.0, "kip").item()
@@ -79,7 +76,7 @@ args = parser.parse_args()
 begin = time.perf_counter()
 walkers, every, n_draws, settings, parameters = PRESETS[args.preset]
 walkers, every = args.walkers or walkers, args.every or every
-folder = data_folder(args.data, "rc_column_cyclic", FILES, SOURCE)
+folder = data_folder(args.data, FILES, SOURCE)
 args.out.mkdir(parents=True, exist_ok=True)
 
 # %% [markdown]

@@ -41,10 +41,7 @@ from fe_likelihoods.models.rc_column import Steel
 from fe_likelihoods.models.steel_coupon import SteelCoupon
 from fe_likelihoods.priors import TruncatedNormal
 
-SOURCE = (
-    "Strains (stress.1.coords, one a line) and stresses (calDataField.csv, MPa, in one line) are those of an example\n"
-    "of quoFEM, repository NHERI-SimCenter/quoFEM on GitHub (BSD licence)."
-)
+SOURCE = "NHERI-SimCenter/quoFEM on GitHub (BSD licence; an example of quoFEM)"
 FILES = ("stress.1.coords", "calDataField.csv")
 BLUE, ORANGE = "#1f5a8c", "#d9822b"
 MPA = 1e6
@@ -57,7 +54,7 @@ parser.add_argument("--out", type=Path, default=Path("results-steel-coupon"))
 args = parser.parse_args()
 
 begin = time.perf_counter()
-folder = data_folder(args.data, "steel_coupon", FILES, SOURCE)
+folder = data_folder(args.data, FILES, SOURCE)
 args.out.mkdir(parents=True, exist_ok=True)
 
 # %% [markdown]

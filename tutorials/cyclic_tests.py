@@ -1,4 +1,4 @@
-"""What the tutorials on real measurements share: where the data lie, one posterior for each idea of the error, tables.
+"""What the tutorials on tests of materials and members share: one posterior for each idea of the error, tables.
 
 What separates a measurement from a simulation is two things. **Measurement error**: what the sensor adds; it is known
 from the sensor or from the scatter of neighbouring samples, and new at each of them. **Model error**: what the model
@@ -10,7 +10,6 @@ sample. White noise takes both for one and counts each sample as a witness of it
 * ``AR(1)``: errors that last, their lag-one correlation unknown, above a sensor's noise that is known.
 """
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ import corner
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from real_data import find
 
 from fe_likelihoods.channels import Measurements
 from fe_likelihoods.figures import plot_residuals
@@ -51,14 +51,9 @@ __all__ = [
 COLOURS = {"white": "#d9822b", "effective": "#5b8c5a", "AR(1)": "#1f5a8c"}
 
 
-def data_folder(given: Path | None, name: str, files: tuple[str, ...], source: str) -> Path:
+def data_folder(given: Path | None, files: tuple[str, ...], source: str) -> Path:
     """Folder of the measured data, or the end of the script with the words that say where to get them."""
-    shared = Path(os.environ.get("FE_SHARED", Path(__file__).resolve().parents[2] / "shared"))
-    folder = given or shared / "measured" / name
-    missing = [file for file in files if not (folder / file).is_file()]
-    if missing:
-        raise SystemExit(f"no {', '.join(missing)} in {folder}: give their folder with --data.\n{source}")
-    return folder
+    return {find(given, file, source).parent for file in files}.pop()
 
 
 class Fit(NamedTuple):
