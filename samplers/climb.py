@@ -2,7 +2,8 @@
 
 By moves it is Sequential Monte Carlo: choose the next beta, weigh, resample, move. By recycling it is importance
 sampling along the ladder (see `samplers.recycling`), thinned to as many points as there are walkers, which then are
-moved. Both end with an estimate of the evidence from draws that had no part in the climb.
+moved. Both end with an estimate of the evidence from draws that had no part in the climb. With a cheaper model to climb
+on first, recycling sets out from where that led to instead of the prior (see `samplers.coarse`).
 """
 
 import logging
@@ -13,7 +14,8 @@ import numpy as np
 from emcee.model import Model
 from emcee.moves import Move
 
-from .alarms import check_climb, check_ladder
+from .alarms import check_climb, check_ladder, sound
+from .coarse import draw_start
 from .edges import find_edges
 from .families import follow
 from .importance import EvidenceCheck, draw_inside, evidence_from_weights
@@ -28,12 +30,14 @@ from .ladder import (
 )
 from .mixtures import fit_mixture, log_density
 from .mutation import Moved, grow_chains, move_together, tempered_log_prob
-from .recycling import recycle
+from .recycling import Start, recycle
 from .settings import Settings
 
 __all__ = ["Climbed", "Tempering", "climb"]
 
 logger = logging.getLogger(__name__)
+
+FEWEST_TO_START = 250
 
 
 class Tempering(NamedTuple):
@@ -42,6 +46,7 @@ class Tempering(NamedTuple):
     Attributes
     ----------
     evaluate : function of points (n, ndim) that returns their records (log_prob, log_prior[, blobs]).
+    evaluate_coarse : the same for a cheaper model to climb on first, or None.
     inside : function of points (n, ndim) that tells which lie in the support of the prior.
     random : RandomState
     moves, shares : the mutation kernels, and how often each is taken.
@@ -53,6 +58,7 @@ class Tempering(NamedTuple):
     """
 
     evaluate: Callable[[np.ndarray], np.ndarray]
+    evaluate_coarse: Callable[[np.ndarray], np.ndarray] | None
     inside: Callable[[np.ndarray], np.ndarray]
     random: np.random.RandomState
     moves: Sequence[Move]
@@ -80,8 +86,13 @@ class Climbed(NamedTuple):
     check: EvidenceCheck | None
 
 
-def climb(coords: np.ndarray, records: np.ndarray, tempering: Tempering) -> Climbed:
-    """Carry draws of the prior (n, ndim) and their records (n,) to beta = 1."""
+def climb(coords: np.ndarray, records: np.ndarray | None, tempering: Tempering) -> Climbed:
+    """Carry draws of the prior (n, ndim) and their records (n,), None if still to be made, to beta = 1."""
+    if tempering.evaluate_coarse is not None:
+        found = _from_coarse(coords, tempering.evaluate_coarse, tempering)
+        if found is not None:
+            return found
+    records = tempering.evaluate(coords) if records is None else records
     found = _by_recycling(coords, records, tempering) if tempering.settings.recycle else None
     return _by_moves(coords, records, tempering) if found is None else found
 
@@ -124,9 +135,43 @@ def _by_moves(coords: np.ndarray, records: np.ndarray, tempering: Tempering) -> 
     return Climbed(coords, records, generations, check)
 
 
-def _by_recycling(coords: np.ndarray, records: np.ndarray, tempering: Tempering) -> Climbed | None:
+def _from_coarse(
+    coords: np.ndarray, evaluate: Callable[[np.ndarray], np.ndarray], tempering: Tempering
+) -> Climbed | None:
+    """Climb on a cheaper model, then from there to the posterior; None where what is found may not be trusted."""
+    n, random, inside = len(coords), tempering.random, tempering.inside
+
+    def enter(beta, effective_sample_size, acceptance, **_):
+        tempering.show(beta, effective_sample_size, acceptance)
+
+    # a start needs no weights of its own, and the draws at beta = 1 decide what the end is worth: half the size will do
+    few = min(n, max(FEWEST_TO_START, n // 2))
+    coarse = recycle(coords[:few], evaluate(coords[:few]), evaluate, inside, random, enter, finish=False)
+    if coarse.doubt:
+        sound(f"the climb on the coarse model failed ({coarse.doubt}): climbing on the fine model alone")
+        return None
+    drawn, start = draw_start(coarse.proposals, coords, few, random, inside)
+    found = _by_recycling(drawn, tempering.evaluate(drawn), tempering, start, n)
+    spent = few + sum(made for made, _ in coarse.proposals)
+    way = sum(stage.evaluations for stage in tempering.ladder[:-1])
+    if found is None:
+        sound(
+            "the coarse posterior is too far from the fine one to lead to it: climbing on the fine model alone. Use a "
+            "closer coarse model, or none"
+        )
+    elif way > spent:
+        sound(
+            f"the coarse posterior is far from the fine one: the way from it took {way} evaluations of the fine model, "
+            f"more than the climb on the coarse one ({spent}). A closer coarse model may be worth its cost"
+        )
+    return found
+
+
+def _by_recycling(
+    coords: np.ndarray, records: np.ndarray, tempering: Tempering, start: Start | None = None, wanted: int | None = None
+) -> Climbed | None:
     """Adaptive importance sampling over all points; None where its result may not be trusted."""
-    n, random, ladder = len(coords), tempering.random, tempering.ladder
+    n, random, ladder = len(coords) if wanted is None else wanted, tempering.random, tempering.ladder
     ladder.clear()
 
     def enter(log_evidence, acceptance, effective_sample_size, **fields):
@@ -140,7 +185,7 @@ def _by_recycling(coords: np.ndarray, records: np.ndarray, tempering: Tempering)
         )
         tempering.show(fields["beta"], effective_sample_size, acceptance)
 
-    found = recycle(coords, records, tempering.evaluate, tempering.inside, random, enter)
+    found = recycle(coords, records, tempering.evaluate, tempering.inside, random, enter, start, wanted)
     if not found.trusted:
         logger.info("recycling is not trusted here, because %s: climbing by moves", found.doubt)
         return None

@@ -20,7 +20,7 @@ Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-
 Owen & Zhou (2000), JASA 95(449), doi:10.1080/01621459.2000.10473909 (deterministic mixture weights)
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,19 @@ EVENED = 0.25
 MOST_COMPONENTS = 8
 
 
+class Start(NamedTuple):
+    """Where a climb by recycling sets out: a density that points were drawn from.
+
+    Attributes
+    ----------
+    made : int — draws made of it, those outside the support of the prior counted.
+    log_density : function of points (n, ndim) and their records (n,) that returns the logarithm of it, (n,).
+    """
+
+    made: int
+    log_density: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
 class Recycled(NamedTuple):
     """Outcome of a climb by recycling.
 
@@ -57,7 +70,8 @@ class Recycled(NamedTuple):
     log_weights : (n,) float — round by round against the one mixture of the round, whose fit they had no part in; a
         round counts by its effective sample size.
     log_evidence, log_evidence_error : float — by the ladder: all points but those of the check.
-    check : EvidenceCheck, or None if beta = 1 was not reached.
+    check : EvidenceCheck, or None if beta = 1 was not reached, or a check was not wanted.
+    proposals : list of (int, Mixture) — the mixtures drawn from, in order, and how many draws were made of each.
     """
 
     doubt: str
@@ -67,6 +81,7 @@ class Recycled(NamedTuple):
     log_evidence: float
     log_evidence_error: float
     check: EvidenceCheck | None
+    proposals: Sequence[tuple[int, Mixture]] = ()
 
     @property
     def trusted(self) -> bool:
@@ -77,33 +92,36 @@ class Recycled(NamedTuple):
 class _Pool:
     """All points, their records, and the log of the mixture of all densities they were drawn from."""
 
-    def __init__(self, coords: np.ndarray, records: np.ndarray):
-        self.coords, self.records = coords, records
-        self._proposals: list[tuple[float, Mixture]] = []
-        self._n_prior = len(coords)
-        self._log_mixture = np.log(self._n_prior) + records["log_prior"]
+    def __init__(self, coords: np.ndarray, records: np.ndarray, start: Start):
+        self.coords, self.records, self._start = coords, records, start
+        self.proposals: list[tuple[int, Mixture]] = []
+        self._log_made = np.log(start.made)
+        self._log_start = start.log_density(coords, records)
+        self._log_mixture = self._log_made + self._log_start
 
     def add(self, mixture: Mixture, made: int, coords: np.ndarray, records: np.ndarray) -> None:
         """Enter the draws (n, ndim) that `made` draws of a mixture left inside the support."""
-        log_mixture = np.log(self._n_prior) + records["log_prior"]
-        for log_count, earlier in self._proposals:
-            log_mixture = np.logaddexp(log_mixture, log_count + log_density(earlier, coords))
-        self._proposals.append((np.log(made), mixture))
+        log_start = self._start.log_density(coords, records)
+        log_mixture = self._log_made + log_start
+        for count, earlier in self.proposals:
+            log_mixture = np.logaddexp(log_mixture, np.log(count) + log_density(earlier, coords))
+        self.proposals.append((made, mixture))
         self.coords = np.concatenate([self.coords, coords])
         self.records = np.concatenate([self.records, records])
+        self._log_start = np.concatenate([self._log_start, log_start])
         self._log_mixture = np.logaddexp(
             np.concatenate([self._log_mixture, log_mixture]), np.log(made) + log_density(mixture, self.coords)
         )
 
     @property
-    def log_likelihood(self) -> np.ndarray:
-        return self.records["log_prob"] - self.records["log_prior"]
+    def log_ratio(self) -> np.ndarray:
+        """Log of the posterior over the start: from the prior, the log-likelihood."""
+        return self.records["log_prob"] - self._log_start
 
     def log_weights(self, beta: float) -> np.ndarray:
         """Log of the tempered target over the mixture, (n,); their sum estimates the evidence at beta."""
         alive = self.records["log_prob"] > -np.inf
-        log_likelihood = np.where(alive, self.log_likelihood, 0.0)
-        tempered = self.records["log_prior"] + beta * log_likelihood - self._log_mixture
+        tempered = self._log_start + beta * np.where(alive, self.log_ratio, 0.0) - self._log_mixture
         return np.where(alive, tempered, -np.inf)
 
 
@@ -114,8 +132,11 @@ def recycle(
     inside: Callable[[np.ndarray], np.ndarray],
     random: np.random.RandomState,
     enter: Callable[..., None],
+    start: Start | None = None,
+    wanted: int | None = None,
+    finish: bool = True,
 ) -> Recycled:
-    """Climb from draws of the prior to beta = 1 by adaptive mixture importance sampling.
+    """Climb from draws of the prior, or of another start, to beta = 1 by adaptive mixture importance sampling.
 
     Parameters
     ----------
@@ -126,22 +147,27 @@ def recycle(
     enter : called for each beta below 1, before its draws are made, with the keywords of a `Stage` that are known here:
         beta, effective_sample_size, acceptance (the share of the latest draws that their weights are worth),
         log_evidence and log_evidence_error (both so far).
+    start : Start, optional — what the points were drawn from instead of the prior; the path from it to the posterior is
+        start^(1 - beta) posterior^beta, and the evidence remains that of the posterior.
+    wanted : int, optional — what sets the size of everything, if not the number of points.
+    finish : bool — False: end as soon as the draws at beta = 1 are worth as much as those of a rung.
     """
-    n, ndim = coords.shape
-    target = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
-    pool = _Pool(coords, records)
+    ndim, n = coords.shape[1], len(coords) if wanted is None else wanted
+    start = Start(len(coords), lambda _, records: records["log_prior"]) if start is None else start
+    target = max(TARGET_SHARE * len(coords), POINTS_PER_DIMENSION * (ndim + 1.0))
+    pool = _Pool(coords, records, start)
     edges = find_edges(inside, coords)
     beta, fresh, yields, checks = 0.0, 0.0, [], 0
     final: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     alive = effective_sample_size(pool.log_weights(0.0))
     if alive < target:
-        doubt = f"only {alive:.0f} of {n} draws of the prior have a likelihood above zero"
-        return Recycled(doubt, coords, records, np.zeros(n), float("-inf"), float("inf"), None)
+        doubt = f"only {alive:.0f} of {len(coords)} first draws have a likelihood above zero"
+        return Recycled(doubt, coords, records, np.zeros(len(coords)), float("-inf"), float("inf"), None)
     while True:
         log_weights, last_beta = pool.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
         if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= FRESH_SHARE * target):
-            beta, fresh = next_beta(pool.log_likelihood, beta, target, log_weights), 0.0
+            beta, fresh = next_beta(pool.log_ratio, beta, target, log_weights), 0.0
             log_weights = pool.log_weights(beta)
             effective = effective_sample_size(log_weights)
         log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
@@ -149,7 +175,7 @@ def recycle(
         luck = 1.0 / target if yields else 0.0
         error = float(np.sqrt(max(1.0 / effective - 1.0 / len(log_weights), 0.0) + luck))
         if last_beta < beta < 1.0:
-            share = yields[-1] if yields else effective / n
+            share = yields[-1] if yields else effective / len(coords)
             enter(
                 beta=beta,
                 effective_sample_size=effective,
@@ -161,7 +187,7 @@ def recycle(
         finished = beta == 1.0 and effective >= n
         new, made = draw_inside(mixture, n if finished else int(round(2.0 * target)), random, inside)
         new_records = evaluate(new)
-        new_weights = _against(mixture, new_records, new, beta)
+        new_weights = _against(mixture, new_records, new, start, beta)
         worth = effective_sample_size(new_weights)
         fresh += worth
         yields.append(worth / max(len(new), 1))
@@ -172,11 +198,12 @@ def recycle(
         check = evidence_from_weights(new_weights, made) if finished else None
         doubt = _doubt(check, log_evidence, beta, yields)
         # draws that tell a fit from the truth also mend it: check again, as long as that is cheap
-        if (finished and (not doubt or checks == MOST_CHECKS)) or (doubt and not finished):
+        reached = not finish and beta == 1.0 and effective >= target and fresh >= FRESH_SHARE * target
+        if (finished and (not doubt or checks == MOST_CHECKS)) or (doubt and not finished) or reached:
             columns = (
                 np.concatenate(column) for column in zip(*final or [(new, new_records, new_weights)], strict=True)
             )
-            return Recycled(doubt, *columns, log_evidence, error, check)
+            return Recycled(doubt, *columns, log_evidence, error, check, pool.proposals)
 
 
 def _evened(mixture: Mixture) -> Mixture:
@@ -209,9 +236,9 @@ def _doubt(check: EvidenceCheck | None, log_evidence: float, beta: float, yields
     return ""
 
 
-def _against(mixture: Mixture, records: np.ndarray, coords: np.ndarray, beta: float) -> np.ndarray:
+def _against(mixture: Mixture, records: np.ndarray, coords: np.ndarray, start: Start, beta: float) -> np.ndarray:
     """Log-weights of draws against the one mixture they came from."""
     alive = records["log_prob"] > -np.inf
     log_prob = np.where(alive, records["log_prob"], 0.0)
-    tempered = (1.0 - beta) * records["log_prior"] + beta * log_prob - log_density(mixture, coords)
+    tempered = (1.0 - beta) * start.log_density(coords, records) + beta * log_prob - log_density(mixture, coords)
     return np.where(alive, tempered, -np.inf)

@@ -159,6 +159,8 @@ def ladder_table(sampler: Any) -> str:
         f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "
         f"{total[0]} evaluations in {total[1]:.3g} s"
     )
+    if coarse := getattr(sampler, "coarse_evaluations", 0):
+        rows.append(f"{coarse} evaluations of the coarse model, in the first stage's seconds")
     check = sampler.log_evidence_check
     if check is not None:
         rows.append(

@@ -31,7 +31,7 @@ class SMCSampler(TemperedSampler):
     ----------
     nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, those of
         `samplers.moves.MixtureMove`: three kernels from a mixture fitted to every stage.
-    log_prior_fn, seed : as in `TemperedSampler`.
+    log_prior_fn, coarse_log_prob_fn, seed : as in `TemperedSampler`.
     recycle : bool, optional — climb by recycling every evaluated point (`samplers.recycling`), and by moves where that
         may not be trusted. By default yes with 250 walkers or more and no `moves` given: with fewer, a mode can be lost
         unnoticed, and the fall back on moves is likely.
@@ -55,6 +55,7 @@ class SMCSampler(TemperedSampler):
         parameter_names=None,
         *,
         log_prior_fn: Callable | None = None,
+        coarse_log_prob_fn: Callable | None = None,
         seed: int | None = None,
         ess_ratio: float = 0.5,
         ess_rule: str = "constant",
@@ -85,6 +86,7 @@ class SMCSampler(TemperedSampler):
             blobs_dtype=blobs_dtype,
             parameter_names=parameter_names,
             log_prior_fn=log_prior_fn,
+            coarse_log_prob_fn=coarse_log_prob_fn,
             seed=seed,
             settings=Settings(
                 ess_ratio=ess_ratio,

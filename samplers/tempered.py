@@ -12,6 +12,7 @@ emcee's private names are touched in this module only.
 
 import copy
 import functools
+import logging
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -37,6 +38,8 @@ from .settings import Settings
 
 __all__ = ["TemperedSampler"]
 
+logger = logging.getLogger(__name__)
+
 
 class TemperedSampler(EnsembleSampler):
     """emcee's ensemble sampler with a ladder from the prior to the posterior.
@@ -50,6 +53,11 @@ class TemperedSampler(EnsembleSampler):
         A point for which `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`);
         it is not called outside the support of the prior. With an emcee `HDFBackend` a journal is kept beside the file,
         and a run that was killed goes on from it (`run_mcmc`).
+    coarse_log_prob_fn : callable, optional
+        A cheaper version of `log_prob_fn` to climb on first, called in the same way (`samplers.coarse`); a posterior
+        may carry one as ``posterior.coarse``. Chain and evidence are those of `log_prob_fn` whatever it is. Its blobs
+        are not kept; where it fails it counts as -inf. A run that goes on from its journal asks it again. It needs
+        ``settings.recycle``.
     log_prior_fn : callable, optional
         Log density of the normalised prior, of the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but without `args` and `kwargs`. By default
@@ -66,7 +74,7 @@ class TemperedSampler(EnsembleSampler):
     Raises
     ------
     ValueError
-        For settings that cannot work, fewer than 2 ndim walkers, or no log-prior.
+        For settings that cannot work, fewer than 2 ndim walkers, no log-prior, or a coarse model without recycling.
     """
 
     def __init__(
@@ -84,6 +92,7 @@ class TemperedSampler(EnsembleSampler):
         parameter_names=None,
         *,
         log_prior_fn: Callable | None = None,
+        coarse_log_prob_fn: Callable | None = None,
         seed: int | None = None,
         settings: Settings = Settings(),
     ):
@@ -103,8 +112,14 @@ class TemperedSampler(EnsembleSampler):
             )
         if settings.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={settings.ess_floor} must be below nwalkers={nwalkers}")
+        if coarse_log_prob_fn is not None and not (callable(coarse_log_prob_fn) and settings.recycle):
+            raise ValueError(
+                "coarse_log_prob_fn must be callable, and the climb one by recycling (the default with 250 walkers or "
+                f"more and no moves of your own); got {coarse_log_prob_fn!r} with recycle={settings.recycle}"
+            )
 
         self.log_prior_fn = log_prior_fn
+        self.coarse_log_prob_fn = coarse_log_prob_fn
         self.settings = settings
         if type(backend) is HDFBackend and not backend.read_only:
             backend = JournaledBackend.of(backend)
@@ -114,6 +129,8 @@ class TemperedSampler(EnsembleSampler):
         self._evaluations = 0
         self._failures = Failures()
         self._records = Records()
+        self._coarse_failures = Failures()
+        self._coarse_evaluations = 0
         self._ladder: list[Stage] = []
         self._check: EvidenceCheck | None = None
         self._generations: list[np.ndarray] = []
@@ -154,6 +171,11 @@ class TemperedSampler(EnsembleSampler):
         Those of simulation-free sweeps are among them.
         """
         return self._evaluations
+
+    @property
+    def coarse_evaluations(self) -> int:
+        """Points handed to `coarse_log_prob_fn` by this object."""
+        return self._coarse_evaluations
 
     @property
     def failure_count(self) -> int:
@@ -375,7 +397,10 @@ class TemperedSampler(EnsembleSampler):
     def _header(self) -> dict:
         """What this run is begun with."""
         fingerprint = getattr(self.log_prob_fn.f, "fingerprint", None)
-        return header(self.nwalkers, self.ndim, fingerprint, self.settings, self._moves, self._weights)
+        begun = header(self.nwalkers, self.ndim, fingerprint, self.settings, self._moves, self._weights)
+        coarse = self.coarse_log_prob_fn
+        name = None if coarse is None else getattr(coarse, "fingerprint", "one without a fingerprint")
+        return begun | {"coarse_log_prob_fn": name}
 
     def _last_or_prior(self):
         """The state to start from when none is given."""
@@ -419,6 +444,18 @@ class TemperedSampler(EnsembleSampler):
         inside = log_prior > -np.inf
         return self._records.evaluated(log_prior, inside, self._outcome(coords[inside]) if inside.any() else None)
 
+    def _evaluate_coarse(self, coords: np.ndarray) -> np.ndarray:
+        """Records (log_prob, log_prior) of points (n, ndim) under the coarse model; those that fail are impossible."""
+        log_prior = self._log_prior(coords)
+        inside = log_prior > -np.inf
+        log_prob = np.full(len(coords), -np.inf)
+        if inside.any():
+            batch = self._ask(coords[inside], self.coarse_log_prob_fn)
+            log_prob[inside] = batch.log_prob
+            self._coarse_evaluations += len(batch.coords)
+            self._coarse_failures.add(batch.coords, batch.reasons)
+        return Records().pack(log_prob, log_prior)
+
     def _outcome(self, coords: np.ndarray) -> Evaluated:
         """What `log_prob_fn` gives for points (n, ndim): recalled from a killed run, or asked for and entered."""
         batch = None if self._memo is None else self._memo.recall(coords)
@@ -434,10 +471,10 @@ class TemperedSampler(EnsembleSampler):
         self._evaluations += len(batch.coords)
         self._failures.add(batch.coords, batch.reasons)
 
-    def _ask(self, coords: np.ndarray) -> Evaluated:
-        """Call `log_prob_fn` for points (n, ndim)."""
-        function = self.log_prob_fn
-        guarded = Guarded(function.f, function.args, function.kwargs)
+    def _ask(self, coords: np.ndarray, function: Callable | None = None) -> Evaluated:
+        """Call `log_prob_fn`, or another function with its arguments, for points (n, ndim)."""
+        fine = self.log_prob_fn
+        guarded = Guarded(fine.f if function is None else function, fine.args, fine.kwargs)
         results = self._call(guarded.of_batch if self.vectorize else guarded, coords, self.pool)
         return Evaluated(coords, *outcomes(results, len(coords), self.blobs_dtype))
 
@@ -484,6 +521,7 @@ class TemperedSampler(EnsembleSampler):
                 records,
                 Tempering(
                     evaluate=self._evaluate,
+                    evaluate_coarse=None if self.coarse_log_prob_fn is None else self._evaluate_coarse,
                     inside=self._inside,
                     random=self._random,
                     moves=self._moves,
@@ -494,6 +532,13 @@ class TemperedSampler(EnsembleSampler):
                     enter=self._add_stage,
                     show=functools.partial(self._show, shown),
                 ),
+            )
+        if self._coarse_failures.count:
+            logger.warning(
+                "%d of %d evaluations of the coarse model failed and count as impossible (%s)",
+                self._coarse_failures.count,
+                self._coarse_evaluations,
+                self._coarse_failures.told(),
             )
         self._generations, self._check = found.generations, found.check
         if self._check is not None:
@@ -514,8 +559,8 @@ class TemperedSampler(EnsembleSampler):
         self._ladder.append(stage)
         write_stage(self.backend, len(self._ladder) - 1, stage)
 
-    def _enter(self, state: State, skip_check: bool) -> np.ndarray:
-        """Check draws of the prior and evaluate them: records of all walkers."""
+    def _enter(self, state: State, skip_check: bool) -> np.ndarray | None:
+        """Check draws of the prior and evaluate them: records of all walkers; None where a coarse model comes first."""
         if state.coords.shape != (self.nwalkers, self.ndim):
             raise ValueError(
                 f"incompatible input dimensions: initial_state must be ({self.nwalkers}, {self.ndim}) draws of the "
@@ -538,7 +583,7 @@ class TemperedSampler(EnsembleSampler):
         if isinstance(self.backend, JournaledBackend) and self._memo is None:
             self.backend.begin(self._header(), Start(state.coords, log_prior, self.random_state))
         if state.log_prob is None:
-            return self._evaluate(state.coords)
+            return None if self.coarse_log_prob_fn is not None else self._evaluate(state.coords)
         log_prob, _ = log_probabilities(np.asarray(state.log_prob), self.nwalkers, "the initial state's log_prob")
         return self._records.pack(log_prob, log_prior, state.blobs)
 
