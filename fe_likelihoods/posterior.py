@@ -48,7 +48,8 @@ class Posterior:
     prior : Prior, or a mapping of names to distributions
         Of exactly the likelihood's parameters, in any order.
     coarse : Posterior, optional
-        A cheaper posterior of the same parameters (a larger step, fewer fibres), for samplers that climb on it first.
+        A cheaper posterior of the same parameters (of the first part of a record, say), for samplers that climb on it
+        first: ``SMCSampler(..., coarse_log_prob_fn=posterior.coarse)``.
 
     Raises
     ------

@@ -364,3 +364,26 @@ def test_another_table_motion(rng):
 def test_bad_arguments_of_the_bridge_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         problems.isolated_bridge(**arguments)
+
+
+def test_the_coarse_column_sees_the_first_part(data, tmp_path):
+    """Of the same response, nearly: it knows less but says nothing else."""
+    fine = bridge_column(every=8, duration=12.0, cache=tmp_path / "cache.db")
+    coarse = fine.coarse
+    assert coarse.parameter_names == fine.parameter_names
+    assert coarse.coarse is None
+    assert coarse.prior.distributions == fine.prior.distributions
+    assert coarse.fingerprint != fine.fingerprint
+    assert coarse.likelihood.cache is fine.likelihood.cache
+    n, measured = coarse.likelihood.measurements.n_steps, fine.likelihood.measurements
+    np.testing.assert_array_equal(coarse.likelihood.measurements.values, measured.values[:, :n])
+    intensity = np.cumsum(fine.likelihood.model.loading.acceleration**2)
+    assert intensity[n - 2] < 0.75 * intensity[-1] <= intensity[n - 1]
+    cheap, whole = (p.likelihood.model.simulate(TRUTH) for p in (coarse, fine))
+    assert np.all(rrmse(cheap, whole[:, :n]) < 5e-3)
+
+
+def test_a_coarse_column_needs_a_record_to_cut(data):
+    record = Record("two samples", data.record.dt, [0.0, 1.0])
+    posterior = bridge_column(record=record)
+    assert posterior.coarse is None

@@ -141,6 +141,35 @@ def test_smc_agrees_with_importance_sampling(run, make):
     assert difference < 4.0 * np.hypot(smc.log_evidence_error, check.log_evidence_error)
 
 
+def test_a_climb_on_the_coarse_posterior_agrees(run):
+    """Mean, sd and evidence of the fine posterior; half the work, counted in samples of the record simulated."""
+    alone, posterior = run(bundled_reduced), bundled_reduced(None)
+    sampler = SMCSampler(
+        WALKERS,
+        posterior.ndim,
+        posterior,
+        vectorize=True,
+        seed=int(os.environ.get("SEED", "1")),
+        coarse_log_prob_fn=posterior.coarse,
+    )
+    sampler.run_mcmc(None, SWEEPS)
+    samples = sampler.get_chain(flat=True)
+    sd = samples.std(axis=0)
+    assert np.all(
+        np.abs(samples.mean(axis=0) - alone.check.mean) < 4.0 * np.hypot(sd / np.sqrt(WALKERS), alone.check.error)
+    )
+    np.testing.assert_allclose(sd, alone.check.sd, rtol=0.2)
+    difference = abs(sampler.log_evidence - alone.check.log_evidence)
+    assert difference < 4.0 * np.hypot(sampler.log_evidence_error, alone.check.log_evidence_error)
+    fine, coarse = posterior.likelihood, posterior.coarse.likelihood
+    samples_alone = (alone.posterior.likelihood.simulations - DRAWS) * fine.measurements.n_steps
+    work = fine.simulations * fine.measurements.n_steps + coarse.simulations * coarse.measurements.n_steps
+    print(
+        f"\n{fine.simulations} simulations, {coarse.simulations} coarse: {work / samples_alone:.2f} of the work alone"
+    )
+    assert work < 0.75 * samples_alone
+
+
 def distance(estimate: Estimate) -> np.ndarray:
     return (estimate.mean - TRUTH) / estimate.sd
 
