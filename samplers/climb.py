@@ -38,6 +38,7 @@ __all__ = ["Climbed", "Tempering", "climb"]
 logger = logging.getLogger(__name__)
 
 FEWEST_TO_START = 250
+START_PER_DIMENSION = 10
 
 
 class Tempering(NamedTuple):
@@ -145,7 +146,7 @@ def _from_coarse(
         tempering.show(beta, effective_sample_size, acceptance)
 
     # a start needs no weights of its own, and the draws at beta = 1 decide what the end is worth: half the size will do
-    few = min(n, max(FEWEST_TO_START, n // 2))
+    few = min(n, max(FEWEST_TO_START, n // 2, START_PER_DIMENSION * (coords.shape[1] + 1)))
     coarse = recycle(coords[:few], evaluate(coords[:few]), evaluate, inside, random, enter, finish=False)
     if coarse.doubt:
         sound(f"the climb on the coarse model failed ({coarse.doubt}): climbing on the fine model alone")

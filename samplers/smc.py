@@ -31,7 +31,9 @@ class SMCSampler(TemperedSampler):
     ----------
     nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, those of
         `samplers.moves.MixtureMove`: three kernels from a mixture fitted to every stage.
-    log_prior_fn, coarse_log_prob_fn, seed : as in `TemperedSampler`.
+    log_prior_fn, seed : as in `TemperedSampler`.
+    coarse_log_prob_fn : callable, optional — a cheaper `log_prob_fn` to climb on first, such as ``posterior.coarse``
+        (None: there is none). The answer is that of `log_prob_fn`; a `SamplingWarning` tells where it was no help.
     recycle : bool, optional — climb by recycling every evaluated point (`samplers.recycling`), and by moves where that
         may not be trusted. By default yes with 250 walkers or more and no `moves` given: with fewer, a mode can be lost
         unnoticed, and the fall back on moves is likely.
