@@ -17,11 +17,11 @@ $(READY): pyproject.toml
 update: $(READY) ## update the bridge column on the bundled data (reduced setting); tables and figures into results/
 	$(BIN)/python tutorials/02_bridge_column.py --preset reduced --out results
 
-test: $(READY)   ## the quick tests
-	$(BIN)/python -m pytest
+test: $(READY)   ## the quick tests, on all cores
+	$(BIN)/python -m pytest -n auto
 
 test-slow: $(READY) ## the slow tests
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow --timeout 7200
 
 clients:         ## every client on one posterior, against quadrature (two environments of their own, 3 GB)
 	PYTHON=$(PYTHON) .ci/clients

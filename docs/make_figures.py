@@ -1,6 +1,7 @@
 """The pictures of README and documentation: `make figures` leaves them in docs/figures, small and alike on every run.
 
-Those of the oscillator are made by tutorial 01; the section and the loops are drawn by the models themselves.
+Those of the oscillator are made by tutorial 01, that of the update by tutorial 02 in its reduced setting (minutes);
+the section and the loops are drawn by the models themselves.
 """
 
 import os
@@ -20,12 +21,18 @@ from fe_likelihoods import problems
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
-OF_TUTORIAL_01 = ("record", "corner", "fit", "prediction")
+OF_TUTORIALS = {
+    "01_linear_oscillator.py": {name: f"oscillator_{name}" for name in ("record", "corner", "fit", "prediction")},
+    "02_bridge_column.py --preset reduced": {"fig5_response": "column_response"},
+}
+WIDEST = 1100  # pixels
 
 
 def shrink(source: Path, name: str) -> None:
     """A picture into docs/figures, with 128 colours: a third of its size, and no difference to the eye."""
-    picture = Image.open(source).convert("RGB").quantize(128, dither=Image.Dither.NONE)
+    picture = Image.open(source).convert("RGB")
+    picture.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
+    picture = picture.quantize(128, dither=Image.Dither.NONE)
     picture.save(TARGET / f"{name}.png", optimize=True)
 
 
@@ -48,10 +55,12 @@ def model_figures() -> dict:
 if __name__ == "__main__":
     TARGET.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        tutorial = [sys.executable, ROOT / "tutorials" / "01_linear_oscillator.py", "--out", folder]
-        subprocess.run(tutorial, check=True, env={k: v for k, v in os.environ.items() if k != "FAST"})
-        for name in OF_TUTORIAL_01:
-            shrink(Path(folder) / f"{name}.png", f"oscillator_{name}")
+        for tutorial, pictures in OF_TUTORIALS.items():
+            script, *options = tutorial.split()
+            command = [sys.executable, ROOT / "tutorials" / script, *options, "--out", folder]
+            subprocess.run(command, check=True, env={k: v for k, v in os.environ.items() if k != "FAST"})
+            for name, as_ in pictures.items():
+                shrink(Path(folder) / f"{name}.png", as_)
         for name, figure in model_figures().items():
             figure.savefig(Path(folder) / f"{name}.png", dpi=85)
             shrink(Path(folder) / f"{name}.png", name)

@@ -75,8 +75,9 @@ class SimulationBatch(NamedTuple):
 class MisfitBatch(NamedTuple):
     """Misfits of a batch of parameter sets.
 
-    misfit : (n, n_channels) float, sums of squared residuals [SI unit of the channel, squared]; (n, n_numbers) where
-        another statistic of the residuals was asked for; rows of failures NaN
+    misfit : (n, n_channels) float, sums of squared residuals [SI unit of the channel, squared]; NaN in failed rows.
+        Where another statistic of the residuals was asked for, (n, n_numbers)
+
     reasons : n strings, empty where the simulation succeeded
     """
 
