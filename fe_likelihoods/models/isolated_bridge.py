@@ -25,6 +25,7 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -226,7 +227,7 @@ class IsolatedBridge:
         SimulationFailed
             For negative friction, stiffness or damping, and where a step does not converge.
         """
-        return self._runner()(theta_row(theta, self.parameters))
+        return self._runner(theta_row(theta, self.parameters))
 
     def history(self, theta: np.ndarray) -> BridgeHistory:
         """States, hysteretic variables and all channels; same errors as `simulate`."""
@@ -240,13 +241,13 @@ class IsolatedBridge:
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses at `thetas` (n, n_parameters), on numba's number of threads."""
         thetas = theta_rows(thetas, self.parameters)
-        return SimulationBatch(*map_threads(self._runner(), thetas, (len(self.outputs), self.n_steps)))
+        return SimulationBatch(*map_threads(self._runner, thetas, (len(self.outputs), self.n_steps)))
 
     def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
         """Sums of squared residuals (n, n_channels) against `measured` (n_channels, n_steps); no response is kept."""
         thetas = theta_rows(thetas, self.parameters)
         measured = channel_rows(measured, self.channels, self.n_steps)
-        run = self._runner()
+        run = self._runner
         return MisfitBatch(
             *map_threads(lambda theta: np.square(run(theta) - measured).sum(axis=1), thetas, (len(self.outputs),))
         )
@@ -419,6 +420,10 @@ class IsolatedBridge:
             rows[f"mean_{name}"] = 0.5 * (pair[0] + pair[1])
         return np.array([rows[name] for name in names])
 
+    def __getstate__(self) -> dict:
+        return {name: value for name, value in vars(self).items() if name != "_runner"}  # each process makes its own
+
+    @cached_property
     def _runner(self):
         """A function of theta that gives its response: what is the same for every theta is done once."""
         # sparse, as a dense product is BLAS's, whose last bit depends on its number of threads, so on the engine

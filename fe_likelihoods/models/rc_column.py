@@ -25,6 +25,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from numbers import Integral
 from typing import TYPE_CHECKING
 
@@ -299,17 +300,17 @@ class RCColumn:
 
     def history(self, theta: np.ndarray) -> ColumnHistory:
         """All that the kernels record: displacements, energies, forces (rows named), same errors as `simulate`."""
-        return self._runner()(theta_row(theta, self.parameters))
+        return self._runner(theta_row(theta, self.parameters))
 
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses at `thetas` (n, n_parameters), on numba's number of threads."""
-        run, rows = self._runner(), self._rows()
+        run, rows = self._runner, self._rows()
         thetas = theta_rows(thetas, self.parameters)
         return SimulationBatch(*map_threads(lambda theta: run(theta).values[rows], thetas, (len(rows), self.n_steps)))
 
     def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
         """Sums of squared residuals (n, n_channels) against `measured` (n_channels, n_steps); no response is kept."""
-        run, rows = self._runner(), self._rows()
+        run, rows = self._runner, self._rows()
         measured = channel_rows(measured, self.channels, self.n_steps)
 
         def misfit(theta: np.ndarray) -> np.ndarray:
@@ -372,6 +373,10 @@ class RCColumn:
             v["fy"], v["fu"], v["Es"], v["Esh"], s.hardening_strain, s.ultimate_strain, column.steel
         )
 
+    def __getstate__(self) -> dict:
+        return {name: value for name, value in vars(self).items() if name != "_runner"}  # each process makes its own
+
+    @cached_property
     def _runner(self) -> Callable[[np.ndarray], ColumnHistory]:
         """What is the same for every theta, done once; the function that is left runs one theta."""
         core, cover, bars = self.section()
