@@ -34,14 +34,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from cyclic_tests import (
     bands,
-    corners,
     data_folder,
     fit_noises,
-    posterior_rows,
+    keep_posterior,
+    keep_residuals,
     predict,
     prediction_row,
     report,
-    residual_figure,
     rrmse,
     scatter,
     table,
@@ -254,11 +253,8 @@ fits = fit_noises(
 seconds_sampling = time.perf_counter() - start
 
 # %%
-posterior_table = table(posterior_rows(fits, prior, KIP, "kip"))
-print(posterior_table)
-figure = corners(fits, prior, f"{first.name}, first half: multiples of nominal values, regions of 50 and 90 %")
-figure.savefig(args.out / "corner.png", dpi=90)
-plt.close(figure)
+title = f"{first.name}, first half: multiples of nominal values, regions of 50 and 90 %"
+posterior_table = keep_posterior(fits, prior, KIP, "kip", title, args.out)
 
 # %% [markdown]
 # ## Residuals
@@ -267,12 +263,7 @@ plt.close(figure)
 # innovations are what is new in each residual if the error is AR(1).
 
 # %%
-checks = {}
-for name, file in (("white", "residuals_white.png"), ("AR(1)", "residuals_ar1.png")):
-    figure, checks[name], words = residual_figure(fits[name], name, KIP, "kip")
-    figure.savefig(args.out / file, dpi=130)
-    plt.close(figure)
-    print(words)
+checks = keep_residuals(fits, KIP, "kip", args.out)
 
 # %% [markdown]
 # ## What the three posteriors say

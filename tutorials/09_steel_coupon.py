@@ -24,14 +24,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from cyclic_tests import (
-    corners,
     data_folder,
     fit_noises,
-    posterior_rows,
+    keep_posterior,
+    keep_residuals,
     predict,
     prediction_row,
     report,
-    residual_figure,
     scatter,
     table,
 )
@@ -110,22 +109,14 @@ seconds_sampling = time.perf_counter() - start
 
 # %%
 names = list(prior)
-posterior_table = table(posterior_rows(fits, prior, MPA, "MPa"))
-print(posterior_table)
-figure = corners(fits, prior, "Steel coupon, first half: multiples of nominal values, regions of 50 and 90 %")
-figure.savefig(args.out / "corner.png", dpi=90)
-plt.close(figure)
+title = "Steel coupon, first half: multiples of nominal values, regions of 50 and 90 %"
+posterior_table = keep_posterior(fits, prior, MPA, "MPa", title, args.out)
 
 # %% [markdown]
 # ## Residuals
 
 # %%
-checks = {}
-for name, file in (("white", "residuals_white.png"), ("AR(1)", "residuals_ar1.png")):
-    figure, checks[name], words = residual_figure(fits[name], name, MPA, "MPa")
-    figure.savefig(args.out / file, dpi=130)
-    plt.close(figure)
-    print(words)
+checks = keep_residuals(fits, MPA, "MPa", args.out)
 
 # %% [markdown]
 # ## What the posterior says, and what it does not

@@ -34,15 +34,14 @@ from samplers.report import summary
 __all__ = [
     "Fit",
     "bands",
-    "corners",
     "coverage",
     "data_folder",
     "fit_noises",
-    "posterior_rows",
+    "keep_posterior",
+    "keep_residuals",
     "predict",
     "prediction_row",
     "report",
-    "residual_figure",
     "rrmse",
     "scatter",
     "table",
@@ -107,7 +106,7 @@ def fit_noises(
     return fits
 
 
-def posterior_rows(fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: float, unit: str) -> list[dict[str, str]]:
+def _posterior_rows(fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: float, unit: str) -> list[dict[str, str]]:
     """Mean and standard deviation of every parameter under every idea of the error; sigma in `unit` of `scale` [SI]."""
     moments = {name: summary(fit.samples, fit.posterior.parameter_names) for name, fit in fits.items()}
     rows = []
@@ -124,7 +123,7 @@ def posterior_rows(fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: flo
     return rows
 
 
-def corners(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> Figure:
+def _corners(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> Figure:
     """Structural parameters under the three ideas of the error: regions of 50 and 90 %."""
     n = len(prior)
     ranges = []
@@ -179,7 +178,7 @@ def report(
     }
 
 
-def residual_figure(fit: Fit, name: str, scale: float, unit: str) -> tuple[Figure, ResidualChecks, str]:
+def _residual_figure(fit: Fit, name: str, scale: float, unit: str) -> tuple[Figure, ResidualChecks, str]:
     """Checks of the residuals at the posterior mean; of AR(1), what is new in each of them. And the checks in words."""
     mean, likelihood = fit.samples.mean(axis=0), fit.posterior.likelihood
     shown, what = likelihood.residuals(mean), f"residuals, errors taken as {name}"
@@ -198,6 +197,29 @@ def residual_figure(fit: Fit, name: str, scale: float, unit: str) -> tuple[Figur
         f"mean {checks.mean[0] / scale:.2f}, sd {checks.standard_deviation[0] / scale:.2f} {unit}"
     )
     return figure, checks, words
+
+
+def keep_posterior(
+    fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: float, unit: str, title: str, out: Path
+) -> str:
+    """Table of the posteriors, printed, and their corner plot in ``corner.png``."""
+    text = table(_posterior_rows(fits, prior, scale, unit))
+    print(text)
+    figure = _corners(fits, prior, title)
+    figure.savefig(out / "corner.png", dpi=90)
+    plt.close(figure)
+    return text
+
+
+def keep_residuals(fits: Mapping[str, Fit], scale: float, unit: str, out: Path) -> dict[str, ResidualChecks]:
+    """Checks of the residuals under white noise and of the innovations under AR(1): in words, and as figures."""
+    checks = {}
+    for name, file in (("white", "residuals_white.png"), ("AR(1)", "residuals_ar1.png")):
+        figure, checks[name], words = _residual_figure(fits[name], name, scale, unit)
+        figure.savefig(out / file, dpi=130)
+        plt.close(figure)
+        print(words)
+    return checks
 
 
 def predict(fit: Fit, n: int, seed: int, model: Any) -> tuple[Prediction, Prediction]:
