@@ -140,8 +140,14 @@ class CacheFile:
             raise ValueError(f"{self.path} cannot be made: there is no folder {folder}; make it first")
         if not self.path.exists() and not os.access(folder, os.W_OK | os.X_OK):
             raise ValueError(f"{self.path} cannot be made: nothing may be written to {folder}; give another path")
-        if self.path.exists() and not os.access(self.path, os.R_OK):
-            raise ValueError(f"{self.path} may not be read by this user; change its permissions or give another path")
+        try:
+            open(self.path, "rb").close()
+        except PermissionError:
+            raise ValueError(
+                f"{self.path} may not be read by this user; change its permissions or give another path"
+            ) from None
+        except OSError:  # not there, or SQLite says better what is wrong
+            pass
         with self.lock:
             try:
                 self._look_through(self.connection())
@@ -350,5 +356,8 @@ class CacheFile:
             raise _Damaged(answer)
 
     def _starts_with(self, signature: bytes) -> bool:
-        with open(self.path, "rb") as file:
-            return file.read(len(signature)) == signature
+        try:
+            with open(self.path, "rb") as file:
+                return file.read(len(signature)) == signature
+        except FileNotFoundError:  # another process has set it aside meanwhile
+            return False

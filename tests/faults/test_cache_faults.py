@@ -422,6 +422,21 @@ def test_programs_that_find_a_damaged_file_at_once(filled):
     assert all(cache.look_up(FINGERPRINT, batch_of(2, n), 2, 8).known.all() for n in range(6))
 
 
+def test_a_damaged_file_that_another_program_sets_aside_at_that_moment(filled, monkeypatch):
+    no_database(filled)
+    opens = CacheFile._open
+
+    def opens_and_loses_it(self):
+        try:
+            return opens(self)
+        except sqlite3.DatabaseError:
+            filled.rename(filled.with_name("cache.sqlite.damaged-1"))
+            raise
+
+    monkeypatch.setattr(CacheFile, "_open", opens_and_loses_it)
+    assert SimulationCache(filled).info().simulations == 0
+
+
 def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
     """The log goes with the damaged file."""
     keep = sqlite3.connect(filled)  # so that the log is there
