@@ -237,6 +237,7 @@ for name in args.problem or PROBLEMS:
             plot_density=False,
             fill_contours=False,
             levels=(0.5, 0.9),
+            smooth=1.0,
             truths=problem.truth,
             truth_color="0.6",
             label_kwargs={"fontsize": 16},
