@@ -102,10 +102,10 @@ class Prediction:
             )
         return self.quantiles[self.probabilities.index(probability)]
 
-    def rrmse(self, measurements: Measurements) -> np.ndarray:
+    def rrmse(self, measurements: Measurements, part: slice = slice(None)) -> np.ndarray:
         """Relative root mean square error of the mean, per channel [-].
 
-        Root of sum (mean - measured)^2 / sum measured^2 over the samples of the history.
+        Root of sum (mean - measured)^2 / sum measured^2 over the samples of the history, or of a part of it.
 
         Returns
         -------
@@ -117,12 +117,14 @@ class Prediction:
             If the prediction has no histories, or the measurements lack a channel or differ in step or length, or a
             measured channel is zero.
         """
-        measured = self._measured(measurements)
+        measured = self._measured(measurements)[:, part]
         power = _power(measured, self.channels)
-        return np.sqrt(np.square(self.mean - measured).sum(axis=1) / power)
+        return np.sqrt(np.square(self.mean[:, part] - measured).sum(axis=1) / power)
 
-    def coverage(self, measurements: Measurements, lower: float = 0.05, upper: float = 0.95) -> np.ndarray:
-        """Share of the measured samples between two quantiles, per channel [-].
+    def coverage(
+        self, measurements: Measurements, lower: float = 0.05, upper: float = 0.95, part: slice = slice(None)
+    ) -> np.ndarray:
+        """Share of the measured samples between two quantiles, per channel [-]; of a part of the history, if wanted.
 
         A prediction with noise should have about ``upper - lower``; one without bounds the response, not what a sensor
         reads, and has less. Same result and errors as `rrmse`; ValueError too where a quantile is not there.
@@ -131,7 +133,7 @@ class Prediction:
             raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
         measured = self._measured(measurements)
         inside = (self.quantile(lower) <= measured) & (measured <= self.quantile(upper))
-        return inside.mean(axis=1)
+        return inside[:, part].mean(axis=1)
 
     def _need_histories(self) -> None:
         if self.dt is None:

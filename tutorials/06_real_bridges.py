@@ -257,10 +257,10 @@ def prediction_rows(
             row = {"noise": noise, "case": name, "channel": channel.name}
             row["rrmse_of_the_end"] = float(np.sqrt(np.square(end - values).sum() / np.square(values).sum()))
             row["delay"] = delay(values, response.mean[k], measured.dt)
-            row["rrmse"] = float(real_data.shares(response, measured)[0][k])
-            row["coverage"] = float(real_data.shares(total, measured)[1][k])
-            row["coverage_strong"] = float(real_data.shares(total, measured, strong)[1][k])
-            row["coverage_response"] = float(real_data.shares(response, measured)[1][k])
+            row["rrmse"] = float(response.rrmse(measured)[k])
+            row["coverage"] = float(total.coverage(measured)[k])
+            row["coverage_strong"] = float(total.coverage(measured, part=strong)[k])
+            row["coverage_response"] = float(response.coverage(measured)[k])
             rows.append(row)
     return rows
 

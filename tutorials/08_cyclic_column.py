@@ -20,7 +20,6 @@
 # %%
 import argparse
 import csv
-import json
 import os
 import time
 from dataclasses import replace
@@ -38,6 +37,7 @@ from cyclic_tests import (
     fit_noises,
     keep_posterior,
     keep_residuals,
+    keep_summary,
     predict,
     prediction_row,
     report,
@@ -347,7 +347,7 @@ plot_loops(args.out / "loops_ar1.png", "AR(1)")
 # ## What it cost
 
 # %%
-result = report(fits, prior, checks, KIP) | {
+settings_and_results = {
     "preset": args.preset,
     "walkers": walkers,
     "every": every,
@@ -358,8 +358,4 @@ result = report(fits, prior, checks, KIP) | {
     "seconds_sampling": seconds_sampling,
     "seconds": time.perf_counter() - begin,
 }
-(args.out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
-print(
-    f"{sum(result['simulations'].values())} simulations ({sum(result['failures'].values())} failed) in "
-    f"{seconds_sampling:.0f} s, the whole in {result['seconds']:.0f} s; tables and figures are in {args.out}/"
-)
+keep_summary(report(fits, prior, checks, KIP) | settings_and_results, args.out)

@@ -13,7 +13,6 @@
 
 # %%
 import argparse
-import json
 import os
 import time
 from pathlib import Path
@@ -28,6 +27,7 @@ from cyclic_tests import (
     fit_noises,
     keep_posterior,
     keep_residuals,
+    keep_summary,
     predict,
     prediction_row,
     report,
@@ -169,7 +169,7 @@ plt.close(figure)
 # ## What it cost
 
 # %%
-result = report(fits, prior, checks, MPA) | {
+settings_and_results = {
     "walkers": args.walkers,
     "seed": args.seed,
     "sensor": sensor / MPA,
@@ -177,8 +177,4 @@ result = report(fits, prior, checks, MPA) | {
     "seconds_sampling": seconds_sampling,
     "seconds": time.perf_counter() - begin,
 }
-(args.out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
-print(
-    f"{sum(result['simulations'].values())} simulations ({sum(result['failures'].values())} failed) in "
-    f"{seconds_sampling:.0f} s, the whole in {result['seconds']:.0f} s; tables and figures are in {args.out}/"
-)
+keep_summary(report(fits, prior, checks, MPA) | settings_and_results, args.out)

@@ -10,6 +10,7 @@ sample. White noise takes both for one and counts each sample as a witness of it
 * ``AR(1)``: errors that last, their lag-one correlation unknown, above a sensor's noise that is known.
 """
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,11 +35,11 @@ from samplers.report import summary
 __all__ = [
     "Fit",
     "bands",
-    "coverage",
     "data_folder",
     "fit_noises",
     "keep_posterior",
     "keep_residuals",
+    "keep_summary",
     "predict",
     "prediction_row",
     "report",
@@ -222,6 +223,15 @@ def keep_residuals(fits: Mapping[str, Fit], scale: float, unit: str, out: Path) 
     return checks
 
 
+def keep_summary(result: dict, out: Path) -> None:
+    """Numbers of the run, with its seconds, into ``summary.json``; what it cost is printed."""
+    (out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
+    print(
+        f"{sum(result['simulations'].values())} simulations ({sum(result['failures'].values())} failed) in "
+        f"{result['seconds_sampling']:.0f} s, the whole in {result['seconds']:.0f} s; tables and figures are in {out}/"
+    )
+
+
 def predict(fit: Fit, n: int, seed: int, model: Any) -> tuple[Prediction, Prediction]:
     """Response of `model` alone, and what a sensor would read, over `n` samples of a posterior."""
     chosen = np.random.default_rng(seed).choice(len(fit.samples), min(n, len(fit.samples)), replace=False)
@@ -249,12 +259,6 @@ class _Remembering:
         return self._kept[key]
 
 
-def coverage(prediction: Prediction, measured: np.ndarray, part: slice) -> float:
-    """Share of the samples of a part of the one channel between the 5 and 95 % quantiles."""
-    low, high = (prediction.quantile(p)[0, part] for p in (0.05, 0.95))
-    return float(np.mean((low <= measured[part]) & (measured[part] <= high)))
-
-
 def prediction_row(
     predictions: Mapping[str, tuple[Prediction, Prediction]], nominal: np.ndarray, measured: np.ndarray, part: slice
 ) -> tuple[dict[str, str], dict]:
@@ -262,8 +266,9 @@ def prediction_row(
     row = {"RRMSE nominal": f"{100 * rrmse(nominal, measured, part):.1f} %"}
     numbers = {"nominal": rrmse(nominal, measured, part)}
     for name, (alone, noisy) in predictions.items():
-        error = rrmse(alone.mean[0], measured, part)
-        inside = coverage(alone, measured, part), coverage(noisy, measured, part)
+        data = Measurements(alone.channels, alone.dt, measured[None])
+        error = float(alone.rrmse(data, part)[0])
+        inside = [float(prediction.coverage(data, part=part)[0]) for prediction in (alone, noisy)]
         row[f"{name}: RRMSE, in bands"] = f"{100 * error:.1f} %, {100 * inside[0]:.0f} and {100 * inside[1]:.0f} %"
         numbers[name] = {"rrmse": error, "coverage_response": inside[0], "coverage": inside[1]}
     return row, numbers

@@ -13,7 +13,6 @@ from fe_likelihoods.likelihood import FELikelihood
 from fe_likelihoods.models.base import Model
 from fe_likelihoods.noise import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.predictive import Prediction
 from fe_likelihoods.priors import Distribution, Prior, Uniform
 from samplers import SMCSampler
 from samplers.report import summary
@@ -105,15 +104,6 @@ def posterior_table(runs: Mapping[str, Run]) -> str:
     simulations = [run.posterior.report()["simulations"] for run in runs.values()]
     rows.append(f"{'simulations':<14}" + "".join(f"{number:>22}" for number in simulations))
     return "\n".join(rows)
-
-
-def shares(prediction: Prediction, measured: Measurements, window: slice = slice(None)) -> tuple:
-    """RRMSE of the mean, and share of the samples in the 90 % band, per channel, over a window of samples."""
-    values = measured.select([channel.name for channel in prediction.channels]).values[:, window]
-    error = np.square(prediction.mean[:, window] - values).sum(axis=1)
-    low, high = prediction.quantile(0.05)[:, window], prediction.quantile(0.95)[:, window]
-    inside = ((low <= values) & (values <= high)).mean(axis=1)
-    return np.sqrt(error / np.square(values).sum(axis=1)), inside
 
 
 def strong_motion(history: np.ndarray) -> slice:

@@ -134,11 +134,10 @@ class _Digest:
             if name in function.__globals__:
                 parts += self._told(name, function.__globals__[name], names, function)
         for name in sorted(set(_imports(function))):
-            module = name if self._known_by_version(name) else importlib.import_module(name)
-            if isinstance(module, str):
+            if self._known_by_version(name):
                 parts += [name, _version(name)]
             else:
-                parts += self._told(name, module, names, function)
+                parts += self._told(name, importlib.import_module(name), names, function)
         return parts
 
     def _told(self, name: str, value: Any, names: list[str], function: types.FunctionType) -> list[str | bytes]:

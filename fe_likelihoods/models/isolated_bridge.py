@@ -231,8 +231,9 @@ class IsolatedBridge:
 
     def history(self, theta: np.ndarray) -> BridgeHistory:
         """States, hysteretic variables and all channels; same errors as `simulate`."""
-        values, iterations = self._integrate(theta_row(theta, self.parameters), self._fixed())
-        beyond = np.abs(self._kinematics() @ values[:5]).max(axis=1) / (self.rubber.limit * self.rubber.scale)
+        fixed = self._fixed()
+        values, iterations = self._integrate(theta_row(theta, self.parameters), fixed)
+        beyond = np.abs(fixed.kinematics @ values[:5]).max(axis=1) / (self.rubber.limit * self.rubber.scale)
         rows = csr_array(self._channel_matrix(ALL_CHANNELS)) @ self._drivers(values)
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
         kept = np.concatenate([values[:N_STATES], values[14:16], rows])[:, :: self.every]

@@ -245,6 +245,12 @@ def test_coverage_of_measurements(oscillator, rng):
     assert np.array_equal(noisy.coverage(swapped), noisy.coverage(measurements))
     expected = np.sqrt(np.square(noisy.mean - measured).sum(axis=1) / np.square(measured).sum(axis=1))
     assert np.allclose(noisy.rrmse(measurements), expected)
+    halves = [slice(0, 200), slice(200, 400)]
+    inside = [noisy.coverage(measurements, part=half) for half in halves]
+    assert np.allclose(np.mean(inside, axis=0), noisy.coverage(measurements)) and not np.allclose(*inside)
+    late, data = noisy.mean[:, halves[1]], measured[:, halves[1]]
+    expected = np.sqrt(np.square(late - data).sum(axis=1) / np.square(data).sum(axis=1))
+    assert np.allclose(noisy.rrmse(measurements, halves[1]), expected)
     with pytest.raises(ValueError, match=r"no quantile 0\.01"):
         noisy.coverage(measurements, lower=0.01)
     with pytest.raises(ValueError, match=r"400 samples at 0\.02 s, the measurements have 200"):
