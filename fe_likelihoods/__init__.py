@@ -1,20 +1,358 @@
 """Structural finite-element models as black-box log-likelihoods.
 
-Every module is there after ``import fe_likelihoods`` alone, as in ``fe_likelihoods.problems.bridge_column()``, and is
-read when it is first named.
+All public names can be imported from here, ``from fe_likelihoods import Record, FELikelihood, Posterior``, and are
+loaded on first use, so that importing the package takes about 0.01 s. Folders and modules are attributes too, as in
+``fe_likelihoods.problems.bridge_column()``.
 """
 
 from importlib import import_module
-from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
+    from . import problems
+    from .adapters import (
+        nautilus_prior,
+        to_bilby,
+        to_pints,
+        to_pymc,
+    )
+    from .models.executable import (
+        ExecutableModel,
+    )
+    from .models.function import (
+        FunctionModel,
+    )
+    from .models.isolated_bridge import (
+        IsolatedBridge,
+    )
+    from .models.isolated_bridge_parts import (
+        Bearing,
+        Damper,
+        Pier,
+        Rubber,
+    )
+    from .models.linear_oscillator import (
+        LinearOscillator,
+    )
+    from .models.linear_structure import (
+        LinearStructure,
+    )
+    from .models.linear_structure_parts import (
+        BridgeDeck,
+        ShearFrame,
+    )
+    from .models.opensees import (
+        OpenSeesModel,
+    )
+    from .models.rc_column import (
+        RCColumn,
+    )
+    from .models.rc_column_parts import (
+        Bars,
+        Concrete,
+        Hoops,
+        Patches,
+        Steel,
+    )
+    from .models.steel_coupon import (
+        SteelCoupon,
+    )
+    from .plots.histories import (
+        plot_bands,
+        plot_fragility,
+        plot_histories,
+        plot_loop,
+        plot_residuals,
+    )
+    from .prediction.averaging import (
+        AveragedPrediction,
+        average_predictions,
+    )
+    from .prediction.propagation import (
+        Prediction,
+        fit_measures,
+        propagate,
+    )
+    from .prediction.quantities import (
+        peak,
+    )
+    from .prediction.reliability import (
+        Exceedance,
+        Fragility,
+        exceedance,
+        fit_fragility,
+        fragility,
+        peak_ground_acceleration,
+    )
+    from .probability.likelihood import (
+        FELikelihood,
+        TooManyFailures,
+    )
+    from .probability.marginal_noise import (
+        MarginalNoise,
+    )
+    from .probability.noise import (
+        AutoregressiveNoise,
+        GaussianNoise,
+        SharedGaussianNoise,
+    )
+    from .probability.posterior import (
+        Posterior,
+    )
+    from .probability.priors import (
+        Distribution,
+        HalfNormal,
+        LogNormal,
+        Prior,
+        TruncatedNormal,
+        Uniform,
+    )
+    from .probability.residuals import (
+        ResidualChecks,
+        residual_checks,
+    )
+    from .signals.channels import (
+        Channel,
+        Dataset,
+        ImposedTest,
+        Measurements,
+        read_columns,
+        read_dataset,
+        read_imposed_test,
+        write_dataset,
+    )
+    from .signals.records import (
+        DisplacementHistory,
+        Record,
+        read_at2,
+        read_csv,
+        read_v2,
+    )
+    from .signals.response_spectrum import (
+        ResponseSpectrum,
+        response_spectrum,
+    )
+    from .simulation.disk_cache import (
+        SimulationCache,
+    )
+    from .simulation.local_pool import (
+        LocalPool,
+    )
+    from .simulation.model import (
+        Model,
+        SimulationFailed,
+    )
+    from .units import (
+        from_si,
+        to_si,
+    )
+
+__all__ = [
+    "AutoregressiveNoise",
+    "AveragedPrediction",
+    "Bars",
+    "Bearing",
+    "BridgeDeck",
+    "Channel",
+    "Concrete",
+    "Damper",
+    "Dataset",
+    "DisplacementHistory",
+    "Distribution",
+    "Exceedance",
+    "ExecutableModel",
+    "FELikelihood",
+    "Fragility",
+    "FunctionModel",
+    "GaussianNoise",
+    "HalfNormal",
+    "Hoops",
+    "ImposedTest",
+    "IsolatedBridge",
+    "LinearOscillator",
+    "LinearStructure",
+    "LocalPool",
+    "LogNormal",
+    "MarginalNoise",
+    "Measurements",
+    "Model",
+    "OpenSeesModel",
+    "Patches",
+    "Pier",
+    "Posterior",
+    "Prediction",
+    "Prior",
+    "RCColumn",
+    "Record",
+    "ResidualChecks",
+    "ResponseSpectrum",
+    "Rubber",
+    "SharedGaussianNoise",
+    "ShearFrame",
+    "SimulationCache",
+    "SimulationFailed",
+    "Steel",
+    "SteelCoupon",
+    "TooManyFailures",
+    "TruncatedNormal",
+    "Uniform",
+    "average_predictions",
+    "exceedance",
+    "fit_fragility",
+    "fit_measures",
+    "fragility",
+    "from_si",
+    "nautilus_prior",
+    "peak",
+    "peak_ground_acceleration",
+    "plot_bands",
+    "plot_fragility",
+    "plot_histories",
+    "plot_loop",
+    "plot_residuals",
+    "problems",
+    "propagate",
+    "read_at2",
+    "read_columns",
+    "read_csv",
+    "read_dataset",
+    "read_imposed_test",
+    "read_v2",
+    "residual_checks",
+    "response_spectrum",
+    "to_bilby",
+    "to_pints",
+    "to_pymc",
+    "to_si",
+    "write_dataset",
+]
+
+_EXPORTS = {
+    "adapters": (
+        "nautilus_prior",
+        "to_bilby",
+        "to_pints",
+        "to_pymc",
+    ),
+    "models.executable": ("ExecutableModel",),
+    "models.function": ("FunctionModel",),
+    "models.isolated_bridge": ("IsolatedBridge",),
+    "models.isolated_bridge_parts": (
+        "Bearing",
+        "Damper",
+        "Pier",
+        "Rubber",
+    ),
+    "models.linear_oscillator": ("LinearOscillator",),
+    "models.linear_structure": ("LinearStructure",),
+    "models.linear_structure_parts": (
+        "BridgeDeck",
+        "ShearFrame",
+    ),
+    "models.opensees": ("OpenSeesModel",),
+    "models.rc_column": ("RCColumn",),
+    "models.rc_column_parts": (
+        "Bars",
+        "Concrete",
+        "Hoops",
+        "Patches",
+        "Steel",
+    ),
+    "models.steel_coupon": ("SteelCoupon",),
+    "plots.histories": (
+        "plot_bands",
+        "plot_fragility",
+        "plot_histories",
+        "plot_loop",
+        "plot_residuals",
+    ),
+    "prediction.averaging": (
+        "AveragedPrediction",
+        "average_predictions",
+    ),
+    "prediction.propagation": (
+        "Prediction",
+        "fit_measures",
+        "propagate",
+    ),
+    "prediction.quantities": ("peak",),
+    "prediction.reliability": (
+        "Exceedance",
+        "Fragility",
+        "exceedance",
+        "fit_fragility",
+        "fragility",
+        "peak_ground_acceleration",
+    ),
+    "probability.likelihood": (
+        "FELikelihood",
+        "TooManyFailures",
+    ),
+    "probability.marginal_noise": ("MarginalNoise",),
+    "probability.noise": (
+        "AutoregressiveNoise",
+        "GaussianNoise",
+        "SharedGaussianNoise",
+    ),
+    "probability.posterior": ("Posterior",),
+    "probability.priors": (
+        "Distribution",
+        "HalfNormal",
+        "LogNormal",
+        "Prior",
+        "TruncatedNormal",
+        "Uniform",
+    ),
+    "probability.residuals": (
+        "ResidualChecks",
+        "residual_checks",
+    ),
+    "signals.channels": (
+        "Channel",
+        "Dataset",
+        "ImposedTest",
+        "Measurements",
+        "read_columns",
+        "read_dataset",
+        "read_imposed_test",
+        "write_dataset",
+    ),
+    "signals.records": (
+        "DisplacementHistory",
+        "Record",
+        "read_at2",
+        "read_csv",
+        "read_v2",
+    ),
+    "signals.response_spectrum": (
+        "ResponseSpectrum",
+        "response_spectrum",
+    ),
+    "simulation.disk_cache": ("SimulationCache",),
+    "simulation.local_pool": ("LocalPool",),
+    "simulation.model": (
+        "Model",
+        "SimulationFailed",
+    ),
+    "units": (
+        "from_si",
+        "to_si",
+    ),
+}
+_MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names}
 
 
-def __getattr__(name: str) -> ModuleType:
-    """A module of the package, imported when it is first named (PEP 562)."""
+def __getattr__(name: str) -> Any:
+    """A public name, or a module or folder of the package, imported on first use (PEP 562)."""
+    if name in _MODULE_OF:
+        value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+        globals()[name] = value
+        return value
     full = f"{__name__}.{name}"
     try:
         return import_module(full)
     except ModuleNotFoundError as error:
-        if error.name != full:  # the module is there, and misses something itself
+        if error.name != full:  # the module exists and lacks one of its own imports
             raise
         raise AttributeError(f"module {__name__!r} has no attribute and no module {name!r}") from None
 
@@ -22,4 +360,4 @@ def __getattr__(name: str) -> ModuleType:
 def __dir__() -> list[str]:
     from pkgutil import iter_modules
 
-    return sorted({*globals(), *(module.name for module in iter_modules(__path__))})
+    return sorted({*globals(), *__all__, *(module.name for module in iter_modules(__path__))})

@@ -22,14 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from .cache import SimulationCache
-from .channels import Channel, Dataset, Measurements, read_dataset
-from .likelihood import FELikelihood
-from .models.bridge_inputs import CHANNEL_SETS
-from .noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
-from .posterior import Posterior
-from .priors import HalfNormal, Prior, TruncatedNormal, Uniform
-from .records import Record
+from .models.isolated_bridge_parts import CHANNEL_SETS
+from .probability.likelihood import FELikelihood
+from .probability.noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
+from .probability.posterior import Posterior
+from .probability.priors import HalfNormal, Prior, TruncatedNormal, Uniform
+from .signals.channels import Channel, Dataset, Measurements, read_dataset
+from .signals.records import Record
+from .simulation.disk_cache import SimulationCache
 from .units import to_si
 
 __all__ = [
@@ -155,7 +155,7 @@ def _noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) 
     if noise == "autoregressive":
         return AutoregressiveNoise(channels)
     raise ValueError(
-        'expected noise="per channel", "shared", "autoregressive" or "marginal", or a noise of fe_likelihoods.noise; '
+        'expected noise="per channel", "shared", "autoregressive" or "marginal", or a noise of fe_likelihoods.probability.noise; '
         f"got {noise!r}"
     )
 
@@ -182,7 +182,7 @@ def bridge_column(
         Keep one sample in `every`: record resampled (anti-aliased), measurements decimated. 2 costs about half.
     duration : float
         Keep the first `duration` seconds.
-    noise : {"per channel", "shared", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.noise`
+    noise : {"per channel", "shared", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.probability.noise`
         White, one sigma for each channel as in the paper, or one for both; or an error that lasts, with a correlation
         ``rho_...`` per channel too. Priors are in `bridge_column_prior`. "marginal" is "per channel" with the sigmas
         integrated out (`Posterior.marginal`): five parameters.
@@ -357,7 +357,7 @@ def isolated_bridge(
         (`IsolatedBridge.exchanged`).
     channels : tuple of str, 5, 6 or 10, optional
         Measured channels that are used. Default: six of "twin", as in the paper's figure of the fit; all of any other.
-    noise : {"shared", "per channel", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.noise`
+    noise : {"shared", "per channel", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.probability.noise`
         White, one sigma for all channels, in root mean squares of the measured channel, as in the paper's results, or
         one for each channel [SI], its general formulation; or an error that lasts, with a correlation ``rho_...`` per
         channel too (uniform between -1 and 1). "marginal" is "shared" with sigma integrated out

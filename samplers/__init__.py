@@ -1,58 +1,135 @@
-"""Tempered ensemble samplers behind the interface of emcee.
+"""Tempered ensemble samplers behind emcee's interface.
 
-The names below, and every module of the package, are looked up when they are first used: emcee starts with all of
-`scipy.stats`, which a program need not wait for until it samples.
+All public names can be imported from here, ``from samplers import SMCSampler, compare_models``, and are loaded on first
+use: importing the package takes about 0.01 s, importing emcee with `scipy.stats` takes longer.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # for type checkers and editors; _HOME says the same when the program runs
-    from .alarms import SamplingWarning
-    from .backends import read_ladder
-    from .importance import EvidenceCheck
-    from .ladder import Stage
-    from .presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
-    from .smc import SMCSampler
-    from .tempered import TemperedSampler
-    from .tmcmc import TMCMCSampler
+if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
+    from . import presets
+    from .moves.kernels import (
+        MixtureMove,
+        RandomWalkMove,
+        StudentTMove,
+    )
+    from .presets import (
+        CHING_CHEN_2007,
+        RAMANCHA_2022_CONSTANT,
+        RAMANCHA_2022_LITERAL,
+    )
+    from .reporting.figures import (
+        ladder_plot,
+        pair_plot,
+    )
+    from .reporting.model_comparison import (
+        ModelComparison,
+        compare_models,
+    )
+    from .reporting.summary import (
+        Summary,
+        comparison_table,
+        ladder_table,
+        summary,
+        to_arviz,
+    )
+    from .smc import (
+        SMCSampler,
+    )
+    from .storage.backends import (
+        read_ladder,
+    )
+    from .tempered import (
+        TemperedSampler,
+    )
+    from .tempering.diagnostics import (
+        SamplingWarning,
+    )
+    from .tempering.evidence_check import (
+        EvidenceCheck,
+    )
+    from .tempering.weights import (
+        Stage,
+    )
+    from .tmcmc import (
+        TMCMCSampler,
+    )
 
 __all__ = [
     "CHING_CHEN_2007",
     "EvidenceCheck",
+    "MixtureMove",
+    "ModelComparison",
     "RAMANCHA_2022_CONSTANT",
     "RAMANCHA_2022_LITERAL",
+    "RandomWalkMove",
     "SMCSampler",
     "SamplingWarning",
     "Stage",
+    "StudentTMove",
+    "Summary",
     "TMCMCSampler",
     "TemperedSampler",
+    "compare_models",
+    "comparison_table",
+    "ladder_plot",
+    "ladder_table",
+    "pair_plot",
+    "presets",
     "read_ladder",
+    "summary",
+    "to_arviz",
 ]
 
-_HOME = {
-    "CHING_CHEN_2007": "presets",
-    "EvidenceCheck": "importance",
-    "RAMANCHA_2022_CONSTANT": "presets",
-    "RAMANCHA_2022_LITERAL": "presets",
-    "SMCSampler": "smc",
-    "SamplingWarning": "alarms",
-    "Stage": "ladder",
-    "TMCMCSampler": "tmcmc",
-    "TemperedSampler": "tempered",
-    "read_ladder": "backends",
+_EXPORTS = {
+    "moves.kernels": (
+        "MixtureMove",
+        "RandomWalkMove",
+        "StudentTMove",
+    ),
+    "presets": (
+        "CHING_CHEN_2007",
+        "RAMANCHA_2022_CONSTANT",
+        "RAMANCHA_2022_LITERAL",
+    ),
+    "reporting.figures": (
+        "ladder_plot",
+        "pair_plot",
+    ),
+    "reporting.model_comparison": (
+        "ModelComparison",
+        "compare_models",
+    ),
+    "reporting.summary": (
+        "Summary",
+        "comparison_table",
+        "ladder_table",
+        "summary",
+        "to_arviz",
+    ),
+    "smc": ("SMCSampler",),
+    "storage.backends": ("read_ladder",),
+    "tempered": ("TemperedSampler",),
+    "tempering.diagnostics": ("SamplingWarning",),
+    "tempering.evidence_check": ("EvidenceCheck",),
+    "tempering.weights": ("Stage",),
+    "tmcmc": ("TMCMCSampler",),
 }
+_MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """A public name or a module of the package, imported when it is first named (PEP 562)."""
-    if name in _HOME:
-        return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    """A public name, or a module or folder of the package, imported on first use (PEP 562)."""
+    if name in _MODULE_OF:
+        value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+        globals()[name] = value
+        return value
     full = f"{__name__}.{name}"
     try:
         return import_module(full)
     except ModuleNotFoundError as error:
-        if error.name != full:  # the module is there, and misses something itself
+        if error.name != full:  # the module exists and lacks one of its own imports
             raise
         raise AttributeError(f"module {__name__!r} has no attribute and no module {name!r}") from None
 

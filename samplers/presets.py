@@ -14,14 +14,14 @@ Ching & Chen (2007), for ``TMCMCSampler(1000, ndim, log_prob_fn, **CHING_CHEN_20
 multinomial leaders, one Metropolis step a point, covariance 0.04 times the weighted one. It can collapse on sharp
 posteriors; the default of `TMCMCSampler` does not.
 
-None of them has sweeps over simulation-free parameters, which are not in the papers.
+None of them has sweeps over fast parameters, which are not in the papers.
 """
 
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from .moves import RandomWalkMove
+from .moves.kernels import RandomWalkMove
 
 __all__ = ["CHING_CHEN_2007", "RAMANCHA_2022_CONSTANT", "RAMANCHA_2022_LITERAL"]
 
@@ -31,7 +31,7 @@ _COMMON = {
     "resampling": "multinomial",
     "min_moves": 10,
     "max_moves": 10,
-    "free_sweeps": 0,
+    "fast_sweeps": 0,
 }
 RAMANCHA_2022_CONSTANT: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "constant"})
 RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "declining", "ess_floor": 50.0})
@@ -42,6 +42,6 @@ CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
         "resampling": "multinomial",
         "chains": "leaders",
         "burn_in": 0,
-        "free_sweeps": 0,
+        "fast_sweeps": 0,
     }
 )

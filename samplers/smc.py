@@ -11,9 +11,9 @@ doi:10.1214/EJP.v14-638). Where such modes are possible, compare runs with more 
 
 from collections.abc import Callable
 
-from .moves import MixtureMove
-from .settings import Settings
+from .moves.kernels import MixtureMove
 from .tempered import TemperedSampler
+from .tempering.settings import Settings
 
 __all__ = ["SMCSampler"]
 
@@ -30,16 +30,16 @@ class SMCSampler(TemperedSampler):
     Parameters
     ----------
     nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, those of
-        `samplers.moves.MixtureMove`: three kernels from a mixture fitted to every stage.
+        `samplers.moves.kernels.MixtureMove`: three kernels from a mixture fitted to every stage.
     log_prior_fn, seed : as in `TemperedSampler`.
     coarse_log_prob_fn : callable, optional — a cheaper `log_prob_fn` to climb on first, such as ``posterior.coarse``
         (None: there is none). The answer is that of `log_prob_fn`; a `SamplingWarning` tells where it was no help.
-    recycle : bool, optional — climb by recycling every evaluated point (`samplers.recycling`), and by moves where that
+    recycle : bool, optional — climb by recycling every evaluated point (`samplers.tempering.adaptive_importance`), and by moves where that
         may not be trusted. By default yes with 250 walkers or more and no `moves` given: with fewer, a mode can be lost
         unnoticed, and the fall back on moves is likely.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation : as in
-        `samplers.settings.Settings`, for a climb by moves.
-    free_sweeps, check_draws, max_failure_share : as there.
+        `samplers.tempering.settings.Settings`, for a climb by moves.
+    fast_sweeps, check_draws, max_failure_share : as there.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SMCSampler(TemperedSampler):
         min_moves: int = 2,
         max_moves: int = 7,
         max_correlation: float = 0.15,
-        free_sweeps: int = 2,
+        fast_sweeps: int = 2,
         recycle: bool | None = None,
         check_draws: int | None = None,
         max_failure_share: float = 0.5,
@@ -98,7 +98,7 @@ class SMCSampler(TemperedSampler):
                 min_moves=min_moves,
                 max_moves=max_moves,
                 max_correlation=max_correlation,
-                free_sweeps=free_sweeps,
+                fast_sweeps=fast_sweeps,
                 recycle=recycle,
                 check_draws=check_draws,
                 max_failure_share=max_failure_share,

@@ -1,7 +1,7 @@
 """An emcee sampler that climbs from the prior to the posterior before it samples.
 
 `TemperedSampler` is an `emcee.EnsembleSampler` whose ``sample`` first carries a population of draws of the prior up the
-tempering ladder (see `samplers.ladder`): choose the next beta, weigh, resample, move. Then emcee's own loop goes on at
+tempering ladder (see `samplers.tempering.weights`): choose the next beta, weigh, resample, move. Then emcee's own loop goes on at
 beta = 1, so that the chain holds states of the posterior only, and everything emcee does with a chain works unchanged.
 
 Each walker carries (log_prob, log_prior, blobs) as the blobs of an emcee State, whose log_prob is the tempered density:
@@ -23,18 +23,18 @@ from emcee.backends import HDFBackend
 from emcee.ensemble import ndarray_to_list_of_dicts, walkers_independent
 from emcee.pbar import get_progress_bar
 
-from .alarms import check_evidence, sound
-from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
-from .climb import Tempering, climb
-from .evaluation import Failures, Guarded, Memo, Records, log_probabilities, outcomes
-from .families import standard_error_of_mean
-from .free_sweeps import with_free_sweeps
-from .importance import EvidenceCheck
-from .journal import Evaluated, Start
-from .ladder import Stage
-from .moves import RandomWalkMove
-from .resume import differences, header
-from .settings import Settings
+from .moves.fast_parameters import with_fast_sweeps
+from .moves.kernels import RandomWalkMove
+from .storage.backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
+from .storage.compatibility import differences, header
+from .storage.evaluation import ErrorCapturing, Failures, Memo, Records, log_probabilities, outcomes
+from .storage.journal import Evaluated, Start
+from .tempering.anneal import Tempering, climb
+from .tempering.diagnostics import check_evidence, warn
+from .tempering.evidence_check import EvidenceCheck
+from .tempering.genealogy import standard_error_of_mean
+from .tempering.settings import Settings
+from .tempering.weights import Stage
 
 __all__ = ["TemperedSampler"]
 
@@ -48,13 +48,13 @@ class TemperedSampler(EnsembleSampler):
     ----------
     nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names :
         as in `emcee.EnsembleSampler`, in its order. `moves` are the mutation kernels, copied; by default a random walk.
-        Where `log_prob_fn` has ``simulation_free``, each is followed by ``settings.free_sweeps`` (but not with a `pool`
+        Where `log_prob_fn` has ``fast_parameters``, each is followed by ``settings.fast_sweeps`` (but not with a `pool`
         and without `vectorize`: workers forget what they simulated, so nothing is free there).
         A point for which `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`);
         it is not called outside the support of the prior. With an emcee `HDFBackend` a journal is kept beside the file,
         and a run that was killed goes on from it (`run_mcmc`).
     coarse_log_prob_fn : callable, optional
-        A cheaper version of `log_prob_fn` to climb on first, called in the same way (`samplers.coarse`); a posterior
+        A cheaper version of `log_prob_fn` to climb on first, called in the same way (`samplers.tempering.multilevel`); a posterior
         may carry one as ``posterior.coarse``. Chain and evidence are those of `log_prob_fn` whatever it is. Its blobs
         are not kept; where it fails it counts as -inf. A run that goes on from its journal asks it again. It needs
         ``settings.recycle``.
@@ -151,8 +151,8 @@ class TemperedSampler(EnsembleSampler):
             parameter_names=parameter_names,
         )
         if pool is None or vectorize:
-            free = getattr(log_prob_fn, "simulation_free", ())
-            self._moves = with_free_sweeps(self._moves, free, ndim, settings.free_sweeps)
+            free = getattr(log_prob_fn, "fast_parameters", ())
+            self._moves = with_fast_sweeps(self._moves, free, ndim, settings.fast_sweeps)
         self._ladder = list(read_ladder(self.backend))
         self._check = read_check(self.backend)
         if self.backend.random_state is None:
@@ -168,7 +168,7 @@ class TemperedSampler(EnsembleSampler):
     def evaluations(self) -> int:
         """Points handed to `log_prob_fn` by this object, and by the killed run that it goes on with.
 
-        Those of simulation-free sweeps are among them.
+        Those of fast sweeps are among them.
         """
         return self._evaluations
 
@@ -220,7 +220,7 @@ class TemperedSampler(EnsembleSampler):
         """Monte-Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
 
         Copies made by the latest resamplings and the correlation along the chain are taken into account (see
-        `samplers.families`). A chain that goes on in another sampler without its journal has lost the record of its
+        `samplers.tempering.genealogy`). A chain that goes on in another sampler without its journal has lost the record of its
         resampling: each walker then counts as independent of the others. Of moves that tie walkers together, such as
         emcee's stretch move, the ties are not seen. Nor can one run tell of a mode it lost, or of a climb whose moves
         did not move: after a `SamplingWarning` the errors are too small.
@@ -355,7 +355,7 @@ class TemperedSampler(EnsembleSampler):
                 if ended and store:
                     self.backend.done()
             if self.failure_count > failure_count:
-                sound(
+                warn(
                     f"{self.failure_count - failure_count} evaluations failed and count as impossible "
                     f"({self._failures.told()}); see failures"
                 )
@@ -474,7 +474,7 @@ class TemperedSampler(EnsembleSampler):
     def _ask(self, coords: np.ndarray, function: Callable | None = None) -> Evaluated:
         """Call `log_prob_fn`, or another function with its arguments, for points (n, ndim)."""
         fine = self.log_prob_fn
-        guarded = Guarded(fine.f if function is None else function, fine.args, fine.kwargs)
+        guarded = ErrorCapturing(fine.f if function is None else function, fine.args, fine.kwargs)
         results = self._call(guarded.of_batch if self.vectorize else guarded, coords, self.pool)
         return Evaluated(coords, *outcomes(results, len(coords), self.blobs_dtype))
 

@@ -11,9 +11,9 @@ doi:10.1063/1.4757266), whose chains are equally long, so that all processors of
 
 from collections.abc import Callable
 
-from .moves import MixtureMove
-from .settings import Settings
+from .moves.kernels import MixtureMove
 from .tempered import TemperedSampler
+from .tempering.settings import Settings
 
 __all__ = ["TMCMCSampler"]
 
@@ -27,13 +27,13 @@ class TMCMCSampler(TemperedSampler):
     Parameters
     ----------
     nwalkers ... parameter_names : as in `emcee.EnsembleSampler`, in its order. Without `moves`, those of
-        `samplers.moves.MixtureMove`.
+        `samplers.moves.kernels.MixtureMove`.
     log_prior_fn, seed : as in `TemperedSampler`.
     coefficient_of_variation : float — of the incremental weights, which sets the next exponent.
-    chains, burn_in : as in `samplers.settings.Settings`. Moves that need many walkers, such as emcee's stretch move,
+    chains, burn_in : as in `samplers.tempering.settings.Settings`. Moves that need many walkers, such as emcee's stretch move,
         need chains="equal".
-    resampling, min_moves, max_moves, max_correlation, free_sweeps, check_draws, max_failure_share : as in
-        `samplers.settings.Settings`.
+    resampling, min_moves, max_moves, max_correlation, fast_sweeps, check_draws, max_failure_share : as in
+        `samplers.tempering.settings.Settings`.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class TMCMCSampler(TemperedSampler):
         min_moves: int = 2,
         max_moves: int = 7,
         max_correlation: float = 0.15,
-        free_sweeps: int = 2,
+        fast_sweeps: int = 2,
         check_draws: int | None = None,
         max_failure_share: float = 0.5,
     ):
@@ -88,7 +88,7 @@ class TMCMCSampler(TemperedSampler):
                 min_moves=min_moves,
                 max_moves=max_moves,
                 max_correlation=max_correlation,
-                free_sweeps=free_sweeps,
+                fast_sweeps=fast_sweeps,
                 check_draws=check_draws,
                 max_failure_share=max_failure_share,
             ),

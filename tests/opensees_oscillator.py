@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from fe_likelihoods.channels import Channel
+from fe_likelihoods.signals.channels import Channel
 
 __all__ = ["CHANNELS", "PERIOD", "DAMPING", "Oscillator"]
 

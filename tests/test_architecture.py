@@ -28,7 +28,7 @@ SAMPLERS = {
     "journal": set(),
     "evaluation": {"journal"},
     "moves": {"edges", "mixtures"},
-    "free_sweeps": {"moves"},
+    "fast_sweeps": {"moves"},
     "backends": {"importance", "journal", "ladder"},
     "alarms": {"importance", "ladder"},
     "settings": {"resampling"},
@@ -55,7 +55,7 @@ SAMPLERS = {
         "climb",
         "evaluation",
         "families",
-        "free_sweeps",
+        "fast_sweeps",
         "importance",
         "journal",
         "ladder",
@@ -113,7 +113,11 @@ def test_the_reader_of_imports_reads(tmp_path, monkeypatch):
     path.parent.mkdir()
     path.write_text("from ..fe_likelihoods import units\nfrom .ladder import Stage\ndef f():\n    import arviz\n")
     monkeypatch.setitem(globals(), "ROOT", tmp_path)
-    assert imports(path) == [("fe_likelihoods.units", True), ("samplers.ladder.Stage", True), ("arviz", False)]
+    assert imports(path) == [
+        ("fe_likelihoods.units", True),
+        ("samplers.tempering.weights.Stage", True),
+        ("arviz", False),
+    ]
 
 
 def test_the_two_packages_do_not_know_each_other(module):

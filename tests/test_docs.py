@@ -10,7 +10,7 @@ INNER = {  # modules that serve one of those that are documented
     "fe_likelihoods.models": {"inputs", "threads", "code_digest"},
     "fe_likelihoods.kernels": {"linear_solve"},
     "samplers": {
-        *("climb", "edges", "evaluation", "families", "free_sweeps", "journal", "mutation"),
+        *("climb", "edges", "evaluation", "families", "fast_sweeps", "journal", "mutation"),
         *("resume", "settings", "shears"),
     },
 }

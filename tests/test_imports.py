@@ -1,5 +1,6 @@
 """An import brings no more along than it needs, and every name is there as if it did."""
 
+import ast
 import json
 import os
 import subprocess
@@ -31,8 +32,8 @@ def fresh(code: str) -> str:
     ("code", "allowed"),
     [
         ("import fe_likelihoods, samplers", set()),
-        ("import fe_likelihoods.problems, fe_likelihoods.priors, fe_likelihoods.models.base", set()),
-        ("import fe_likelihoods.cache, fe_likelihoods.likelihood, fe_likelihoods.records", set()),
+        ("import fe_likelihoods.problems, fe_likelihoods.probability.priors, fe_likelihoods.simulation.model", set()),
+        ("from fe_likelihoods import FELikelihood, Record, SimulationCache", set()),
         ("import fe_likelihoods.models.linear_oscillator, fe_likelihoods.models.function", set()),
         ("import fe_likelihoods.models.rc_column", {"numba"}),
         ("import fe_likelihoods; fe_likelihoods.problems.bridge_column()", {"h5py", "numba", "scipy.special"}),
@@ -47,9 +48,12 @@ def test_import_brings_what_it_needs(code, allowed):
 
 
 @pytest.mark.parametrize("package", ["fe_likelihoods", "samplers"])
-def test_every_module_is_there_after_the_package(package):
-    names = sorted(path.stem for path in (ROOT / package).glob("*.py") if path.stem != "__init__")
-    assert len(names) > 10
+def test_every_module_and_folder_is_an_attribute_of_the_package(package):
+    names = sorted(
+        path.stem for path in (ROOT / package).iterdir() if (path / "__init__.py").exists() or path.suffix == ".py"
+    )
+    names.remove("__init__")
+    assert len(names) > 5
     code = (
         f"import {package} as package; names = {names}; "
         "assert set(names) <= set(dir(package)); print([getattr(package, name).__name__ for name in names])"
@@ -57,11 +61,25 @@ def test_every_module_is_there_after_the_package(package):
     assert fresh(code).strip() == str([f"{package}.{name}" for name in names])
 
 
-def test_every_public_name_of_the_samplers_is_there():
-    code = "import samplers; print([getattr(samplers, name) is not None for name in samplers.__all__])"
-    assert fresh(code).strip() == str([True] * len(samplers.__all__))
-    assert fresh("from samplers import *; print(SMCSampler.__name__)").strip() == "SMCSampler"
-    assert set(samplers._HOME) == set(samplers.__all__) <= set(dir(samplers))
+@pytest.mark.parametrize("package", ["fe_likelihoods", "samplers"])
+def test_every_public_name_is_there(package):
+    names = sorted(__import__(package).__all__)
+    code = f"import {package}; print(sorted(n for n in {package}.__all__ if getattr({package}, n) is not None))"
+    assert fresh(code).strip() == str(names)
+    assert fresh(f"from {package} import *; print({names[0]} is not None)").strip() == "True"
+
+
+@pytest.mark.parametrize("package", ["fe_likelihoods", "samplers"])
+def test_editors_see_the_names_that_exist_at_run_time(package):
+    """The imports under TYPE_CHECKING, `__all__` and `_EXPORTS` list the same names from the same modules."""
+    tree = ast.parse((ROOT / package / "__init__.py").read_text())
+    (guarded,) = [node for node in tree.body if isinstance(node, ast.If)]
+    static = {alias.name: node.module for node in guarded.body for alias in node.names}
+    exported = {name: module for module, names in __import__(package)._EXPORTS.items() for name in names}
+    modules = {name for name, module in static.items() if module is None}
+    assert {name: module for name, module in static.items() if module is not None} == exported
+    assert set(__import__(package).__all__) == set(static) == set(exported) | modules
+    assert set(static) <= set(dir(__import__(package)))
 
 
 @pytest.mark.parametrize("package", [fe_likelihoods, samplers])

@@ -27,17 +27,17 @@ from matplotlib.lines import Line2D
 from scipy.special import logsumexp
 
 from fe_likelihoods import problems
-from fe_likelihoods.channels import Measurements
-from fe_likelihoods.figures import plot_bands
-from fe_likelihoods.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.predictive import propagate
-from fe_likelihoods.priors import HalfNormal, Prior, TruncatedNormal
-from fe_likelihoods.quantities import peak
+from fe_likelihoods.plots.histories import plot_bands
+from fe_likelihoods.prediction.propagation import propagate
+from fe_likelihoods.prediction.quantities import peak
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, Prior, TruncatedNormal
+from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.units import from_si, to_si
 from samplers import SMCSampler, TMCMCSampler
-from samplers.report import comparison_table, to_arviz
+from samplers.reporting.summary import comparison_table, to_arviz
 
 FAST = bool(os.environ.get("FAST"))
 parser = argparse.ArgumentParser(description="The ten-minute introduction; figures and summary.json into a folder.")

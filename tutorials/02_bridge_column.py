@@ -34,12 +34,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fe_likelihoods import problems, records
+from fe_likelihoods import problems
 from fe_likelihoods.models.rc_column import PARAMETERS
+from fe_likelihoods.signals import records
 from fe_likelihoods.units import from_si
 from samplers import RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler
-from samplers.figures import ladder_plot, pair_plot
-from samplers.report import ladder_table, summary, to_arviz
+from samplers.reporting.figures import ladder_plot, pair_plot
+from samplers.reporting.summary import ladder_table, summary, to_arviz
 
 # walkers, one sample kept in `every`, sweeps at beta = 1, settings of the sampler
 PRESETS = {
@@ -274,9 +275,9 @@ plt.close(figure)
 # %%
 classes = {}
 if args.classes:
-    from fe_likelihoods.averaging import average_predictions
-    from fe_likelihoods.predictive import propagate
-    from samplers.comparison import compare_models
+    from fe_likelihoods.prediction.averaging import average_predictions
+    from fe_likelihoods.prediction.propagation import propagate
+    from samplers.reporting.model_comparison import compare_models
 
     concrete = model.concrete
     variants = {

@@ -35,16 +35,16 @@ from fe_likelihoods.data.make_isolated_bridge import table_motion
 from scipy.stats import gaussian_kde
 
 from fe_likelihoods import problems
-from fe_likelihoods.figures import plot_bands, plot_fragility
 from fe_likelihoods.models.isolated_bridge import Bearing
-from fe_likelihoods.predictive import fit_measures, propagate
-from fe_likelihoods.quantities import peak
-from fe_likelihoods.reliability import exceedance, fragility
+from fe_likelihoods.plots.histories import plot_bands, plot_fragility
+from fe_likelihoods.prediction.propagation import fit_measures, propagate
+from fe_likelihoods.prediction.quantities import peak
+from fe_likelihoods.prediction.reliability import exceedance, fragility
 from samplers import CHING_CHEN_2007, SMCSampler, TMCMCSampler
-from samplers.alarms import SamplingWarning
-from samplers.comparison import compare_models
-from samplers.figures import ladder_plot
-from samplers.report import ladder_table, summary, to_arviz
+from samplers.reporting.figures import ladder_plot
+from samplers.reporting.model_comparison import compare_models
+from samplers.reporting.summary import ladder_table, summary, to_arviz
+from samplers.tempering.diagnostics import SamplingWarning
 
 # walkers, sweeps at beta = 1, step of integration [s], samples that are propagated, settings of the sampler
 PRESETS = {

@@ -37,10 +37,10 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from fe_likelihoods import problems
-from fe_likelihoods.posterior import Posterior
+from fe_likelihoods.probability.posterior import Posterior
 from samplers import CHING_CHEN_2007, SMCSampler, TMCMCSampler
-from samplers.alarms import SamplingWarning
-from samplers.report import comparison_table
+from samplers.reporting.summary import comparison_table
+from samplers.tempering.diagnostics import SamplingWarning
 
 FAST = bool(os.environ.get("FAST"))
 parser = argparse.ArgumentParser(description="Compare SMC, TMCMC and emcee; tables and figures into a folder.")

@@ -28,15 +28,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 import own_models
 
-from fe_likelihoods.channels import Measurements
-from fe_likelihoods.likelihood import FELikelihood
 from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.opensees import OpenSeesModel
-from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.priors import HalfNormal, Prior, TruncatedNormal
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, Prior, TruncatedNormal
+from fe_likelihoods.signals.channels import Measurements
 from samplers import SMCSampler
-from samplers.report import summary
+from samplers.reporting.summary import summary
 
 TRUTH = np.array([1.15, 0.85])
 NOISE = np.array([0.3, 2e-3])  # m/s2, m

@@ -34,17 +34,17 @@ import numpy as np
 import real_data
 from real_data import COLOURS, FAST, NOISES
 
-from fe_likelihoods.channels import Channel, Measurements
-from fe_likelihoods.figures import plot_bands, plot_residuals
-from fe_likelihoods.likelihood import FELikelihood
-from fe_likelihoods.models.linear_parts import BridgeDeck
 from fe_likelihoods.models.linear_structure import LinearStructure
-from fe_likelihoods.noise import AutoregressiveNoise, GaussianNoise
-from fe_likelihoods.predictive import Prediction, propagate
-from fe_likelihoods.priors import HalfNormal, Uniform
-from fe_likelihoods.records import Record, read_v2
-from fe_likelihoods.residuals import residual_checks
-from samplers.comparison import compare_models
+from fe_likelihoods.models.linear_structure_parts import BridgeDeck
+from fe_likelihoods.plots.histories import plot_bands, plot_residuals
+from fe_likelihoods.prediction.propagation import Prediction, propagate
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
+from fe_likelihoods.probability.priors import HalfNormal, Uniform
+from fe_likelihoods.probability.residuals import residual_checks
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record, read_v2
+from samplers.reporting.model_comparison import compare_models
 
 SOURCE = "https://www.strongmotioncenter.org (CESMD), processed data of that station"
 ONE_SUPPORT = {"ends only": 1.0, "column only": 0.0}

@@ -27,17 +27,17 @@ import numpy as np
 import real_data
 from real_data import COLOURS, FAST, NOISES
 
-from fe_likelihoods.channels import Channel, Measurements, read_columns
-from fe_likelihoods.figures import plot_bands, plot_residuals
-from fe_likelihoods.likelihood import FELikelihood
-from fe_likelihoods.models.linear_parts import ShearFrame
 from fe_likelihoods.models.linear_structure import LinearStructure
-from fe_likelihoods.noise import AutoregressiveNoise, GaussianNoise
-from fe_likelihoods.predictive import propagate
-from fe_likelihoods.priors import HalfNormal, LogNormal
-from fe_likelihoods.records import Record
-from fe_likelihoods.residuals import residual_checks
-from samplers.comparison import compare_models
+from fe_likelihoods.models.linear_structure_parts import ShearFrame
+from fe_likelihoods.plots.histories import plot_bands, plot_residuals
+from fe_likelihoods.prediction.propagation import propagate
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
+from fe_likelihoods.probability.priors import HalfNormal, LogNormal
+from fe_likelihoods.probability.residuals import residual_checks
+from fe_likelihoods.signals.channels import Channel, Measurements, read_columns
+from fe_likelihoods.signals.records import Record
+from samplers.reporting.model_comparison import compare_models
 
 SOURCE = "the repository STAIRlab/mdof on GitHub"
 FLOORS = {"floor1": 1, "floor2": 2, "floor3": 3}

@@ -46,10 +46,10 @@ from cyclic_tests import (
     table,
 )
 
-from fe_likelihoods.channels import Channel, Measurements, read_imposed_test
 from fe_likelihoods.models.rc_column import Bars, Concrete, Hoops, RCColumn, Steel
-from fe_likelihoods.priors import TruncatedNormal
-from fe_likelihoods.records import DisplacementHistory
+from fe_likelihoods.probability.priors import TruncatedNormal
+from fe_likelihoods.signals.channels import Channel, Measurements, read_imposed_test
+from fe_likelihoods.signals.records import DisplacementHistory
 from fe_likelihoods.units import from_si, to_si
 
 SOURCE = "kuanshi/ductile-fracture on GitHub (MIT licence; from the PEER structural performance database)"

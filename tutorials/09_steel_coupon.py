@@ -35,10 +35,10 @@ from cyclic_tests import (
     table,
 )
 
-from fe_likelihoods.channels import Measurements
 from fe_likelihoods.models.rc_column import Steel
 from fe_likelihoods.models.steel_coupon import SteelCoupon
-from fe_likelihoods.priors import TruncatedNormal
+from fe_likelihoods.probability.priors import TruncatedNormal
+from fe_likelihoods.signals.channels import Measurements
 
 SOURCE = "NHERI-SimCenter/quoFEM on GitHub (BSD licence; an example of quoFEM)"
 FILES = ("stress.1.coords", "calDataField.csv")

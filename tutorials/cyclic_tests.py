@@ -21,16 +21,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from real_data import find
 
-from fe_likelihoods.channels import Measurements
-from fe_likelihoods.figures import plot_residuals
-from fe_likelihoods.likelihood import FELikelihood
-from fe_likelihoods.noise import AutoregressiveNoise, GaussianNoise
-from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.predictive import Prediction, propagate
-from fe_likelihoods.priors import HalfNormal, Prior, Uniform
-from fe_likelihoods.residuals import ResidualChecks, effective_samples, innovations, residual_checks
+from fe_likelihoods.plots.histories import plot_residuals
+from fe_likelihoods.prediction.propagation import Prediction, propagate
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, Prior, Uniform
+from fe_likelihoods.probability.residuals import ResidualChecks, effective_samples, innovations, residual_checks
+from fe_likelihoods.signals.channels import Measurements
 from samplers import SMCSampler
-from samplers.report import summary
+from samplers.reporting.summary import summary
 
 __all__ = [
     "Fit",

@@ -10,7 +10,7 @@ import numpy as np
 from fe_likelihoods.data.make_isolated_bridge import table_motion
 from own_program import solve
 
-from fe_likelihoods.channels import Channel
+from fe_likelihoods.signals.channels import Channel
 
 NAMES = ("stiffness", "strength")
 CHANNELS = (

@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe_likelihoods.channels import Measurements
-from fe_likelihoods.likelihood import FELikelihood
-from fe_likelihoods.models.base import Model
-from fe_likelihoods.noise import AutoregressiveNoise, GaussianNoise
-from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.priors import Distribution, Prior, Uniform
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import Distribution, Prior, Uniform
+from fe_likelihoods.signals.channels import Measurements
+from fe_likelihoods.simulation.model import Model
 from samplers import SMCSampler
-from samplers.report import summary
+from samplers.reporting.summary import summary
 
 FAST = bool(os.environ.get("FAST"))
 BESIDE = Path(os.environ.get("FE_SHARED", Path(__file__).resolve().parents[2] / "shared")) / "measured"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..posterior import Posterior
+from ..probability.posterior import Posterior
 
 if TYPE_CHECKING:
     import pints

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..posterior import Posterior
-from ..priors import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from ..probability.posterior import Posterior
+from ..probability.priors import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 
 if TYPE_CHECKING:
     import pymc
@@ -38,7 +38,7 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
     Raises
     ------
     ValueError
-        If a prior is none of `fe_likelihoods.priors`, or a parameter is named ``log_likelihood``.
+        If a prior is none of `fe_likelihoods.probability.priors`, or a parameter is named ``log_likelihood``.
 
     Examples
     --------

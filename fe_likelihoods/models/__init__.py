@@ -1,1 +1,1 @@
-"""Structural models: objects with named parameters that turn them into responses."""
+"""Structural models: the built-in ones and wrappers for a user's own."""

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ..channels import Channel
-from ..processes import RunFailed, Started, TemporaryFolder, ending, last_lines
-from .base import SimulationFailed
-from .checked import CheckedModel, positive
-from .code_digest import code_digest
+from ..signals.channels import Channel
+from ..simulation.code_digest import code_digest
+from ..simulation.model import SimulationFailed
+from ..simulation.processes import RunFailed, Started, TemporaryFolder, ending, last_lines
+from .external import CheckedModel, positive
 
 __all__ = ["ExecutableModel"]
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..channels import Channel
-from ..isolated import Isolated
-from .checked import CheckedModel, positive
-from .code_digest import code_digest
+from ..signals.channels import Channel
+from ..simulation.code_digest import code_digest
+from ..simulation.sandbox import Sandbox
+from .external import CheckedModel, positive
 
 __all__ = ["FunctionModel"]
 
@@ -30,7 +30,7 @@ class FunctionModel(CheckedModel):
     parameter_names, channels, dt, n_steps : as in `CheckedModel`
     version : str, optional
         Takes the place of the code in the fingerprint: change it whenever the function computes something else. By
-        default a digest of the code is taken, and of all that it uses (see `fe_likelihoods.models.code_digest`).
+        default a digest of the code is taken, and of all that it uses (see `fe_likelihoods.simulation.code_digest`).
     isolated : bool
         Run in a process of its own; limits below imply it.
     time_limit : float, optional
@@ -75,7 +75,7 @@ class FunctionModel(CheckedModel):
         )
         self.isolated = bool(isolated) or time_limit is not None or memory_limit is not None
         self.fingerprint = self._digest(self._version_of(function))
-        self._run = Isolated(function, self.time_limit, self.memory_limit or 0) if self.isolated else function
+        self._run = Sandbox(function, self.time_limit, self.memory_limit or 0) if self.isolated else function
 
     def _version_of(self, function: Callable) -> list[str]:
         if self.version is not None:

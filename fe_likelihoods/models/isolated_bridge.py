@@ -31,21 +31,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..channels import Channel
 from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC
 from ..kernels.exponential import matrix_exponential
-from ..kernels.isolated import N_OUT, N_STATES, step_isolated
+from ..kernels.isolated_bridge import N_OUT, N_STATES, step_isolated
 from ..kernels.jit import KERNEL_HASH
-from ..records import Record
-from .base import MisfitBatch, SimulationBatch, SimulationFailed
-from .bridge_inputs import CHANNEL_SETS, Bearing, Damper, Pier, Rubber
-from .inputs import channel_rows, number, refuse, theta_row, theta_rows, whole_number
-from .threads import map_threads
+from ..signals.channels import Channel
+from ..signals.records import Record
+from ..simulation.model import MisfitBatch, SimulationBatch, SimulationFailed
+from ..simulation.threads import map_threads
+from .isolated_bridge_parts import CHANNEL_SETS, Bearing, Damper, Pier, Rubber
+from .validation import channel_rows, number, refuse, theta_row, theta_rows, whole_number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..channels import Measurements
+    from ..signals.channels import Measurements
 
 __all__ = ["CHANNEL_SETS", "Bearing", "BridgeHistory", "Damper", "IsolatedBridge", "Pier", "Rubber"]
 
@@ -115,7 +115,7 @@ class BridgeHistory:
 
 @dataclass(frozen=True, eq=False)
 class IsolatedBridge:
-    """Isolated bridge on a shake table; `simulate` turns multiples of the nominal parameters into responses.
+    """Sandbox bridge on a shake table; `simulate` turns multiples of the nominal parameters into responses.
 
     Attributes
     ----------
@@ -267,13 +267,13 @@ class IsolatedBridge:
 
     def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
         """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
-        from .figures import plot_response
+        from ..plots.structures import plot_response
 
         return plot_response(self, theta, measurements)
 
     def plot_hysteresis(self, theta: np.ndarray) -> Figure:
         """Isolator force against bearing displacement of both piers (`models.figures.plot_bearing_loops`)."""
-        from .figures import plot_bearing_loops
+        from ..plots.structures import plot_bearing_loops
 
         return plot_bearing_loops(replace(self, every=1).history(theta))
 

@@ -26,13 +26,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.linalg import eigh
 
-from ..channels import Channel
 from ..kernels.complex_modes import superpose_modes
 from ..kernels.jit import KERNEL_HASH
-from ..records import Record, sample_window
-from .base import SimulationFailed
-from .checked import CheckedModel
-from .linear_oscillator import hold_integrals
+from ..signals.channels import Channel
+from ..signals.records import Record, sample_window
+from ..signals.sdof import hold_integrals
+from ..simulation.model import SimulationFailed
+from .external import CheckedModel
 
 __all__ = [
     "LinearStructure",

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..channels import Channel
+from ..signals.channels import Channel
 from .function import FunctionModel
 
 __all__ = ["OpenSeesModel"]

@@ -31,15 +31,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..channels import Channel
 from ..kernels import concrete04, reinforcing_steel
 from ..kernels.frame import Column, allocate
 from ..kernels.jit import KERNEL_HASH
 from ..kernels.newmark import HISTORY_ROWS, newmark
 from ..kernels.static import impose_displacement
-from ..records import DisplacementHistory, Record
+from ..signals.channels import Channel
+from ..signals.records import DisplacementHistory, Record
+from ..simulation.model import MisfitBatch, SimulationBatch, SimulationFailed
+from ..simulation.threads import map_threads
 from ..units import G0, find_unit, to_si
-from .base import MisfitBatch, SimulationBatch, SimulationFailed
 from .circular_section import (
     Confinement,
     bar_circle,
@@ -48,15 +49,14 @@ from .circular_section import (
     gauss_lobatto,
     mander_confinement,
 )
-from .column_inputs import Bars, Concrete, Hoops, Patches, Steel
-from .inputs import channel_rows, number, refuse, theta_row, theta_rows, whole_number
-from .threads import map_threads
+from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
+from .validation import channel_rows, number, refuse, theta_row, theta_rows, whole_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ..channels import Measurements
+    from ..signals.channels import Measurements
 
 __all__ = ["Bars", "ColumnHistory", "Concrete", "Hoops", "Patches", "RCColumn", "Steel"]
 
@@ -320,19 +320,19 @@ class RCColumn:
 
     def plot_section(self, axes: Axes | None = None) -> Axes:
         """Cover, core, mesh and bars of the section (`models.figures.plot_section`)."""
-        from .figures import plot_section
+        from ..plots.structures import plot_section
 
         return plot_section(self, axes)
 
     def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
         """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
-        from .figures import plot_response
+        from ..plots.structures import plot_response
 
         return plot_response(self, theta, measurements)
 
     def plot_hysteresis(self, theta: np.ndarray) -> Figure:
         """Base moment against curvature, force against displacement of the top (`models.figures.plot_column_loops`)."""
-        from .figures import plot_column_loops
+        from ..plots.structures import plot_column_loops
 
         return plot_column_loops(self, self.history(theta))
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..channels import Channel
 from ..kernels import reinforcing_steel
 from ..kernels.jit import KERNEL_HASH
-from .base import SimulationFailed
-from .column_inputs import Steel
-from .inputs import refuse, theta_row
+from ..signals.channels import Channel
+from ..simulation.model import SimulationFailed
+from .rc_column_parts import Steel
+from .validation import refuse, theta_row
 
 __all__ = ["SteelCoupon"]
 

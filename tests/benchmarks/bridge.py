@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 from scipy.signal import cont2discrete, lfilter
 
-from fe_likelihoods.records import Record
+from fe_likelihoods.signals.records import Record
 from tests.opensees_bridge import run
 from tests.scipy_bridge import CHANNELS, Definition, peak_errors, solve
 

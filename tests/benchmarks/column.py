@@ -9,10 +9,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from fe_likelihoods.engines import LocalPool, as_engine
-from fe_likelihoods.models.base import misfit_batch
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
+from fe_likelihoods.simulation.executors import LocalPool, as_executor
+from fe_likelihoods.simulation.model import misfit_batch
 from tests.opensees_column import INCH, KIP, peer_of, shake
 
 from .rows import Row
@@ -84,7 +84,7 @@ def batch(repeats: int) -> list[Row]:
     ]
     numba.set_num_threads(1)
     for name, pool, close in _pools():
-        engine, times = as_engine(pool, model), {1: [], 2: []}
+        engine, times = as_executor(pool, model), {1: [], 2: []}
         misfit_batch(model, thetas, np.zeros((2, model.n_steps)), engine)  # workers start and compile nothing
         for _ in range(repeats):
             for n, used in ((1, None), (2, engine)):

@@ -16,11 +16,11 @@ from statistics import median
 
 import numpy as np
 
-from fe_likelihoods.engines import as_engine
-from fe_likelihoods.models.base import simulate_batch
 from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.processes import Started
+from fe_likelihoods.simulation.executors import as_executor
+from fe_likelihoods.simulation.model import simulate_batch
+from fe_likelihoods.simulation.processes import Started
 from tests.faults.pooled_run import NAMES, POOLS, WORKERS, at_work
 from tests.faults.treacherous import CHANNELS, DT, KILLED, N_STEPS, DiesOnce, Treacherous, descendants, gone, line
 
@@ -146,7 +146,7 @@ def _overhead(name: str, repeats: int) -> dict:
         model = ExecutableModel(command, template, "out.txt", NAMES, CHANNELS, DT, N_STEPS, **settings)
         seconds = _seconds(model, thetas[:100], None, repeats)
     else:
-        seconds = _seconds(Treacherous(), thetas, as_engine(POOLS[name]()), repeats)
+        seconds = _seconds(Treacherous(), thetas, as_executor(POOLS[name]()), repeats)
     return {"microseconds": 1e6 * (seconds - cheap)}
 
 
@@ -164,7 +164,7 @@ def _cluster() -> dict:
     from distributed import Client, LocalCluster
 
     cluster = LocalCluster(n_workers=WORKERS, threads_per_worker=THREADS // WORKERS, dashboard_address=None)
-    engine = as_engine(Client(cluster))
+    engine = as_executor(Client(cluster))
     thetas = _thetas()[: 4 * THREADS]
     simulate_batch(Sleeper(), thetas[:THREADS], engine)
     start = time.perf_counter()
@@ -181,7 +181,7 @@ def _death(name: str) -> dict:
     """Two of twenty items kill their worker, the first time that they are tried."""
     thetas = _thetas()[:20]
     thetas[[4, 11], 0] += KILLED
-    engine = as_engine(POOLS[name]())
+    engine = as_executor(POOLS[name]())
     simulate_batch(Treacherous(), _thetas()[:10], engine)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()

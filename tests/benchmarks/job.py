@@ -101,7 +101,7 @@ def _how_far(path: Path) -> str:
     from emcee.backends import HDFBackend
 
     from samplers import read_ladder
-    from samplers.backends import JournaledBackend
+    from samplers.storage.backends import JournaledBackend
 
     ladder = read_ladder(JournaledBackend.of(HDFBackend(str(path)))) if path.exists() else ()
     if not ladder:

@@ -14,7 +14,7 @@ from typing import Any
 from emcee.backends import HDFBackend
 
 from samplers import read_ladder
-from samplers.backends import JournaledBackend
+from samplers.storage.backends import JournaledBackend
 
 from .cost import STEPS, per_evaluation, run_emcee, run_walk
 from .rows import Row

@@ -16,12 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from fe_likelihoods.channels import Measurements
-from fe_likelihoods.likelihood import FELikelihood
-from fe_likelihoods.models.linear_oscillator import LinearOscillator, respond
-from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.priors import HalfNormal, LogNormal, Prior, TruncatedNormal, Uniform
-from fe_likelihoods.records import Record
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, LogNormal, Prior, TruncatedNormal, Uniform
+from fe_likelihoods.signals.channels import Measurements
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.signals.sdof import respond
 
 __all__ = ["CRITICAL", "PRIOR", "Exact", "exact", "make_posterior", "reference_log_prob"]
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
-from fe_likelihoods.posterior import Posterior
+from fe_likelihoods.probability.posterior import Posterior
 
 from .scoring import Found, chains, replicates, weighted
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
-from fe_likelihoods.priors import HalfNormal, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods.probability.priors import HalfNormal, LogNormal, TruncatedNormal, Uniform
 
 from .problem import PRIOR, make_posterior
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from fe_likelihoods.priors import TruncatedNormal
+from fe_likelihoods.probability.priors import TruncatedNormal
 
 from .problem import CRITICAL, PRIOR, exact, make_posterior, reference_log_prob
 from .runs import CLIENTS

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.priors import TruncatedNormal, Uniform
+from fe_likelihoods.probability.priors import TruncatedNormal, Uniform
 
 from .problem import CRITICAL, PRIOR, make_posterior
 

@@ -335,11 +335,11 @@ def test_emcees_moves_are_kernels(Sampler, moves):
 
 def test_our_moves_are_emcees():
     """Inside a plain EnsembleSampler nobody calibrates; the moves fit themselves to the first ensemble."""
-    from samplers.free_sweeps import WithFreeSweeps
-    from samplers.moves import MixtureMove, RandomWalkMove, StudentTMove
+    from samplers.moves.fast_parameters import WithFastSweeps
+    from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
 
     posterior = Gaussian()
-    followed = [WithFreeSweeps(move, (2,)) for move in (MixtureMove(), emcee.moves.StretchMove())]
+    followed = [WithFastSweeps(move, (2,)) for move in (MixtureMove(), emcee.moves.StretchMove())]
     for move in (RandomWalkMove(), StudentTMove(), MixtureMove(), *followed):
         sampler = emcee.EnsembleSampler(N, 3, posterior, moves=move)
         sampler.run_mcmc(posterior.mean + posterior.sd * start(posterior), 20, tune=True)

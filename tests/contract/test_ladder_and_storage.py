@@ -19,10 +19,10 @@ from samplers import (
     TMCMCSampler,
     read_ladder,
 )
-from samplers.figures import ladder_plot, pair_plot
-from samplers.moves import RandomWalkMove
-from samplers.report import comparison_table, ladder_table, summary, to_arviz
-from samplers.resampling import stratified
+from samplers.moves.kernels import RandomWalkMove
+from samplers.reporting.figures import ladder_plot, pair_plot
+from samplers.reporting.summary import comparison_table, ladder_table, summary, to_arviz
+from samplers.tempering.resampling import stratified
 from tests.contract.targets import Box, Gaussian
 
 N = 40
@@ -203,8 +203,8 @@ def test_points_of_a_chain_follow_each_other():
     """Every point of the new population is one step from the last point of its leader's chain."""
     from emcee.model import Model
 
-    from samplers.mutation import grow_chains
-    from samplers.settings import Settings
+    from samplers.tempering.mutation import grow_chains
+    from samplers.tempering.settings import Settings
 
     random = np.random.RandomState(0)
     ancestors = np.sort(random.randint(5, size=30))[random.permutation(30)]
@@ -345,8 +345,8 @@ def test_no_evidence_before_a_run():
         {"min_moves": 5, "max_moves": 4},
         {"max_correlation": 0.0},
         {"check_draws": -1},
-        {"free_sweeps": -1},
-        {"free_sweeps": 1.5},
+        {"fast_sweeps": -1},
+        {"fast_sweeps": 1.5},
     ],
     ids=str,
 )

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fe_likelihoods.engines import LocalPool
 from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.simulation.executors import LocalPool
 from tests.faults.treacherous import (
     CHANNELS,
     DT,

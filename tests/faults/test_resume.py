@@ -11,7 +11,7 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers.journal import read_journal
+from samplers.storage.journal import read_journal
 from tests.contract.targets import Gaussian
 from tests.faults.resumable_run import NDIM, SAMPLERS, N, make
 

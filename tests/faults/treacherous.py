@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fe_likelihoods.channels import Channel, Measurements
-from fe_likelihoods.models.base import SimulationFailed
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.simulation.model import SimulationFailed
 
 CHANNELS = (Channel("a", "acceleration", "m/s2"),)
 DT, N_STEPS = 0.1, 20
@@ -151,9 +151,9 @@ def deadly(theta: np.ndarray) -> np.ndarray:
 
 def posterior_of(model, top: float = 1.0, **options):
     """Posterior of a model of two parameters, whose offset is between 0 and `top`."""
-    from fe_likelihoods.likelihood import FELikelihood  # the workers need none of this, and start faster
-    from fe_likelihoods.posterior import Posterior
-    from fe_likelihoods.priors import HalfNormal, Uniform
+    from fe_likelihoods.probability.likelihood import FELikelihood  # the workers need none of this, and start faster
+    from fe_likelihoods.probability.posterior import Posterior
+    from fe_likelihoods.probability.priors import HalfNormal, Uniform
 
     noise = np.random.default_rng(3).normal(size=(1, N_STEPS))
     measurements = Measurements(CHANNELS, DT, line(np.array([0.4, 0.7])) + 0.3 * noise)

@@ -9,7 +9,7 @@ import pytest
 
 from fe_likelihoods.models.rc_column import Patches, RCColumn
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
-from fe_likelihoods.records import DisplacementHistory
+from fe_likelihoods.signals.records import DisplacementHistory
 from tests.opensees_column import INCH, KIP, peer_of, push, require_opensees, shake
 
 NOMINAL, PAPER = np.ones(5), np.array(list(BRIDGE_COLUMN_MEANS.values()))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
-from fe_likelihoods.records import Record
+from fe_likelihoods.signals.records import Record
 from tests.opensees_bridge import run
 from tests.opensees_column import require_opensees
 from tests.scipy_bridge import CHANNELS, Definition, peak_errors, solve

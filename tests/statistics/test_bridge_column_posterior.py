@@ -14,9 +14,9 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods import problems
-from fe_likelihoods.posterior import Posterior
-from fe_likelihoods.priors import TruncatedNormal
-from fe_likelihoods.records import Record, read_csv
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import TruncatedNormal
+from fe_likelihoods.signals.records import Record, read_csv
 from samplers import SMCSampler
 
 pytestmark = pytest.mark.slow

@@ -18,12 +18,12 @@ from fe_likelihoods.data.make_isolated_bridge import table_motion
 from scipy import stats
 
 from fe_likelihoods import problems
-from fe_likelihoods.likelihood import FELikelihood
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
-from fe_likelihoods.noise import SharedGaussianNoise
-from fe_likelihoods.posterior import Posterior
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import SharedGaussianNoise
+from fe_likelihoods.probability.posterior import Posterior
 from samplers import CHING_CHEN_2007, SMCSampler, TMCMCSampler
-from samplers.alarms import SamplingWarning
+from samplers.tempering.diagnostics import SamplingWarning
 
 pytestmark = pytest.mark.slow
 

@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler
-from samplers.families import follow, standard_error_of_mean
-from samplers.moves import RandomWalkMove
-from samplers.resampling import multinomial
+from samplers.moves.kernels import RandomWalkMove
+from samplers.tempering.genealogy import follow, standard_error_of_mean
+from samplers.tempering.resampling import multinomial
 from tests.contract.targets import Box, Gaussian
 from tests.statistics.test_posteriors import MODES, runs
 

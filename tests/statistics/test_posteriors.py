@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from samplers import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler, TMCMCSampler
-from samplers.moves import MixtureMove, RandomWalkMove, StudentTMove
+from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
 from tests.contract.targets import Box, Gaussian
 
 MODES = {

@@ -1,0 +1,1 @@
+"""Figures of records, measurements, responses and structures."""

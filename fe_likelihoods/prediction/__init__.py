@@ -1,0 +1,1 @@
+"""Predictions from posterior samples: propagation, reliability and model averaging."""

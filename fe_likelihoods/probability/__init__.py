@@ -1,0 +1,1 @@
+"""Priors, noise models, the likelihood and the posterior."""

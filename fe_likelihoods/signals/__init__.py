@@ -1,0 +1,1 @@
+"""Ground motions, measured channels, file formats and response spectra."""

@@ -1,0 +1,1 @@
+"""How simulations are run and stored: model protocol, executors, processes and caches."""

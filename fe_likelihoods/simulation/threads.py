@@ -1,0 +1,54 @@
+"""A batch of simulations on threads: compiled kernels hold no lock, and each run has its own memory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+
+from .model import SimulationFailed
+
+__all__ = ["map_threads"]
+
+
+def map_threads(
+    run: Callable[[np.ndarray], np.ndarray], thetas: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, list[str]]:
+    """Results of many runs, on numba's number of threads.
+
+    Parameters
+    ----------
+    run : callable
+        Turns one row of `thetas` into an array of `shape`, or raises `SimulationFailed`.
+    thetas : (n, n_parameters) float
+    shape : tuple of int
+
+    Returns
+    -------
+    (n, *shape) float : NaN where a run failed.
+    list of str : reasons, empty where a run succeeded.
+    """
+    out = np.full((len(thetas), *shape), np.nan)
+    reasons = [""] * len(thetas)
+
+    def one(i: int) -> None:
+        try:
+            out[i] = run(thetas[i])
+        except SimulationFailed as failure:
+            reasons[i] = failure.reason
+
+    n_threads = min(numba.get_num_threads(), len(thetas), os.cpu_count() or 1)
+    if n_threads <= 1:
+        for i in range(len(thetas)):
+            one(i)
+        return out, reasons
+    with ThreadPoolExecutor(n_threads) as threads:
+        try:
+            list(threads.map(one, range(len(thetas))))
+        except BaseException:  # Ctrl-C: do not wait for what has not begun
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
+    return out, reasons

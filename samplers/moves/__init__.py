@@ -1,0 +1,1 @@
+"""Mutation kernels in the form of emcee moves."""

@@ -1,0 +1,1 @@
+"""Proposal densities: mixtures of Student t distributions on transformed parameters."""

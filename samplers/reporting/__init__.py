@@ -1,0 +1,1 @@
+"""Tables, figures and model comparison from finished runs."""

@@ -1,0 +1,156 @@
+"""Figures of a finished run: the climb, and the posterior by pairs of parameters. matplotlib is imported where used."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import gaussian_kde
+
+from .summary import finished_ladder, summary
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["ladder_plot", "pair_plot"]
+
+BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
+
+
+def ladder_plot(sampler: Any) -> "Figure":
+    """Figure of the climb: beta, effective sample size and distinct points, acceptance and moves against the stage."""
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import MaxNLocator
+
+    stages = finished_ladder(sampler)
+    number = np.arange(1, len(stages) + 1)
+    column = {name: np.array([getattr(s, name) for s in stages]) for name in stages[0]._fields}
+    figure, (top, middle, bottom) = plt.subplots(3, 1, sharex=True, figsize=(7.0, 7.0), layout="constrained")
+
+    top.semilogy(number, column["beta"], "o-", color=BLUE, markersize=4)
+    top.set_ylabel(r"$\beta$ [-]")
+    if stages[-1].beta == 1.0:
+        top.set_title(
+            f"{len(stages)} stages, {column['evaluations'].sum()} evaluations, "
+            rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2f}",
+            fontsize="medium",
+        )
+    middle.plot(number, column["effective_sample_size"], "o-", color=BLUE, markersize=4, label="effective sample size")
+    middle.plot(number, column["distinct_ancestors"], "s--", color=ORANGE, markersize=4, label="distinct survivors")
+    middle.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
+    middle.set_ylim(0, 1.08 * sampler.nwalkers)
+    middle.set_ylabel("points")
+    middle.legend(frameon=False, fontsize="small", ncols=3, loc="lower left")
+    bottom.bar(number, column["moves"], color=GREY, alpha=0.35, width=0.7)
+    bottom.set_ylabel("sweeps a stage (bars)")
+    bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
+    share = bottom.twinx()
+    share.plot(number, column["acceptance"], "o-", color=BLUE, markersize=4)
+    share.set_ylim(0, 1)
+    share.set_ylabel("acceptance [-]", color=BLUE)
+    bottom.set_xlabel("stage")
+    bottom.set_xlim(0.3, len(stages) + 0.7)
+    bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
+    for axes in (top, middle):
+        axes.grid(alpha=0.25)
+    return figure
+
+
+def _kde(values: np.ndarray) -> gaussian_kde | None:
+    """Kernel density of (n,) or (k, n) values; None where they have no spread."""
+    try:
+        return gaussian_kde(values)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def pair_plot(
+    samples: np.ndarray,
+    labels: Sequence[str] | None = None,
+    truth: Sequence[float] | None = None,
+    max_points: int = 2000,
+    grid: int = 60,
+) -> "Figure":
+    """Pair plot in the manner of Ramancha et al. (2022), Fig. 4.
+
+    Diagonal: histogram and kernel density, the coefficient of variation on top. Above it the samples, below it
+    contours of the kernel density with Pearson's r.
+
+    Parameters
+    ----------
+    samples : (n, ndim) float
+    labels : one a parameter, with its unit.
+    truth : (ndim,) float, optional — marked by lines, where the truth is known.
+    max_points : int — at most so many samples are drawn, and used for the two-dimensional densities.
+    grid : int — points a side of the density grids.
+    """
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import MaxNLocator
+
+    moments = summary(samples, labels)
+    samples = np.asarray(samples, dtype=float)
+    ndim = samples.shape[1]
+    shown = samples[np.linspace(0, len(samples) - 1, min(max_points, len(samples))).astype(int)]
+    low, high = np.quantile(samples, [0.002, 0.998], axis=0)
+    margin = np.where(high > low, 0.12 * (high - low), np.maximum(0.05 * np.abs(low), 1e-12))
+    low, high = low - margin, high + margin
+    size = max(4.0, 1.5 * ndim + 0.8)
+    figure, axes = plt.subplots(ndim, ndim, figsize=(size, size), squeeze=False, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
+
+    for i in range(ndim):
+        for j in range(ndim):
+            ax = axes[i, j]
+            x, y = samples[:, j], samples[:, i]
+            ax.set_xlim(low[j], high[j])
+            if i == j:
+                ax.hist(x, bins=40, range=(low[j], high[j]), density=True, color=BLUE, alpha=0.3)
+                density = _kde(x)
+                if density is not None:
+                    t = np.linspace(low[j], high[j], 200)
+                    ax.plot(t, density(t), color=BLUE, linewidth=1.4)
+                ax.set_title(f"CV = {moments.cv[j]:.2e}", fontsize="small", pad=3)
+                ax.set_yticks([])
+            else:
+                ax.set_ylim(low[i], high[i])
+            if i < j:
+                ax.plot(shown[:, j], shown[:, i], ".", color=BLUE, markersize=2, alpha=0.35, markeredgewidth=0)
+            elif i > j:
+                _density_contours(ax, shown[:, j], shown[:, i], (low[j], high[j]), (low[i], high[i]), grid)
+                if np.ptp(x) > 0.0 and np.ptp(y) > 0.0:
+                    r = np.corrcoef(x, y)[0, 1]
+                    ax.text(0.05, 0.95, f"r = {r:.2f}", transform=ax.transAxes, va="top", fontsize="small")
+            if truth is not None:
+                ax.axvline(truth[j], color=ORANGE, linewidth=1)
+                if i != j:
+                    ax.axhline(truth[i], color=ORANGE, linewidth=1)
+            _dress(ax, MaxNLocator, bottom=i == ndim - 1, left=j == 0 and i > 0)
+            if i == ndim - 1:
+                ax.set_xlabel(moments.names[j])
+            if j == 0:
+                ax.set_ylabel(moments.names[i])
+    figure.align_ylabels(axes[:, 0])
+    return figure
+
+
+def _density_contours(ax, x, y, xlim, ylim, grid):
+    """Contours that hold 20, 40, 60, 80 and 95 % of the samples."""
+    density = _kde(np.stack([x, y])) if np.ptp(x) > 0.0 and np.ptp(y) > 0.0 else None
+    if density is None:
+        return
+    u, v = np.meshgrid(np.linspace(*xlim, grid), np.linspace(*ylim, grid))
+    height = density(np.stack([u.ravel(), v.ravel()])).reshape(u.shape)
+    levels = np.unique(np.quantile(density(np.stack([x, y])), [0.05, 0.2, 0.4, 0.6, 0.8]))
+    shades = [BLUE + f"{alpha:02x}" for alpha in np.linspace(40, 230, len(levels)).astype(int)]
+    ax.contourf(u, v, height, [*levels, 2.0 * max(height.max(), levels[-1])], colors=shades)
+    ax.contour(u, v, height, levels, colors=BLUE, linewidths=0.5)
+
+
+def _dress(ax, locator, bottom, left):
+    """Few ticks, labelled at the outer edges only."""
+    ax.xaxis.set_major_locator(locator(3, prune="both"))
+    if ax.get_yticks().size:
+        ax.yaxis.set_major_locator(locator(3, prune="both"))
+    ax.tick_params(labelsize="x-small", labelbottom=bottom, labelleft=left, length=2.5)
+    ax.tick_params(axis="x", labelrotation=35)
+    ax.xaxis.get_offset_text().set_fontsize("x-small")
+    ax.yaxis.get_offset_text().set_fontsize("x-small")

@@ -1,0 +1,1 @@
+"""The annealing from prior to posterior: weights, resampling, mutation, evidence and diagnostics."""

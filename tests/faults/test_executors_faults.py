@@ -1,0 +1,281 @@
+"""Workers that die, parents that die, models that fail: nothing hangs, nothing is lost, nothing is left over."""
+
+import gc
+import importlib.util
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import emcee
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.probability.likelihood import TooManyFailures
+from fe_likelihoods.simulation.executors import LocalPool
+from fe_likelihoods.simulation.model import simulate_batch
+from samplers import SMCSampler
+from tests.faults import treacherous as bad
+from tests.faults.pooled_run import NAMES, WORKERS, at_work
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, DiesOnce, Treacherous, descendants, gone, line, posterior_of
+
+ROOT = Path(__file__).parents[2]
+needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: cannot list processes")
+
+
+def needs(module):
+    missing = importlib.util.find_spec(module) is None
+    return pytest.mark.skipif(missing, reason=f"NO {module.upper()}: install it to test this engine")
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left():
+    """No process that a test started outlives it."""
+    before = set(descendants(os.getpid())) if Path("/proc").is_dir() else set()
+    yield
+    gc.collect()  # samplers and their states hold each other
+    if Path("/proc").is_dir():
+        # the minder stays with this process, and the resource tracker of multiprocessing
+        left = [
+            pid
+            for pid in set(descendants(os.getpid())) - before
+            if b"fe_likelihoods.simulation.processes" in _command(pid)
+        ]
+        assert gone(left)
+
+
+def _command(pid):
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+def theta(what, n=1):
+    return np.column_stack([what + np.linspace(0.1, 0.9, n), np.full(n, 0.1)])
+
+
+# workers that die ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_deadly_item_is_a_failure_of_its_own_and_not_of_its_neighbours(workers):
+    thetas = np.concatenate([theta(bad.FINE, 8), theta(bad.CRASHES), theta(bad.FINE, 8), theta(bad.LEAVES)])
+    with LocalPool(workers) as pool:
+        batch = simulate_batch(Treacherous(), thetas, pool)
+        fine = [row for row in range(18) if row not in (8, 17)]
+        np.testing.assert_array_equal(batch.response[fine], [line(thetas[row]) for row in fine])
+        assert np.isnan(batch.response[[8, 17]]).all()
+        assert [batch.reasons[row] for row in (8, 17)] == [
+            "the worker process died (signal 11)",
+            "the worker process ended with exit code 3",
+        ]
+        assert [batch.reasons[row] for row in fine] == [""] * 16
+        again = simulate_batch(Treacherous(), thetas[fine], pool)  # and the pool goes on
+        np.testing.assert_array_equal(again.response, batch.response[fine])
+
+
+def test_items_of_killed_workers_are_run_again(tmp_path):
+    thetas = np.concatenate([theta(bad.KILLED, 4), theta(bad.FINE, 4)])
+    with LocalPool(2) as pool:
+        batch = simulate_batch(DiesOnce(tmp_path), thetas, pool)
+    assert len(list(tmp_path.iterdir())) == 4
+    assert batch.reasons == [""] * 8
+    np.testing.assert_array_equal(batch.response, [line(row) for row in thetas])
+
+
+@needs_proc
+def test_worker_killed_while_it_waits_is_replaced():
+    with LocalPool(1) as pool:
+        expected = simulate_batch(Treacherous(), theta(bad.FINE, 3), pool)
+        (pid,) = [
+            child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.processes" in _command(child)
+        ]
+        os.kill(pid, 9)
+        assert gone([pid])
+        batch = simulate_batch(Treacherous(), theta(bad.FINE, 3), pool)
+        np.testing.assert_array_equal(batch.response, expected.response)
+
+
+@needs_proc
+def test_workers_end_with_the_likelihood_and_after_an_interrupt():
+    posterior = posterior_of(Treacherous(), pool=2)
+    posterior(posterior.sample_prior(4, 1))
+    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.processes" in _command(child)]
+    assert len(workers) == 2
+    del posterior
+    assert gone(workers)
+    with LocalPool(2) as pool, pytest.raises(KeyboardInterrupt):
+        pool.map(_interrupts, range(4))
+
+
+class _Interrupt(Exception):
+    def __reduce__(self):
+        return _interrupt, ()
+
+
+def _interrupt():
+    raise KeyboardInterrupt  # when the parent reads the answer of a worker
+
+
+def _interrupts(item):
+    return _Interrupt()
+
+
+@needs("dask")
+@needs("distributed")
+def test_dask_tries_again_and_gives_up_on_the_deadly_item_alone(tmp_path):
+    import dask
+    from dask.distributed import Client, LocalCluster
+
+    thetas = np.concatenate([theta(bad.FINE, 3), theta(bad.KILLED), theta(bad.FINE, 3)])
+    x = np.column_stack([thetas, np.full(7, 0.5)])
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 2}),
+        LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        expected = posterior_of(Treacherous(), top=20.0)(x[:3])
+        posterior = posterior_of(DiesOnce(tmp_path), top=20.0, pool=client)
+        assert np.isfinite(posterior(x)).all()
+        posterior = posterior_of(Treacherous(), top=20.0, pool=client)
+        values = posterior(x)
+        np.testing.assert_array_equal(values[:3], expected)
+        assert np.isneginf(values[3])
+        assert np.isfinite(values[4:]).all()
+        assert posterior.report()["failure_reasons"] == {"the worker process died each time that dask tried": 1}
+        # short runs travel in groups once their time is known: the one that kills is still told from its neighbours
+        many = np.column_stack([theta(bad.FINE, 40), np.full(40, 0.5)])
+        expected = posterior_of(Treacherous(), top=20.0)(many)
+        np.testing.assert_array_equal(posterior(many), expected)
+        many[:, 1] *= 0.5
+        expected = posterior_of(Treacherous(), top=20.0)(many)
+        many[3, 0] += bad.KILLED
+        values = posterior(many)
+        assert np.isneginf(values[3])
+        np.testing.assert_array_equal(np.delete(values, 3), np.delete(expected, 3))
+
+
+@needs("mpi4py")
+def test_mpi_gives_the_same_bits():
+    """mpi4py.futures, two workers of their own ranks."""
+    code = (
+        "from mpi4py.futures import MPICommExecutor; from fe_likelihoods.simulation.executors import as_executor;"
+        "from fe_likelihoods.simulation.model import simulate_batch;"
+        "from tests.faults.treacherous import *; x = np.array([[.1 * k, .2, .5] for k in range(1, 9)])\n"
+        "with MPICommExecutor() as pool:\n"
+        "    if pool is not None:\n"
+        "        print(posterior_of(Treacherous(), pool=pool)(x).tolist() == posterior_of(Treacherous())(x).tolist())\n"
+        "        print(set(simulate_batch(Large(), x[:, :2], as_executor(pool)).response[:, 0, 0].tolist()))\n"
+    )
+    mpiexec = Path(sys.executable).with_name("mpiexec")
+    command = [mpiexec if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", "3", sys.executable, "-c", code]
+    environment = os.environ | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    assert run.stdout.split() == ["True", "{1.0}"], run.stderr  # and the model was loaded once in each rank
+
+
+# parents that die ---------------------------------------------------------------------------------------------------
+
+PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask", marks=needs("distributed"))]
+
+
+@needs_proc
+@pytest.mark.parametrize("engine", PARENTS)
+def test_nothing_outlives_a_parent_that_is_killed(engine, tmp_path, tmp_path_factory):
+    # a minder beside each process that starts others; the program and its child, which are two more
+    expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 4, "dask": WORKERS}.get(engine, 1 + WORKERS)
+    at_once = 1 if engine == "isolated" else WORKERS
+    command = [sys.executable, "-m", "tests.faults.pooled_run", engine, str(tmp_path)]
+    place = tmp_path_factory.mktemp("place")
+    environment = os.environ | {"TMPDIR": str(place)}
+    with subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    ) as parent:
+        try:
+            stop = time.monotonic() + 60.0
+            while len(at_work(tmp_path)) < at_once or len(descendants(parent.pid)) < expected:
+                assert parent.poll() is None, parent.stdout.read().decode()
+                assert time.monotonic() < stop, descendants(parent.pid)
+                time.sleep(0.02)
+            children = descendants(parent.pid)
+        finally:
+            parent.kill()
+        assert at_work(tmp_path) - {parent.pid} <= set(children)
+        assert gone(children)
+    assert list(place.glob("fe_likelihoods_*")) == []
+
+
+# models that fail ---------------------------------------------------------------------------------------------------
+
+
+def third(**options):
+    return posterior_of(FunctionModel(bad.third, NAMES, CHANNELS, DT, N_STEPS), **options)
+
+
+@pytest.mark.parametrize("pool", [None, 2])
+def test_sampler_lives_with_nan_in_a_third_of_the_prior(pool, seed):
+    posterior = third(pool=pool)
+    sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=seed)
+    sampler.run_mcmc(None, 2)
+    assert np.isfinite(sampler.get_log_prob()).all()
+    assert sampler.get_chain()[..., 0].min() >= 1.0 / 3.0
+    report = posterior.report()
+    reasons = report["failure_reasons"]
+    assert reasons.pop("ValueError: too stiff", 0) < reasons.pop("the response of channel 'a' is not finite")
+    assert reasons == {}
+    # those drawn from the prior alone fail to a third, the rest less
+    assert 0 < report["failure_count"] < 0.5 * report["simulations"]
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning:emcee")  # it subtracts -inf from -inf
+@pytest.mark.parametrize("kind", ["smc", "emcee"])
+def test_stated_share_of_failures_stops_the_run_and_keeps_what_there_is(kind, tmp_path, seed):
+    """0.25 is allowed and a third of the prior fails: the run stops, by an error that says so."""
+    posterior = third(max_failure_share=0.25)
+    if kind == "smc":
+        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+        sampler = SMCSampler(200, posterior.ndim, posterior, vectorize=True, seed=seed, backend=backend)
+        with pytest.raises(RuntimeError, match=r"TooManyFailures: \d+ of \d+ simulations failed.*share of 0.25"):
+            sampler.run_mcmc(None, 2)
+        assert sampler.evaluations >= 200
+    else:
+        sampler = emcee.EnsembleSampler(200, posterior.ndim, posterior, vectorize=True)
+        with pytest.raises(TooManyFailures, match=r"\d+ of \d+ simulations failed"):
+            sampler.run_mcmc(posterior.sample_prior(200, seed), 2)
+    report = posterior.report()
+    assert report["simulations"] >= 200
+    assert report["failure_count"] == len(report["failures"]) > 0.25 * report["simulations"]
+    known = posterior.sample_prior(200, seed)
+    if kind == "emcee":  # what was simulated is remembered, so it can still be asked for
+        assert np.isfinite(posterior(known)).sum() == 200 - report["failure_count"]
+
+
+def test_share_that_is_allowed_does_not_stop_it(seed):
+    posterior = third(max_failure_share=0.5)
+    for _ in range(3):
+        posterior(posterior.sample_prior(60, seed))
+    assert 0.2 < posterior.report()["failure_count"] / 60 < 0.5
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_share_must_be_one(share):
+    with pytest.raises(ValueError, match="max_failure_share must lie in"):
+        third(max_failure_share=share)
+
+
+def test_sampler_over_a_deadly_isolated_model(seed):
+    """Some of the prior crashes, some hangs: the run ends, and the report knows both."""
+    posterior = posterior_of(FunctionModel(bad.deadly, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.3))
+    sampler = SMCSampler(
+        20, posterior.ndim, posterior, vectorize=True, seed=seed, check_draws=0, ess_ratio=0.2, max_moves=2
+    )
+    start = posterior.sample_prior(20, seed)
+    start[:2, 0] = 0.01, 0.03
+    sampler.run_mcmc(start, 1)
+    assert np.isfinite(sampler.get_log_prob()).all()
+    reasons = posterior.report()["failure_reasons"]
+    assert set(reasons) == {"the worker process died (signal 11)", "stopped at the time limit of 0.3 s"}
+    assert sum(reasons.values()) == posterior.report()["failure_count"]

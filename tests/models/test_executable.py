@@ -1,0 +1,238 @@
+"""A program as a model: parameters into files to the last digit, responses back, whatever the program does."""
+
+import os
+import pickle
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.executable import ExecutableModel
+from fe_likelihoods.simulation.executors import LocalPool
+from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch, split_seconds
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
+
+PROGRAM = Path(__file__).with_name("program.py")
+NAMES = ("offset", "slope")
+THETA = np.array([1.0 / 3.0, 1e-17])
+
+
+def model_of(what="fine", **options):
+    settings = {
+        "command": [sys.executable, PROGRAM, "in.txt"],
+        "templates": {"in.txt": f"${{offset}}\n$slope\n{N_STEPS} {DT!r}\n{what}"},
+        "output": "out.txt",
+        "columns": [1],
+        "parameter_names": NAMES,
+        "channels": CHANNELS,
+        "dt": DT,
+        "n_steps": N_STEPS,
+        "time_limit": 20.0,
+    }
+    return ExecutableModel(**settings | options)
+
+
+def failure(model):
+    with pytest.raises(SimulationFailed) as caught:
+        model.simulate(THETA)
+    return split_seconds(caught.value.reason)
+
+
+def family(path):
+    return [int(pid) for pid in path.read_text().split()]
+
+
+# what it computes ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"what": "commas"}, {"what": "one", "columns": None}], ids=str)
+def test_parameters_arrive_and_responses_return_to_the_last_digit(options):
+    theta = np.array([1.0 / 3.0, -(2.0**-40) / 7.0])
+    np.testing.assert_array_equal(model_of(**options).simulate(theta), line(theta))
+
+
+def test_parameters_in_the_command_files_and_a_function_of_the_folder(tmp_path):
+    data = tmp_path / "record.txt"
+    data.write_text("17 $5\n")
+    model = model_of(
+        command=[
+            sys.executable,
+            "-c",
+            "import sys; print(*sys.argv[1:]); print(open('sub/record.txt').read())",
+            "$slope",
+        ],
+        templates={"deck/in.txt": "${offset} costs $$5"},
+        files={"sub/record.txt": data},
+        output=_read_everything,
+    )
+    response = model.simulate(THETA)
+    np.testing.assert_array_equal(response[0, :4], [*THETA, 5.0, 17.0])
+
+
+def _read_everything(folder):
+    offset, _, price = (folder / "deck" / "in.txt").read_text().split()
+    slope, amount, _ = (folder.parent / "stdout.txt").read_text().split()
+    row = np.zeros((1, N_STEPS))
+    row[0, :4] = float(offset), float(slope), float(price[1:]), float(amount)
+    return row
+
+
+def test_same_bits_on_two_processes():
+    thetas = np.random.default_rng(2).uniform(-1.0, 1.0, size=(6, 2))
+    with LocalPool(2) as pool:
+        batch = simulate_batch(model_of(), thetas, pool)
+    np.testing.assert_array_equal(batch.response, [line(theta) for theta in thetas])
+
+
+def test_runs_leave_no_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    model_of().simulate(THETA)
+    failure(model_of("fail"))
+    assert list(tmp_path.iterdir()) == []
+
+
+# what goes wrong ----------------------------------------------------------------------------------------------------
+
+CASES = {
+    "fail": "the program ended with exit code 1: matrix is singular / at step 12",
+    "crash": "the program died (signal 6)",
+    "silent": "the program ended well and left no file out.txt",
+    "nan": "the response of channel 'a' is not finite",
+    "short": "the response has shape (1, 19), expected (n_channels, n_steps) = (1, 20)",
+    "words": "out.txt is no table of numbers",
+    "empty": "out.txt is empty",
+    "one": "out.txt has 1 columns, expected columns 1",
+    "hang": "stopped at the time limit of 0.5 s",
+    "flood": "stopped because it wrote more than 1000000 bytes",
+    "fill": "stopped because it wrote more than 1000000 bytes",
+}
+
+
+@pytest.mark.parametrize("what", CASES)
+def test_reason_and_duration(what):
+    limits = {"time_limit": 0.5} if what == "hang" else {"max_output": 1_000_000}
+    reason, seconds = failure(model_of(what, **limits))
+    assert reason.startswith(CASES[what])
+    assert (0.5 if what == "hang" else 0.0) < seconds < 60.0
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: programs in the background are not found")
+def test_hanging_program_is_killed_with_its_children(tmp_path, monkeypatch):
+    monkeypatch.setenv("FAMILY", str(tmp_path / "pids"))
+    reason, _ = failure(model_of("family", time_limit=2.0))
+    assert reason == "stopped at the time limit of 2 s"
+    pids = family(tmp_path / "pids")
+    assert len(pids) == 3
+    assert gone(pids)
+
+
+def test_children_that_a_program_leaves_are_killed(tmp_path, monkeypatch):
+    monkeypatch.setenv("FAMILY", str(tmp_path / "pids"))
+    np.testing.assert_array_equal(model_of("leftover").simulate(THETA), line(THETA))
+    assert gone(family(tmp_path / "pids"))
+
+
+def test_folders_of_failures_are_kept_up_to_a_number(tmp_path):
+    model = model_of("fail", keep_failures=tmp_path / "kept", max_kept=2)
+    for _ in range(3):
+        failure(model)
+    kept = list((tmp_path / "kept").iterdir())
+    assert len(kept) == 2
+    for folder in kept:
+        assert (folder / "run" / "in.txt").read_text().split()[:2] == [repr(float(value)) for value in THETA]
+        assert "matrix is singular" in (folder / "stderr.txt").read_text()
+        assert "matrix is singular" in (folder / "reason.txt").read_text()
+        assert f"slope = {float(THETA[1])!r}" in (folder / "reason.txt").read_text()
+    good = model_of(keep_failures=tmp_path / "none")
+    good.simulate(THETA)
+    assert not (tmp_path / "none").exists()
+
+
+def test_failures_are_counted_by_the_posterior():
+    posterior = posterior_of(model_of("fail"))
+    assert np.isneginf(posterior([0.3, 0.1, 0.5]))
+    report = posterior.report()
+    assert report["failure_reasons"] == {CASES["fail"]: 1}
+    assert report["failures"][0]["seconds"] > 0.0
+
+
+# settings and fingerprint -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "advice"),
+    [
+        ({"command": ["no_such_program_anywhere", "in.txt"]}, "there is no program 'no_such_program_anywhere'"),
+        ({"command": ["/no/such/program"]}, "there is no program"),
+        ({"command": [str(PROGRAM)]}, "that can be executed"),
+        ({"command": f"{sys.executable} in.txt"}, "command must be a list"),
+        ({"command": []}, "command must be a list"),
+        ({"time_limit": 0.0}, "time_limit must be a positive number of seconds"),
+        ({"time_limit": float("nan")}, "time_limit"),
+        ({"time_limit": None}, "time_limit"),
+        ({"max_output": 0}, "max_output must be a positive number of bytes"),
+        ({"max_kept": -1}, "max_kept must be"),
+        ({"templates": {"in.txt": "$offset $slope $damping"}}, "template in.txt asks for damping"),
+        ({"templates": {"in.txt": "$offset"}}, "has a placeholder for slope"),
+        ({"templates": {"in.txt": "$offset $slope costs 5 $"}}, "begins no placeholder"),
+        ({"templates": {"../in.txt": "$offset $slope"}}, "inside the run's folder"),
+        ({"templates": {"/in.txt": "$offset $slope"}}, "inside the run's folder"),
+        ({"templates": {"in.txt": Path("/no/such/template")}}, "Path of a file that exists"),
+        ({"files": {"record.txt": Path("/no/such/record")}}, "Path of a file that exists"),
+        ({"files": {"in.txt": PROGRAM}}, "both a template and a file"),
+        ({"output": 3}, "output must be a file name or a function"),
+        ({"columns": [0, 1]}, "a column, 0 or more, for each of the 1 channels"),
+        ({"columns": [-1]}, "a column, 0 or more"),
+    ],
+    ids=str,
+)
+def test_bad_settings_are_refused(options, advice):
+    with pytest.raises(ValueError, match=advice):
+        model_of(**options)
+
+
+def test_fingerprint_knows_all_that_is_run(tmp_path):
+    script, template, data = tmp_path / "solver", tmp_path / "template", tmp_path / "data"
+    script.write_text("#!/bin/sh\necho 1\n")
+    script.chmod(0o755)
+    template.write_text("$offset $slope")
+    data.write_text("1")
+
+    def fingerprint(**options):
+        settings = {"command": [str(script), "-x"], "templates": {"in.txt": template}, "files": {"d": data}}
+        return model_of(**settings | options).fingerprint
+
+    first = fingerprint()
+    assert first == fingerprint() == fingerprint(time_limit=1.0, keep_failures=tmp_path)
+    prints = {
+        first,
+        fingerprint(command=[str(script), "-y"]),
+        fingerprint(output="other.txt"),
+        fingerprint(version="2"),
+    }
+    prints |= {fingerprint(columns=[2]), fingerprint(output=_read_everything), fingerprint(hash_executable=False)}
+    for path, text in ((script, "#!/bin/sh\necho 2\n"), (template, "$slope $offset"), (data, "2")):
+        path.write_text(text)
+        prints.add(fingerprint())
+    assert len(prints) == 10
+    unhashed = fingerprint(hash_executable=False)
+    script.write_text("#!/bin/sh\necho 3\n")
+    assert fingerprint(hash_executable=False) == unhashed
+
+
+def test_pickle():
+    model = model_of()
+    copy = pickle.loads(pickle.dumps(model))
+    assert copy.fingerprint == model.fingerprint
+    np.testing.assert_array_equal(copy.simulate(THETA), line(THETA))
+
+
+def test_program_found_by_a_relative_path_is_started_in_another_folder(tmp_path, monkeypatch):
+    script = tmp_path / "solver"
+    script.write_text(f"#!{sys.executable}\n" + PROGRAM.read_text())
+    script.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    model = model_of(command=["./solver", "in.txt"])
+    os.chdir("/")
+    np.testing.assert_array_equal(model.simulate(THETA), line(THETA))

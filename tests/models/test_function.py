@@ -1,0 +1,366 @@
+"""A Python function as a model: the same bits wherever it runs, a fingerprint of its code, and what goes wrong told."""
+
+import functools
+import json
+import math
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import dataclass
+from multiprocessing.pool import ThreadPool
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.signals.channels import Channel
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.code_digest import code_digest
+from fe_likelihoods.simulation.model import SimulationFailed, split_seconds
+from tests.faults import treacherous as bad
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line, posterior_of, treacherous
+
+ROOT = Path(__file__).parents[2]
+NAMES = ("offset", "slope")
+THETA = np.array([0.3, 0.1])
+
+
+def model_of(function=treacherous, **options):
+    return FunctionModel(function, NAMES, CHANNELS, DT, N_STEPS, **options)
+
+
+def failure(model, what):
+    """Reason and seconds of a simulation that fails."""
+    with pytest.raises(SimulationFailed) as caught:
+        model.simulate([what + 0.5, 0.1])
+    return split_seconds(caught.value.reason)
+
+
+@pytest.fixture(scope="module")
+def guarded():
+    return model_of(time_limit=1.0)
+
+
+# what it computes ---------------------------------------------------------------------------------------------------
+
+
+def test_same_bits_in_process_and_isolated(guarded):
+    assert guarded.isolated
+    assert not model_of().isolated
+    for theta in np.random.default_rng(0).uniform(0.0, 1.0, size=(5, 2)):
+        np.testing.assert_array_equal(guarded.simulate(theta), line(theta))
+        np.testing.assert_array_equal(model_of().simulate(theta), line(theta))
+
+
+def test_posterior_of_an_oscillator_as_a_function(rng):
+    """A wrapped model gives the posterior of the model itself."""
+    oscillator = LinearOscillator(Record("noise", 0.02, rng.normal(size=200)), period=0.5)
+    wrapped = FunctionModel(
+        oscillator.simulate, oscillator.parameter_names, oscillator.channels, oscillator.dt, oscillator.n_steps
+    )
+    np.testing.assert_array_equal(wrapped.simulate([1.1, 0.9]), oscillator.simulate([1.1, 0.9]))
+    other = LinearOscillator(oscillator.record, period=0.6)
+    again = FunctionModel(other.simulate, other.parameter_names, other.channels, other.dt, other.n_steps)
+    assert wrapped.fingerprint != again.fingerprint
+
+
+def test_caller_keeps_its_theta():
+    def scribbles(theta):
+        theta[:] = 0.0
+        return line(theta)
+
+    theta = THETA.copy()
+    model_of(scribbles).simulate(theta)
+    np.testing.assert_array_equal(theta, THETA)
+
+
+def _attempt(model, theta):
+    try:
+        return model.simulate(theta).tolist()
+    except SimulationFailed as error:
+        return split_seconds(error.reason)[0]
+
+
+@pytest.mark.parametrize("kind", ["threads", "forks"])
+def test_threads_and_forks_have_processes_of_their_own(kind, guarded):
+    """Also where the model had one before the fork: it belongs to the parent."""
+    guarded.simulate(THETA)
+    thetas = [np.array([0.1 * k, 0.2]) for k in range(6)]
+    thetas[2][0] = bad.CRASHES + 0.5
+    pool = ThreadPool(3) if kind == "threads" else multiprocessing.get_context("fork").Pool(2)
+    with pool:
+        results = pool.map(functools.partial(_attempt, guarded), thetas, chunksize=1)
+    expected = [line(theta).tolist() for theta in thetas]
+    expected[2] = "the worker process died (signal 11)"
+    assert results == expected
+    np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
+
+
+def test_travels_with_its_settings(guarded):
+    copy = pickle.loads(pickle.dumps(guarded))
+    assert (copy.fingerprint, copy.time_limit, copy.isolated) == (guarded.fingerprint, 1.0, True)
+    np.testing.assert_array_equal(copy.simulate(THETA), line(THETA))
+
+
+# what goes wrong ----------------------------------------------------------------------------------------------------
+
+REASONS = {
+    "RAISES": "ZeroDivisionError: float division by zero",
+    "REFUSES": "no convergence at step 3",
+    "NOT_FINITE": "the response of channel 'a' is not finite",
+    "SHAPE": "the response has shape (1, 19), expected (n_channels, n_steps) = (1, 20)",
+}
+DEADLY = {
+    "CRASHES": "the worker process died (signal 11)",
+    "KILLED": "the worker process died (signal 9)",
+    "LEAVES": "the worker process ended with exit code 3",
+    "HANGS": "stopped at the time limit of 1 s",
+    "HANGS_HARD": "stopped at the time limit of 1 s",
+    "FLOODS": "stopped because it printed more than 16777216 bytes",
+}
+
+
+@pytest.mark.parametrize("name", REASONS)
+def test_reason_and_duration_in_process_and_isolated(name, guarded):
+    for model in (model_of(), guarded):
+        reason, seconds = failure(model, getattr(bad, name))
+        assert reason == REASONS[name]
+        assert 0.0 < seconds < 60.0
+
+
+@pytest.mark.parametrize("name", DEADLY)
+def test_deadly_runs_are_failures_and_the_next_is_fine(name, guarded):
+    reason, seconds = failure(guarded, getattr(bad, name))
+    assert reason.startswith(DEADLY[name])
+    assert (seconds >= 1.0) == name.startswith("HANGS")
+    np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
+
+
+def test_last_words_of_a_crash_are_told():
+    reason, _ = failure(model_of(bad.speaks, isolated=True), 0)
+    assert reason == "the worker process ended with exit code 1; out of licences"
+
+
+def test_memory_is_limited():
+    reason, _ = failure(model_of(bad.eats, memory_limit=2**34), 0)
+    assert reason.startswith("MemoryError")
+
+
+def test_failures_are_in_the_report_with_their_seconds():
+    posterior = posterior_of(model_of(time_limit=0.5), top=10.0)
+    x = np.array([[what + 0.5, 0.1, 0.5] for what in (bad.FINE, bad.RAISES, bad.HANGS, bad.CRASHES, bad.RAISES)])
+    x[4, 1] = 0.2
+    values = posterior(x)
+    assert np.isfinite(values[0])
+    assert np.isneginf(values[1:]).all()
+    report = posterior.report()
+    assert report["failure_count"] == 4
+    assert report["failure_reasons"] == {
+        "ZeroDivisionError: float division by zero": 2,
+        "stopped at the time limit of 0.5 s": 1,
+        "the worker process died (signal 11)": 1,
+    }
+    assert report["failures"][1]["parameters"] == {"offset": bad.HANGS + 0.5, "slope": 0.1}
+    assert all(entry["seconds"] >= 0.0 for entry in report["failures"])
+    assert report["failures"][1]["seconds"] >= 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "advice"),
+    [
+        ({"time_limit": 0.0}, "time_limit must be a positive number of seconds"),
+        ({"time_limit": -1}, "time_limit"),
+        ({"time_limit": math.inf}, "time_limit"),
+        ({"time_limit": "long"}, "time_limit"),
+        ({"memory_limit": 0}, "memory_limit must be a positive number of bytes"),
+        ({"function": 3}, "expected a function"),
+        ({"function": lambda theta: line(theta), "isolated": True}, "cannot be sent to another process"),
+        ({"parameter_names": ()}, "parameter_names must be one or more str"),
+        ({"parameter_names": "ab"}, "parameter_names"),
+        ({"parameter_names": ("a", "a")}, "must differ"),
+        ({"channels": ("a",)}, "channels must be one or more Channel"),
+        ({"channels": CHANNELS * 2}, "must differ"),
+        ({"dt": 0.0}, "dt must be a positive number of seconds"),
+        ({"n_steps": 0}, "n_steps must be a positive whole number"),
+        ({"n_steps": 20.0}, "n_steps"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",  # a lambda's address differs from process to process
+)
+def test_bad_settings_are_refused(options, advice):
+    settings = {"function": line, "parameter_names": NAMES, "channels": CHANNELS, "dt": DT, "n_steps": N_STEPS}
+    with pytest.raises(ValueError, match=advice):
+        FunctionModel(**settings | options)
+
+
+def test_theta_of_wrong_length_is_refused():
+    with pytest.raises(ValueError, match="expected values of offset, slope"):
+        model_of().simulate([1.0])
+
+
+# fingerprints -------------------------------------------------------------------------------------------------------
+
+
+def scaled(by):
+    return lambda theta: by * line(theta)
+
+
+def defined(source):
+    """The function f of a piece of source, as a module would define it."""
+    space = {"__name__": "someones_model", "np": np, "math": math}
+    exec(source, space)
+    return space["f"]
+
+
+CODE = "G = 9.8\ndef g(x):\n    return x * G\ndef f(theta, n=3):\n    '''Doc.'''\n    return g(theta) + 1.5 * n\n"
+
+
+def test_equal_code_has_equal_digests():
+    assert code_digest(defined(CODE)) == code_digest(defined(CODE))
+    assert code_digest(defined(CODE)) == code_digest(defined("# a comment\n" + CODE.replace(" * ", "*")))
+    assert code_digest(scaled(2.0)) == code_digest(scaled(2.0))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("G = 9.8", "G = 9.81"), ("x * G", "x / G"), ("1.5", "1.25"), ("n=3", "n=4"), ("+ 1.5", "- 1.5"), ("1.5", "15")],
+)
+def test_every_change_changes_the_digest(old, new):
+    assert code_digest(defined(CODE)) != code_digest(defined(CODE.replace(old, new)))
+
+
+def test_values_that_are_closed_over_count():
+    record = Record("r", 0.1, np.arange(5.0))
+    table = np.arange(6.0)
+    values = [2.0, 3.0, "2.0", (1, 2), [1, 2], {"a": 1}, {"a": 2}, table, table[::2], record, record.scale(2.0), None]
+    values += [functools.partial(scaled, 2.0), functools.partial(scaled, 3.0), Path("a"), np.float64(2.0), {3, 4}]
+    digests = {code_digest(scaled(value)) for value in values}
+    assert len(digests) == len(values)
+    assert code_digest(scaled(table.copy())) == code_digest(scaled(table))
+    assert code_digest(scaled(Record("r", 0.1, np.arange(5.0)))) == code_digest(scaled(record))
+
+
+@dataclass
+class Spring:
+    stiffness: float
+
+    def respond(self, theta):
+        return self.stiffness * line(theta)
+
+    def __call__(self, theta):
+        return self.respond(theta)
+
+
+class Counting:
+    def __init__(self):
+        self.file = sys.stdout
+
+    def respond(self, theta):
+        return line(theta)
+
+
+def test_methods_and_callable_objects():
+    assert code_digest(Spring(1.0).respond) == code_digest(Spring(1.0).respond)
+    assert code_digest(Spring(1.0).respond) != code_digest(Spring(2.0).respond)
+    assert code_digest(Spring(1.0)) != code_digest(Spring(2.0))
+    assert code_digest(Spring(1.0)) != code_digest(Spring(1.0).respond)
+
+
+def test_what_has_no_stable_digest_needs_a_version():
+    with pytest.raises(ValueError, match="needs version= here.*no digest can be made of"):
+        model_of(Counting().respond)
+    first, second = (model_of(Counting().respond, version=version) for version in ("1", "2"))
+    assert first.fingerprint == model_of(Counting().respond, version="1").fingerprint
+    assert first.fingerprint != second.fingerprint
+
+
+def test_recursion_ends():
+    assert code_digest(defined("def f(n):\n    return f(n - 1) if n else h(n)\ndef h(n):\n    return f(n)\n"))
+
+
+def test_fingerprint_knows_names_channels_and_steps():
+    models = [
+        model_of(),
+        FunctionModel(treacherous, ("a", "b"), CHANNELS, DT, N_STEPS),
+        FunctionModel(treacherous, NAMES, (Channel("b", "acceleration", "g"),), DT, N_STEPS),
+        FunctionModel(treacherous, NAMES, CHANNELS, 0.2, N_STEPS),
+        FunctionModel(treacherous, NAMES, CHANNELS, DT, 21),
+    ]
+    assert len({model.fingerprint for model in models}) == len(models)
+    assert model_of(time_limit=1.0).fingerprint == models[0].fingerprint  # where it runs changes no response
+
+
+@pytest.mark.parametrize("hash_seed", ["0", "123"])
+def test_fingerprint_is_the_same_in_another_process(hash_seed):
+    code = (
+        "from tests.faults.treacherous import *; from fe_likelihoods.models.function import FunctionModel;"
+        "print(FunctionModel(treacherous, ('offset', 'slope'), CHANNELS, DT, N_STEPS).fingerprint)"
+    )
+    environment = os.environ | {"PYTHONHASHSEED": hash_seed, "PYTHONPATH": str(ROOT)}
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert run.stdout.strip() == model_of().fingerprint, run.stderr
+
+
+CALLS = {
+    "name": "from aside import shift\ndef f(x):\n    return shift(x)",
+    "module": "import aside\ndef f(x):\n    return aside.shift(x)",
+    "submodule": "import pack.deep\ndef f(x):\n    return pack.deep.shift(x)",
+    "late": "def f(x):\n    from aside import shift\n    return shift(x)",
+    "late submodule": "def f(x):\n    import pack.deep as deep\n    return deep.shift(x)",
+    "relative": "def f(x):\n    import pack\n    return pack.late(x)",
+    "two steps": "import between\ndef f(x):\n    return between.shift(x)",
+    "class": "from aside import Spring\ndef f(x):\n    return Spring().shift(x)",
+    "constant": "import aside\ndef f(x):\n    return x + aside.NUMBER",
+}
+ASIDE = """
+NUMBER = {number}
+def shift(x):
+    return x + NUMBER
+class Spring:
+    def shift(self, x):
+        return x + {number}
+"""
+
+
+def test_a_change_in_a_file_beside_the_function_is_another_model(tmp_path):
+    """Files of the user's own that the function imports: an old simulation must not be served for their new state."""
+    for name, call in CALLS.items():
+        (tmp_path / f"own_{name.replace(' ', '_')}.py").write_text(call + "\n")
+    (tmp_path / "between.py").write_text("import aside\ndef shift(x):\n    return aside.shift(x)\n")
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("def late(x):\n    from .deep import shift\n    return shift(x)\n")
+    code = (
+        "import importlib, json; from fe_likelihoods.simulation.code_digest import code_digest\n"
+        f"names = {list(CALLS)!r}\n"
+        "own = {name: importlib.import_module('own_' + name.replace(' ', '_')).f for name in names}\n"
+        "print(json.dumps({name: code_digest(f) for name, f in own.items()}))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    found = []
+    for number in (1.0, 2.0, 1.0):
+        for file in ("aside.py", "pack/deep.py"):
+            (tmp_path / file).write_text(ASIDE.format(number=number))
+        run = subprocess.run(
+            [sys.executable, "-B", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert run.returncode == 0, run.stderr
+        found.append(json.loads(run.stdout))
+    assert found[0] == found[2]
+    assert [name for name in CALLS if found[0][name] == found[1][name]] == []
+
+
+def test_equal_values_need_not_be_the_same_objects():
+    """Whether two equal things are one object is an accident of the process, so it may not enter."""
+    one = (1.5, [2.5])
+    assert code_digest(scaled((one, one))) == code_digest(scaled(((1.5, [2.5]), (1.5, [2.5]))))
+
+
+def test_things_that_contain_themselves_end():
+    circle = [1.0]
+    circle.append(circle)
+    other = [2.0]
+    other.append(other)
+    assert code_digest(scaled(circle)) != code_digest(scaled(other))

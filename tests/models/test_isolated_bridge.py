@@ -1,0 +1,380 @@
+"""The isolated bridge: golden results, closed forms, orders of convergence, energy, invariances, bad input."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lsim, lti
+
+from fe_likelihoods.models.isolated_bridge import CHANNEL_SETS, Bearing, Damper, IsolatedBridge, Pier, Rubber
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.model import SimulationFailed
+
+PART = Path(__file__).parents[1] / "kernels" / "data" / "isolated_bridge.npz"
+LIMIT = 1e-3
+"""Of the peak, per channel: what the default step must give."""
+NO_RUBBER = Rubber(skeleton=(0.0,) * 6, half_loop=(0.0,) * 3)
+FEEBLE = Damper(stiffness=1e-3, viscosity=1e-6)
+STIFF = Pier(inertia=3.02e-1)
+G = 9.81
+
+
+def shaking(rng, duration=4.0, dt=0.005, peak=8.0) -> Record:
+    """Smooth noise that starts and ends at zero: a record of our own."""
+    n = round(duration / dt) + 1
+    noise = np.convolve(rng.standard_normal(n), np.hanning(25), mode="same") * np.sin(np.linspace(0.0, np.pi, n))
+    return Record("noise", dt, peak * noise / np.abs(noise).max())
+
+
+def worst(response, reference, peak) -> float:
+    """Largest error of any channel, in shares of its peak."""
+    return float((np.abs(response - reference).max(axis=-1) / peak).max())
+
+
+@pytest.fixture(scope="module")
+def part():
+    return np.load(PART)
+
+
+# ------------------------------------------------------------------ golden results
+
+
+def test_the_golden_part_in_the_project(part):
+    model = IsolatedBridge(Record("own", float(part["dt"]), part["ag"]), every=8, outputs=tuple(part["channels"]))
+    for theta, reference, peak in zip(part["theta"], part["Y"], part["peak"], strict=True):
+        assert worst(model.simulate(theta), reference, peak) < LIMIT
+
+
+def test_p_delta_and_vertical_motion(part):
+    dt = float(part["dt"])
+    model = IsolatedBridge(Record("own", dt, part["ag"]), every=8, outputs=tuple(part["channels"]))
+    both = replace(model, p_delta=True, vertical=Record("own", dt, part["av"]))
+    reference = part["Y_opt"]
+    peak = np.abs(reference).max(axis=1)
+    assert worst(both.simulate(np.ones(10)), reference, peak) < LIMIT
+    for alone in (model, replace(both, p_delta=False), replace(both, vertical=None)):  # each of the two is needed
+        assert worst(alone.simulate(np.ones(10)), reference, peak) > 5 * LIMIT
+
+
+@pytest.mark.parametrize("file", ["setA", "own_records"])
+def test_every_golden_case(shared, file):
+    golden = np.load(shared / "golden" / "isolated_bridge" / f"{file}.npz")
+    for k in (0, 1):
+        record = Record("golden", float(golden[f"dt{k}"]), golden[f"ag{k}"])
+        model = IsolatedBridge(record, every=2, outputs=tuple(golden["channels"]))
+        batch = model.simulate_batch(golden["theta"])
+        assert not any(batch.reasons)
+        errors = [worst(y, *pair) for y, *pair in zip(batch.response, golden[f"Y{k}"], golden[f"peak{k}"], strict=True)]
+        print(f"{file} record {k}: largest error of {len(errors)} cases {max(errors):.1e} of the peak")
+        assert max(errors) < LIMIT
+
+
+# ------------------------------------------------------------------ closed forms
+
+
+def test_frequencies_of_the_nominal_bridge(rng):
+    """Pier alone 9.6 and 123 Hz; sliding .75 Hz (specs/isolated_bridge.md, section 4)."""
+    pier = Pier()
+    alone = np.sqrt(np.linalg.eigvals(np.linalg.solve(pier.mass_matrix, pier.stiffness)).real) / (2 * np.pi)
+    np.testing.assert_allclose(sorted(alone), [9.6, 123.0], rtol=5e-3)
+    model = IsolatedBridge(shaking(rng))
+    mass, _, stiffness = model._structure()
+    b = model._kinematics()
+    sliding = np.linalg.eigvals(np.linalg.solve(mass, stiffness + 8500.0 / 0.05 * b.T @ b)).real.min()
+    assert math.sqrt(sliding) / (2 * np.pi) == pytest.approx(0.75, rel=0.05)
+
+
+def test_a_block_on_a_sliding_table():
+    """Rigid piers, friction alone: the deck slides at a - mu g; below mu g it moves with the table."""
+    mu = 0.1
+    bearing = Bearing(load=70e3, f_min=mu, df=0.0)
+    model = IsolatedBridge(
+        Record("step", 0.01, np.full(101, 3.0)),
+        deck_mass=140e3 / G,
+        piers=(STIFF, STIFF),
+        bearings=(bearing, bearing),
+        dampers=(FEEBLE, FEEBLE),
+        rubber=NO_RUBBER,
+        friction="coulomb",
+        parameters=("fmin_1",),
+        outputs=("Ud", "acc_d", "Ub_1"),
+    )
+    displacement, acceleration, _ = model.simulate([1.0])
+    time = model.record.time
+    late = model.step / time[-1]  # the force is constant over a step: the law of first order is a step late
+    np.testing.assert_allclose(displacement, -0.5 * (3.0 - mu * G) * time**2, atol=2.0 * late * abs(displacement[-1]))
+    np.testing.assert_allclose(acceleration[1:], mu * G, rtol=1e-6)
+    gentle = model.with_record(Record("gentle", 0.01, 0.9 * mu * G * np.sin(np.linspace(0.0, 12.0, 101))))
+    _, acceleration, bearing_displacement = gentle.simulate([1.0])
+    assert np.abs(bearing_displacement).max() < 1e-7  # at rest at every step; in between the table turns under it
+    steepest = np.abs(np.diff(gentle.record.acceleration)).max() / gentle.dt
+    np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=3.0 * model.step * steepest)
+
+
+def test_without_hysteresis_the_bridge_is_linear(rng):
+    """Against scipy's simulation of a linear system, assembled here from the equations of section 2."""
+    record = shaking(rng, duration=3.0)
+    rubber = Rubber(skeleton=(8500.0, 0, 0, 0, 0, 0), half_loop=(0.0,) * 3)
+    slippery = Bearing(f_min=1e-12, df=0.0)
+    pier, damper = Pier(), Damper()
+    model = IsolatedBridge(record, bearings=(slippery, slippery), rubber=rubber, parameters=("fmin_1",))
+    history = model.history([1.0])
+    m, h, hc, k, c = pier.mass, pier.height, pier.center, pier.stiffness, pier.damping
+    inertia = np.zeros((5, 5))
+    inertia[0, 0] = model.deck_mass
+    for s in (1, 3):
+        inertia[s : s + 2, s : s + 2] = [[m, m * hc], [m * hc, pier.rotary_inertia + m * hc**2]]
+
+    def rates(q, v, f, ground):
+        forces = np.zeros((5, *np.shape(q[0])))
+        forces[0] = -model.deck_mass * ground
+        df = []
+        for i, s in enumerate((1, 3)):
+            ub, vb = q[0] - q[s] - h * q[s + 1], v[0] - v[s] - h * v[s + 1]
+            isolator = 8500.0 / 0.05 * ub + f[i]
+            properties = model.dampers[i]
+            df.append(properties.count * properties.stiffness * vb - f[i] * properties.stiffness / properties.viscosity)
+            forces[0] -= isolator
+            elastic = k @ q[s : s + 2] + c @ v[s : s + 2]
+            forces[s] = isolator - elastic[0] - m * ground
+            forces[s + 1] = h * isolator - elastic[1] - m * hc * ground
+        return np.concatenate([v, np.linalg.solve(inertia, forces), df])
+
+    eye = np.eye(12)
+    a = rates(eye[:5], eye[5:10], eye[10:], np.zeros(12))
+    b = rates(np.zeros((5, 1)), np.zeros((5, 1)), np.zeros((2, 1)), np.ones(1))
+    _, states, _ = lsim(lti(a, b, eye, np.zeros((12, 1))), record.acceleration, record.time)
+    assert damper.count == 2
+    peak = np.abs(states).max(axis=0)
+    np.testing.assert_allclose(history.values[:12] / peak[:, None], states.T / peak[:, None], atol=1e-8)
+
+
+def test_the_deck_is_in_equilibrium(rng):
+    history = IsolatedBridge(shaking(rng), p_delta=True).history(np.full(10, 1.1))
+    inertia = 140e3 / 9.81 * history["acc_d"]
+    np.testing.assert_allclose(inertia + history["Fb_1"] + history["Fb_2"], 0.0, atol=1e-9 * np.abs(inertia).max())
+
+
+# ------------------------------------------------------------------ convergence and energy
+
+
+@pytest.mark.parametrize(("friction", "order"), [("bouc-wen", 1.7), ("elastic-plastic", 0.8), ("coulomb", 0.9)])
+def test_order_of_convergence(rng, friction, order):
+    """Second order where the law is smooth; corners of the elastic-plastic law cost up to one, Coulomb's has one."""
+    record = shaking(rng, duration=2.0)
+    model = IsolatedBridge(record, friction=friction, outputs=("Ub_1", "Ub_2", "Ud"), tolerance=1e-8)
+    steps = 1e-3 / 2.0 ** np.arange(5)
+    fine = replace(model, step=1e-3 / 128).simulate(np.ones(10))
+    errors = [np.sqrt(np.mean((replace(model, step=h).simulate(np.ones(10)) - fine) ** 2)) for h in steps]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    print(f"{friction}: order {slope:.2f}, errors {errors} m")
+    assert slope > order
+
+
+def test_a_thin_elastic_plastic_slider_is_coulombs(rng):
+    record = shaking(rng, duration=2.0)
+    outputs = ("Ub_1", "Ub_2", "drift_1", "Ud")
+    exact = IsolatedBridge(record, friction="coulomb", outputs=outputs, step=0.05e-3).simulate(np.ones(10))
+    peak = np.abs(exact).max(axis=1)
+    distance = []
+    for y in (0.1e-3, 0.01e-3):
+        bearings = (Bearing(yield_displacement=y), Bearing(f_min=0.05, df=0.07, a=28.0, yield_displacement=y))
+        model = IsolatedBridge(record, friction="elastic-plastic", bearings=bearings, outputs=outputs, step=0.05e-3)
+        distance.append(worst(model.simulate(np.ones(10)), exact, peak))
+    print("largest distance to Coulomb's law, in shares of the peak:", distance)
+    assert distance[1] < 0.3 * distance[0] < 0.02
+
+
+@pytest.mark.parametrize("friction", ["bouc-wen", "elastic-plastic"])
+def test_energy_is_balanced(rng, friction):
+    """Work of the table = kinetic + elastic + damped + done on the isolators, with second order."""
+    theta = np.array([1.2, 0.8, 1.1, 0.9, 1.2, 0.9, 1.1, 0.8, 0.9, 1.3])
+    coarse = shaking(rng, duration=2.0)
+    defects = []
+    for divisions in (10, 20):
+        dt = coarse.dt / divisions
+        n = (coarse.n_steps - 1) * divisions + 1
+        record = Record("fine", dt, np.interp(dt * np.arange(n), coarse.time, coarse.acceleration))
+        model = IsolatedBridge(record, step=dt, friction=friction)
+        mass, damping, stiffness = model._structure()
+        h = model.history(theta)
+        q, v = h.values[:5], h.values[5:10]
+        bearing_velocity = model._kinematics() @ v
+        influence = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
+        power = (
+            (mass @ influence) @ v * record.acceleration
+            + np.einsum("it,ij,jt->t", v, damping, v)
+            + h["Fb_1"] * bearing_velocity[0]
+            + h["Fb_2"] * bearing_velocity[1]
+        )
+        work = np.concatenate([[0.0], np.cumsum(0.5 * dt * (power[1:] + power[:-1]))])
+        stored = 0.5 * np.einsum("it,ij,jt->t", v, mass, v) + 0.5 * np.einsum("it,ij,jt->t", q, stiffness, q)
+        total = np.trapezoid(np.abs(h["Fb_1"] * bearing_velocity[0]), dx=dt)
+        defects.append(np.abs(work + stored).max() / total)
+    print(f"{friction}: defect of energy {defects} of what a bearing takes")
+    assert defects[0] < 2e-3
+    assert defects[1] < 0.4 * defects[0]
+
+
+# ------------------------------------------------------------------ invariances
+
+
+def test_a_mirrored_record_mirrors_the_response(rng):
+    model = IsolatedBridge(shaking(rng))
+    mirrored = model.with_record(model.record.scale(-1.0))
+    np.testing.assert_allclose(mirrored.simulate(np.ones(10)), -model.simulate(np.ones(10)), atol=1e-9)
+
+
+def test_piers_can_be_exchanged(rng):
+    theta = rng.uniform(0.6, 1.5, 10)
+    outputs = CHANNEL_SETS[10]
+    model = IsolatedBridge(shaking(rng), piers=(Pier(), Pier(length=1.8)), outputs=outputs)
+    other = replace(
+        model, piers=model.piers[::-1], bearings=model.bearings[::-1], dampers=model.dampers[::-1], outputs=outputs
+    )
+    swapped = other.simulate(theta[[3, 4, 5, 0, 1, 2, 8, 9, 6, 7]])
+    response = model.simulate(theta)
+    peak = np.abs(response).max(axis=1)
+    assert worst(swapped[[5, 6, 7, 8, 9, 0, 1, 2, 3, 4]], response, peak) < 1e-7
+
+
+def test_means_of_the_piers(rng):
+    record = shaking(rng, duration=1.0)
+    both = IsolatedBridge(record, outputs=10).simulate(np.ones(10))
+    names = ("mean_Ub", "mean_Fb", "mean_drift", "mean_shear", "mean_acc_p")
+    np.testing.assert_allclose(
+        IsolatedBridge(record, outputs=names).simulate(np.ones(10)), 0.5 * (both[:5] + both[5:]), rtol=1e-9, atol=1e-9
+    )
+
+
+def test_a_batch_is_its_rows(rng):
+    model = IsolatedBridge(shaking(rng, duration=1.0), outputs=6)
+    thetas = rng.uniform(0.5, 1.5, (5, 10))
+    thetas[3, 6] = -1.0
+    batch = model.simulate_batch(thetas)
+    measured = model.simulate(np.ones(10))
+    misfit = model.misfit_batch(thetas, measured)
+    assert "Kd_1" in batch.reasons[3]
+    assert np.isnan(batch.response[3]).all()
+    assert np.isnan(misfit.misfit[3]).all()
+    for i in (0, 1, 2, 4):
+        np.testing.assert_array_equal(batch.response[i], model.simulate(thetas[i]))
+        np.testing.assert_allclose(misfit.misfit[i], ((batch.response[i] - measured) ** 2).sum(axis=1), rtol=1e-12)
+
+
+def test_fingerprint_changes_with_what_changes_the_response(rng):
+    model = IsolatedBridge(shaking(rng, duration=1.0))
+    others = [
+        replace(model, step=0.5e-3),
+        replace(model, friction="coulomb"),
+        replace(model, p_delta=True),
+        replace(model, outputs=("Ub_1",)),
+        replace(model, bearings=(Bearing(a=25.0), model.bearings[1])),
+        replace(model, vertical=model.record.scale(0.1)),
+        model.with_record(model.record.scale(1.01)),
+    ]
+    assert len({m.fingerprint for m in [model, *others]}) == 8
+    assert model.fingerprint == replace(model).fingerprint
+
+
+def test_thousand_draws_of_the_prior(rng):
+    model = IsolatedBridge(shaking(rng, duration=5.0), outputs=("Ub_1", "acc_p1"), step=0.5e-3)
+    thetas = np.clip(rng.normal(1.0, 0.5, (1000, 10)), 0.2, 2.5)
+    batch = model.misfit_batch(thetas, np.zeros((2, model.n_steps)))
+    assert not any(batch.reasons)
+    assert np.isfinite(batch.misfit).all()
+
+
+@pytest.mark.parametrize("friction", ["elastic-plastic", "coulomb"])
+def test_draws_of_the_prior_with_the_other_laws(rng, friction):
+    model = IsolatedBridge(shaking(rng, duration=3.0), friction=friction, outputs=("Ub_1",))
+    batch = model.misfit_batch(np.clip(rng.normal(1.0, 0.5, (100, 10)), 0.2, 2.5), np.zeros((1, model.n_steps)))
+    assert not any(batch.reasons)
+
+
+# ------------------------------------------------------------------ beyond the range, bad input
+
+
+def test_beyond_the_rubbers_range_is_said(rng, caplog):
+    gentle = IsolatedBridge(shaking(rng))
+    assert gentle.history(np.ones(10)).beyond_range.max() < 1.0
+    gentle.simulate(np.ones(10))
+    assert not caplog.records
+    violent = gentle.with_record(gentle.record.scale(6.0))
+    history = violent.history(np.ones(10))
+    assert history.beyond_range.max() > 1.0
+    assert np.isfinite(history.values).all()
+    violent.simulate(np.ones(10))
+    violent.simulate(np.ones(10))
+    assert "beyond the 60.0 mm" in caplog.text
+    assert len(caplog.records) == 1, "said once for a model, not for every one of thousands of runs"
+
+
+@pytest.mark.parametrize("name", ["fmin_1", "df_2", "a_1", "Kd_2", "C0_1"])
+def test_negative_devices_are_not_simulated(rng, name):
+    model = IsolatedBridge(shaking(rng, duration=1.0))
+    theta = np.ones(10)
+    theta[model.parameter_names.index(name)] = -0.1
+    with pytest.raises(SimulationFailed, match=name):
+        model.simulate(theta)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"record": np.zeros(10)}, "Record"),
+        ({"step": 0.3e-3}, "divides the record's 0.005"),
+        ({"step": 0.01}, "divides"),
+        ({"step": -1.0}, "positive step"),
+        ({"outputs": ("Ub_1", "Ub_3")}, "Ub_3"),
+        ({"outputs": 7}, "5, 6 or 10"),
+        ({"outputs": ("Ub_1", "Ub_1")}, "once"),
+        ({"outputs": "Ub_1"}, "outputs"),
+        ({"parameters": ("fmin",)}, "fmin_1"),
+        ({"friction": "smooth"}, "bouc-wen"),
+        ({"piers": (Pier(),)}, "two of Pier"),
+        ({"every": 0}, "every"),
+        ({"deck_mass": math.nan}, "deck_mass"),
+        ({"bearings": (Bearing(), Bearing(gamma=0.8))}, "gamma"),
+        ({"bearings": (Bearing(df=0.0), Bearing())}, "df_1"),
+    ],
+)
+def test_bad_input_is_refused(rng, changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(IsolatedBridge(shaking(rng, duration=1.0)), **changes)
+
+
+def test_vertical_motion_must_fit(rng):
+    model = IsolatedBridge(shaking(rng, duration=1.0))
+    with pytest.raises(ValueError, match="vertical"):
+        replace(model, vertical=shaking(rng, duration=2.0))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Pier(length=-1.0),
+        lambda: Bearing(f_min=0.0),
+        lambda: Bearing(gamma=0.4),
+        lambda: Damper(viscosity=math.inf),
+        lambda: Damper(count=1.5),
+        lambda: Rubber(skeleton=(1.0,)),
+        lambda: Rubber(skeleton=(100.0, -5000.0, 0, 0, 0, 0)),
+        lambda: Rubber(half_loop=(-1.0, 0.0, 0.0)),
+    ],
+)
+def test_impossible_devices_are_refused(make):
+    with pytest.raises(ValueError, match="expected"):
+        make()
+
+
+def test_parameters_of_the_wrong_length(rng):
+    model = IsolatedBridge(shaking(rng, duration=1.0))
+    with pytest.raises(ValueError, match="10"):
+        model.simulate(np.ones(9))
+    with pytest.raises(ValueError, match="shape"):
+        model.simulate_batch(np.ones(10))
+    with pytest.raises(ValueError, match="measured"):
+        model.misfit_batch(np.ones((1, 10)), np.zeros((2, 5)))

@@ -1,0 +1,234 @@
+"""Structures on several supports against closed forms, scipy's state-space solver, and the oscillator."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+from scipy import signal
+from scipy.linalg import eigh
+
+from fe_likelihoods.kernels.complex_modes import superpose_modes
+from fe_likelihoods.models.linear_structure import LinearStructure, LinearSystem, modal_damping, respond_structure
+from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.signals.sdof import respond
+from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch
+
+DT = 0.02
+
+
+def system(mass, damping, stiffness, influence) -> LinearSystem:
+    n, n_supports = np.shape(influence)
+    arrays = (np.array(each, dtype=float) for each in (mass, damping, stiffness, influence))
+    return LinearSystem(*arrays, np.eye(n), np.zeros((n, n_supports)))
+
+
+@pytest.fixture
+def three(rng) -> list[Record]:
+    """A column's base and two ends."""
+    return [Record(name, DT, rng.normal(size=400)) for name in ("base", "first", "second")]
+
+
+@pytest.mark.parametrize("zeta", [0.01, 0.3, 0.95])
+def test_one_degree_of_freedom_is_the_oscillator(three, zeta):
+    a, omega = np.stack([record.acceleration for record in three]), 9.0
+    shares = np.array([0.2, 0.5, 0.3])
+    response = respond_structure(system([[2.0]], [[4 * zeta * omega]], [[2 * omega**2]], [shares]), a, DT)
+    for ours, theirs in zip(response, respond(shares @ a, DT, omega, zeta), strict=True):
+        np.testing.assert_allclose(ours[0], theirs, rtol=0, atol=1e-12 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("strength", [0.2, 5.0], ids=["damped", "overdamped"])
+def test_equals_state_space_solution_where_damping_couples_the_modes(three, strength):
+    """One damper to the ground at one floor: no modal ratios give this matrix."""
+    a = np.stack([record.acceleration for record in three])
+    mass, stiffness = np.diag([2.0, 1.0]), np.array([[900.0, -400.0], [-400.0, 400.0]])
+    damping = np.array([[0.4 + 40.0 * strength, -0.4], [-0.4, 0.4]])
+    influence = np.array([[0.2, 0.3, 0.5], [0.6, 0.4, 0.0]])
+    inverse = np.linalg.inv(mass)
+    matrix = np.block([[np.zeros((2, 2)), np.eye(2)], [-inverse @ stiffness, -inverse @ damping]])
+    _, modes = eigh(stiffness, mass)
+    coupled = modes.T @ damping @ modes
+    assert abs(coupled[0, 1]) > 0.1 * coupled[0, 0], "control: the modes are coupled"
+    assert (np.abs(np.linalg.eigvals(matrix).imag).min() == 0.0) == (strength > 1.0), "control"
+    forced = np.vstack([np.zeros((2, 3)), -influence])
+    _, state, _ = signal.lsim((matrix, forced, np.eye(4), np.zeros((4, 3))), a.T, DT * np.arange(400))
+    response = respond_structure(system(mass, damping, stiffness, influence), a, DT)
+    for ours, theirs in zip(response, (state[:, :2], state[:, 2:], state @ matrix[2:].T), strict=True):
+        np.testing.assert_allclose(ours, theirs.T, rtol=0, atol=1e-10 * np.abs(theirs).max())
+
+
+def test_the_kernel_is_the_same_compiled_and_not(rng):
+    plain = getattr(superpose_modes, "py_func", superpose_modes)  # compilation may be switched off
+    n_modes, n_inputs, n_rows, n_steps = 3, 2, 4, 50
+
+    def numbers(*shape):
+        return 0.5 * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
+
+    decay = 0.5 * np.exp(1j * rng.uniform(0, 2, n_modes))
+    before, after, participation, shapes = (
+        numbers(n_modes),
+        numbers(n_modes),
+        numbers(n_modes, n_inputs),
+        numbers(n_modes, n_rows),
+    )
+    excitation, start = rng.normal(size=(n_inputs, n_steps)), rng.normal(size=(n_rows, n_steps))
+    results = [start.copy(), start.copy()]
+    for function, out in zip((superpose_modes, plain), results, strict=True):
+        function(decay, before, after, participation, shapes, excitation, out)
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-12, atol=1e-12)
+    forcing = participation @ excitation
+    expected = start.copy()
+    for k in range(n_modes):  # the same recursion by scipy
+        initial = [-after[k] * forcing[k, 0]]
+        state, _ = signal.lfilter([after[k], before[k]], [1.0, -decay[k]], forcing[k], zi=initial)
+        expected += (shapes[k][:, None] * state).real
+    np.testing.assert_allclose(results[0], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_two_storeys_under_a_step_follow_their_modes():
+    """m = 1, k_1 = 3 k, k_2 = 2 k: eigenvalues k and 6 k; modes (1, 2) and (2, -1) over root 5."""
+    k, ratios, step = 50.0, np.array([0.05, 0.02]), 1.3
+    time = DT * np.arange(500)
+    model = LinearStructure(ShearFrame({"low": 1, "top": 2}, [1, 1], [3, 2]), Record("step", DT, step + 0 * time))
+    expected = np.zeros((2, 500))
+    for omega, zeta, mode in zip(np.sqrt([k, 6 * k]), ratios, np.array([[1, 2], [2, -1]]) / math.sqrt(5), strict=True):
+        damped = omega * math.sqrt(1 - zeta**2)
+        decay = np.exp(-zeta * omega * time)
+        # absolute acceleration of an oscillator under a step: a (1 - e^(-zeta omega t) (cos - zeta omega / damped sin))
+        unit = 1 - decay * (np.cos(damped * time) - zeta * omega / damped * np.sin(damped * time))
+        expected += np.outer(mode * mode.sum(), step * unit)
+    theta = np.array([k, k, *ratios])
+    np.testing.assert_allclose(model.simulate(theta), expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    heavy = LinearStructure(ShearFrame([("low", 1), ("top", 2)], [2, 4], [3, 2], free_masses=[2]), model.supports)
+    same = heavy.simulate(np.array([2 * k, 2 * k, *ratios, 0.5]))  # masses cannot be told from stiffnesses
+    np.testing.assert_allclose(same, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+def test_a_sampled_sine_converges_at_second_order():
+    """The one error is that of straight lines between samples."""
+    parts, forcing = ShearFrame({"top": 3}, [1, 1, 1.3], [1, 1, 1]), 9.0
+    theta = np.array([2000.0, 2500.0, 1800.0, 0.2, 0.1, 0.15])
+    found = parts.assemble(theta)
+    dynamic = found.stiffness - forcing**2 * found.mass + 1j * forcing * found.damping
+    amplitude = 1.0 - forcing**2 * np.linalg.solve(dynamic, -found.mass @ np.ones(3))[2]
+    errors = []
+    for n_steps in (501, 1001, 2001):
+        time = np.linspace(0.0, 10.0, n_steps)
+        late = time > 8.0  # the slowest mode has decayed by exp(-30)
+        response = LinearStructure(parts, Record("sine", time[1], np.sin(forcing * time))).simulate(theta)[0]
+        errors.append(np.abs(response - (amplitude * np.exp(1j * forcing * time)).imag)[late].max())
+    ratios = np.array(errors[:-1]) / errors[1:]
+    assert (np.abs(ratios - 4.0) < 0.1).all(), ratios
+
+
+def test_modal_damping_gives_the_ratios():
+    mass, stiffness = np.diag([1.0, 2.0, 0.5]), np.array([[5.0, -2.0, 0.0], [-2.0, 3.0, -1.0], [0.0, -1.0, 1.0]])
+    ratios = np.array([0.01, 0.2, 0.05])
+    squares, modes = eigh(stiffness, mass)
+    damping = modal_damping(mass, stiffness, ratios)
+    np.testing.assert_allclose(modes.T @ damping @ modes, np.diag(2 * ratios * np.sqrt(squares)), atol=1e-13)
+    with pytest.raises(SimulationFailed, match="positive definite"):
+        modal_damping(mass, stiffness - 3.0 * mass, ratios)
+
+
+def test_deck_follows_its_shares(three):
+    base, first, second = (record.acceleration for record in three)
+    model = LinearStructure(BridgeDeck("m", "s1", "s2"), three)
+    assert model.parameter_names == ("frequency", "damping", "share", "shape")
+    middle = respond(0.3 * base + 0.35 * (first + second), DT, 2 * math.pi * 3.0, 0.08).acceleration
+    expected = [0.4 * first + 0.6 * middle, middle, 0.4 * second + 0.6 * middle]
+    response = model.simulate([3.0, 0.08, 0.7, 0.6])
+    np.testing.assert_allclose(response, expected, rtol=0, atol=1e-11)
+    assert [channel.name for channel in model.channels] == ["s1", "m", "s2"]
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_one_support_is_a_limit_of_two(three, share):
+    fixed = LinearStructure(BridgeDeck("m", share=share), three)
+    assert fixed.parameter_names == ("frequency", "damping")
+    free = LinearStructure(BridgeDeck("m"), three).simulate([3.0, 0.1, share])
+    np.testing.assert_array_equal(fixed.simulate([3.0, 0.1]), free)
+    silent = [Record("none", DT, 0 * record.acceleration) for record in three]
+    alone = [three[0], *silent[1:]] if share == 0.0 else [silent[0], *three[1:]]
+    np.testing.assert_array_equal(fixed.with_record(alone).simulate([3.0, 0.1]), free)
+
+
+def test_stiff_structure_moves_with_its_supports():
+    time = DT * np.arange(400)
+    slow = [Record("slow", DT, np.sin(2 * math.pi * f * time)) for f in (0.3, 0.5, 0.7)]
+    (middle,) = LinearStructure(BridgeDeck("m"), slow).simulate([1000.0, 0.5, 0.6])
+    carried = 0.4 * slow[0].acceleration + 0.3 * (slow[1].acceleration + slow[2].acceleration)
+    np.testing.assert_allclose(middle[2:], carried[2:], atol=2e-3)
+
+
+def test_a_lead_brings_the_structure_into_its_state(three):
+    theta = [3.0, 0.02, 0.7, 0.6]
+    whole = LinearStructure(BridgeDeck("m", "s"), three).simulate(theta)
+    late = LinearStructure(BridgeDeck("m", "s"), three, lead=1.0)
+    assert late.n_steps == 350
+    np.testing.assert_array_equal(late.simulate(theta), whole[:, 50:])
+    assert late.with_record(three[::-1]).lead == 1.0
+    from_rest = LinearStructure(BridgeDeck("m", "s"), [record.trim(1.0) for record in three]).simulate(theta)
+    assert np.abs(from_rest - whole[:, 50:]).max() > 0.1 * np.abs(whole).max(), "control: the state matters"
+
+
+def test_impossible_parameters_fail_alone_and_say_why(three):
+    model = LinearStructure(BridgeDeck("m"), three)
+    thetas = np.array([[3, 0.1, 0.5], [-3, 0.1, 0.5], [3, 0.1, 1.5], [3, 0.0, 0.5], [3, 1.0, 0.5], [3, 1.1, 0.5]])
+    response, reasons = simulate_batch(model, thetas)
+    assert [bool(reason) for reason in reasons] == [False, True, True, True, True, False]
+    for reason, word in zip(reasons[1:5], ("frequency", "share", "damping", "coincide"), strict=True):
+        assert word in reason
+    np.testing.assert_array_equal(response[0], model.simulate(thetas[0]))
+    frame = LinearStructure(ShearFrame({"top": 2}, [1, 1], [1, 1]), three[0])
+    with pytest.raises(SimulationFailed, match="damping_2 are not"):
+        frame.simulate([1.0, 1.0, 0.1, -0.1])
+
+
+def test_travels_to_other_processes(three):
+    model = LinearStructure(BridgeDeck("m", "s"), three, lead=0.5)
+    twin = pickle.loads(pickle.dumps(model))
+    assert twin.fingerprint == model.fingerprint
+    np.testing.assert_array_equal(twin.simulate([3.0, 0.1, 0.5, 0.6]), model.simulate([3.0, 0.1, 0.5, 0.6]))
+
+
+def test_fingerprint_knows_parts_and_supports(three):
+    model = LinearStructure(BridgeDeck("m"), three)
+    assert model.fingerprint == LinearStructure(BridgeDeck("m"), three, unit="m/s2").fingerprint
+    others = [
+        LinearStructure(BridgeDeck("n"), three),
+        LinearStructure(BridgeDeck("m", share=0.5), three),
+        LinearStructure(BridgeDeck("m"), three[::-1]),
+        LinearStructure(BridgeDeck("m"), three, lead=1.0),
+        model.with_record([three[0].scale(2.0), *three[1:]]),
+        LinearStructure(ShearFrame({"m": 1}, [1], [1]), three[0]),
+        LinearStructure(ShearFrame({"m": 1}, [1], [2]), three[0]),
+    ]
+    assert len({model.fingerprint, *(other.fingerprint for other in others)}) == 8
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda r: LinearStructure(BridgeDeck("m"), r[:2]), "stands on 3 supports; got 2"),
+        (lambda r: LinearStructure(BridgeDeck("m"), [r[0], r[1], r[2].trim(0, 1)]), "one step and length"),
+        (lambda r: LinearStructure(BridgeDeck("m"), [r[0], r[1], r[2].resample(0.01)]), "one step and length"),
+        (lambda r: LinearStructure(BridgeDeck("m"), []), "expected the Records"),
+        (lambda r: LinearStructure(BridgeDeck("m"), [r[0].acceleration] * 3), "expected the Records"),
+        (lambda r: LinearStructure(BridgeDeck("m"), r, lead=8.0), "stop"),
+        (lambda r: LinearStructure(BridgeDeck("m"), r, lead=-1.0), "start = -1"),
+        (lambda r: BridgeDeck(""), "name of a channel"),
+        (lambda r: BridgeDeck("m", share=1.1), "share must be a number from 0 to 1"),
+        (lambda r: BridgeDeck("m", "s", shape=math.nan), "shape must be a number from 0 to 1"),
+        (lambda r: ShearFrame({"top": 3}, [1, 1], [1, 1]), "floors from 1 to 2; got 3"),
+        (lambda r: ShearFrame({"top": 2}, [1, 1], [1]), "a stiffness for each of 2"),
+        (lambda r: ShearFrame({"top": 2}, [1, -1], [1, 1]), "positive mass or stiffness"),
+        (lambda r: ShearFrame({"top": 2}, [1, 1], [1, 1], [1, 2]), "fewer than 2"),
+        (lambda r: LinearStructure(ShearFrame((), [1, 1], [1, 1]), r[0]), "channels must be one or more"),
+    ],
+)
+def test_bad_input_is_refused(three, make, words):
+    with pytest.raises(ValueError, match=words):
+        make(three)

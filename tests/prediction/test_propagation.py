@@ -1,0 +1,429 @@
+"""Uncertainty propagation: closed forms, what streams against what is computed at once, and models that misbehave."""
+
+import logging
+import tracemalloc
+from multiprocessing.pool import ThreadPool
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.plots.histories import plot_bands
+from fe_likelihoods.prediction.averaging import average_predictions
+from fe_likelihoods.prediction.propagation import fit_measures, propagate
+from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
+from fe_likelihoods.prediction.streaming import Moments
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, Prior, TruncatedNormal
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import DisplacementHistory, Record
+from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed
+
+NAMES = ("offset", "slope")
+MEAN, COVARIANCE = np.array([1.0, -0.5]), np.array([[0.04, 0.01], [0.01, 0.09]])
+NOISE = np.array([0.3, 0.05])
+
+
+class Line:
+    """Responses linear in the parameters: of Gaussian parameters they are Gaussian. May fail at small offsets."""
+
+    parameter_names = NAMES
+    channels = (Channel("a", "acceleration", "g"), Channel("b", "displacement", "cm"))
+    dt = 0.1
+    n_steps = 25
+    fingerprint = "line"
+
+    def __init__(self, fails=False):
+        self.fails = fails
+        self.runs = 0
+        time = np.arange(self.n_steps) * self.dt
+        self.design = np.stack([np.stack([np.ones_like(time), time]), np.stack([time**2, 3.0 * np.ones_like(time)])])
+
+    def simulate(self, theta):
+        self.runs += 1
+        if self.fails and theta[0] < 0.9:
+            raise SimulationFailed("the offset is too small" if theta[0] > 0.7 else "the offset is far too small")
+        return np.einsum("cpt,p->ct", self.design, theta)
+
+
+def closed_form(model):
+    mean = np.einsum("cpt,p->ct", model.design, MEAN)
+    return mean, np.einsum("cpt,pq,cqt->ct", model.design, COVARIANCE, model.design)
+
+
+def draws(rng, n):
+    return rng.multivariate_normal(MEAN, COVARIANCE, size=n)
+
+
+def with_noise(model, measured=None):
+    values = np.ones((2, model.n_steps)) if measured is None else measured
+    prior = Prior(
+        {name: TruncatedNormal(1.0, 0.5) for name in model.parameter_names}
+        | {f"sigma_{c.name}": HalfNormal(1.0) for c in model.channels}
+    )
+    return Posterior(FELikelihood(model, Measurements(model.channels, model.dt, values)), prior)
+
+
+def quiet(*args, **kwargs):
+    return propagate(*args, progress=False, **kwargs)
+
+
+def test_gaussian_closed_form_within_its_stated_errors(rng):
+    model = Line()
+    p = quiet(model, draws(rng, 4000))
+    mean, variance = closed_form(model)
+    # few independent numbers are behind the many steps (two parameters), so four standard errors hold for all of them
+    assert np.all(np.abs(p.mean - mean) < 4.0 * p.standard_error)
+    assert np.allclose(p.standard_error, np.sqrt(p.variance / 4000))
+    assert np.all(np.abs(p.variance / variance - 1.0) < 4.0 * np.sqrt(2.0 / 4000))
+    for probability, quantile, error in zip(p.probabilities, p.quantiles, p.quantile_error, strict=True):
+        exact = mean + stats.norm.ppf(probability) * np.sqrt(variance)
+        assert np.all(np.abs(quantile - exact) < 5.0 * error)
+        density = stats.norm.pdf(stats.norm.ppf(probability)) / np.sqrt(variance)
+        asymptotic = np.sqrt(probability * (1.0 - probability) / 4000) / density
+        assert np.all((error > 0.5 * asymptotic) & (error < 2.0 * asymptotic))
+    # negative control: the errors are not so wide that anything passes
+    assert np.any(np.abs(p.mean - 1.05 * mean) > 4.0 * p.standard_error)
+
+
+def test_streaming_is_all_at_once_and_copies_count(rng):
+    model = Line()
+    samples = draws(rng, 300)[rng.integers(0, 300, size=500)]
+    responses = np.array([Line().simulate(theta) for theta in samples])
+    for batch in (1, 7, 1000):
+        model.runs = 0
+        p = quiet(model, samples, batch=batch)
+        assert model.runs == len(np.unique(samples, axis=0)) < 280
+        assert p.n_samples == p.n_quantile == 500
+        assert np.allclose(p.mean, responses.mean(axis=0), rtol=1e-13)
+        assert np.allclose(p.variance, responses.var(axis=0), rtol=1e-11)
+        assert np.allclose(p.quantiles, np.quantile(responses, p.probabilities, axis=0), rtol=1e-12)
+    single = quiet(model, samples, memory=model.runs * 50 * 4)  # in single precision all fit, in double they do not
+    assert single.n_quantile == 500 and not np.array_equal(single.quantiles, p.quantiles)
+    assert np.allclose(single.quantiles, p.quantiles, rtol=1e-6)
+    with ThreadPool(2) as pool:
+        pooled = quiet(model, samples, batch=7, pool=pool)
+    assert np.array_equal(pooled.quantiles, quiet(model, samples, batch=7).quantiles)
+
+
+def test_a_small_spread_about_a_large_value(rng):
+    """The mean of squares less the squared mean would give nonsense here."""
+    numbers = 1e9 + 1e-2 * rng.normal(size=5000)
+    moments = Moments()
+    for part in np.split(numbers, 50):
+        moments.add(part, np.ones(len(part)))
+    assert np.isclose(moments.variance, np.var(numbers - 1e9), rtol=1e-4)
+    assert np.mean(numbers**2) - np.mean(numbers) ** 2 != pytest.approx(1e-4, rel=0.5)
+
+
+@pytest.mark.parametrize("huge", [1e50, 1e200])
+def test_responses_that_have_blown_up_stay_numbers(rng, huge):
+    class Unstable(Line):
+        def simulate(self, theta):
+            return super().simulate(theta) * (huge if theta[0] > 1.3 else 1.0)
+
+    p = quiet(Unstable(), draws(rng, 200), batch=10, memory=200 * 50 * 4)
+    for values in (p.mean, p.variance, p.standard_error, p.quantiles, p.quantile_error):
+        assert not np.isnan(values).any()
+    assert np.all(np.abs(p.quantile(0.5)) < 20.0)
+
+
+class Big:
+    """Long responses, made in batches."""
+
+    parameter_names = ("x",)
+    channels = tuple(Channel(f"c{k}", "acceleration", "g") for k in range(4))
+    dt = 0.01
+    n_steps = 5000
+    fingerprint = "big"
+
+    def simulate(self, theta):
+        return np.full((4, self.n_steps), theta[0])
+
+    def simulate_batch(self, thetas):
+        response = np.empty((len(thetas), 4, self.n_steps))
+        response[...] = thetas[:, 0, None, None]
+        return SimulationBatch(response, [""] * len(thetas))
+
+
+def test_memory_is_bounded(rng, caplog):
+    # 240 MB of responses, 120 MB in single precision; in order, so that a part from one end would be seen
+    samples = np.sort(rng.normal(size=(1500, 1)), axis=0)
+    memory = 8 * 2**20
+    tracemalloc.start()
+    try:
+        p = quiet(Big(), samples, memory=memory, batch=16, seed=1)
+        peak_memory = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    batch_bytes = 16 * 4 * 5000 * 8
+    assert peak_memory < memory + 6 * batch_bytes + 16 * 2**20 < 0.5 * 120e6
+    assert p.n_samples == 1500 and p.n_quantile == memory // (4 * 4 * 5000)
+    assert "quantiles are of 104 of 1500 samples" in caplog.text
+    assert np.allclose(p.mean, samples.mean()) and np.allclose(p.variance, samples.var())
+    whole = quiet(Big(), samples[:, :1], quantity=lambda response: response[0, 0])
+    assert whole.n_quantile == 1500 and whole.values.shape == (1500,)
+    assert 1.9 < np.mean(p.quantile_error[:, 0, 0]) / np.mean(whole.quantile_error) < 7.6  # 104 of 1500: 3.8 times
+    assert np.all(np.abs(p.quantiles[:, 0, 0] - stats.norm.ppf(p.probabilities)) < 5.0 * p.quantile_error[:, 0, 0])
+
+
+def test_numbers_are_kept_all_in_the_order_of_the_samples(rng):
+    samples = draws(rng, 60)[rng.integers(0, 60, size=100)]
+    p = quiet(Line(), samples, quantity=peak("b"), memory=0)
+    expected = [np.abs(Line().simulate(theta)[1]).max() for theta in samples]
+    assert np.allclose(p.values, expected, rtol=1e-13) and p.dt is None
+    assert np.allclose(p.quantiles, np.quantile(expected, p.probabilities))
+    assert p.channels == (Line.channels[1],)
+    both = quiet(Line(), samples, quantity=[peak("b"), ChannelQuantity("a", lambda history: history[-1])])
+    assert both.values.shape == (100, 2) and np.allclose(both.values[:, 0], expected)
+    energy = quiet(Line(), samples, quantity=lambda response: np.square(response).sum(axis=1))
+    assert energy.mean.shape == (2,) and energy.values.shape == (100, 2) and energy.channels == ()
+    without = quiet(Line(), samples, quantity=peak("b"), quantiles=())
+    assert without.quantiles.shape == (0,) and np.array_equal(without.values, p.values)
+
+
+def test_channels_by_name(rng):
+    samples = draws(rng, 50)
+    whole = quiet(Line(), samples)
+    one = quiet(Line(), samples, quantity="b")
+    assert one.mean.shape == (1, Line.n_steps) and np.allclose(one.mean[0], whole.mean[1])
+    turned = quiet(Line(), samples, quantity=["b", "a"])
+    assert [c.name for c in turned.channels] == ["b", "a"] and np.allclose(turned.quantiles, whole.quantiles[:, ::-1])
+
+
+def test_noise_adds_its_variance(rng):
+    posterior = with_noise(Line())
+    sigma = NOISE * rng.uniform(0.5, 1.5, size=(3000, 2))
+    samples = np.hstack([draws(rng, 3000), sigma])
+    clean, noisy = quiet(posterior, samples), quiet(posterior, samples, noise=True, seed=3)
+    assert np.array_equal(clean.mean, noisy.mean) and np.array_equal(clean.standard_error, noisy.standard_error)
+    assert np.allclose(noisy.variance - clean.variance, np.mean(sigma**2, axis=0)[:, None])
+    # the quantiles of the mixture, from one draw a sample, against all of it
+    mean = np.einsum("cpt,np->nct", posterior.likelihood.model.design, samples[:, :2])
+    below = stats.norm.cdf((noisy.quantile(0.05) - mean) / sigma[:, :, None]).mean(axis=0)
+    # 50 quantiles of (nearly) independent noise, 3000 draws each
+    assert np.all(np.abs(below - 0.05) < 4.5 * np.sqrt(0.05 * 0.95 / 3000))
+    peaks = quiet(posterior, samples, noise=True, quantity=peak("a"), seed=3)
+    assert peaks.mean > quiet(posterior, samples, quantity=peak("a")).mean + 10.0 * peaks.standard_error
+
+
+def test_noise_depends_on_the_seed_only(rng):
+    posterior = with_noise(Line())
+    samples = np.hstack([draws(rng, 40)[rng.integers(0, 40, size=60)], np.tile(NOISE, (60, 1))])
+    for quantity in (None, peak("a")):
+        first = quiet(posterior, samples, noise=True, seed=5, quantity=quantity)
+        again = quiet(posterior, samples, noise=True, seed=5, quantity=quantity, batch=3)
+        other = quiet(posterior, samples, noise=True, seed=6, quantity=quantity)
+        assert np.allclose(first.quantiles, again.quantiles) and not np.allclose(first.quantiles, other.quantiles)
+    alone = quiet(posterior, samples, noise=True, seed=5, quantity="b")
+    whole = quiet(posterior, samples, noise=True, seed=5)
+    assert np.allclose(alone.quantiles[:, 0], whole.quantiles[:, 1])
+
+
+@pytest.fixture
+def oscillator(rng):
+    return LinearOscillator(Record("noise", 0.02, rng.normal(size=400)), period=0.6, damping_ratio=0.05)
+
+
+def test_coverage_of_measurements(oscillator, rng):
+    """Measurements from the same posterior predictive lie in the 5-95 % band nine times out of ten."""
+    sigma = np.array([0.05, 0.002])
+    truth = np.array([1.05, 0.9])
+    measured = oscillator.simulate(truth) + sigma[:, None] * rng.normal(size=(2, 400))
+    posterior = with_noise(oscillator, measured)
+    samples = np.hstack([rng.normal(truth, 1e-4, size=(600, 2)), np.tile(sigma, (600, 1))])
+    measurements = posterior.likelihood.measurements
+    noisy = quiet(posterior, samples, noise=True, seed=0)
+    # 400 independent samples in each channel, and a band whose own level is known from 600 draws
+    error = np.sqrt(0.9 * 0.1 * (1 / 400 + 1 / (600 * 400) * 2))
+    assert np.all(np.abs(noisy.coverage(measurements) - 0.9) < 4.0 * error)
+    assert np.all(quiet(posterior, samples).coverage(measurements) < 0.2)  # the response is known far better
+    swapped = measurements.select(["displacement", "acceleration"])
+    assert np.array_equal(noisy.coverage(swapped), noisy.coverage(measurements))
+    expected = np.sqrt(np.square(noisy.mean - measured).sum(axis=1) / np.square(measured).sum(axis=1))
+    assert np.allclose(noisy.rrmse(measurements), expected)
+    halves = [slice(0, 200), slice(200, 400)]
+    inside = [noisy.coverage(measurements, part=half) for half in halves]
+    assert np.allclose(np.mean(inside, axis=0), noisy.coverage(measurements)) and not np.allclose(*inside)
+    late, data = noisy.mean[:, halves[1]], measured[:, halves[1]]
+    expected = np.sqrt(np.square(late - data).sum(axis=1) / np.square(data).sum(axis=1))
+    assert np.allclose(noisy.rrmse(measurements, halves[1]), expected)
+    with pytest.raises(ValueError, match=r"no quantile 0\.01"):
+        noisy.coverage(measurements, lower=0.01)
+    with pytest.raises(ValueError, match=r"400 samples at 0\.02 s, the measurements have 200"):
+        noisy.rrmse(measurements.decimate(2))
+    with pytest.raises(ValueError, match="histories"):
+        quiet(posterior, samples, quantity=peak("displacement")).rrmse(measurements)
+
+
+def test_fit_measures(oscillator, rng):
+    measured = oscillator.simulate([1.0, 1.0])
+    posterior = with_noise(oscillator, measured)
+    samples = rng.uniform(0.8, 1.2, size=(6, 4))
+    expected = [
+        np.square(oscillator.simulate(t[:2]) - measured).sum(axis=1) / np.square(measured).sum(axis=1) for t in samples
+    ]
+    assert np.allclose(fit_measures(posterior, samples), expected)
+    assert posterior.likelihood.simulations == 6
+    assert np.array_equal(fit_measures(posterior, samples[:, :2]), fit_measures(posterior, samples))
+    assert posterior.likelihood.simulations == 6  # remembered
+    samples[2, 0] = -1.0
+    assert np.isnan(fit_measures(posterior, samples)).all(axis=1).tolist() == [False, False, True, False, False, False]
+    with pytest.raises(ValueError, match="not zero"):
+        fit_measures(with_noise(oscillator, measured * [[1.0], [0.0]]), samples)
+    with pytest.raises(ValueError, match="with measurements"):
+        fit_measures(oscillator, samples)
+
+
+def test_another_record(oscillator, rng):
+    samples = rng.normal(1.0, 0.05, size=(30, 2))
+    longer = Record("other", 0.01, rng.normal(size=700))
+    p = quiet(with_noise(oscillator), samples, record=longer)
+    same = quiet(LinearOscillator(longer, period=0.6, damping_ratio=0.05), samples)
+    assert np.array_equal(p.mean, same.mean) and p.dt == 0.01 and len(p.time) == 700
+    double = quiet(oscillator, samples, record=oscillator.record.scale(2.0), quantity=peak("displacement"))
+    assert np.allclose(double.values, 2.0 * quiet(oscillator, samples, quantity=peak("displacement")).values)
+
+
+def test_with_record_of_the_column(rng):
+    column = RCColumn.lhpost(Record("short", 0.01, rng.normal(size=20)), mesh=20, outputs=("displacement",))
+    other = Record("other", 0.005, rng.normal(size=30))
+    moved = column.with_record(other)
+    assert moved.loading is other and moved.channels == column.channels and moved.mesh == 20 and moved.dt == 0.005
+    assert column.loading.name == "short" and moved.fingerprint != column.fingerprint
+    with pytest.raises(ValueError, match="a Record, as the loading of this column"):
+        column.with_record(DisplacementHistory("push", [0.0, 0.01]))
+    push = RCColumn.lhpost(DisplacementHistory("push", [0.0, 0.01]), parameters=("Ec",))
+    assert push.with_record(DisplacementHistory("more", [0.0, 0.01, 0.02])).n_steps == 3
+    with pytest.raises(ValueError, match="a DisplacementHistory"):
+        push.with_record(other)
+
+
+def test_failures_are_counted_and_left_out(rng, caplog):
+    samples = draws(rng, 200)[rng.integers(0, 200, size=300)]
+    good = samples[:, 0] >= 0.9
+    with caplog.at_level(logging.WARNING):
+        p = quiet(Line(fails=True), samples)
+    assert np.array_equal(p.failed, np.flatnonzero(~good)) and p.n_failed == (~good).sum() > 50
+    assert p.failure_reasons == {
+        "the offset is too small": int(np.sum(~good & (samples[:, 0] > 0.7))),
+        "the offset is far too small": int(np.sum(samples[:, 0] <= 0.7)),
+    }
+    assert f"{p.n_failed} of 300 samples failed" in caplog.text
+    rest = quiet(Line(), samples[good])
+    assert np.allclose(p.mean, rest.mean) and np.allclose(p.quantiles, rest.quantiles, atol=1e-6)
+    assert np.allclose(p.standard_error, rest.standard_error)
+    peaks = quiet(Line(fails=True), samples, quantity=peak("a"))
+    assert np.allclose(peaks.values, quiet(Line(), samples[good], quantity=peak("a")).values)
+    endless = quiet(Line(), samples, quantity=lambda response: np.inf if response[0, 0] < 0.9 else response[0, 0])
+    assert endless.failure_reasons == {"the quantity is not finite": p.n_failed} and len(endless.values) == good.sum()
+    noisy = np.hstack([samples, np.tile(NOISE, (300, 1))])
+    assert np.array_equal(quiet(with_noise(Line(fails=True)), noisy, noise=True).failed, p.failed)
+
+
+def test_all_failed():
+    with pytest.raises(SimulationFailed, match="all 3 samples failed .3: the offset is far too small"):
+        quiet(Line(fails=True), np.zeros((3, 2)))
+
+
+def test_effective_sample_size_widens_the_errors(rng):
+    samples = draws(rng, 400)
+    full, quarter = quiet(Line(), samples), quiet(Line(), samples, effective_sample_size=100)
+    assert np.allclose(quarter.standard_error, 2.0 * full.standard_error)
+    ratio = np.median(quarter.quantile_error[1] / full.quantile_error[1])  # of the median, whose tails are even
+    assert 1.4 < ratio < 2.8
+
+
+def test_one_sample():
+    p = quiet(Line(), MEAN[None])
+    assert np.allclose(p.mean, closed_form(Line())[0]) and np.all(p.variance == 0.0)
+    assert np.all(p.quantiles == p.mean) and np.all(np.isinf(p.quantile_error))
+
+
+def test_average_of_two_models_is_their_mixture(rng):
+    first, second = draws(rng, 800), draws(rng, 1200) + [0.3, 0.0]
+    predictions = {"one": quiet(Line(), first), "two": quiet(Line(), second)}
+    average = average_predictions(predictions, {"two": 0.6, "one": 0.4})
+    mixture = quiet(Line(), np.vstack([first, second]))  # 800 : 1200
+    assert np.allclose(average.mean, mixture.mean) and np.allclose(average.variance, mixture.variance)
+    assert np.allclose(average.within + average.between, average.variance)
+    errors = np.stack([p.standard_error for p in predictions.values()])
+    assert np.allclose(average.standard_error, np.hypot(0.4 * errors[0], 0.6 * errors[1]))
+    with pytest.raises(ValueError, match="sum to one"):
+        average_predictions(predictions, {"one": 0.4, "two": 0.4})
+    with pytest.raises(ValueError, match="one probability for each"):
+        average_predictions(predictions, {"one": 0.4, "three": 0.6})
+    with pytest.raises(ValueError, match="one quantity"):
+        average_predictions(predictions | {"two": quiet(Line(), second, quantity="a")}, {"one": 0.4, "two": 0.6})
+
+
+@pytest.mark.parametrize(
+    ("samples", "settings", "message"),
+    [
+        (np.ones((5, 3)), {}, r"one value for each of the 4 parameters offset, slope, sigma_a, sigma_b.*\(5, 3\)"),
+        (np.ones((5, 7, 4)), {}, r"\(5, 7, 4\)"),
+        (np.ones(4), {}, r"shape \(n, 4\)"),
+        (np.ones((0, 4)), {}, r"got \(0, 4\)"),
+        (np.array([[1.0, 1.0], [1.0, np.nan]]), {}, "first is sample 1"),
+        (np.ones((5, 2)), {"noise": True}, "sigma_a, sigma_b"),
+        (np.array([[1.0, 1.0, 1.0, 0.0]]), {"noise": True}, "positive standard deviation"),
+        (np.ones((5, 4)), {"record": Record("r", 0.1, [0.0, 1.0])}, "Line knows no other record.*with_record"),
+        (np.ones((5, 4)), {"quantity": "c"}, "no channel 'c'; the channels of the model are a, b"),
+        (np.ones((5, 4)), {"quantity": ["a", "a"]}, "quantity must be"),
+        (np.ones((5, 4)), {"quantity": peak("c")}, "no channel 'c'"),
+        (np.ones((5, 4)), {"quantity": 3}, "quantity must be"),
+        (np.ones((5, 4)), {"quantiles": (0.05, 1.0)}, "between 0 and 1"),
+        (np.ones((5, 4)), {"quantiles": 0.5}, "sequence"),
+        (np.ones((5, 4)), {"effective_sample_size": 0.0}, "effective_sample_size"),
+        (np.ones((5, 4)), {"batch": 0}, "batch"),
+        (np.ones((5, 4)), {"memory": -1}, "memory must be"),
+        (np.ones((5, 4)), {"seed": -1}, "seed must be"),
+        (np.arange(200.0).reshape(50, 4), {"memory": 1000}, "at least 20 results of 200 bytes"),
+    ],
+)
+def test_refused_before_any_simulation(samples, settings, message):
+    posterior = with_noise(Line())
+    with pytest.raises(ValueError, match=message):
+        quiet(posterior, samples, **settings)
+    assert posterior.likelihood.model.runs == 0
+
+
+def test_refused_otherwise(oscillator, rng):
+    with pytest.raises(ValueError, match="noise=True needs the posterior"):
+        quiet(Line(), np.ones((5, 2)), noise=True)
+    with pytest.raises(ValueError, match="expected a Record as excitation; got ndarray"):
+        quiet(oscillator, np.ones((5, 2)), record=np.ones(10))
+    with pytest.raises(ValueError, match="expected a Posterior"):
+        quiet(lambda theta: theta, np.ones((5, 2)))
+    with pytest.raises(ValueError, match=r"one shape for every response; got \(1,\), then \(2,\)"):
+        shapes = iter([1, 2])
+        quiet(Line(), draws(rng, 5), quantity=lambda response: np.ones(next(shapes)))
+    with pytest.raises(ZeroDivisionError):
+        quiet(Line(), draws(rng, 5), quantity=lambda response: 1 // 0)
+
+    class Mute:
+        parameter_names = ("s",)
+
+    posterior = with_noise(Line())
+    posterior.likelihood.noise = Mute()
+    with pytest.raises(ValueError, match="Mute cannot be drawn from.*standard_deviations"):
+        quiet(posterior, np.ones((5, 3)), noise=True)
+
+
+def test_plot_bands(oscillator, rng):
+    samples = np.hstack([rng.normal(1.0, 0.02, size=(40, 2)), np.full((40, 2), 0.01)])
+    posterior = with_noise(oscillator, oscillator.simulate([1.0, 1.0]))
+    p = quiet(posterior, samples, noise=True)
+    figure = plot_bands(p, posterior.likelihood.measurements)
+    acceleration, displacement = figure.axes
+    assert acceleration.get_ylabel() == "acceleration [g]" and displacement.get_ylabel() == "displacement [cm]"
+    assert np.allclose(displacement.lines[-1].get_ydata(), 100.0 * p.mean[1])
+    assert "5-95 % with noise" in [text.get_text() for text in acceleration.get_legend().get_texts()]
+    assert len(plot_bands(p, channels=["displacement"]).axes) == 1
+    with pytest.raises(ValueError, match="some of acceleration, displacement"):
+        plot_bands(p, channels=["force"])
+    with pytest.raises(ValueError, match="the measurements have 200"):
+        plot_bands(p, posterior.likelihood.measurements.decimate(2))

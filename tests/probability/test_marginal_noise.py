@@ -1,0 +1,252 @@
+"""Standard deviations integrated out: the integral against other methods, the same posterior with less to search."""
+
+import math
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+from scipy import integrate, special, stats
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.prediction.propagation import fit_measures, propagate
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.marginal_noise import MarginalNoise
+from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods.problems import isolated_bridge
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+
+TOP = Channel("top", "absolute acceleration", "g")
+DRIFT = Channel("drift", "relative displacement", "in")
+PRIORS = {
+    "half-normal": HalfNormal(1.0),
+    "bounded below": TruncatedNormal(0.0, 0.3, 1e-3),
+    "informative": TruncatedNormal(1.0, 0.1),
+    "uniform": Uniform(0.05, 2.0),
+    "uniform from zero": Uniform(0.0, 3.0),
+    "lognormal": LogNormal(0.5, 1.5),
+}
+
+
+def by_quadrature(squares, n, prior):
+    """Logarithm of the integral over sigma, by scipy's adaptive rule in pieces about the maximum."""
+
+    def log_integrand(t):
+        sigma = np.exp(t)
+        return -n * (0.5 * math.log(2.0 * math.pi) + t) - 0.5 * squares / sigma**2 + prior.logpdf(sigma) + t
+
+    low, high = math.log(max(prior.bounds[0], 1e-8)) + 1e-14, math.log(min(prior.bounds[1], 1e4)) - 1e-14
+    a, b = low, high
+    for _ in range(6):
+        t = np.linspace(a, b, 2001)
+        best = np.argmax(log_integrand(t))
+        a, b = t[max(best - 1, 0)], t[min(best + 1, 2000)]
+    top, largest = t[best], log_integrand(t[best])
+    slope = abs(n * (squares / n * math.exp(-2.0 * top) - 1.0))
+    width = min(1.0 / math.sqrt(2.0 * n), 1.0 / (slope + 1e-9))
+    steps = [0.0, 1.0, 3.0, 6.0, 10.0, 20.0, 50.0, 200.0, 1e3, 1e4]
+    ends = sorted({min(max(top + side * width * step, low), high) for side in (-1, 1) for step in steps} | {low, high})
+    pieces = [
+        integrate.quad(lambda t: math.exp(log_integrand(t) - largest), *ab, epsabs=1e-14, epsrel=1e-12, limit=200)[0]
+        for ab in zip(ends[:-1], ends[1:], strict=True)
+    ]
+    return largest + math.log(sum(pieces))
+
+
+@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
+def test_equals_an_adaptive_quadrature(prior):
+    """From perfect fits to hopeless ones, beyond the prior's bounds too, all rows at once."""
+    for n, tolerance in ((10, 1e-6), (100, 1e-8), (5000, 1e-7)):
+        rms = np.array([1e-3, 0.049, 0.3, 1.0, 20.0])
+        if n == 10 and prior == PRIORS["informative"]:
+            rms = rms[2:]  # two humps, see the Notes of MarginalNoise
+        got = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": prior}).log_likelihood(n * rms[:, None] ** 2, n)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", integrate.IntegrationWarning)
+            expected = [by_quadrature(n * r**2, n, prior) for r in rms]
+        np.testing.assert_allclose(got, expected, atol=tolerance, rtol=1e-13)
+
+
+def test_equals_the_closed_form_of_a_flat_prior():
+    """Of sigma^-n exp(-J / (2 sigma^2)) over all sigma: 1/2 (J / 2)^(-(n-1)/2) Gamma((n-1)/2)."""
+    n, squares = 60, np.array([[2.0], [0.5]])
+    got = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.0, 100.0)}).log_likelihood(squares, n)
+    half = 0.5 * (n - 1)
+    expected = -0.5 * n * math.log(2.0 * math.pi) - math.log(200.0) - half * np.log(squares / 2) + special.gammaln(half)
+    np.testing.assert_allclose(got, expected[:, 0], rtol=1e-13)
+
+
+def test_channels_are_a_sum_and_a_shared_sigma_is_one_integral(rng):
+    priors = {"sigma_drift": HalfNormal(0.5), "sigma_top": LogNormal(1.0, 0.5)}  # in any order
+    misfit = rng.uniform(20.0, 90.0, size=(5, 2))
+    each = [MarginalNoise(GaussianNoise([c]), {k: priors[k]}) for c, k in ((TOP, "sigma_top"), (DRIFT, "sigma_drift"))]
+    expected = sum(noise.log_likelihood(misfit[:, [k]], 80) for k, noise in enumerate(each))
+    both = MarginalNoise(GaussianNoise([TOP, DRIFT]), priors)
+    np.testing.assert_allclose(both.log_likelihood(misfit, 80), expected, rtol=1e-14)
+    shared = SharedGaussianNoise([TOP, DRIFT], [2.0, 0.5])
+    grid = np.geomspace(0.2, 4.0, 4001)
+    for noise in (shared, SharedGaussianNoise([TOP, DRIFT], [2.0, 0.5], effective_samples=(20.0, 1e3))):
+        one = MarginalNoise(noise, {"sigma": HalfNormal(1.0)})
+        values = [noise.log_likelihood(np.tile(j, (4001, 1)), 80, grid[:, None]) for j in misfit]
+        values = np.array(values) + HalfNormal(1.0).logpdf(grid)
+        expected = np.log(np.trapezoid(np.exp(values - values.max()), grid, axis=1)) + values.max()
+        np.testing.assert_allclose(one.log_likelihood(misfit, 80), expected, rtol=1e-6)
+
+
+def test_impossible_values_and_perfect_fits():
+    noise = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": HalfNormal(1.0)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        values = noise.log_likelihood(np.array([[math.nan], [math.inf], [0.0], [1e-280], [1e280], [3.0]]), 50)
+        bounded = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.1, 1.0)})
+        perfect = bounded.log_likelihood(np.zeros((1, 1)), 50)
+        assert noise.log_likelihood(np.zeros((0, 1)), 50).shape == (0,)
+    assert values[:2].tolist() == [-np.inf] * 2 and values[2] == np.inf and np.isfinite(values[[3, 5]]).all()
+    assert values[4] < -1e100
+    assert perfect[0] == pytest.approx(by_quadrature(0.0, 50, Uniform(0.1, 1.0)), rel=1e-9)
+
+
+def test_a_row_does_not_depend_on_the_others_but_for_round_off(rng):
+    noise = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": HalfNormal(1.0)})
+    misfit = rng.uniform(0.1, 1e4, size=(40, 1))
+    apart = [noise.log_likelihood(row[None], 500)[0] for row in misfit]
+    np.testing.assert_allclose(noise.log_likelihood(misfit, 500), apart, rtol=1e-13)
+
+
+def test_draws_have_the_conditional_distribution(rng):
+    """Of sigma given J, at a flat prior: J / sigma^2 is chi-squared of n - 1 degrees of freedom."""
+    n, n_draws = 12, 5000
+    noise = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.0, 1e3)})
+    sigma = noise.draw(np.full((n_draws, 1), 3.0), n, rng)
+    assert sigma.shape == (n_draws, 1)
+    assert stats.kstest(3.0 / sigma[:, 0] ** 2, stats.chi2(n - 1).cdf).pvalue > 1e-4
+    assert stats.kstest(3.0 / sigma[:, 0] ** 2, stats.chi2(n).cdf).pvalue < 1e-4  # control
+    bounded = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.1, 0.4)}).draw(np.full((500, 1), 3.0), n, rng)
+    assert ((bounded > 0.1) & (bounded < 0.4)).all()
+    for misfit in (0.0, math.nan):
+        with pytest.raises(ValueError, match="finite and positive; in 1 of 1 rows"):
+            noise.draw(np.array([[misfit]]), n, rng)
+
+
+@pytest.mark.parametrize(
+    "noise", [AutoregressiveNoise([TOP]), GaussianNoise([TOP], sensor=[0.1]), "white"], ids=["AR", "sensor", "name"]
+)
+def test_what_cannot_be_integrated_out_is_refused(noise):
+    with pytest.raises(ValueError, match="keep the parameters of this one"):
+        MarginalNoise(noise, {"sigma_top": HalfNormal(1.0)})
+
+
+def test_priors_must_be_of_the_noises_parameters():
+    with pytest.raises(ValueError, match="without a prior: .*sigma_top"):
+        MarginalNoise(GaussianNoise([TOP]), {"sigma": HalfNormal(1.0)})
+
+
+# posteriors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def full(rng):
+    model = LinearOscillator(Record("noise", 0.02, rng.normal(size=200)), period=0.6, damping_ratio=0.05)
+    values = model.simulate([1.15, 0.8])
+    values = values + 0.3 * values.std(axis=1, keepdims=True) * rng.normal(size=values.shape)
+    prior = {
+        "stiffness": TruncatedNormal(1.0, 0.3),
+        "damping": TruncatedNormal(1.0, 0.6),
+        "sigma_acceleration": HalfNormal(1.0),
+        "sigma_displacement": HalfNormal(0.02),
+    }
+    return Posterior(FELikelihood(model, Measurements(model.channels, model.dt, values)), prior)
+
+
+def test_the_posterior_is_the_full_one_summed_over_the_noise(full):
+    """At each structural point, hence the same posterior and the same evidence."""
+    marginal = full.marginal()
+    assert marginal.parameter_names == ["stiffness", "damping"] and marginal.fast_parameters == ()
+    thetas = np.array([[1.15, 0.8], [1.1, 1.0], [0.7, 0.5]])
+    rms = np.sqrt(full.likelihood.misfit(thetas) / full.likelihood.measurements.n_steps)
+    t = np.linspace(-0.5, 0.5, 121)
+    for theta, scale in zip(thetas, rms, strict=True):
+        grid = scale * np.exp(np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2))
+        values = full.log_prob(np.hstack([np.tile(theta, (len(grid), 1)), grid])) + np.log(grid).sum(axis=1)
+        # the trapezoidal rule converges exponentially for a hump that it holds whole
+        expected = special.logsumexp(values) + 2.0 * math.log(t[1] - t[0])
+        assert marginal.log_prob(theta) == pytest.approx(expected, abs=1e-8)
+    assert np.isneginf(marginal.log_prob([-1.0, 1.0])) and np.isneginf(marginal.log_prob([1.0, 100.0]))
+    assert marginal.fingerprint != full.fingerprint == pickle.loads(pickle.dumps(full)).fingerprint
+    assert pickle.loads(pickle.dumps(marginal)).fingerprint == marginal.fingerprint == full.marginal().fingerprint
+    with pytest.raises(ValueError, match="keep the parameters of this one"):
+        marginal.marginal()
+
+
+def test_the_noise_is_drawn_afterwards_without_a_simulation(full, rng):
+    marginal = full.marginal()
+    samples = np.column_stack([rng.normal(1.15, 0.02, 300), rng.normal(0.8, 0.05, 300)])
+    marginal.log_prob(samples)
+    assert marginal.likelihood.simulations == 300 and full.likelihood.simulations == 0
+    named = marginal.draw_noise(samples, 3)
+    assert list(named) == full.parameter_names and marginal.likelihood.simulations == 300
+    assert np.array_equal(named["damping"], samples[:, 1])
+    rms = np.sqrt(marginal.likelihood.misfit(samples) / 200)
+    ratio = np.stack([named["sigma_acceleration"], named["sigma_displacement"]], axis=1) / rms
+    assert np.all(np.abs(ratio.mean(axis=0) - 1.0) < 0.02) and np.all(np.abs(ratio.std(axis=0) * 20.0 - 1.0) < 0.2)
+    assert np.array_equal(marginal.draw_noise(samples, 3)["sigma_displacement"], named["sigma_displacement"])
+    with_noise = propagate(marginal, named, noise=True, seed=1, progress=False)
+    without = propagate(marginal, samples, progress=False)
+    expected = np.square(named["sigma_displacement"]).mean()
+    np.testing.assert_allclose((with_noise.variance - without.variance)[1], expected, rtol=1e-9)
+    np.testing.assert_array_equal(fit_measures(marginal, samples), fit_measures(full, samples))
+    with pytest.raises(ValueError, match="shape"):
+        propagate(marginal, samples, noise=True, progress=False)
+    with pytest.raises(ValueError, match="are in the samples of this posterior"):
+        full.draw_noise(samples)
+
+
+def test_cache_pool_and_coarse_posterior_come_along(full, tmp_path):
+    model, measurements = full.likelihood.model, full.likelihood.measurements
+    likelihood = FELikelihood(model, measurements, cache=tmp_path / "sums.sqlite", max_failure_share=0.5, memory=7)
+    posterior = Posterior(likelihood, full.prior, coarse=full)
+    posterior.log_prob([1.0, 1.0, 0.5, 0.01])
+    marginal = posterior.marginal()
+    marginal.log_prob([1.0, 1.0])
+    assert (marginal.likelihood.simulations, marginal.likelihood.disk_hits) == (0, 1)
+    assert marginal.likelihood.max_failure_share == 0.5 and marginal.coarse.parameter_names == ["stiffness", "damping"]
+
+
+def test_problems_with_the_noise_integrated_out():
+    marginal = isolated_bridge(noise="marginal", step=1e-3)
+    assert marginal.ndim == 10 and marginal.likelihood.noise.noise.parameter_names == ("sigma",)
+
+
+@pytest.mark.slow
+def test_a_sampler_finds_the_same_evidence_with_fewer_simulations(full, seed):
+    """SMC against the exact evidence (a sum over the plane of stiffness and damping), with the noise and without it."""
+    from samplers import SMCSampler
+
+    marginal = full.marginal()
+    ends = [(1.05, 1.25), (0.4, 1.4)]
+    axes = [np.linspace(*end, 161) for end in ends]
+    plane = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    values = marginal.log_prob(plane)
+    edge = values.reshape(161, 161)
+    assert max(edge[0].max(), edge[-1].max(), edge[:, 0].max(), edge[:, -1].max()) < values.max() - 18.0
+    exact = special.logsumexp(values) + math.log((axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0]))
+    weights = np.exp(values - values.max())
+    weights /= weights.sum()
+    mean = weights @ plane
+    simulations = {}
+    for name, posterior in (("full", full), ("marginal", full.marginal())):
+        found, means = [], []
+        for k in range(4):
+            sampler = SMCSampler(200, posterior.ndim, posterior, vectorize=True, seed=seed + k)
+            sampler.run_mcmc(None, 1, progress=False)
+            found.append(sampler.log_evidence)
+            means.append(sampler.get_chain(flat=True)[:, :2].mean(axis=0))
+        simulations[name] = posterior.likelihood.simulations
+        sd = np.sqrt(weights @ (plane - mean) ** 2)
+        # 800 points, worth some 400 independent ones; the evidence of one run spreads by some .05
+        assert np.all(np.abs(np.mean(means, axis=0) - mean) < 4.5 * sd / math.sqrt(400.0)), name
+        assert abs(np.mean(found) - exact) < 0.1, name
+    assert simulations["marginal"] < 0.75 * simulations["full"], simulations

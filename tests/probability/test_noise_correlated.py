@@ -1,0 +1,382 @@
+"""Noise for real measurements: errors that last, known sensors, effective samples; and what white noise would say."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from scipy import linalg, stats
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.prediction.accumulator import SampleNoise
+from fe_likelihoods.prediction.propagation import fit_measures, propagate
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal, Uniform
+from fe_likelihoods.probability.residuals import effective_samples, lag_one_sums
+from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed
+
+CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
+
+
+def autoregressive(rng, shape, rho):
+    """AR(1) series of unit variance along the last axis, written as its definition."""
+    errors = rng.standard_normal(shape)
+    for t in range(1, shape[-1]):
+        errors[..., t] = rho * errors[..., t - 1] + math.sqrt(1.0 - rho**2) * errors[..., t]
+    return errors
+
+
+# autoregressive noise -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rho", [-0.999, -0.6, 0.0, 0.3, 0.9, 0.9999])
+@pytest.mark.parametrize("n_steps", [1, 2, 60])
+def test_equals_the_normal_density_with_the_toeplitz_covariance(rng, rho, n_steps):
+    noise = AutoregressiveNoise(CHANNELS)
+    assert noise.parameter_names == ("sigma_top", "sigma_drift", "rho_top", "rho_drift")
+    residuals = rng.normal(size=(2, n_steps)) * [[1.0], [0.02]]
+    sigma, rhos = np.array([0.7, 0.03]), np.array([rho, 0.5 * rho])
+    expected = sum(
+        stats.multivariate_normal.logpdf(r, cov=s**2 * linalg.toeplitz(q ** np.arange(n_steps)))
+        for r, s, q in zip(residuals, sigma, rhos, strict=True)
+    )
+    got = noise.log_likelihood(lag_one_sums(residuals)[None], n_steps, np.concatenate([sigma, rhos])[None])
+    assert got[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_is_white_noise_without_correlation(rng):
+    residuals = rng.normal(size=(5, 2, 40))
+    statistics = np.array([lag_one_sums(r) for r in residuals])
+    sigma = rng.uniform(0.5, 2.0, size=(5, 2))
+    np.testing.assert_allclose(
+        AutoregressiveNoise(CHANNELS).log_likelihood(statistics, 40, np.hstack([sigma, np.zeros((5, 2))])),
+        GaussianNoise(CHANNELS).log_likelihood(statistics[:, :2], 40, sigma),
+        rtol=1e-13,
+    )
+
+
+def test_residuals_smoother_than_round_off_do_not_cancel():
+    """With products of neighbours in place of differences, nothing would be left of Q at this correlation."""
+    residuals = 1.0 + 1e-9 * np.sin(np.arange(50.0))[None]
+    rho, sigma = 1.0 - 1e-12, 1.3
+    new = (residuals[0, 1:] - residuals[0, :-1]) + (1.0 - rho) * residuals[0, :-1]
+    spread = (1.0 - rho) * (1.0 + rho)
+    expected = stats.norm.logpdf(residuals[0, 0], scale=sigma)
+    expected += stats.norm.logpdf(new, scale=sigma * math.sqrt(spread)).sum()
+    noise = AutoregressiveNoise(CHANNELS[:1])
+    got = noise.log_likelihood(lag_one_sums(residuals)[None], 50, np.array([[sigma, rho]]))[0]
+    assert got == pytest.approx(expected, rel=1e-6)
+
+
+def test_impossible_values_are_minus_infinity_without_a_warning():
+    noise = AutoregressiveNoise(CHANNELS[:1])
+    statistics = np.tile([5.0, 4.0, 1.0], (10, 1))
+    parameters = np.tile([1.0, 0.5], (10, 1))
+    parameters[:5, 1] = [1.0, -1.0, 2.0, math.nan, math.inf]
+    parameters[5:8, 0] = [0.0, -1.0, math.inf]
+    statistics[8] = math.nan
+    statistics[9, 1] = math.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        values = noise.log_likelihood(statistics, 10, parameters)
+    assert np.isneginf(values).all()
+    assert np.isfinite(noise.log_likelihood(np.zeros((1, 3)), 10, np.array([[1.0, -0.99]])))
+
+
+# sensors and effective samples ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given", [{"drift": 0.03}, (0.0, 0.03)])
+def test_a_known_sensor_adds_its_variance(rng, given):
+    misfit, sigma = rng.uniform(1.0, 2.0, (4, 2)), rng.uniform(0.1, 1.0, (4, 2))
+    total = np.sqrt(sigma**2 + [0.0, 0.03**2])
+    noise = GaussianNoise(CHANNELS, sensor=given)
+    np.testing.assert_allclose(noise.standard_deviations(sigma), total)
+    white = GaussianNoise(CHANNELS)
+    np.testing.assert_allclose(noise.log_likelihood(misfit, 30, sigma), white.log_likelihood(misfit, 30, total))
+    shared = SharedGaussianNoise(CHANNELS, [2.0, 0.5], sensor=given)
+    np.testing.assert_allclose(
+        shared.standard_deviations(sigma[:, :1]), np.sqrt((sigma[:, :1] * [2.0, 0.5]) ** 2 + [0.0, 0.03**2])
+    )
+    lasting = AutoregressiveNoise(CHANNELS, sensor=given)
+    np.testing.assert_allclose(lasting.standard_deviations(np.hstack([sigma, 0.0 * sigma])), total)
+    # no model error at all is possible where the sensor is known, and only there; a negative one is not
+    edge = np.array([[0.5, 0.0], [0.0, 0.5], [0.5, -1e-9], [0.5, math.nan]])
+    assert np.isfinite(noise.log_likelihood(misfit, 30, edge)).tolist() == [True, False, False, False]
+    assert len({repr(noise), repr(white), repr(GaussianNoise(CHANNELS, sensor=(0.0, 0.04)))}) == 3
+
+
+def test_effective_samples_weigh_the_channels(rng):
+    misfit, sigma = rng.uniform(1.0, 2.0, (4, 2)), rng.uniform(0.1, 1.0, (4, 2))
+    apart = [GaussianNoise([c]).log_likelihood(misfit[:, [k]], 40, sigma[:, [k]]) for k, c in enumerate(CHANNELS)]
+    for given, expected in (
+        ((10.0, 4.0), 0.25 * apart[0] + 0.1 * apart[1]),
+        ({"drift": 4.0}, apart[0] + 0.1 * apart[1]),
+        ((1e9, 40.0), apart[0] + apart[1]),  # never more than there are
+    ):
+        noise = GaussianNoise(CHANNELS, effective_samples=given)
+        np.testing.assert_allclose(noise.log_likelihood(misfit, 40, sigma), expected, rtol=1e-13)
+        assert noise == GaussianNoise(CHANNELS, effective_samples=given) != GaussianNoise(CHANNELS)
+        shared = SharedGaussianNoise(CHANNELS, [1.0, 1.0], effective_samples=given)
+        np.testing.assert_allclose(
+            shared.log_likelihood(misfit, 40, sigma[:, :1]),
+            noise.log_likelihood(misfit, 40, sigma[:, [0, 0]]),
+            rtol=1e-13,
+        )
+
+
+@pytest.mark.parametrize("kind", [GaussianNoise, AutoregressiveNoise])
+def test_sensors_that_cannot_be_are_refused(kind):
+    for sensor, message in (
+        ({"bottom": 1.0}, "names no channel with .*bottom.*they are top, drift"),
+        ([1.0], "one number for each of top, drift; got 1"),
+        ([1.0, -1.0], "zero or more"),
+        ([1.0, math.nan], "zero or more"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            kind(CHANNELS, sensor=sensor)
+    for effective in ([1.0, 0.0], [1.0, math.nan], {"drift": -3.0}):
+        with pytest.raises(ValueError, match="positive numbers of samples"):
+            GaussianNoise(CHANNELS, effective_samples=effective)
+
+
+# in a likelihood ------------------------------------------------------------------------------------------------------
+
+
+class Line:
+    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one, and counts its runs."""
+
+    parameter_names = ("offset", "slope")
+    channels = CHANNELS
+    dt = 0.5
+    n_steps = 12
+    fingerprint = "line"
+
+    def __init__(self):
+        self.runs = 0
+
+    def simulate(self, theta):
+        self.runs += 1
+        if theta[1] > 1.0:
+            raise SimulationFailed("too steep")
+        line = theta[0] + theta[1] * self.dt * np.arange(self.n_steps)
+        return np.vstack([line, -line])
+
+
+class BatchLine(Line):
+    """With its own sums of squares, which must not be taken for anything else."""
+
+    def simulate_batch(self, thetas):
+        self.runs += len(thetas)
+        line = thetas[:, :1] + thetas[:, 1:] * self.dt * np.arange(self.n_steps)
+        return SimulationBatch(np.stack([line, -line], axis=1), ["too steep" if t[1] > 1.0 else "" for t in thetas])
+
+    def misfit_batch(self, thetas, measured):
+        raise AssertionError("white noise only")
+
+
+def measured_by(model, rng):
+    return Measurements(model.channels, model.dt, rng.normal(size=(2, model.n_steps)))
+
+
+@pytest.mark.parametrize("kind", [Line, BatchLine])
+def test_sigmas_and_correlations_cost_no_simulation(rng, kind):
+    model = kind()
+    likelihood = FELikelihood(model, measured_by(Line(), rng), AutoregressiveNoise(CHANNELS))
+    assert likelihood.fast_parameters == (2, 3, 4, 5)
+    x = np.column_stack([rng.normal(size=(30, 2)), rng.uniform(0.5, 1.0, (30, 2)), rng.uniform(-0.9, 0.9, (30, 2))])
+    values = likelihood.log_likelihood(x)
+    assert np.array_equal(np.isneginf(values), x[:, 1] > 1.0) and 0 < np.isneginf(values).sum() < 30
+    x[:, 2:] = 0.9 * x[:, 2:]
+    likelihood.log_likelihood(x)
+    assert likelihood.simulations == model.runs == 30
+    good = x[x[:, 1] <= 1.0]
+    residuals = np.array([likelihood.measurements.values - Line().simulate(theta[:2]) for theta in good])
+    expected = AutoregressiveNoise(CHANNELS).log_likelihood(
+        np.array([lag_one_sums(r) for r in residuals]), 12, good[:, 2:]
+    )
+    np.testing.assert_allclose(likelihood.log_likelihood(good), expected, rtol=1e-12)
+    # sums of squares stay what they were, for those who ask for them
+    np.testing.assert_allclose(likelihood.misfit(good[:, :2]), np.square(residuals).sum(axis=2), rtol=1e-13)
+    power = np.square(likelihood.measurements.values).sum(axis=1)
+    posterior = Posterior(likelihood, dict(zip(likelihood.parameter_names, [Uniform(-9.0, 9.0)] * 6, strict=True)))
+    np.testing.assert_allclose(fit_measures(posterior, good), likelihood.misfit(good[:, :2]) / power)
+
+
+def test_no_propositions_outside_the_possible_are_simulated(rng):
+    model = Line()
+    likelihood = FELikelihood(model, measured_by(model, rng), AutoregressiveNoise(CHANNELS))
+    x = np.array([[0.0, 0.0, 1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 1.0, -1.0, 0.5, 0.5]])
+    assert np.isneginf(likelihood.log_likelihood(x)).all() and model.runs == 0
+
+
+@pytest.mark.parametrize("responses", [False, True])
+def test_the_cache_tells_statistics_apart(tmp_path, rng, responses):
+    """What was kept for white noise must not be served to another one, in either order."""
+    measurements, thetas = measured_by(Line(), rng), rng.uniform(-1.0, 1.0, size=(6, 2))
+    cache = SimulationCache(tmp_path / "lines.sqlite", responses=responses)
+    expected = {}
+    for round_ in range(2):
+        for noise in (GaussianNoise(CHANNELS), AutoregressiveNoise(CHANNELS), SharedGaussianNoise(CHANNELS, [1, 1])):
+            model = Line()
+            likelihood = FELikelihood(model, measurements, noise, cache=cache)
+            statistics = likelihood.statistics(thetas)
+            white = not isinstance(noise, AutoregressiveNoise)
+            assert statistics.shape == (6, 2 if white else 6)
+            assert np.array_equal(expected.setdefault(white, statistics), statistics)
+            known = round_ or isinstance(noise, SharedGaussianNoise)
+            assert (model.runs, likelihood.disk_hits) == ((0, 6) if known else (6, 0))
+    np.testing.assert_array_equal(expected[True], expected[False][:, :2])
+    assert cache.damaged == 0
+
+
+def test_a_noise_of_other_channels_is_refused(rng):
+    with pytest.raises(ValueError, match="noise is of the channels drift, top, the model's are top, drift"):
+        FELikelihood(Line(), measured_by(Line(), rng), GaussianNoise(CHANNELS[::-1]))
+
+
+def test_residuals_of_a_likelihood(rng):
+    likelihood = FELikelihood(Line(), measured_by(Line(), rng))
+    expected = likelihood.measurements.values - Line().simulate(np.array([0.2, 0.1]))
+    np.testing.assert_array_equal(likelihood.residuals([0.2, 0.1]), expected)
+    np.testing.assert_array_equal(likelihood.residuals([0.2, 0.1, 1.0, 1.0]), expected)
+    with pytest.raises(ValueError, match=r"shape \(2,\) or \(4,\)"):
+        likelihood.residuals([0.2])
+    with pytest.raises(SimulationFailed, match="too steep"):
+        likelihood.residuals([0.0, 2.0])
+
+
+# predictions ----------------------------------------------------------------------------------------------------------
+
+
+def test_drawn_errors_have_the_covariance_that_the_likelihood_assumes(rng):
+    noise = SampleNoise(np.array([[0.5, 2.0]]), np.array([[0.9, -0.4]]))
+    errors = np.array([noise.draw(0, 6, rng) for _ in range(20_000)])
+    for k in range(2):
+        expected = noise.deviations[0, k] ** 2 * linalg.toeplitz(noise.lag_one[0, k] ** np.arange(6))
+        got = errors[:, k].T @ errors[:, k] / len(errors)
+        error = np.sqrt((np.outer(np.diag(expected), np.diag(expected)) + expected**2) / len(errors))
+        assert np.all(np.abs(got - expected) < 4.5 * error)
+
+
+def test_predictions_draw_errors_that_last(rng):
+    """Every reading spreads by sigma, whatever the correlation; their mean spreads the more the longer errors last."""
+    sigma, rho, n = 0.3, 0.8, 4000
+    likelihood = FELikelihood(Line(), measured_by(Line(), rng), AutoregressiveNoise(CHANNELS))
+    names = likelihood.parameter_names
+    posterior = Posterior(likelihood, dict(zip(names, [Uniform(-9.0, 9.0)] * len(names), strict=True)))
+    samples = np.tile([0.1, 0.2, sigma, sigma, rho, 0.0], (n, 1))
+    means = propagate(posterior, samples, quantity=lambda r: r.mean(axis=1), noise=True, seed=1, progress=False)
+    covariance = sigma**2 * linalg.toeplitz(rho ** np.arange(12))
+    expected = np.array([covariance.mean(), sigma**2 / 12])
+    assert np.all(np.abs(means.variance / expected - 1.0) < 4.5 * math.sqrt(2.0 / n))
+    histories = propagate(posterior, samples, noise=True, seed=1, progress=False)
+    np.testing.assert_allclose(histories.variance, sigma**2, rtol=1e-10)
+    low = stats.norm.cdf((histories.quantile(0.05) - histories.mean) / sigma)
+    assert np.all(np.abs(low - 0.05) < 4.5 * math.sqrt(0.05 * 0.95 / n))
+    with pytest.raises(ValueError, match="correlation between -1 and 1"):
+        propagate(posterior, samples + [0, 0, 0, 0, 0.2, 0], noise=True, progress=False)
+
+
+# calibration ----------------------------------------------------------------------------------------------------------
+
+LEVEL, N_DATA, RHO = 0.9, 200, 0.9
+STEPS = 600
+# at this period [s] the spectrum of the errors is what effective_samples takes it to be, (1 + rho^2) / (1 - rho^2) of
+# white noise; at a shorter one it is lower, and the effective number errs on the safe side
+LIKE_THE_ERRORS = 1.2
+
+
+def credible_interval_holds(likelihood, noise, statistics, grid, truth, options):
+    """Whether the central 90 % interval of the first parameter, by summation over a grid, holds the truth.
+
+    `grid` are its values, `options` those of the noise's parameters (rows), with flat priors over the grid.
+    """
+    rows = np.repeat(statistics, len(options), axis=0)
+    values = noise.log_likelihood(rows, likelihood.measurements.n_steps, np.tile(options, (len(grid), 1)))
+    density = np.exp(values - values.max()).reshape(len(grid), -1).sum(axis=1)
+    assert max(density[0], density[-1]) < 1e-2 * density.max(), "the grid is too narrow"
+    cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    probability = np.interp(truth, grid, cumulative / cumulative[-1])
+    return abs(2.0 * probability - 1.0) < LEVEL
+
+
+@pytest.mark.parametrize("period", [0.6, LIKE_THE_ERRORS])
+def test_coverage_of_what_each_noise_infers_from_errors_that_last(rng, period):
+    """The 90 % interval of the stiffness over 200 data sets whose errors are AR(1) with rho = .9."""
+    oscillator = LinearOscillator(Record("noise", 0.02, rng.normal(size=STEPS)), period=period, damping_ratio=0.05)
+
+    class OneChannel:
+        parameter_names, channels = ("stiffness",), oscillator.channels[1:]
+        dt, n_steps, fingerprint = oscillator.dt, STEPS, "stiffness alone"
+
+        def simulate(self, theta):
+            return oscillator.simulate([theta[0], 1.0])[1:]
+
+    model = OneChannel()
+    clean = model.simulate([1.0])
+    sigma = 0.2 * clean.std()
+    sensitivity = (model.simulate([1.001]) - model.simulate([0.999]))[0] / 0.002
+    covariance = sigma**2 * linalg.toeplitz(RHO ** np.arange(STEPS))
+    sd = (sensitivity @ np.linalg.solve(covariance, sensitivity)) ** -0.5
+    grid = 1.0 + sd * np.linspace(-16.0, 16.0, 97)
+    sigmas = sigma * np.geomspace(0.4, 2.5, 15)
+    white = sigmas[:, None]
+    lasting = np.stack(np.meshgrid(sigmas, np.linspace(0.6, 0.98, 16), indexing="ij"), axis=-1).reshape(-1, 2)
+    autoregressive_noise = AutoregressiveNoise(model.channels)
+    held = dict.fromkeys(("white", "autoregressive", "effective"), 0)
+    for _ in range(N_DATA):
+        values = clean + sigma * autoregressive(rng, (1, STEPS), RHO)
+        likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values), autoregressive_noise)
+        statistics = likelihood.statistics(grid[:, None])
+        misfit = statistics[:, :1]
+        residuals = likelihood.residuals(grid[[np.argmin(misfit)]])
+        effective = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
+        for name, noise, numbers, options in (
+            ("white", GaussianNoise(model.channels), misfit, white),
+            ("autoregressive", autoregressive_noise, statistics, lasting),
+            ("effective", effective, misfit, white),
+        ):
+            held[name] += credible_interval_holds(likelihood, noise, numbers, grid, 1.0, options)
+    error = math.sqrt(LEVEL * (1.0 - LEVEL) / N_DATA)
+    share = {name: count / N_DATA for name, count in held.items()}
+    assert share["white"] < LEVEL - 8.0 * error, share
+    assert abs(share["autoregressive"] - LEVEL) < 3.0 * error, share
+    assert share["effective"] > LEVEL - 3.0 * error, share
+    if period == LIKE_THE_ERRORS:
+        assert abs(share["effective"] - LEVEL) < 3.0 * error, share
+
+
+# problems -------------------------------------------------------------------------------------------------------------
+
+
+def test_problems_take_another_noise():
+    posterior = isolated_bridge(channels=("acc_p1", "Ub_2"), noise="autoregressive", step=1e-3)
+    assert posterior.parameter_names[-4:] == ["sigma_acc_p1", "sigma_Ub_2", "rho_acc_p1", "rho_Ub_2"]
+    assert posterior.prior.distributions["rho_Ub_2"] == Uniform(-1.0, 1.0)
+    measurements = posterior.likelihood.measurements
+    noise = SharedGaussianNoise.of(measurements, effective_samples={"Ub_2": 50.0})
+    given = isolated_bridge(channels=("acc_p1", "Ub_2"), noise=noise, step=1e-3)
+    assert given.likelihood.noise is noise and given.ndim == 11
+    assert given.fingerprint != isolated_bridge(channels=("acc_p1", "Ub_2"), step=1e-3).fingerprint
+    with pytest.raises(ValueError, match='"per channel", "shared", "autoregressive" or "marginal"'):
+        isolated_bridge(noise="pink")
+    column = bridge_column(noise="autoregressive", duration=1.0, mesh=20)
+    assert column.fast_parameters == (5, 6, 7, 8)
+    x = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.2, 2e-3, 0.0, 0.0])
+    white = bridge_column(duration=1.0, mesh=20)
+    assert column.log_likelihood(x) == pytest.approx(white.log_likelihood(x[:7]), rel=1e-12)
+    assert bridge_column(noise="marginal", duration=1.0, mesh=20).parameter_names == white.parameter_names[:5]
+    names = AutoregressiveNoise((CHANNELS[0],)).parameter_names
+    with pytest.raises(ValueError, match="no default prior for nu_top"):
+        bridge_column_prior((*names[1:], "nu_top"))
+    prior = bridge_column_prior(("sigma_acceleration", "rho_acceleration"))
+    assert prior.names[-2:] == ("sigma_acceleration", "rho_acceleration")
+    assert bridge_column_prior(("sigma",)).distributions["sigma"] == HalfNormal(0.3)
+    assert prior.distributions["Ec"] == TruncatedNormal(1.0, 0.3)

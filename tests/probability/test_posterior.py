@@ -1,0 +1,510 @@
+"""The posterior: its formula, its promises to any client, and what it does with models that misbehave."""
+
+import logging
+import math
+import multiprocessing
+import pickle
+import warnings
+from multiprocessing.pool import ThreadPool
+
+import emcee
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, LogNormal, Prior, TruncatedNormal, Uniform
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.model import MisfitBatch, SimulationBatch, SimulationFailed, misfit_batch, simulate_batch
+
+TRUTH = np.array([1.15, 0.8])
+SIGMA = np.array([0.05, 0.001])
+
+
+@pytest.fixture
+def oscillator(rng):
+    return LinearOscillator(Record("noise", 0.02, rng.normal(size=300)), period=0.6, damping_ratio=0.05)
+
+
+@pytest.fixture
+def measurements(oscillator, rng):
+    values = oscillator.simulate(TRUTH) + SIGMA[:, None] * rng.normal(size=(2, oscillator.n_steps))
+    return Measurements(oscillator.channels, oscillator.dt, values)
+
+
+@pytest.fixture
+def prior():
+    return Prior(
+        {
+            "stiffness": TruncatedNormal(1.0, 0.3),
+            "damping": TruncatedNormal(1.0, 0.6),
+            "sigma_acceleration": HalfNormal(0.2),
+            "sigma_displacement": HalfNormal(0.005),
+        }
+    )
+
+
+@pytest.fixture
+def posterior(oscillator, measurements, prior):
+    return Posterior(FELikelihood(oscillator, measurements), prior)
+
+
+class Polynomial:
+    """Responses ``theta[0] + theta[1] t``, in two channels; misbehaves where it is told to, and counts its runs."""
+
+    parameter_names = ("offset", "slope")
+    channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
+    dt = 0.5
+    n_steps = 8
+    fingerprint = "polynomial"
+
+    def __init__(self):
+        self.runs = []
+
+    def simulate(self, theta):
+        offset, slope = theta
+        self.runs.append(tuple(theta))
+        theta[:] = np.nan  # a model that scribbles on its input must not harm the caller
+        if offset == 1.0:
+            raise SimulationFailed("no convergence at step 3")
+        if offset == 2.0:
+            raise ZeroDivisionError("float division by zero")
+        response = np.vstack([np.full(self.n_steps, offset), slope * self.dt * np.arange(self.n_steps)])
+        if offset == 3.0:
+            response[1, 5] = np.nan
+        if offset == 4.0:
+            response[0] = np.inf
+        if offset == 5.0:
+            return response[:, :-1]
+        if offset == 6.0:
+            return None
+        if offset == 7.0:
+            raise KeyboardInterrupt
+        if offset == 8.0:
+            response *= 1e200
+        if offset == 9.0:
+            raise SimulationFailed("")
+        return response
+
+
+class BatchPolynomial(Polynomial):
+    """The same with batch methods, which break as a whole where `broken` says how."""
+
+    broken = ""
+
+    def simulate_batch(self, thetas):
+        if self.broken == "raises":
+            raise MemoryError("too many")
+        if self.broken == "shape":
+            return SimulationBatch(np.zeros((1, 2, 3)), [""])
+        response = np.zeros((len(thetas), 2, self.n_steps))
+        response[:, 0] = thetas[:, :1]
+        response[:, 1] = thetas[:, 1:] * self.dt * np.arange(self.n_steps)
+        self.runs += [tuple(theta) for theta in thetas]
+        response[thetas[:, 0] == 3.0, 1, 5] = np.nan
+        return SimulationBatch(response, ["told so" if theta[0] == 1.0 else "" for theta in thetas])
+
+
+class MisfitPolynomial(BatchPolynomial):
+    def misfit_batch(self, thetas, measured):
+        response, reasons = self.simulate_batch(thetas)
+        return MisfitBatch(((response - measured) ** 2).sum(axis=2), reasons)
+
+
+BAD = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 9.0)
+
+
+def polynomial_posterior(model):
+    rng = np.random.default_rng(5)
+    measurements = Measurements(model.channels, model.dt, rng.normal(size=(2, model.n_steps)))
+    names = ("offset", "slope", "sigma_a", "sigma_b")
+    distributions = (Uniform(-10.0, 10.0), TruncatedNormal(0.2, 1.0, -math.inf), HalfNormal(1.0), LogNormal(1.0, 0.3))
+    return Posterior(FELikelihood(model, measurements), dict(zip(names, distributions, strict=True)))
+
+
+# formula ------------------------------------------------------------------------------------------------------------
+
+
+def test_equals_the_direct_formula(posterior, oscillator, measurements):
+    x = np.array([1.1, 0.7, 0.06, 0.0012])
+    residuals = measurements.values - oscillator.simulate(x[:2])
+    log_likelihood = stats.norm.logpdf(residuals, scale=x[2:, None]).sum()
+    log_prior = (
+        stats.truncnorm.logpdf(x[0], -1 / 0.3, np.inf, 1.0, 0.3)
+        + stats.truncnorm.logpdf(x[1], -1 / 0.6, np.inf, 1.0, 0.6)
+        + stats.halfnorm.logpdf(x[2:], 0, [0.2, 0.005]).sum()
+    )
+    assert posterior.log_likelihood(x) == pytest.approx(log_likelihood, rel=1e-12)
+    assert posterior.log_prior(x) == pytest.approx(log_prior, rel=1e-12)
+    assert posterior(x) == posterior.log_prob(x) == pytest.approx(log_likelihood + log_prior, rel=1e-12)
+
+
+def test_equals_the_conjugate_posterior_up_to_a_constant():
+    # a response linear in its parameter, normal prior, known noise: the posterior of the slope is normal
+    model = Polynomial()
+    posterior = polynomial_posterior(model)
+    basis = model.dt * np.arange(model.n_steps)
+    sigma = 0.7
+    precision = 1.0 + basis @ basis / sigma**2
+    mean = (0.2 + basis @ posterior.likelihood.measurements.values[1] / sigma**2) / precision
+    slopes = np.linspace(-3.0, 3.0, 25)
+    x = np.column_stack([np.full(25, 0.3), slopes, np.full(25, 1.1), np.full(25, sigma)])
+    difference = posterior(x) - stats.norm.logpdf(slopes, mean, precision**-0.5)
+    np.testing.assert_allclose(difference, difference[0], rtol=0, atol=1e-10)
+
+
+def test_display_units_change_nothing(oscillator, measurements):
+    # the same data under another display unit: nothing changes, values are SI everywhere
+    x = np.array([[1.1, 0.7, 0.06, 0.0012], [0.9, 1.2, 0.03, 0.004]])
+    other = tuple(
+        Channel(channel.name, channel.quantity, unit)
+        for channel, unit in zip(measurements.channels, ("in/s2", "ft"), strict=True)
+    )
+    shown = Measurements(other, measurements.dt, measurements.values)
+    np.testing.assert_array_equal(
+        FELikelihood(oscillator, shown).log_likelihood(x), FELikelihood(oscillator, measurements).log_likelihood(x)
+    )
+
+
+# shapes, names, orders ----------------------------------------------------------------------------------------------
+
+
+def test_points_and_batches(posterior, rng):
+    x = posterior.sample_prior(7, rng)
+    for density in (posterior, posterior.log_prob, posterior.log_prior, posterior.log_likelihood):
+        batch = density(x)
+        assert batch.shape == (7,)
+        assert batch.dtype == float
+        assert density(x[:0]).shape == (0,)
+        assert type(density(x[0])) is float
+        assert [density(row) for row in x] == batch.tolist()  # to the last bit
+        assert density(x[:1]).tolist() == [batch[0]]
+    u = rng.random((5, 4))
+    np.testing.assert_array_equal(posterior.prior_transform(u)[2], posterior.prior_transform(u[2]))
+    np.testing.assert_array_equal(posterior.sample_prior(3, 8), posterior.prior.rvs(3, 8))
+
+
+def test_named_values(posterior, rng):
+    x = posterior.sample_prior(3, rng)
+    named = [dict(zip(posterior.parameter_names[::-1], row[::-1], strict=True)) for row in x]
+    assert [posterior(point) for point in named] == posterior(x).tolist()
+    columns = dict(zip(posterior.parameter_names, x.T, strict=True))
+    assert posterior(columns).tolist() == posterior(x).tolist()
+    with pytest.raises(ValueError, match="stiffness, damping.*got the names stiffness"):
+        posterior({"stiffness": 1.0})
+
+
+def test_prior_is_put_in_the_order_of_the_parameters(posterior, oscillator, measurements, prior):
+    assert posterior.parameter_names == ["stiffness", "damping", "sigma_acceleration", "sigma_displacement"]
+    assert posterior.fast_parameters == (2, 3)
+    assert posterior.ndim == posterior.prior.dim == 4
+    turned = Posterior(FELikelihood(oscillator, measurements), prior.reorder(prior.names[::-1]))
+    x = posterior.sample_prior(4, 1)
+    np.testing.assert_array_equal(turned.log_prior(x), posterior.log_prior(x))
+    np.testing.assert_array_equal(turned(x), posterior(x))
+
+
+def test_prior_of_other_parameters_is_refused(oscillator, measurements, prior):
+    likelihood = FELikelihood(oscillator, measurements)
+    more = Prior({**prior.distributions, "extra": HalfNormal(1.0)})
+    fewer = Prior({name: prior.distributions[name] for name in prior.names[1:]})
+    with pytest.raises(ValueError, match=r"'extra'.*'sigma_displacement'\];.*unknown: \['extra'\]"):
+        Posterior(likelihood, more)
+    with pytest.raises(ValueError, match=r"without a prior: \['stiffness'\]"):
+        Posterior(likelihood, fewer)
+    with pytest.raises(ValueError, match="expects a non-empty mapping"):
+        Posterior(likelihood, None)
+
+
+@pytest.mark.parametrize("shape", [(3,), (5,), (2, 3), (2, 2, 4), ()])
+def test_wrong_length_is_refused(posterior, shape):
+    for density in (posterior, posterior.log_prior, posterior.log_likelihood):
+        with pytest.raises(ValueError, match=r"4 parameters stiffness, damping, .*got shape"):
+            density(np.ones(shape))
+
+
+def test_coarse_posterior(posterior, oscillator, measurements, prior):
+    assert posterior.coarse is None
+    assert Posterior(posterior.likelihood, prior, coarse=posterior).coarse is posterior
+    with pytest.raises(ValueError, match="coarse"):
+        Posterior(posterior.likelihood, prior, coarse=polynomial_posterior(Polynomial()))
+
+
+# measurements against the model --------------------------------------------------------------------------------------
+
+
+def test_channels_are_matched_by_name(oscillator, measurements):
+    turned = measurements.select(["displacement", "acceleration"])
+    x = np.array([1.1, 0.7, 0.06, 0.0012])
+    straight = FELikelihood(oscillator, measurements)
+    likelihood = FELikelihood(oscillator, turned)
+    assert likelihood.log_likelihood(x) == straight.log_likelihood(x)
+    assert likelihood.fingerprint == straight.fingerprint
+
+
+def test_measurements_that_do_not_fit_are_refused(oscillator, measurements):
+    cases = {
+        "select": measurements.select(["acceleration"]),
+        "decimate": measurements.decimate(2),
+        "trim": measurements.trim(0.0, 3.0),
+        "relative acceleration": Measurements(
+            (Channel("acceleration", "relative acceleration", "g"), measurements.channels[1]),
+            measurements.dt,
+            measurements.values,
+        ),
+        "in the measurements": Measurements(
+            (Channel("acceleration", "force", "kN"), measurements.channels[1]), measurements.dt, measurements.values
+        ),
+    }
+    for advice, case in cases.items():
+        with pytest.raises(ValueError, match=advice):
+            FELikelihood(oscillator, case)
+    with pytest.raises(ValueError, match="map"):
+        FELikelihood(oscillator, measurements, pool="four")
+
+
+def test_fingerprint_knows_model_and_measurements(oscillator, measurements):
+    likelihood = FELikelihood(oscillator, measurements)
+    assert likelihood.fingerprint == FELikelihood(oscillator, measurements).fingerprint
+    other = Measurements(measurements.channels, measurements.dt, measurements.values * 1.01)
+    model = LinearOscillator(oscillator.record, 0.7)
+    fingerprints = {FELikelihood(oscillator, other).fingerprint, FELikelihood(model, measurements).fingerprint}
+    assert len(fingerprints | {likelihood.fingerprint}) == 3
+
+
+# failures ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
+    model = Polynomial()
+    posterior = polynomial_posterior(model)
+    x = np.array([[offset, 0.1, 0.5, 1.0] for offset in (*BAD, 0.5)])
+    with warnings.catch_warnings(), caplog.at_level(logging.WARNING), ThreadPool(max(threads, 1)) as pool:
+        warnings.simplefilter("error")
+        posterior.likelihood.pool = pool if threads else None
+        values = posterior(x)
+    posterior.likelihood.pool = None
+    assert np.isneginf(values[:-1]).all()
+    assert np.isfinite(values[-1])
+    report = posterior.report()
+    reasons = {failure["parameters"]["offset"]: failure["reason"] for failure in report["failures"]}
+    assert list(reasons) == list(BAD)
+    assert reasons[1.0] == "no convergence at step 3"
+    assert reasons[2.0] == "ZeroDivisionError: float division by zero"
+    assert reasons[3.0] == "the misfit of channel 'b' is not finite"
+    assert reasons[4.0] == reasons[8.0] == "the misfit of channel 'a' is not finite"
+    assert "shape (2, 7), expected (n_channels, n_steps) = (2, 8)" in reasons[5.0]
+    assert "shape" in reasons[6.0]
+    assert reasons[9.0] == "no reason given"
+    assert report["failures"][0]["parameters"] == {"offset": 1.0, "slope": 0.1}
+    assert report["simulations"] == len(BAD) + 1
+    assert report["failure_count"] == sum(report["failure_reasons"].values()) == len(BAD)
+    assert report["cache_hits"] == 0
+    assert report["seconds"] > 0.0
+    assert len(caplog.records) == 1  # the first failure speaks, the others are counted
+    assert "no convergence at step 3" in caplog.text
+    assert posterior(x[0]) == -np.inf
+    assert type(posterior.log_likelihood(x[0])) is float
+    assert len(caplog.records) == 1
+
+
+def test_an_interrupt_passes():
+    posterior = polynomial_posterior(Polynomial())
+    with pytest.raises(KeyboardInterrupt):
+        posterior([7.0, 0.1, 0.5, 1.0])
+
+
+def test_records_of_failures_are_bounded():
+    class AlwaysFails(Polynomial):
+        def simulate(self, theta):
+            raise SimulationFailed(f"no convergence at offset {theta[0]}")
+
+    posterior = polynomial_posterior(AlwaysFails())
+    posterior(np.column_stack([np.linspace(-9.0, 9.0, 1500), np.ones((1500, 3))]))
+    report = posterior.report()
+    assert report["failure_count"] == sum(report["failure_reasons"].values()) == 1500
+    assert len(report["failures"]) == 1000
+    assert len(report["failure_reasons"]) == 101
+
+
+def test_nan_from_a_noise_is_a_failure():
+    class BadNoise:
+        parameter_names = ("scale",)
+
+        def log_likelihood(self, misfit, n_steps, parameters):
+            return np.full(len(misfit), np.nan)
+
+    model = Polynomial()
+    measurements = Measurements(model.channels, model.dt, np.ones((2, model.n_steps)))
+    likelihood = FELikelihood(model, measurements, noise=BadNoise())
+    assert likelihood.parameter_names == ("offset", "slope", "scale")
+    assert likelihood.log_likelihood([0.5, 0.1, np.nan]) == -np.inf
+    assert likelihood.failures == []
+    assert likelihood.log_likelihood([0.5, 0.1, 1.0]) == -np.inf
+    assert likelihood.failures[0]["reason"] == "the log-likelihood of the noise is nan"
+
+
+# what is simulated ----------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_simulated_outside_the_support():
+    model = Polynomial()
+    posterior = polynomial_posterior(model)
+    good = [0.5, 0.1, 0.5, 1.0]
+    x = np.tile(good, (9, 1))
+    x[0, 0], x[1, 0] = 10.1, -10.1
+    x[2, 2], x[3, 3] = -0.1, -1.0
+    x[4, 0], x[5, 1], x[6, 2], x[7, 3] = np.nan, np.inf, np.nan, -np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for density in (posterior, posterior.log_likelihood):
+            values = density(x)
+            assert np.isneginf(values[:8]).all()
+            assert np.isfinite(values[8])
+            assert [density(row) for row in x[:8]] == [-np.inf] * 8
+    assert set(model.runs) == {(0.5, 0.1)}
+    assert posterior.report()["simulations"] == len(model.runs) == 1
+    assert posterior.report()["failure_count"] == 0
+
+
+def test_the_likelihood_alone_simulates_only_what_can_count():
+    model = Polynomial()
+    likelihood = polynomial_posterior(model).likelihood
+    x = np.array([[0.5, 0.1, 0.0, 1.0], [0.5, 0.1, 0.5, -1.0], [np.nan, 0.1, 0.5, 1.0], [0.5, np.inf, 0.5, 1.0]])
+    assert np.isneginf(likelihood.log_likelihood(x)).all()
+    assert np.isnan(likelihood.misfit(x[2:, :2])).all()
+    assert model.runs == []
+    assert likelihood.failure_count == 0
+
+
+def test_equal_structural_parameters_are_simulated_once():
+    model = Polynomial()
+    posterior = polynomial_posterior(model)
+    x = np.array(
+        [[0.5, 0.1, 0.5, 1.0], [0.0, 0.2, 0.5, 1.0], [0.5, 0.1, 0.9, 2.0], [-0.0, 0.2, 0.3, 1.0], [1.0, 0.2, 0.3, 1.0]]
+        + [[1.0, 0.2, 0.4, 1.0]]
+    )
+    kept = x.copy()
+    values = posterior(x)
+    np.testing.assert_array_equal(x, kept)
+    assert model.runs == [(0.5, 0.1), (0.0, 0.2), (1.0, 0.2)]
+    assert posterior.report()["simulations"] == 3
+    assert posterior.report()["failure_count"] == 1
+    assert values.tolist() == [posterior(row) for row in x]
+
+
+# batch methods --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [BatchPolynomial, MisfitPolynomial])
+def test_batch_methods_give_the_same_as_single_simulations(kind, rng):
+    thetas = rng.normal(size=(6, 2))
+    thetas[2, 0], thetas[4, 0] = 1.0, 3.0
+    model = kind()
+    measured = np.ones((2, model.n_steps))
+    single, batch = misfit_batch(Polynomial(), thetas, measured), misfit_batch(model, thetas, measured)
+    np.testing.assert_array_equal(batch.misfit, single.misfit)
+    assert len(model.runs) == 6
+    assert batch.reasons[2] == "told so"
+    assert "not finite" in batch.reasons[4]
+    assert [bool(reason) for reason in batch.reasons] == [bool(reason) for reason in single.reasons]
+    assert np.isnan(batch.misfit[[2, 4]]).all()
+    response = simulate_batch(model, thetas)
+    np.testing.assert_array_equal(response.response, simulate_batch(Polynomial(), thetas).response)
+    assert np.isnan(response.response[[2, 4]]).all()
+    assert response.reasons[4] == "the response of channel 'b' is not finite"
+
+
+@pytest.mark.parametrize("kind", [BatchPolynomial, MisfitPolynomial])
+@pytest.mark.parametrize("broken", ["raises", "shape"])
+def test_a_batch_that_breaks_as_a_whole_is_run_row_by_row(kind, broken, caplog):
+    thetas = np.array([[0.5, 0.1], [1.0, 0.1], [0.6, 0.3]])
+    model = kind()
+    model.broken = broken
+    measured = np.ones((2, model.n_steps))
+    with caplog.at_level(logging.WARNING):
+        batch = misfit_batch(model, thetas, measured)
+    np.testing.assert_array_equal(batch.misfit, misfit_batch(Polynomial(), thetas, measured).misfit)
+    assert batch.reasons == ["", "no convergence at step 3", ""]
+    assert "one by one" in caplog.text
+
+
+def test_an_empty_batch():
+    for model in (Polynomial(), BatchPolynomial(), MisfitPolynomial()):
+        assert simulate_batch(model, np.empty((0, 2))).response.shape == (0, 2, 8)
+        assert misfit_batch(model, np.empty((0, 2)), np.ones((2, 8))).misfit.shape == (0, 2)
+        assert model.runs == []
+
+
+# pools, pickles, clients ----------------------------------------------------------------------------------------------
+
+
+def test_threads_give_the_same_bits(posterior, oscillator, measurements, prior):
+    x = posterior.sample_prior(40, 3)
+    with ThreadPool(2) as pool:
+        pooled = Posterior(FELikelihood(oscillator, measurements, pool=pool), prior)
+        np.testing.assert_array_equal(pooled(x), posterior(x))
+        assert pooled.report()["simulations"] == 40
+
+
+def test_spawned_processes_give_the_same_bits(posterior, oscillator, measurements, prior):
+    x = posterior.sample_prior(12, 3)
+    x[5, 1] = 25.0  # overdamped: fails in the worker
+    expected = posterior(x)
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        pooled = Posterior(FELikelihood(oscillator, measurements, pool=pool), prior)
+        np.testing.assert_array_equal(pooled(x), expected)
+        assert pooled.report()["failures"] == posterior.report()["failures"]
+        assert pooled.report()["failure_count"] == 1
+        np.testing.assert_array_equal(pool.map(pooled, list(x)), expected)  # the pool itself stays at home
+
+
+def test_pickle(posterior):
+    x = posterior.sample_prior(5, 1)
+    copy = pickle.loads(pickle.dumps(posterior))
+    np.testing.assert_array_equal(copy(x), posterior(x))
+    assert copy.parameter_names == posterior.parameter_names
+    assert copy.likelihood.fingerprint == posterior.likelihood.fingerprint
+
+
+@pytest.mark.parametrize("settings", [{"vectorize": True}, {"parameter_names": "ours"}], ids=str)
+def test_emcee(posterior, settings, seed):
+    if "parameter_names" in settings:
+        settings = {"parameter_names": posterior.parameter_names}
+    start = posterior.sample_prior(10, seed)
+
+    def run(**settings):
+        sampler = emcee.EnsembleSampler(10, posterior.ndim, posterior, **settings)
+        sampler._random = np.random.RandomState(seed)
+        sampler.run_mcmc(start, 5)
+        return sampler.get_chain(), sampler.get_log_prob()
+
+    chain, log_prob = run(**settings)
+    reference, expected = run()
+    np.testing.assert_array_equal(chain, reference)
+    np.testing.assert_array_equal(log_prob, expected)
+    assert np.isfinite(log_prob[-1]).all()
+
+
+def test_optimum_is_near_the_truth(posterior):
+    x0 = np.array([1.0, 1.0, 0.1, 0.002])
+    result = optimize.minimize(
+        lambda x: -posterior(x),
+        x0,
+        method="Nelder-Mead",
+        options={"maxiter": 2000, "maxfev": 2000, "xatol": 1e-8, "fatol": 1e-8},
+    )
+    assert result.success
+    # standard deviations from the curvature at the optimum, in steps of a thousandth
+    step = 1e-3 * result.x
+    sd = []
+    for k in range(4):
+        e = np.eye(4)[k] * step
+        curvature = (posterior(result.x + e) - 2 * posterior(result.x) + posterior(result.x - e)) / step[k] ** 2
+        sd.append((-curvature) ** -0.5)
+    assert (np.abs(result.x - np.concatenate([TRUTH, SIGMA])) < 4.5 * np.array(sd)).all()
+    assert (np.array(sd[:2]) < 0.05).all()

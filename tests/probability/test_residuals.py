@@ -1,0 +1,119 @@
+"""Residuals of known origin: their correlation, their worth in samples, their checks."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from fe_likelihoods.plots.histories import plot_residuals
+from fe_likelihoods.probability.residuals import (
+    autocorrelation,
+    effective_samples,
+    innovations,
+    lag_one_sums,
+    residual_checks,
+)
+from fe_likelihoods.signals.channels import Channel
+
+N = 4000
+
+
+def autoregressive(rng, rho, n=N, n_channels=1):
+    z = rng.standard_normal((n_channels, n))
+    z[:, 1:] *= math.sqrt(1.0 - rho**2)
+    return signal.lfilter([1.0], [1.0, -rho], z, axis=1)
+
+
+def test_autocorrelation_is_its_definition(rng):
+    residuals = rng.normal(size=(2, 30)) * [[1e-200], [3.0]]
+    got = autocorrelation(residuals)
+    scaled = residuals / np.abs(residuals).max(axis=1, keepdims=True)
+    for lag in range(30):
+        expected = (scaled[:, lag:] * scaled[:, : 30 - lag]).sum(axis=1) / np.square(scaled).sum(axis=1)
+        np.testing.assert_allclose(got[:, lag], expected, atol=1e-13)
+
+
+def test_sums_are_their_definition(rng):
+    residuals = rng.normal(size=(2, 9))
+    expected = [(r**2).sum() for r in residuals]
+    expected += [((r[1:] - r[:-1]) ** 2).sum() for r in residuals] + [r[0] ** 2 + r[-1] ** 2 for r in residuals]
+    np.testing.assert_allclose(lag_one_sums(residuals), expected)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9, -0.9])
+def test_effective_samples_of_autoregressive_errors(rng, rho):
+    """n (1 - rho^2) / (1 + rho^2), and the same for either sign: 200 series, so the mean is known to some percent."""
+    found = effective_samples(autoregressive(rng, rho, n_channels=200)).mean()
+    assert found == pytest.approx(N * (1.0 - rho**2) / (1.0 + rho**2), rel=0.06)
+
+
+def test_effective_samples_are_what_sigma_is_inferred_from(rng):
+    """The mean square of correlated errors spreads as that of n_eff independent ones."""
+    errors = autoregressive(rng, 0.8, n=1000, n_channels=2000)
+    spread = np.square(errors).mean(axis=1).var()
+    assert 2.0 / spread == pytest.approx(effective_samples(errors).mean(), rel=0.15)
+
+
+def test_errors_that_oscillate_are_worth_fewer_samples_too(rng):
+    """The correlation time of a mean would say the contrary: more samples than there are."""
+    z = rng.standard_normal((1, N))
+    pole = 0.97 * np.exp(0.6j)
+    errors = signal.lfilter([1.0], np.poly([pole, pole.conjugate()]).real, z, axis=1)
+    pulse = signal.lfilter([1.0], np.poly([pole, pole.conjugate()]).real, np.eye(1, N)[0])
+    assert pulse.sum() ** 2 / np.square(pulse).sum() < 1.0  # that time: spectrum at zero frequency over the variance
+    assert effective_samples(errors)[0] < 0.1 * N
+
+
+def test_an_offset_is_worth_few_samples(rng):
+    assert effective_samples(1.0 + 0.01 * rng.standard_normal((1, 500)))[0] < 5.0
+    assert effective_samples(rng.standard_normal((1, 2)))[0] >= 1.0
+
+
+def test_innovations_of_autoregressive_errors_are_white(rng):
+    errors = 3.0 * autoregressive(rng, 0.9)
+    new = innovations(errors, [0.9])
+    assert new.shape == (1, N - 1)
+    assert new.std() == pytest.approx(3.0, rel=4.0 / math.sqrt(2 * N))
+    assert residual_checks(errors).white[0] < 1e-10 < 1e-3 < residual_checks(new).white[0]
+    with pytest.raises(ValueError, match="correlation between -1 and 1 for each of 1 channels"):
+        innovations(errors, [1.0])
+
+
+def test_checks_tell_white_from_lasting_and_normal_from_heavy_tails(rng):
+    """Of true ones probabilities are uniform: 400 of each, a share below .1 within its binomial error."""
+    white = residual_checks(rng.standard_normal((400, 500)))
+    lasting = residual_checks(autoregressive(rng, 0.9, n=2000, n_channels=400))
+    error = math.sqrt(0.1 * 0.9 / 400)
+    assert abs(np.mean(white.white < 0.1) - 0.1) < 4.0 * error
+    assert abs(np.mean(white.normal < 0.1) - 0.1) < 4.0 * error
+    assert np.mean(lasting.white < 1e-6) == 1.0
+    assert np.mean(lasting.normal < 0.1) < 0.25  # lasting errors are normal all the same
+    heavy = residual_checks(rng.standard_t(3, size=(50, 1000)))
+    assert np.mean(heavy.normal < 0.01) > 0.95
+    np.testing.assert_allclose(lasting.lag_one, 0.9, atol=0.06)
+
+
+@pytest.mark.parametrize("function", [autocorrelation, effective_samples, residual_checks])
+def test_what_are_no_residuals_is_refused(function):
+    for residuals, message in (
+        (np.ones(5), "shape"),
+        (np.ones((1, 1)), "two samples"),
+        (np.full((1, 5), np.nan), "finite"),
+        (np.array([[1.0, 2.0], [0.0, 0.0]]), r"channels \[1\] are all zero"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            function(residuals)
+
+
+def test_figure_of_residuals(rng):
+    channels = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
+    residuals = autoregressive(rng, 0.9, n=300, n_channels=2)
+    figure = plot_residuals(residuals, channels, 0.02)
+    axes = np.reshape(figure.axes, (2, 3))
+    time, values = axes[0, 0].lines[0].get_data()
+    assert time[-1] == pytest.approx(299 * 0.02) and np.allclose(values, residuals[0] / 9.80665)
+    lags = np.concatenate([line.get_xdata() for line in axes[0, 1].lines])
+    assert lags.max() > 0.1 and axes[1, 0].get_ylabel() == "drift [in]"
+    with pytest.raises(ValueError, match="one channel for each row.*got 1 and 2"):
+        plot_residuals(residuals, channels[:1], 0.02)

@@ -1,0 +1,225 @@
+"""Mixtures and shears: densities that are drawn from as stated, fits that find what is there and follow units."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import logsumexp
+
+from samplers.moves.kernels import MixtureMove
+from samplers.proposals.mixture import draw, fit_mixture, log_density, log_responsibilities
+from samplers.proposals.shears import bend, find_shears, straighten
+from samplers.proposals.support_bounds import (
+    SupportBounds,
+    find_support_bounds,
+    from_unbounded,
+    log_abs_det_jacobian,
+    to_unbounded,
+)
+
+
+def uniform(n):
+    return np.full(n, 1.0 / n)
+
+
+def banana(rng, n=2000):
+    x = rng.standard_normal((n, 3))
+    x[:, 1] = 0.1 * x[:, 1] + x[:, 0] ** 2
+    return x
+
+
+def groups(rng, n=2000):
+    """Two groups apart in one direction of eight: no principal component shows them."""
+    x = rng.standard_normal((n, 8))
+    second = rng.uniform(size=n) < 0.3
+    x[:, 4] = 0.2 * x[:, 4] + np.where(second, 2.0, -1.0)
+    return x, second
+
+
+def test_groups_are_found(rng):
+    x, second = groups(rng)
+    mixture = fit_mixture(x, uniform(len(x)))
+    assert len(mixture.weights) == 2
+    owner = log_responsibilities(mixture, x).argmax(axis=1) == mixture.weights.argmin()
+    assert np.mean(owner == second) > 0.995
+    assert mixture.weights.min() == pytest.approx(second.mean(), abs=0.01)
+
+
+def test_a_gaussian_is_one_component(rng):
+    mixture = fit_mixture(rng.standard_normal((1000, 5)), uniform(1000))
+    assert len(mixture.weights) == 1 and mixture.shears == ()
+
+
+def test_weights_count_as_points(rng):
+    """Weighted points give the mixture of the population they stand for."""
+    x = 2.0 * rng.standard_normal((40000, 2))
+    log_weights = -0.5 * np.sum((x - 1.0) ** 2, axis=1) + 0.5 * np.sum((x / 2.0) ** 2, axis=1)
+    weights = np.exp(log_weights - logsumexp(log_weights))
+    mixture = fit_mixture(x, weights, max_components=1)
+    effective = 1.0 / (weights @ weights)
+    assert np.allclose(mixture.means[0], 1.0, atol=5 / np.sqrt(effective))
+
+
+@pytest.mark.parametrize("population", [lambda rng: groups(rng)[0][:, 3:6], banana], ids=["groups", "banana"])
+def test_draws_follow_the_stated_density(rng, population):
+    x = population(rng)
+    mixture = fit_mixture(x, uniform(len(x)))
+    drawn = draw(mixture, 100_000, rng)
+    # importance sampling of a known density, a Gaussian inside a component: mean weight one, moments right
+    mean, root = mixture.means[0], 0.7 * mixture.roots[0]
+    straight = straighten(mixture.shears, drawn)
+    log_reference = stats.multivariate_normal(mean, root @ root.T).logpdf(straight)
+    weights = np.exp(log_reference - log_density(mixture, drawn))
+    assert abs(weights.mean() - 1.0) < 4.5 * weights.std() / np.sqrt(len(drawn))
+    errors = weights[:, None] * (straight - mean)
+    assert np.all(np.abs(errors.mean(axis=0)) < 4.5 * errors.std(axis=0) / np.sqrt(len(drawn)))
+    # control: the density of another mixture does not pass
+    wrong = np.exp(log_reference - log_density(mixture._replace(means=mixture.means + 0.1 * x.std(axis=0)), drawn))
+    assert abs(wrong.mean() - 1.0) > 4.5 * wrong.std() / np.sqrt(len(drawn))
+
+
+def test_shears_straighten_and_bend_back(rng):
+    x = banana(rng)
+    shears = find_shears(x, uniform(len(x)))
+    assert [(s.target, s.source) for s in shears] == [(1, 0)]
+    straight = straighten(shears, x)
+    assert np.allclose(bend(shears, straight), x, rtol=0, atol=1e-12)
+    assert straight[:, 1].std() < 0.15
+    assert fit_mixture(x, uniform(len(x))).shears == shears
+
+
+@pytest.mark.parametrize("population", [lambda rng: groups(rng)[0], banana], ids=["groups", "banana"])
+def test_fits_follow_units(rng, population):
+    x = population(rng)
+    units = 10.0 ** rng.uniform(-11, 11, size=x.shape[1])
+    plain, scaled = fit_mixture(x, uniform(len(x))), fit_mixture(x * units, uniform(len(x)))
+    assert np.allclose(scaled.weights, plain.weights, rtol=1e-6)
+    assert np.allclose(log_density(scaled, x * units) + np.sum(np.log(units)), log_density(plain, x), rtol=0, atol=1e-5)
+    again = fit_mixture(x * 2.0**-14, uniform(len(x)))
+    assert np.array_equal(again.weights, plain.weights)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((50, 3)),
+        np.repeat(np.arange(6.0).reshape(2, 3), 25, axis=0),
+        np.column_stack([np.arange(50.0), np.arange(50.0), np.full(50, 3e10)]),
+        np.column_stack([np.arange(50.0), np.arange(50.0) ** 2, np.zeros(50)]),
+    ],
+    ids=["one point", "two points", "line", "parabola"],
+)
+def test_degenerate_populations(points, rng):
+    mixture = fit_mixture(points, uniform(50))
+    assert np.all(np.isfinite(draw(mixture, 20, rng)))
+    assert np.all(np.isfinite(log_density(mixture, points)))
+
+
+@pytest.mark.parametrize("kernel", [0, 1, 2], ids=["independence", "local walk", "differences"])
+def test_each_kernel_keeps_the_target(kernel, rng):
+    """Exact draws of a bent, two-group target stay such draws; a proposal fitted to something else makes no matter."""
+
+    def log_target(x):
+        bent = stats.norm.logpdf(x[:, 1] - x[:, 0] ** 2, 0, 0.5)
+        return np.logaddexp(stats.norm.logpdf(x[:, 0], -1, 0.3), stats.norm.logpdf(x[:, 0], 1.5, 0.5)) + bent
+
+    n = 40_000
+    first = np.where(rng.uniform(size=n) < 0.5, rng.normal(-1, 0.3, n), rng.normal(1.5, 0.5, n))
+    x = np.column_stack([first, rng.normal(first**2, 0.5)])
+    move = MixtureMove()
+    fitted = x[:300] * np.array([1.1, 0.9])
+    move.calibrate(fitted, uniform(300))
+    random = np.random.RandomState(rng.integers(2**31))
+    start = x.copy()
+    for _ in range(5):
+        move._turn = kernel
+        proposed, factors = move._draw(x, random)
+        accepted = np.log(random.uniform(size=n)) < log_target(proposed) - log_target(x) + factors
+        x = np.where(accepted[:, None], proposed, x)
+    assert accepted.mean() > 0.1
+    assert np.mean(np.any(x != start, axis=1)) > 0.3
+    for column in (0, 1):
+        assert stats.ks_2samp(x[: n // 2, column], start[n // 2 :, column]).pvalue > 1e-4
+    assert abs(np.mean(x[:, 0] > 0.2) - np.mean(start[:, 0] > 0.2)) < 4.5 * np.sqrt(0.5 / n)
+
+
+def test_impossible_mixtures():
+    with pytest.raises(ValueError, match="max_components"):
+        MixtureMove(max_components=0)
+
+
+# ---------------------------------------------------------------- edges
+
+
+def box(low, high):
+    return lambda x: np.all((x >= low) & (x <= high), axis=1)
+
+
+@pytest.mark.parametrize("unit", [1e-11, 1.0, 1e11])
+def test_edges_are_found(rng, unit):
+    low, high = np.array([0.0, -3.0, -np.inf, -np.inf]) * unit, np.array([np.inf, 7.0, 5.0, np.inf]) * unit
+    points = rng.uniform(-1, 1, size=(100, 4)) * unit + np.array([1.5, 2.0, 3.0, 0.0]) * unit
+    edges = find_support_bounds(box(low, high), points)
+    assert np.array_equal(np.isfinite(edges.low), np.isfinite(low))
+    assert np.array_equal(np.isfinite(edges.high), np.isfinite(high))
+    finite = np.isfinite(low)
+    assert np.allclose(edges.low[finite], low[finite], rtol=0, atol=1e-14 * unit)
+    assert np.all(edges.low <= low) and np.all(edges.high >= high)  # a point in the support is never beyond
+
+
+def test_a_triangle_has_no_edges_where_they_depend_on_the_rest(rng):
+    points = np.sort(rng.uniform(size=(200, 2)), axis=1)
+    edges = find_support_bounds(lambda x: (0 <= x[:, 0]) & (x[:, 0] <= x[:, 1]) & (x[:, 1] <= 1), points)
+    assert edges.high[0] == np.inf and edges.low[1] == -np.inf
+    assert edges.low[0] == pytest.approx(0, abs=1e-12) and edges.high[1] == pytest.approx(1)
+
+
+def test_points_open_up_and_close(rng):
+    edges = SupportBounds(np.array([0.0, -3.0, -np.inf, -np.inf]), np.array([np.inf, 7.0, 5.0, np.inf]), np.ones(4))
+    x = np.array([1.0, 2.0, 4.0, 0.0]) + 0.9 * rng.uniform(-1, 1, size=(50, 4))
+    assert np.allclose(from_unbounded(edges, to_unbounded(edges, x)), x, rtol=1e-12)
+    step = 1e-6
+    slopes = [
+        (to_unbounded(edges, x + step * e) - to_unbounded(edges, x - step * e))[:, j] for j, e in enumerate(np.eye(4))
+    ]
+    assert np.allclose(log_abs_det_jacobian(edges, x), np.sum(np.log(np.array(slopes) / (2 * step)), axis=0), atol=1e-6)
+    assert np.all(log_abs_det_jacobian(edges, x - [10, 0, 0, 0]) == -np.inf)
+
+
+def corner(rng, n):
+    return rng.exponential(size=(n, 3)) * np.array([1e-3, 1.0, 1e3])
+
+
+def test_a_corner_is_followed_to_the_edge(rng):
+    """The density of a mixture at an exponential corner is the one drawn from, and it is nearly that of the corner."""
+    scale = np.array([1e-3, 1.0, 1e3])
+    x = corner(rng, 2000)
+    edges = find_support_bounds(box(np.zeros(3), np.full(3, np.inf)), x)
+    mixture = fit_mixture(x, uniform(2000), edges=edges)
+    assert np.all(np.isfinite(mixture.edges.low))
+    drawn = draw(mixture, 20_000, rng)
+    assert drawn.min() > -1e-12
+    weights = np.exp(-np.sum(drawn / scale, axis=1) - np.sum(np.log(scale)) - log_density(mixture, drawn))
+    assert abs(weights.mean() - 1.0) < 4.5 * weights.std() / np.sqrt(len(drawn))
+    assert weights.sum() ** 2 / np.sum(weights**2) > 0.6 * len(drawn)
+
+
+@pytest.mark.parametrize("kernel", [0, 1, 2], ids=["independence", "local walk", "differences"])
+def test_each_kernel_keeps_a_target_at_an_edge(kernel, rng):
+    n = 20_000
+    x = corner(rng, n)
+    scale = np.array([1e-3, 1.0, 1e3])
+    inside = box(np.zeros(3), np.full(3, np.inf))
+    move = MixtureMove()
+    move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0]), uniform(300), inside)
+    assert move._mixture.edges is not None
+    random = np.random.RandomState(rng.integers(2**31))
+    start = x.copy()
+    for _ in range(5):
+        move._turn = kernel
+        proposed, factors = move._draw(x, random)
+        change = np.where(inside(proposed), -np.sum((proposed - x) / scale, axis=1), -np.inf)
+        accepted = np.log(random.uniform(size=n)) < change + factors
+        x = np.where(accepted[:, None], proposed, x)
+    assert accepted.mean() > 0.1
+    for column in range(3):
+        assert stats.ks_2samp(x[: n // 2, column], start[n // 2 :, column]).pvalue > 1e-4

@@ -1,0 +1,158 @@
+"""Comparison of models: against exact evidences, and the propagation of their errors against Monte Carlo."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import softmax
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, Uniform
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+from samplers import SMCSampler
+from samplers.reporting.model_comparison import compare_models
+from tests.contract.targets import Gaussian
+
+
+class Regression:
+    """Polynomial of a given degree through noisy data, standard normal coefficients: the evidence is known."""
+
+    def __init__(self, degree, x, y, sd):
+        self.ndim = degree + 1
+        self.design, self.y, self.noise = np.vander(x, self.ndim, increasing=True), y, sd
+        covariance = sd**2 * np.eye(len(x)) + self.design @ self.design.T
+        self.log_evidence = stats.multivariate_normal(np.zeros(len(x)), covariance).logpdf(y)
+
+    def log_prior(self, theta):
+        return stats.norm.logpdf(theta).sum(axis=-1)
+
+    def __call__(self, theta):
+        return self.log_prior(theta) + stats.norm.logpdf(self.y, theta @ self.design.T, self.noise).sum(axis=-1)
+
+    def sample_prior(self, n, rng):
+        return rng.standard_normal((n, self.ndim))
+
+
+def test_conjugate_models_by_smc(seed, rng):
+    x = np.linspace(-1.0, 1.0, 25)
+    y = 0.3 + 0.8 * x + 0.25 * rng.normal(size=25)
+    models = {f"degree {d}": Regression(d, x, y, 0.25) for d in (1, 2, 3)}
+    samplers = {}
+    for k, (name, model) in enumerate(models.items()):
+        samplers[name] = SMCSampler(300, model.ndim, model, vectorize=True, seed=[seed, k])
+        samplers[name].run_mcmc(None, 1)
+    found = compare_models(samplers)
+    exact = np.array([model.log_evidence for model in models.values()])
+    assert found.names == tuple(models) and not found.rough
+    assert np.all(np.abs(found.log_evidence - exact) < 4.0 * found.log_evidence_error)
+    # the stated errors are estimates of one run each: five of them
+    assert np.all(np.abs(found.probability - softmax(exact)) < 5.0 * found.probability_error)
+    assert np.all((found.lower < found.probability) & (found.probability < found.upper))
+    assert found.probability.sum() == pytest.approx(1.0)
+    assert found.probabilities[found.best] == found.probability.max() and found.best in models
+
+
+@pytest.mark.parametrize("values", [(0.0, -1.0), (0.0, -0.3, -2.0), (5000.0, 4999.0, 4990.0)])
+def test_errors_against_monte_carlo(values, rng):
+    errors = np.linspace(0.02, 0.08, len(values))
+    prior = np.arange(1.0, len(values) + 1.0)
+    prior /= prior.sum()
+    names = [f"m{k}" for k in range(len(values))]
+    found = compare_models(
+        dict(zip(names, zip(values, errors, strict=True), strict=True)), dict(zip(names, prior, strict=True))
+    )
+    draws = rng.normal(values, errors, size=(20_000, len(values)))
+    probabilities = softmax(np.log(prior) + draws, axis=1)
+    assert np.allclose(found.probability, softmax(np.log(prior) + np.array(values)))
+    # first order, and the scatter of a standard deviation of 20 000 draws
+    assert np.allclose(found.probability_error, probabilities.std(axis=0), rtol=0.05)
+    low, high = np.quantile(probabilities, [0.025, 0.975], axis=0)
+    assert np.allclose(found.upper - found.lower, high - low, rtol=0.07)
+    factors = draws - draws[:, :1]
+    assert np.allclose(found.log_bayes_factor_error, factors.std(axis=0), rtol=0.05)
+    assert found.log_bayes_factor[0] == 0.0 and found.best == "m0" and not found.rough
+
+
+def test_large_errors_are_said_to_be_rough(rng):
+    found = compare_models({"a": (0.0, 2.0), "b": (-1.0, 0.1)})
+    assert found.rough and "rough" in found.table()
+    # the interval still holds: for two models the log-odds are exactly normal
+    low, high = np.quantile(
+        softmax(rng.normal([0.0, -1.0], [2.0, 0.1], size=(20_000, 2)), axis=1), [0.025, 0.975], axis=0
+    )
+    assert np.allclose(found.lower, low, atol=0.01) and np.allclose(found.upper, high, atol=0.01)
+    assert np.all((found.lower >= 0.0) & (found.upper <= 1.0))
+
+
+def test_table():
+    table = str(compare_models({"worse": (-12.0, 0.1), "better": (-10.0, 0.05)}))
+    head, first, second = table.splitlines()
+    assert (
+        first.startswith("better") and second.startswith("worse") and len({len(r) for r in (head, first, second)}) == 1
+    )
+    assert "-10.000 +- 0.050" in first and "-2.000 +- 0.112" in second and "0.8808" in first
+
+
+def test_a_model_excluded_by_its_prior():
+    found = compare_models({"a": (0.0, 0.1), "b": (3.0, 0.1)}, prior={"a": 1.0, "b": 0.0})
+    assert found.probability.tolist() == [1.0, 0.0] and found.probability_error.tolist() == [0.0, 0.0]
+    assert np.isfinite(found.lower).all() and np.isfinite(found.upper).all()
+    assert found.best == "b"
+
+
+@pytest.mark.parametrize(
+    ("models", "prior", "message"),
+    [
+        ({"a": (0.0, 0.1)}, None, "two models or more"),
+        ([(0.0, 0.1), (1.0, 0.1)], None, "by name"),
+        ({"a": (0.0, 0.1), "b": (np.nan, 0.1)}, None, "'b'.*finite"),
+        ({"a": (0.0, 0.1), "b": (-np.inf, 0.1)}, None, "'b'.*finite"),
+        ({"a": (0.0, -0.1), "b": (0.0, 0.1)}, None, "'a'.*negative"),
+        ({"a": (0.0, 0.1), "b": 3.0}, None, "'b'.*expected a sampler"),
+        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": 0.5, "b": 0.4}, "sum to one"),
+        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": 1.5, "b": -0.5}, "non-negative"),
+        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": 0.5, "c": 0.5}, "one prior probability for each of a, b"),
+        ({"a": (0.0, 0.1), "b": (1.0, 0.1)}, {"a": np.nan, "b": 0.5}, "non-negative"),
+    ],
+)
+def test_refused(models, prior, message):
+    with pytest.raises(ValueError, match=message):
+        compare_models(models, prior)
+
+
+def test_a_sampler_that_has_not_run():
+    posterior = Gaussian(2)
+    sampler = SMCSampler(20, 2, posterior, vectorize=True)
+    with pytest.raises(ValueError, match="run_mcmc"):
+        compare_models({"a": sampler, "b": (0.0, 0.1)})
+
+
+def test_different_data_are_refused(rng):
+    model = LinearOscillator(Record("noise", 0.02, rng.normal(size=50)))
+    values = model.simulate([1.0, 1.0])
+
+    def sampler(measured):
+        prior = {"stiffness": Uniform(0.5, 2.0), "damping": Uniform(0.5, 2.0)}
+        prior |= {"sigma_acceleration": HalfNormal(0.1), "sigma_displacement": HalfNormal(0.01)}
+        posterior = Posterior(FELikelihood(model, measured), prior)
+        return SMCSampler(20, 4, posterior, vectorize=True)
+
+    data = Measurements(model.channels, model.dt, values)
+    with pytest.raises(ValueError, match="one, other are of different measurements"):
+        compare_models({"one": sampler(data), "other": sampler(Measurements(model.channels, model.dt, values + 1e-9))})
+
+
+def test_the_same_data_in_another_order_are_compared(rng):
+    channels = (Channel("a", "acceleration", "g"), Channel("d", "displacement", "cm"))
+    data = Measurements(channels, 0.1, rng.normal(size=(2, 10)))
+
+    def finished(measurements):
+        posterior = SimpleNamespace(likelihood=SimpleNamespace(measurements=measurements))
+        return SimpleNamespace(log_evidence=0.0, log_evidence_error=0.1, log_prob_fn=SimpleNamespace(f=posterior))
+
+    found = compare_models({"one": finished(data), "two": finished(data.select(["d", "a"])), "pair": (0.0, 0.1)})
+    assert np.allclose(found.probability, 1.0 / 3.0)

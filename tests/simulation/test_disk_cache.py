@@ -1,0 +1,608 @@
+"""What was simulated is kept on disk: one simulation for every noise, sampler and run, and never an old value."""
+
+import dataclasses
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from multiprocessing.pool import ThreadPool
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal, Uniform
+from fe_likelihoods.problems import bridge_column
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation import cache_rows
+from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
+
+SINE = np.sin(np.arange(50.0))
+
+
+class Line:
+    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above `steepest`, and counts its runs."""
+
+    parameter_names = ("offset", "slope")
+    channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
+    dt = 0.5
+    n_steps = 8
+
+    def __init__(self, steepest=1.0, fingerprint="line"):
+        self.steepest = steepest
+        self.fingerprint = fingerprint
+        self.runs = 0
+
+    def simulate(self, theta):
+        self.runs += 1
+        if theta[1] > self.steepest:
+            raise SimulationFailed(f"too steep: {theta[1]:.3f} \N{GREEK SMALL LETTER THETA}")
+        line = theta[0] + theta[1] * self.dt * np.arange(self.n_steps)
+        return np.vstack([line, -line])
+
+
+class Batched(Line):
+    """The same, many at once."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.sizes = []
+
+    def simulate_batch(self, thetas):
+        self.sizes.append(len(thetas))
+        self.runs += len(thetas)
+        line = thetas[:, :1] + thetas[:, 1:] * self.dt * np.arange(self.n_steps)
+        return SimulationBatch(np.stack([line, -line], axis=1), [""] * len(thetas))
+
+
+def likelihood_of(model, cache=None, data=1.0, **kwargs):
+    measured = Measurements(model.channels, model.dt, np.full((2, model.n_steps), data))
+    return FELikelihood(model, measurements=measured, cache=cache, **kwargs)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cache.sqlite"
+
+
+@pytest.fixture
+def thetas(rng):
+    """Three hundred points, some fifty of which fail."""
+    return np.column_stack([rng.normal(size=300), rng.uniform(0.0, 1.2, size=300)])
+
+
+# hits and misses ------------------------------------------------------------------------------------------------------
+
+
+def test_another_run_simulates_nothing(path, thetas):
+    first = likelihood_of(Line(), path)
+    expected = likelihood_of(Line()).misfit(thetas)
+    np.testing.assert_array_equal(first.misfit(thetas), expected)
+    assert (first.simulations, first.cache_hits, first.disk_hits) == (300, 0, 0)
+    second = likelihood_of(Line(), path)
+    np.testing.assert_array_equal(second.misfit(thetas), expected)
+    assert (second.simulations, second.cache_hits, second.disk_hits) == (0, 300, 300)
+    np.testing.assert_array_equal(second.misfit(thetas), expected)
+    assert (second.simulations, second.cache_hits, second.disk_hits) == (0, 600, 300)
+    assert (second.cache.hits, second.cache.misses) == (300, 0)
+    assert second.model.runs == 0
+
+
+def test_failures_are_remembered_with_their_reasons(path, thetas):
+    first, second = likelihood_of(Line(), path), likelihood_of(Line(), path)
+    first.misfit(thetas)
+    second.misfit(thetas)
+    second.misfit(thetas)
+    assert first.failure_count > 20
+    assert second.model.runs == 0
+    assert second.failures == first.failures
+    assert second.failure_reasons == first.failure_reasons
+    assert second.cache.info().failures == first.failure_count
+
+
+def test_duplicates_and_zeros_of_both_signs(path):
+    rows = np.array([[0.0, 0.5], [-0.0, 0.5], [1.0, 0.5], [0.0, 0.5], [np.nan, 0.5]])
+    likelihood_of(Line(), path).misfit(rows[[1, 2]])
+    likelihood = likelihood_of(Line(), path)
+    assert np.isnan(likelihood.misfit(rows)[4]).all()
+    assert (likelihood.simulations, likelihood.cache_hits, likelihood.disk_hits) == (0, 4, 4)
+    likelihood.misfit(rows[:3])
+    assert (likelihood.cache_hits, likelihood.disk_hits) == (7, 4)
+    assert likelihood.cache.info().simulations == 2
+
+
+def test_without_memory_the_disk_answers(path, thetas):
+    likelihood = likelihood_of(Line(), path, memory=0)
+    for _ in range(3):
+        likelihood.misfit(thetas)
+    assert (likelihood.simulations, likelihood.disk_hits) == (300, 600)
+
+
+def test_a_batch_is_asked_for_once_and_written_once(path, thetas):
+    likelihood = likelihood_of(Batched(), path)
+    statements = []
+    likelihood.cache._file.connection().set_trace_callback(statements.append)
+    likelihood._chunk = 1000
+    likelihood.misfit(thetas)
+    kinds = [statement.split()[0] for statement in statements]
+    assert kinds.count("SELECT") == kinds.count("BEGIN") == kinds.count("COMMIT") == 1
+    assert kinds.count("INSERT") == 300
+    statements.clear()
+    likelihood.misfit(thetas)
+    assert statements == []  # memory is in front
+
+
+def test_more_rows_than_one_query_takes(path, rng):
+    thetas = np.column_stack([rng.normal(size=2345), np.full(2345, 0.5)])
+    likelihood_of(Line(), path).misfit(thetas[::2])
+    likelihood = likelihood_of(Line(), path)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(Line()).misfit(thetas))
+    assert (likelihood.simulations, likelihood.disk_hits) == (1172, 1173)
+
+
+# what is another simulation, and what is not --------------------------------------------------------------------------
+
+
+def oscillator(path, **changes):
+    options = {"record": SINE, "dt": 0.02, "period": 0.6, "damping": 0.05, "data": 1.0, "channels": None} | changes
+    model = LinearOscillator(Record("sine", options["dt"], options["record"]), options["period"], options["damping"])
+    values = np.ones((2, 50))
+    values[1, 7] = options["data"]
+    channels = options["channels"] or model.channels
+    return FELikelihood(model, Measurements(channels, model.dt, values), cache=path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"record": np.where(np.arange(50) == 30, np.nextafter(SINE, 2.0), SINE)},
+        {"dt": 0.02 * (1 + 1e-15)},
+        {"period": np.nextafter(0.6, 1.0)},
+        {"damping": np.nextafter(0.05, 1.0)},
+        {"data": np.nextafter(1.0, 2.0)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_whatever_changes_a_misfit_is_simulated_anew(path, change):
+    theta = [[1.1, 0.9]]
+    oscillator(path).misfit(theta)
+    changed = oscillator(path, **change)
+    np.testing.assert_array_equal(changed.misfit(theta), oscillator(None, **change).misfit(theta))
+    assert (changed.simulations, changed.disk_hits) == (1, 0)
+    again = oscillator(path)
+    again.misfit(theta)
+    assert (again.simulations, again.disk_hits) == (0, 1)
+
+
+@pytest.mark.parametrize("change", [{"substeps": 2}, {"tolerance": 2e-8}, {"mesh": 22}, {"n_elements": 3}], ids=str)
+def test_settings_of_the_integrator_are_part_of_the_key(path, change):
+    record = Record("pulse", 0.01, np.sin(np.arange(20) / 3))
+    theta = np.ones((1, 5))
+    for settings in ({"mesh": 20}, {"mesh": 20} | change):
+        model = RCColumn.lhpost(record, **settings)
+        likelihood = FELikelihood(model, Measurements(model.channels, 0.01, np.zeros((2, 20))), cache=path)
+        likelihood.misfit(theta)
+        assert (likelihood.simulations, likelihood.disk_hits) == (1, 0)
+
+
+def test_other_code_of_the_models_is_another_simulation(path, monkeypatch):
+    oscillator(path).misfit([[1.1, 0.9]])
+    monkeypatch.setattr(cache_rows, "_sources", lambda: b"other code")
+    changed = oscillator(path)
+    changed.misfit([[1.1, 0.9]])
+    assert (changed.simulations, changed.disk_hits) == (1, 0)
+
+
+def test_the_sources_of_the_models_are_what_the_key_depends_on(tmp_path, monkeypatch):
+    (tmp_path / "models").mkdir()
+    found = set()
+    for text in ("x = 1", "x = 2"):
+        (tmp_path / "models" / "any.py").write_text(text)
+        monkeypatch.setattr(cache_rows, "__file__", str(tmp_path / "cache_rows.py"))
+        found.add(cache_rows._sources.__wrapped__())
+    assert len(found) == 2
+
+
+def test_noise_prior_and_display_units_change_nothing(path):
+    x = np.array([[1.1, 0.9, 0.2, 0.005], [0.8, 1.3, 0.1, 0.001]])
+    names = ("stiffness", "damping", "sigma_acceleration", "sigma_displacement")
+    wide = [TruncatedNormal(1.0, 0.3), TruncatedNormal(1.0, 0.6), HalfNormal(0.3), HalfNormal(0.005)]
+    narrow = [Uniform(0.5, 2.0), Uniform(0.0, 2.0), HalfNormal(3.0), Uniform(0.0, 1.0)]
+    Posterior(oscillator(path), dict(zip(names, wide, strict=True))).log_prob(x)
+    other = Posterior(oscillator(path), dict(zip(names, narrow, strict=True)))
+    other.log_prob(x * [1.0, 1.0, 2.0, 3.0])
+    assert other.report()["simulations"] == 0
+    assert (other.report()["cache_hits"], other.report()["disk_hits"]) == (2, 2)
+    channels = tuple(dataclasses.replace(c, unit={"g": "m/s2", "cm": "in"}[c.unit]) for c in LinearOscillator.channels)
+    shown = oscillator(path, channels=channels)
+    shown.misfit(x[:, :2])
+    assert shown.simulations == 0
+
+
+def test_a_model_that_changes_under_way_is_an_error(path):
+    likelihood = oscillator(path)
+    likelihood.misfit([[1.0, 1.0]])
+    likelihood.model.period = 0.7
+    with pytest.raises(ValueError, match="changed since the likelihood was made"):
+        likelihood.misfit([[1.1, 1.0]])
+    assert likelihood.cache.info().simulations == 1
+
+
+def test_fingerprint_and_parameters_cannot_be_confused():
+    thetas = np.arange(6.0).reshape(3, 2)
+    keys = [cache_rows.simulation_keys(fingerprint, thetas) for fingerprint in ("line", "line1", "", "lin")]
+    assert len({key for group in keys for key in group}) == 12
+    swapped = cache_rows.simulation_keys("line", thetas[:, ::-1])
+    assert not set(swapped) & set(keys[0])
+
+
+# failures once more ---------------------------------------------------------------------------------------------------
+
+
+def test_failures_are_run_again_where_asked(path):
+    steep = [[0.0, 0.5], [0.0, 2.0], [0.0, 3.0]]
+    likelihood_of(Line(1.0), path).misfit(steep)
+    retried = likelihood_of(Line(2.5), SimulationCache(path, retry_failures=True))
+    for _ in range(2):
+        misfit = retried.misfit(steep)
+    assert (retried.model.runs, retried.disk_hits) == (2, 1)
+    assert np.isfinite(misfit[:2]).all() and np.isnan(misfit[2]).all()
+    after = likelihood_of(Line(1.0), path)  # the success has replaced the failure
+    np.testing.assert_array_equal(after.misfit(steep), misfit)
+    assert (after.simulations, after.failure_count) == (0, 1)
+    after.cache.store(after.fingerprint, np.array([[0.0, 0.5]]), 8, np.full((1, 2), np.nan), ["now it fails"], 0.1)
+    assert np.isfinite(likelihood_of(Line(), path).misfit(steep[:1])).all()  # and is never replaced by one
+
+
+def test_reasons_of_any_kind(path):
+    cache = SimulationCache(path)
+    reasons = ["x" * 10_000, "nul \0 byte", "lone surrogate \udc80", ""]
+    thetas = np.arange(8.0).reshape(4, 2)
+    cache.store("f", thetas, 8, np.full((4, 2), np.nan), reasons, 1.0)
+    found = SimulationCache(path).look_up("f", thetas, 2, 8)
+    assert found.known.all()
+    assert found.reasons == ["x" * 2000, "nul \0 byte", "lone surrogate \\udc80", ""]
+
+
+# bounds, statistics, other files --------------------------------------------------------------------------------------
+
+
+def test_the_oldest_are_evicted(path, rng):
+    cache = SimulationCache(path, max_rows=10)
+    thetas = rng.normal(size=(25, 2))
+    likelihood = likelihood_of(Batched(), cache)
+    likelihood.misfit(thetas[:8])
+    assert (len(likelihood.model.sizes), cache.evictions) == (1, 0)
+    likelihood.misfit(thetas[8:14])
+    assert (cache.info().simulations, cache.evictions) == (10, 4)
+    known = SimulationCache(path).look_up(likelihood.fingerprint, thetas, 2, 8).known
+    assert np.flatnonzero(known).tolist() == list(range(4, 14))
+    likelihood.misfit(thetas)  # a batch larger than the bound
+    assert (cache.info().simulations, cache.evictions) == (10, 15)
+
+
+def test_the_file_does_not_grow_beyond_its_bound(path, rng):
+    cache = SimulationCache(path, max_rows=500)
+    sizes = []
+    for _ in range(30):
+        thetas = rng.normal(size=(500, 2))
+        cache.store("f", thetas, 8, thetas, [""] * 500, 1.0)
+        cache.close()  # moves the log into the file
+        sizes.append(path.stat().st_size)
+    assert max(sizes) < 3 * sizes[0]
+
+
+def test_info_and_clear(path, thetas):
+    likelihood = likelihood_of(Line(), path)
+    likelihood.misfit(thetas)
+    info = likelihood.cache.info()
+    assert info.path == path
+    assert (info.simulations, info.failures) == (300, likelihood.failure_count)
+    assert info.seconds == pytest.approx(likelihood.seconds)
+    assert (info.hits, info.misses, info.evictions, info.damaged, info.responses) == (0, 300, 0, 0, 0)
+    likelihood.cache.close()
+    full = path.stat().st_size
+    likelihood.cache.clear()
+    likelihood.cache.close()
+    assert likelihood.cache.info().simulations == 0
+    assert path.stat().st_size < full
+    again = likelihood_of(Line(), path)
+    again.misfit(thetas)
+    assert again.simulations == 300
+
+
+def test_export_and_import(tmp_path, path, thetas):
+    first = likelihood_of(Line(), path)
+    first.misfit(thetas)
+    wide = LinearOscillator(Record("sine", 0.02, SINE))
+    FELikelihood(wide, Measurements(wide.channels, 0.02, np.ones((2, 50))), cache=path).misfit([[1.0, 1.0]])
+    assert SimulationCache(path).export_hdf5(tmp_path / "out.h5") == 301
+    other = SimulationCache(tmp_path / "other.sqlite")
+    other.store(likelihood_of(Line()).fingerprint, thetas[:1], 8, np.ones((1, 2)), [""], 1.0)
+    assert other.import_hdf5(tmp_path / "out.h5") == 301
+    likelihood = likelihood_of(Line(), other)
+    misfit = likelihood.misfit(thetas)
+    assert likelihood.simulations == 0
+    np.testing.assert_array_equal(misfit[1:], likelihood_of(Line()).misfit(thetas)[1:])
+    assert (misfit[0] == 1.0).all()  # what was known stays
+    assert likelihood.failure_reasons == first.failure_reasons
+    assert other.info().seconds > 1.0
+    empty = SimulationCache(tmp_path / "empty.sqlite")
+    assert empty.export_hdf5(tmp_path / "empty.h5") == other.import_hdf5(tmp_path / "empty.h5") == 0
+
+
+def test_exports_that_cannot_be_taken_in(tmp_path, path, thetas):
+    likelihood_of(Line(), path).misfit(thetas)
+    cache = SimulationCache(path)
+    with pytest.raises(ValueError, match="the cache itself"):
+        cache.export_hdf5(path)
+    with pytest.raises(ValueError, match="no folder"):
+        cache.export_hdf5(tmp_path / "nowhere" / "out.h5")
+    with pytest.raises(ValueError, match="not a complete export"):
+        cache.import_hdf5(path)
+    exported = tmp_path / "out.h5"
+    cache.export_hdf5(exported)
+    with h5py.File(exported, "r+") as file:
+        file["misfit"][17] *= 1.0 + 1e-12
+    with pytest.raises(ValueError, match="do not match their checksums"):
+        SimulationCache(tmp_path / "new.sqlite").import_hdf5(exported)
+    with h5py.File(exported, "r+") as file:
+        file.attrs["schema_version"] = 2
+    with pytest.raises(ValueError, match="version 1, got .* version 2"):
+        cache.import_hdf5(exported)
+    assert cache.info().simulations == 300
+
+
+@pytest.mark.parametrize("name", ["max_rows", "max_response_bytes"])
+@pytest.mark.parametrize("value", [0, -1, 2.5, None, True])
+def test_impossible_bounds(path, name, value):
+    with pytest.raises(ValueError, match=f"{name} must be a whole number"):
+        SimulationCache(path, **{name: value})
+    assert not path.exists()
+
+
+# chunks ---------------------------------------------------------------------------------------------------------------
+
+
+def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
+    monkeypatch.setattr("fe_likelihoods.probability.likelihood._SECONDS_PER_CHUNK", 0.0)
+    for model in (Line(), Batched()):
+        likelihood = likelihood_of(model, path.with_name(type(model).__name__))
+        np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(type(model)()).misfit(thetas))
+    assert model.sizes[0] == min(300, 8 * (os.cpu_count() or 1))  # every worker is busy
+    assert sum(model.sizes) == 300
+
+
+def test_an_interrupted_batch_is_kept_so_far(path, rng, monkeypatch):
+    monkeypatch.setattr("fe_likelihoods.probability.likelihood._SECONDS_PER_CHUNK", 0.0)
+
+    class Interrupted(Line):
+        def simulate(self, theta):
+            if self.runs == 7:
+                raise KeyboardInterrupt
+            return super().simulate(theta)
+
+    thetas = rng.normal(size=(20, 2)) * [1.0, 0.1]
+    likelihood = likelihood_of(Interrupted(), path)
+    with pytest.raises(KeyboardInterrupt):
+        likelihood.misfit(thetas)
+    again = likelihood_of(Line(), path)
+    again.misfit(thetas)
+    assert (likelihood.simulations, again.disk_hits, again.simulations) == (7, 7, 13)
+
+
+class Pool:
+    """Runs here, and notes how many items came at once."""
+
+    def __init__(self, **attributes):
+        self.sizes = []
+        self.__dict__.update(attributes)
+
+    def map(self, function, items):
+        self.sizes.append(len(items))
+        return list(map(function, items))
+
+
+@pytest.mark.parametrize(
+    ("attributes", "sizes"),
+    [({"n_workers": 3}, [24] * 4 + [4]), ({"_max_workers": 20}, [100]), ({"_processes": 5}, [40, 40, 20]), ({}, [100])],
+    ids=str,
+)
+def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attributes, sizes):
+    monkeypatch.setattr("fe_likelihoods.probability.likelihood._SECONDS_PER_CHUNK", 0.0)
+    pool = Pool(**attributes)
+    likelihood_of(Line(), path, pool=pool).misfit(thetas[:100])
+    assert pool.sizes == sizes
+
+
+def test_chunks_grow_with_the_speed_but_not_at_once(path, rng):
+    class Fast(Batched):
+        def simulate_batch(self, thetas):
+            return SimulationBatch(np.zeros((len(thetas), 2, 8)), self.sizes.append(len(thetas)) or [""] * len(thetas))
+
+    model = Fast()
+    least = 8 * (os.cpu_count() or 1)
+    likelihood_of(model, path).misfit(rng.normal(size=(30 * least, 2)))
+    assert model.sizes == [least, 4 * least, 16 * least, 9 * least]
+
+
+# processes and threads ------------------------------------------------------------------------------------------------
+
+
+def _simulate_some(likelihood, thetas, results):
+    results.put((likelihood.misfit(thetas), likelihood.simulations, likelihood.disk_hits))
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_other_processes_share_the_file(path, thetas, method):
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"NO {method} ON THIS SYSTEM")
+    likelihood = likelihood_of(Line(), path)
+    expected = likelihood.misfit(thetas[:200])
+    context = multiprocessing.get_context(method)
+    results = context.Queue()
+    process = context.Process(target=_simulate_some, args=(likelihood, thetas, results))
+    process.start()
+    misfit, simulations, disk_hits = results.get(timeout=60)
+    process.join(60)
+    assert process.exitcode == 0
+    np.testing.assert_array_equal(misfit[:200], expected)
+    # both count on; a fork brings the memory along, a spawned process reads from disk
+    assert (simulations, disk_hits) == (300, 0 if method == "fork" else 200)
+    likelihood.misfit(thetas)  # what the other one has simulated
+    assert likelihood.simulations == 200
+    assert likelihood.disk_hits == 100
+
+
+def test_a_connection_does_not_go_through_a_fork(path, thetas):
+    if not hasattr(os, "fork"):
+        pytest.skip("NO fork ON THIS SYSTEM")
+    likelihood = likelihood_of(Line(), path)
+    likelihood.misfit(thetas)
+    assert likelihood.cache._file._connection is not None
+    context = multiprocessing.get_context("fork")
+    process = context.Process(target=lambda: sys.exit(17 if likelihood.cache._file._connection is None else 1))
+    process.start()
+    process.join(60)
+    assert process.exitcode == 17
+    assert likelihood.cache.info().simulations == 300
+
+
+def test_forks_while_threads_write(path, rng):
+    """A lock held by another thread, or a connection taken along, would hang or break the child."""
+    if not hasattr(os, "fork"):
+        pytest.skip("NO fork ON THIS SYSTEM")
+    cache = SimulationCache(path)
+    stop = threading.Event()
+
+    def write():
+        own = np.random.default_rng(1)
+        while not stop.is_set():
+            thetas = own.normal(size=(20, 2))
+            cache.store("f", thetas, 8, thetas, [""] * 20, 1.0)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    context = multiprocessing.get_context("fork")
+    try:
+        for i in range(15):
+            thetas = rng.normal(size=(5, 2))
+            process = context.Process(target=cache.store, args=(f"child {i}", thetas, 8, thetas, [""] * 5, 1.0))
+            process.start()
+            process.join(60)
+            assert process.exitcode == 0
+            found = cache.look_up(f"child {i}", thetas, 2, 8)
+            np.testing.assert_array_equal(found.misfit, thetas)
+    finally:
+        stop.set()
+        thread.join()
+    assert cache._file.connection().execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+
+
+def test_threads_share_a_cache(path, rng):
+    likelihood = likelihood_of(Line(), path, memory=50)
+    thetas = rng.normal(size=(60, 2)) * [1.0, 0.3]
+    expected = likelihood_of(Line()).misfit(thetas)
+    batches = [np.arange(start, start + 20) % 60 for start in range(0, 400, 7)]
+    with ThreadPool(4) as pool:
+        results = pool.map(lambda rows: likelihood.misfit(thetas[rows]), batches)
+    for rows, misfit in zip(batches, results, strict=True):
+        np.testing.assert_array_equal(misfit, expected[rows])
+    assert likelihood.cache.info().simulations == 60
+
+
+def test_pickles_by_path(tmp_path, monkeypatch, thetas):
+    monkeypatch.chdir(tmp_path)
+    cache = SimulationCache("relative.sqlite", max_rows=1000, retry_failures=True)
+    likelihood = likelihood_of(Line(), cache, memory=0)
+    likelihood.misfit(thetas)
+    data = pickle.dumps(likelihood)
+    assert len(data) < 4000
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    copy = pickle.loads(data)
+    assert copy.cache.path == tmp_path / "relative.sqlite"
+    assert (copy.cache.max_rows, copy.cache.retry_failures, copy.cache.misses) == (1000, True, 0)
+    copy.misfit(thetas)
+    assert copy.model.runs - likelihood.model.runs == likelihood.failure_count > 0
+
+
+def test_the_key_is_the_same_in_another_process():
+    code = (
+        "import numpy as np; from fe_likelihoods.simulation.cache_rows import simulation_keys; "
+        "print(b''.join(simulation_keys('any', np.array([[1.5, -0.0], [2.0, np.pi]]))).hex())"
+    )
+    root = Path(__file__).resolve().parents[2]
+    environment = {**os.environ, "PYTHONHASHSEED": "3", "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    here = b"".join(cache_rows.simulation_keys("any", np.array([[1.5, 0.0], [2.0, np.pi]])))
+    assert done.stdout.strip() == here.hex()
+
+
+# responses ------------------------------------------------------------------------------------------------------------
+
+
+def models():
+    record = Record("pulse", 0.01, np.sin(np.arange(30) / 3))
+    return [Line(), Batched(), LinearOscillator(record), RCColumn.lhpost(record, mesh=10)]
+
+
+@pytest.mark.parametrize("model", models(), ids=lambda model: type(model).__name__)
+def test_responses_are_kept_beside_the_sums(path, rng, model):
+    thetas = rng.uniform(0.5, 1.4, size=(12, len(model.parameter_names)))
+    likelihood = likelihood_of(model, SimulationCache(path, responses=True), data=0.1)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(model, data=0.1).misfit(thetas))
+    again = SimulationCache(path)
+    kept = 0
+    for theta, failed in zip(thetas, np.isnan(likelihood.misfit(thetas)).any(axis=1), strict=True):
+        response = again.response(model.fingerprint, theta)
+        if failed:
+            assert response is None
+        else:
+            kept += 1
+            assert response.dtype == np.float32
+            np.testing.assert_array_equal(response, simulate_batch(model, theta[None]).response[0].astype("f4"))
+    assert again.info().responses == kept > 0
+    assert again.response(model.fingerprint, thetas[0] + 1e-9) is None
+    assert again.response("another model", thetas[0]) is None
+
+
+def test_responses_are_bounded(path, rng):
+    bytes_each = 2 * 8 * 4
+    cache = SimulationCache(path, responses=True, max_response_bytes=10 * bytes_each)
+    thetas = rng.normal(size=(25, 2)) * [1.0, 0.1]
+    likelihood = likelihood_of(Batched(), cache)
+    likelihood.misfit(thetas[:14])
+    likelihood.misfit(thetas[14:])
+    assert (cache.info().responses, cache.info().response_bytes) == (10, 10 * bytes_each)
+    kept = [cache.response("line", theta) is not None for theta in thetas]
+    assert kept == [False] * 15 + [True] * 10
+    assert cache.info().simulations == 25
+
+
+def test_a_response_whose_misfit_overflows_is_a_failure(path):
+    likelihood = likelihood_of(Line(), SimulationCache(path, responses=True))
+    assert np.isnan(likelihood.misfit([[1e200, 0.0]])).all()
+    assert likelihood.failures[0]["reason"] == "the misfit of channel 'a' is not finite"
+
+
+# the ready-made posterior ---------------------------------------------------------------------------------------------
+
+
+def test_bridge_column_takes_a_cache(path):
+    x = np.append(np.ones(5), [0.5, 0.002])
+    first = bridge_column(duration=1.0, every=4, cache=path)
+    value = first.log_prob(x)
+    second = bridge_column(duration=1.0, every=4, cache=SimulationCache(path))
+    assert second.log_prob(x) == value
+    assert (second.report()["simulations"], second.report()["disk_hits"]) == (0, 1)
+    assert second.fingerprint == first.fingerprint == bridge_column(duration=1.0, every=4).fingerprint

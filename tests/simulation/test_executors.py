@@ -1,0 +1,327 @@
+"""The rule for ``pool=``: every engine gives the same bits, the model travels once, bad input is refused early."""
+
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing.pool import ThreadPool
+from pathlib import Path
+
+import emcee
+import numpy as np
+import pytest
+
+from fe_likelihoods import problems
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation import executors
+from fe_likelihoods.simulation.executors import DaskEngine, LocalPool, PoolEngine, as_executor
+from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
+from tests.faults import treacherous
+from tests.faults.treacherous import Absent, Large, Treacherous, Unpicklable, posterior_of
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+class Recorder:
+    """A pool that pickles as processes would, and counts the bytes."""
+
+    def __init__(self, forget=False):
+        self.bytes, self.forget = [], forget
+
+    def map(self, function, items):
+        for item in items:
+            if self.forget:
+                executors._functions.clear()
+            task = pickle.dumps((function, item))
+            self.bytes.append(len(task))
+            function, item = pickle.loads(task)
+            yield function(item)
+
+
+@pytest.fixture(autouse=True)
+def nothing_known():
+    executors._functions.clear()
+
+
+@pytest.fixture
+def oscillator(rng):
+    return LinearOscillator(Record("noise", 0.02, rng.normal(size=300)), period=0.6)
+
+
+@pytest.fixture
+def thetas(rng):
+    thetas = rng.uniform(0.5, 2.0, size=(23, 2))
+    thetas[5, 1] = 25.0  # overdamped: fails
+    return thetas
+
+
+def pools():
+    yield "None", lambda: None
+    yield "one process", lambda: LocalPool(1)
+    yield "three processes", lambda: LocalPool(3)
+    yield "threads", lambda: ThreadPoolExecutor(3)
+    yield "ThreadPool", lambda: ThreadPool(2)
+    yield "executor", lambda: ProcessPoolExecutor(2, mp_context=SPAWN)
+    yield "multiprocessing", lambda: SPAWN.Pool(2)
+    yield "another object", Recorder
+
+
+@pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in pools()])
+def test_same_bits_on_every_engine(make, oscillator, thetas, rng):
+    measured = rng.normal(size=(2, 300))
+    expected = misfit_batch(oscillator, thetas, measured)
+    assert [bool(reason) for reason in expected.reasons] == [row == 5 for row in range(23)]
+    pool = make()
+    engine = as_executor(pool, oscillator)
+    for n in (23, 3, 1):
+        result = misfit_batch(oscillator, thetas[:n], measured, engine)
+        np.testing.assert_array_equal(result.misfit, expected.misfit[:n])
+        assert result.reasons == expected.reasons[:n]
+    responses = simulate_batch(oscillator, thetas, engine)
+    np.testing.assert_array_equal(responses.response, simulate_batch(oscillator, thetas).response)
+    for end in ("terminate", "shutdown", "close"):
+        if hasattr(pool, end):
+            getattr(pool, end)()
+            break
+
+
+def test_kind_of_engine():
+    class Client(Recorder):
+        def gather(self, futures): ...
+
+    with LocalPool(2) as pool:
+        assert as_executor(pool) is pool
+        assert as_executor(as_executor(pool)) is pool
+    assert as_executor(None) is None
+    assert as_executor(3).workers == as_executor(np.int64(3)).workers == 3
+    assert type(as_executor(Client())) is DaskEngine
+    assert type(as_executor(Recorder())) is PoolEngine
+
+
+def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
+    """A client that does the work itself, and notes what each task was."""
+
+    class Client:
+        def __init__(self):
+            self.tasks = []
+
+        def nthreads(self):
+            return {"one": 1, "other": 1}
+
+        def map(self, function, groups, pure):
+            assert not pure
+            self.tasks.append([len(group) for group in groups])
+            return [function(group) for group in groups]
+
+        def gather(self, futures):
+            return futures
+
+    def slow(item):
+        time.sleep(0.35)
+        return item, ""
+
+    monkeypatch.setattr(executors, "_settle", lambda: None)
+    client = Client()
+    engine = as_executor(client)
+    items = list(range(64))
+    for _ in range(2):
+        assert engine.map(lambda item: (item, ""), items) == [(item, "") for item in items]
+    assert engine.map(slow, items[:3]) == [(item, "") for item in items[:3]]
+    assert engine.map(slow, items[:12]) == [(item, "") for item in items[:12]]
+    assert client.tasks[0] == [1] * 64  # nothing is known yet
+    assert client.tasks[1][0] == 16 and client.tasks[1][-1] == 1 and sum(client.tasks[1]) == 64
+    assert len(client.tasks[1]) < 20
+    assert client.tasks[3] == [2, 2, 2, 1, 1, 1, 1, 1, 1]  # .35 s each, so two to a second
+
+
+@pytest.mark.parametrize(
+    "pool",
+    [0, -1, True, 2.5, "four", object(), float("nan"), [2]],
+    ids=lambda pool: type(pool).__name__ if type(pool) is object else str(pool),
+)
+def test_bad_pools_are_refused(pool):
+    with pytest.raises(ValueError, match="pool must be None, a positive number of processes, or an object with map"):
+        posterior_of(Treacherous(), pool=pool)
+
+
+def test_model_travels_once_to_each_process():
+    with LocalPool(2) as pool:
+        for _ in range(3):
+            batch = simulate_batch(Large(), np.tile([0.2, 0.3], (20, 1)), pool)
+            assert set(batch.response[:, 0, 0]) == {1.0}
+
+
+def _absent_file(path):
+    raise FileNotFoundError(path)
+
+
+@pytest.mark.parametrize("forget", [False, True], ids=["file", "no file"])
+def test_bytes_sent_with_each_item(forget, monkeypatch):
+    model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
+    recorder = Recorder()
+    engine = as_executor(recorder)
+    treacherous.LOADED.clear()
+    if forget:  # as on another machine: there is no such folder, so the model travels beside the items
+        monkeypatch.setattr(executors.Path, "read_bytes", _absent_file)
+    for _ in range(2):
+        batch = simulate_batch(model, thetas, engine)
+        assert batch.reasons == [""] * 20
+    assert len(treacherous.LOADED) == 1
+    large = [size for size in recorder.bytes if size > 2**20]
+    assert len(large) == (20 if forget else 0)
+    assert max(size for size in recorder.bytes if size <= 2**20) < 500
+    assert recorder.bytes[-20:] == [recorder.bytes[-1]] * 20
+
+
+def test_few_functions_are_kept_in_a_worker():
+    engine = as_executor(Recorder())
+    for ballast in range(20):
+        model = Treacherous()
+        model.ballast = ballast
+        simulate_batch(model, np.array([[0.1, 0.2]]), engine)
+    assert len(executors._functions) == executors._KNOWN_FUNCTIONS
+
+
+def test_temporary_files_go_with_the_engine():
+    engine = as_executor(Recorder())
+    simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), engine)
+    folder = engine._folder.path
+    assert [file.stat().st_size > 0 for file in folder.iterdir()] == [True]
+    del engine
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: 2, lambda: ProcessPoolExecutor(1), lambda: LocalPool(1)], ids=["2", "executor", "pool"]
+)
+def test_model_that_cannot_be_pickled_is_refused_with_the_attribute(make):
+    with pytest.raises(ValueError, match=r"Unpicklable must go to other processes, which its attribute solver\.lock ="):
+        posterior_of(Unpicklable(), pool=make())
+
+
+def test_model_that_cannot_be_pickled_runs_in_threads():
+    with ThreadPoolExecutor(2) as pool:
+        posterior = posterior_of(Unpicklable(), pool=pool)
+        assert np.isfinite(posterior(posterior.sample_prior(5, 1))).all()
+
+
+def test_model_that_cannot_be_loaded_is_an_error_and_no_failure():
+    posterior = posterior_of(Absent(), pool=1)
+    with pytest.raises(ValueError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
+        posterior(posterior.sample_prior(5, 1))
+    with SPAWN.Pool(1) as pool:
+        posterior = posterior_of(Absent(), pool=pool)
+        with pytest.raises(RuntimeError, match="cannot load the model: ModuleNotFoundError"):
+            posterior(posterior.sample_prior(5, 1))
+    assert posterior.report()["simulations"] == 0
+
+
+def test_local_pool_maps_any_function_and_raises_what_it_raises():
+    with LocalPool(2) as pool:
+        assert pool.map(abs, range(-5, 0)) == [5, 4, 3, 2, 1]
+        assert pool.map(abs, []) == []
+        with pytest.raises(TypeError, match="bad operand"):
+            pool.map(abs, [1, "two", 3])
+        assert pool.map(str, [1, 2]) == ["1", "2"]
+        with pytest.raises(ValueError, match="cannot be sent to another process"):
+            pool.map(lambda x: x, [1])
+
+
+def test_threads_in_workers_are_limited(monkeypatch):
+    names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"]
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # the user's own word
+    with LocalPool(1) as pool:
+        assert pool.map(os.getenv, names) == ["2", "1", "1"]
+
+
+def test_likelihood_with_a_pool_of_its_own_pickles_without_it():
+    posterior = posterior_of(Treacherous(), pool=2)
+    x = posterior.sample_prior(7, 2)
+    values = posterior(x)
+    copy = pickle.loads(pickle.dumps(posterior))
+    assert copy.likelihood.pool is None
+    np.testing.assert_array_equal(copy(x), values)
+    posterior.likelihood.pool.close()
+
+
+def test_as_the_pool_of_a_sampler(seed):
+    """The posterior goes to the processes once, and the chain is that of a run without them."""
+    posterior = posterior_of(Treacherous())
+    start = posterior.sample_prior(10, seed)
+    chains = []
+    with LocalPool(2) as pool:
+        for workers in (None, pool):
+            sampler = emcee.EnsembleSampler(10, posterior.ndim, posterior, pool=workers)
+            sampler.random_state = np.random.RandomState(seed).get_state()
+            sampler.run_mcmc(start, 5)
+            chains.append(sampler.get_chain())
+    np.testing.assert_array_equal(*chains)
+
+
+SCRIPT = """
+import numpy as np
+from fe_likelihoods.models.function import FunctionModel
+from tests.faults.treacherous import CHANNELS, line, posterior_of
+
+def mine(theta):
+    return 2.0 * line(theta)
+
+def main():
+    x = np.array([[0.1 * k, 0.2, 0.5] for k in range(1, 9)])
+    for limit in (None, 60.0):
+        model = FunctionModel(mine, ("offset", "slope"), CHANNELS, 0.1, 20, time_limit=limit)
+        print(posterior_of(model, pool=2)(x).tolist() == posterior_of(model)(x).tolist())
+
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "expected"),
+    [
+        ('if __name__ == "__main__":\n    main()\n', "True True"),
+        (
+            "main()\n",
+            'must not start workers of its own then: put what the script does under if __name__ == "__main__"',
+        ),
+    ],
+    ids=["guarded", "not guarded"],
+)
+def test_models_defined_in_a_script(end, expected, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT + end)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    run = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
+    assert expected in (" ".join(run.stdout.split()) or run.stderr)
+
+
+def test_models_of_a_notebook_are_refused():
+    code = "import numpy as np\n" + SCRIPT + "main()\n"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert (
+        "ValueError: with this pool the model must go to other processes. what is defined in a notebook" in run.stderr
+    )
+
+
+@pytest.mark.parametrize("system", ["column", "bridge"])
+def test_compiled_models_go_through_a_pool_to_the_same_bits(system):
+    """Without a pool a batch runs on threads of this process, with one set by set in the workers."""
+    if system == "column":
+        posterior = problems.bridge_column(duration=2.0)
+        thetas = posterior.sample_prior(6, 1)[:, :5]
+    else:
+        record = problems.isolated_bridge_data().record.trim(0.0, 2.0)
+        posterior = problems.isolated_bridge(record=record, step=1e-3)
+        thetas = posterior.sample_prior(6, 1)[:, :10]
+    likelihood = posterior.likelihood
+    with LocalPool(2) as pool:
+        pooled = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, pool=pool)
+        np.testing.assert_array_equal(pooled.misfit(thetas), likelihood.misfit(thetas))
+        assert pooled.simulations == 6

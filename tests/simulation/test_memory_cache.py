@@ -1,0 +1,263 @@
+"""What was simulated is not simulated again, and the digest that says whether two posteriors are the same."""
+
+import dataclasses
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import dataclass
+from multiprocessing.pool import ThreadPool
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import Distribution, HalfNormal, TruncatedNormal, Uniform
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.memory_cache import MisfitMemory
+from fe_likelihoods.simulation.model import SimulationFailed
+
+
+class Line:
+    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one, and counts its runs."""
+
+    parameter_names = ("offset", "slope")
+    channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
+    dt = 0.5
+    n_steps = 8
+    fingerprint = "line"
+
+    def __init__(self):
+        self.runs = []
+
+    def simulate(self, theta):
+        self.runs.append(tuple(theta))
+        if theta[1] > 1.0:
+            raise SimulationFailed("too steep")
+        line = theta[0] + theta[1] * self.dt * np.arange(self.n_steps)
+        return np.vstack([line, -line])
+
+
+def likelihood_of(model, **kwargs):
+    return FELikelihood(model, Measurements(model.channels, model.dt, np.ones((2, model.n_steps))), **kwargs)
+
+
+def points(rng, n, slope=0.5):
+    return np.column_stack([rng.normal(size=n), np.full(n, slope), rng.uniform(0.5, 2.0, size=(n, 2))])
+
+
+# memory ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_change_of_the_noise_costs_no_simulation(rng):
+    model = Line()
+    likelihood = likelihood_of(model)
+    x = points(rng, 20)
+    likelihood.log_likelihood(x)
+    assert (likelihood.simulations, likelihood.cache_hits) == (20, 0)
+    x[:, 2:] *= rng.uniform(0.5, 2.0, size=(20, 2))
+    again = likelihood.log_likelihood(x)
+    assert (likelihood.simulations, likelihood.cache_hits, len(model.runs)) == (20, 20, 20)
+    np.testing.assert_array_equal(again, likelihood_of(Line(), memory=0).log_likelihood(x))
+    x[3, 0] = np.nextafter(x[3, 0], 9.0)
+    likelihood.log_likelihood(x)
+    assert (likelihood.simulations, likelihood.cache_hits) == (21, 39)
+
+
+def test_hits_are_rows_from_memory_only():
+    model = Line()
+    likelihood = likelihood_of(model)
+    thetas = np.array([[0.0, 0.5], [-0.0, 0.5], [1.0, 0.5], [0.0, 0.5]])
+    likelihood.misfit(thetas)  # duplicates of the same batch
+    assert (likelihood.simulations, likelihood.cache_hits) == (2, 0)
+    first = likelihood.misfit(np.vstack([thetas, [[2.0, 0.5], [2.0, 0.5], [np.nan, 0.5]]]))
+    assert (likelihood.simulations, likelihood.cache_hits) == (3, 4)
+    np.testing.assert_array_equal(first[:4], likelihood_of(Line()).misfit(thetas))
+    np.testing.assert_array_equal(first[4], first[5])
+    assert np.isnan(first[6]).all()
+    first[:] = 0.0  # what is handed out is not what is remembered
+    assert (likelihood.misfit(thetas) > 0.0).all()
+
+
+def test_failures_are_remembered_and_recorded_once():
+    model = Line()
+    likelihood = likelihood_of(model)
+    for _ in range(3):
+        assert np.isnan(likelihood.misfit([[0.0, 2.0], [0.0, 2.0]])).all()
+    assert model.runs == [(0.0, 2.0)]
+    assert likelihood.failure_count == len(likelihood.failures) == 1
+    assert likelihood.failure_reasons == {"too steep": 1}
+    assert likelihood.cache_hits == 4
+
+
+def test_the_memory_is_bounded(rng):
+    model = Line()
+    likelihood = likelihood_of(model, memory=10)
+    thetas = points(rng, 15)[:, :2]
+    likelihood.misfit(thetas)  # a batch larger than the memory
+    likelihood.misfit(thetas[5:])
+    assert likelihood.simulations == 15
+    likelihood.misfit(thetas[5:6])  # asked for just now, so it outlives the others
+    likelihood.misfit(points(rng, 9)[:, :2])
+    assert likelihood.simulations == 24
+    likelihood.misfit(thetas[[5, 6]])
+    assert likelihood.simulations == 25
+    assert len(likelihood._memory) == 10
+
+
+def test_without_memory():
+    model = Line()
+    likelihood = likelihood_of(model, memory=0)
+    for _ in range(2):
+        likelihood.misfit([[0.0, 0.5], [0.0, 0.5]])
+    assert len(model.runs) == likelihood.simulations == 2
+    assert likelihood.cache_hits == 0
+
+
+@pytest.mark.parametrize("rows", [-1, 2.5, None, True])
+def test_impossible_memories(rows):
+    with pytest.raises(ValueError, match="memory is the number of simulations"):
+        likelihood_of(Line(), memory=rows)
+
+
+def test_memory_does_not_travel(rng):
+    likelihood = likelihood_of(Line(), memory=500)
+    x = points(rng, 200)
+    small = len(pickle.dumps(likelihood))
+    values = likelihood.log_likelihood(x)
+    likelihood.model.runs = []
+    assert len(pickle.dumps(likelihood)) <= small + 100
+    copy = pickle.loads(pickle.dumps(likelihood))
+    assert len(copy._memory) == 0
+    assert copy._memory.rows == 500
+    np.testing.assert_array_equal(copy.log_likelihood(x), values)
+    assert len(copy.model.runs) == 200
+
+
+def test_threads_share_a_memory(rng):
+    likelihood = likelihood_of(Line(), memory=50)
+    x = points(rng, 60)
+    expected = likelihood_of(Line()).log_likelihood(x)
+    batches = [np.arange(start, start + 20) % 60 for start in range(0, 400, 7)]
+    with ThreadPool(4) as pool:
+        for rows, values in zip(
+            batches, pool.map(lambda rows: likelihood.log_likelihood(x[rows]), batches), strict=True
+        ):
+            np.testing.assert_array_equal(values, expected[rows])
+    assert len(likelihood._memory) == 50
+
+
+def test_the_memory_alone():
+    memory = MisfitMemory(2)
+    misfit, known = memory.look_up([], 3)
+    assert misfit.shape == (0, 3)
+    assert known == []
+    memory.store([b"a", b"b"], np.array([[1.0], [2.0]]))
+    memory.look_up([b"a"], 1)
+    memory.store([b"c"], np.array([[3.0]]))  # b is the one not asked for longest
+    misfit, known = memory.look_up([b"a", b"b", b"c"], 1)
+    assert known == [True, False, True]
+    assert misfit[known].ravel().tolist() == [1.0, 3.0]
+    assert np.isnan(misfit[1, 0])
+
+
+# fingerprint ----------------------------------------------------------------------------------------------------------
+
+
+def oscillator_posterior(**changes):
+    samples = np.sin(np.arange(50.0))
+    options = {"record": samples, "period": 0.6, "scale": 1.0, "unit": "g", "sd": 0.3, "noise": None, "sigma": 0.2}
+    options |= changes
+    model = LinearOscillator(Record("sine", 0.02, options["record"]), options["period"])
+    channels = tuple(dataclasses.replace(c, unit=options["unit"]) if c.unit == "g" else c for c in model.channels)
+    measurements = Measurements(channels, model.dt, options["scale"] * np.ones((2, 50)))
+    likelihood = FELikelihood(model, measurements, noise=options["noise"])
+    free = [HalfNormal(options["sigma"]), HalfNormal(0.005)]
+    prior = {"stiffness": TruncatedNormal(1.0, options["sd"]), "damping": TruncatedNormal(1.0, 0.6)}
+    prior |= dict(zip(likelihood.noise.parameter_names, free, strict=True))
+    return Posterior(likelihood, prior)
+
+
+@dataclass(frozen=True)
+class ScaledNoise:
+    """Two levels and a table of weights."""
+
+    weights: np.ndarray
+    parameter_names: tuple[str, ...] = ("level_a", "level_b")
+
+    def log_likelihood(self, misfit, n_steps, parameters):
+        return -(misfit / parameters).sum(axis=1)
+
+
+class NamelessNoise(ScaledNoise):
+    __repr__ = object.__repr__
+
+
+def test_fingerprint_changes_with_what_the_density_depends_on():
+    weights = np.ones(2000)
+    other = weights.copy()
+    other[1000] += 1e-12  # in the middle of a long table, and far behind the point
+    changes = [
+        {},
+        {"record": np.cos(np.arange(50.0))},
+        {"period": 0.61},
+        {"scale": 1.0 + 1e-12},
+        {"sd": np.nextafter(0.3, 1.0)},
+        {"sigma": 0.21},
+        {"noise": ScaledNoise(weights)},
+        {"noise": ScaledNoise(other)},
+        {"noise": ScaledNoise(weights, ("level_b", "level_a"))},
+    ]
+    fingerprints = [oscillator_posterior(**change).fingerprint for change in changes]
+    assert len(set(fingerprints)) == len(changes)
+    assert fingerprints[0] == oscillator_posterior().fingerprint
+    assert fingerprints[0] == oscillator_posterior(unit="m/s2").fingerprint  # a display unit changes nothing
+    swapped = oscillator_posterior()
+    distributions = dict(swapped.prior.distributions)
+    assert Posterior(swapped.likelihood, dict(reversed(distributions.items()))).fingerprint == fingerprints[0]
+    uniform = Posterior(swapped.likelihood, {**distributions, "damping": Uniform(0.0, 2.0)})
+    assert uniform.fingerprint not in fingerprints
+    traded = {**distributions, "stiffness": distributions["damping"], "damping": distributions["stiffness"]}
+    assert Posterior(swapped.likelihood, traded).fingerprint not in fingerprints
+
+
+def test_fingerprint_of_a_noise_that_does_not_say_what_it_is():
+    with pytest.raises(ValueError, match="repr that says what NamelessNoise is"):
+        _ = oscillator_posterior(noise=NamelessNoise(np.ones(2))).fingerprint
+
+
+def test_fingerprint_of_a_distribution_that_does_not_say_what_it_is():
+    class Vague(Distribution):
+        bounds = (0.0, 1.0)
+        moments = (0.5, 0.3)
+
+        def _log_density(self, x):
+            return 0.0 * x
+
+        def _quantile(self, u):
+            return u
+
+    posterior = oscillator_posterior()
+    posterior = Posterior(posterior.likelihood, {**posterior.prior.distributions, "damping": Vague()})
+    with pytest.raises(ValueError, match="repr that says what .*Vague is"):
+        _ = posterior.fingerprint
+
+
+def test_fingerprint_is_the_same_in_another_process():
+    root = Path(__file__).resolve().parents[2]
+    code = "from test_memory import oscillator_posterior; print(oscillator_posterior().fingerprint)"
+    found = set()
+    for hash_seed in ("1", "2"):
+        environment = {
+            **os.environ,
+            "PYTHONHASHSEED": hash_seed,
+            "PYTHONPATH": f"{root}{os.pathsep}{Path(__file__).parent}",
+        }
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        found.add(done.stdout.strip())
+    assert found == {oscillator_posterior().fingerprint}
+    assert pickle.loads(pickle.dumps(oscillator_posterior())).fingerprint in found

@@ -1,0 +1,148 @@
+"""The pure functions: weights, next beta, resampling, the error of the evidence; and the proposals' exactness."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import logsumexp
+
+from samplers.moves.kernels import RandomWalkMove, StudentTMove
+from samplers.proposals.mixture import location_and_root
+from samplers.tempering.resampling import RESAMPLING
+from samplers.tempering.weights import (
+    EvidenceError,
+    coarse_weights,
+    effective_sample_size,
+    log_mean_weight,
+    next_beta,
+    normalised_weights,
+)
+
+
+@pytest.mark.parametrize("offset", [-5000.0, 0.0, 5000.0, 1e8])
+def test_weights_know_no_offset(rng, offset):
+    log_weights = 30 * rng.standard_normal(500)
+    log_weights[7] = -np.inf
+    shifted = log_weights + offset
+    assert effective_sample_size(shifted) == pytest.approx(effective_sample_size(log_weights), rel=1e-6)
+    assert log_mean_weight(shifted) == pytest.approx(logsumexp(log_weights) - np.log(500) + offset, rel=1e-12)
+    assert np.allclose(normalised_weights(shifted), np.exp(log_weights - logsumexp(log_weights)), atol=1e-9)
+    if abs(offset) <= 5000:
+        assert np.array_equal(coarse_weights(shifted), coarse_weights(log_weights))
+    assert np.allclose(coarse_weights(log_weights), normalised_weights(log_weights), rtol=1e-3)
+
+
+def test_extremes():
+    assert effective_sample_size(np.zeros(10)) == pytest.approx(10)
+    assert effective_sample_size(np.array([0.0, -np.inf, -np.inf])) == 1
+    assert effective_sample_size(np.full(3, -np.inf)) == 0
+    assert log_mean_weight(np.full(3, -np.inf)) == -np.inf
+    with pytest.raises(ValueError, match="every weight is zero"):
+        normalised_weights(np.full(3, -np.inf))
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e9])
+@pytest.mark.parametrize("beta", [0.0, 1e-9, 0.3])
+def test_next_beta_meets_the_target_or_is_one(rng, scale, beta):
+    log_likelihood = -scale * rng.chisquare(5, size=400) - 5000
+    found = next_beta(log_likelihood, beta, 200)
+    assert beta < found <= 1
+    reached = effective_sample_size((found - beta) * log_likelihood)
+    if found == 1:
+        assert reached >= 200
+    elif (found - beta) > 1e-9 * found:
+        assert reached == pytest.approx(200, rel=1e-4)
+
+
+def test_next_beta_of_special_likelihoods(rng):
+    assert next_beta(np.full(100, -5000.0), 0.0, 99) == 1.0
+    half_dead = np.where(np.arange(100) < 50, -np.inf, -1.0)
+    assert next_beta(half_dead, 0.0, 95) == 1.0  # the target is meant per point that is left
+    log_likelihood = np.where(np.arange(100) < 50, -np.inf, -1e4 * rng.uniform(size=100))
+    found = next_beta(log_likelihood, 0.0, 80)
+    assert effective_sample_size(found * log_likelihood[50:]) == pytest.approx(40, rel=1e-4)
+    with pytest.raises(ValueError, match="no point"):
+        next_beta(np.full(5, -np.inf), 0.0, 3)
+    cliff = np.append(np.full(99, -1e300), 0.0)  # no representable step keeps the target: climb, do not hang
+    assert 0.5 < next_beta(cliff, 0.5, 50) < 0.5 + 1e-15
+
+
+def test_next_beta_does_not_snap(rng):
+    log_likelihood = -200 * rng.chisquare(3, size=300)
+    beta = next_beta(log_likelihood, 0.97, 299)
+    assert beta < 0.98
+
+
+@pytest.mark.parametrize("name", sorted(RESAMPLING))
+def test_resampling_is_unbiased(rng, name):
+    n, repeats = 40, 4000
+    weights = rng.dirichlet(2.0 * np.ones(n))
+    weights[5] = 0
+    weights[-1] = 0
+    weights /= weights.sum()
+    counts = np.zeros((repeats, n))
+    for k in range(repeats):
+        ancestors = RESAMPLING[name](weights, rng)
+        assert ancestors.shape == (n,)
+        counts[k] = np.bincount(ancestors, minlength=n)
+    assert counts[:, 5].max() == counts[:, -1].max() == 0
+    error = counts.std(axis=0, ddof=1) / np.sqrt(repeats) + 1e-9
+    assert np.max(np.abs(counts.mean(axis=0) - n * weights) / error) < 4.5
+    if name == "systematic":
+        assert np.max(np.abs(counts - n * weights)) < 1
+    if name == "residual":
+        assert np.all(counts >= np.floor(n * weights))
+
+
+def test_evidence_error_of_independent_points_is_that_of_importance_sampling(rng):
+    n, runs, estimates, errors = 300, 400, [], []
+    for _ in range(runs):
+        log_weights = rng.standard_normal(n)
+        estimates.append(log_mean_weight(log_weights))
+        errors.append(EvidenceError(n).weigh(normalised_weights(log_weights)))
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(estimates), rel=4 * np.sqrt(0.5 / runs) + 0.05)
+
+
+def test_evidence_error_sees_points_that_never_move(rng):
+    """Two half steps without moves in between are one whole step of importance sampling."""
+    n = 400
+    log_likelihood = 1.5 * rng.standard_normal(n)
+    whole = EvidenceError(n).weigh(normalised_weights(log_likelihood))
+    halves = EvidenceError(n)
+    weights = normalised_weights(0.5 * log_likelihood)
+    halves.weigh(weights)
+    ancestors = RESAMPLING["systematic"](weights, rng)
+    halves.resample(ancestors)
+    assert halves.weigh(normalised_weights(0.5 * log_likelihood[ancestors])) == pytest.approx(whole, rel=0.05)
+
+
+def test_roots_are_regular_and_follow_units(rng):
+    ndim = 4
+    coords = rng.standard_normal((200, ndim)) @ np.tril(rng.standard_normal((ndim, ndim)))
+    weights = rng.dirichlet(np.ones(200))
+    mean, root = location_and_root(coords, weights)
+    assert np.allclose(root @ root.T, np.cov(coords.T, aweights=weights, ddof=0))
+    units = np.array([1e-4, 1.0, 1e4, 1e11])
+    scaled_mean, scaled_root = location_and_root(coords * units, weights)
+    assert np.allclose(scaled_mean, mean * units)
+    assert np.allclose(scaled_root, units[:, None] * root)
+    for degenerate in (
+        np.repeat(coords[:1], 200, axis=0),
+        np.repeat(coords[:2], 100, axis=0),
+        np.column_stack([coords[:, 0], coords[:, 0], coords[:, 1], np.full(200, 3e10)]),
+    ):
+        _, root = location_and_root(degenerate, weights)
+        assert np.all(np.isfinite(root)) and np.all(root.diagonal() > 0)
+
+
+def test_student_t_is_drawn_from_the_density_it_states(rng):
+    move = StudentTMove(dof=5.0)
+    move.calibrate(rng.standard_normal((500, 2)) @ np.array([[1.0, 0.0], [2.0, 0.3]]), np.full(500, 1 / 500))
+    x, factors = move._draw(np.zeros((20000, 2)), rng)
+    theirs = stats.multivariate_t(move._mean, move._root @ move._root.T, df=5.0)
+    assert np.allclose(factors, theirs.logpdf(np.zeros(2)) - theirs.logpdf(x))
+    distance = np.linalg.solve(move._root, (x - move._mean).T)
+    assert stats.kstest(np.sum(distance**2, axis=0) / 2, stats.f(2, 5).cdf).pvalue > 1e-4
+    with pytest.raises(ValueError, match="dof"):
+        StudentTMove(dof=2.0)
+    with pytest.raises(ValueError, match="scale"):
+        RandomWalkMove(scale=-1.0)

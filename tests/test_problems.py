@@ -1,0 +1,389 @@
+"""The ready-made bridge column: bundled data, prior, options, and no holes in the posterior."""
+
+from importlib import resources
+
+import emcee
+import h5py
+import numpy as np
+import pytest
+from fe_likelihoods.data import make_bridge_column_eq1, make_isolated_bridge
+from scipy import stats
+
+from fe_likelihoods import problems
+from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.problems import (
+    BRIDGE_COLUMN_MEANS,
+    BRIDGE_COLUMN_NOISE,
+    bridge_column,
+    bridge_column_data,
+    bridge_column_measurements,
+    bridge_column_prior,
+)
+from fe_likelihoods.signals.channels import Channel, Measurements, read_dataset, write_dataset
+from fe_likelihoods.signals.records import Record, read_csv
+from fe_likelihoods.units import G0, to_si
+
+INCH = to_si(1.0, "in").item()
+TRUTH = np.array(list(BRIDGE_COLUMN_MEANS.values()))
+NOISE = np.array(list(BRIDGE_COLUMN_NOISE.values()))
+PAPER_CV = np.array([0.30, 0.10, 1.2, 9.2, 0.68]) / 100  # of the posterior, Ec Es a0 a1 ft
+REAL_RECORD = "loma_prieta_1989_apeel2_redwood_city_133.csv"
+
+
+def rrmse(values, reference):
+    return np.sqrt(np.sum((values - reference) ** 2, axis=-1) / np.sum(reference**2, axis=-1))
+
+
+@pytest.fixture(scope="module")
+def data():
+    return bridge_column_data()
+
+
+@pytest.fixture(scope="module")
+def strong(data):
+    """Five seconds around the peak of the bundled record, twice as strong."""
+    return data.record.trim(5.0, 10.0).scale(2.0)
+
+
+# --- the bundled data ------------------------------------------------------------------------------------------------
+
+
+def test_the_data_have_the_features_of_the_paper(data):
+    record, measurements, attributes = data
+    assert (record.dt, record.n_steps) == (1 / 256, 12800)
+    assert record.n_steps * record.dt == 50.0
+    assert np.abs(record.acceleration).max() / G0 == pytest.approx(0.2, abs=0.02)
+    assert (measurements.n_channels, measurements.n_steps, measurements.dt) == (2, 12800, 1 / 256)
+    assert [c.name for c in measurements.channels] == ["acceleration", "displacement"]
+    assert 1.5 < np.abs(measurements.channel("displacement")).max() / INCH < 3.0
+    # at rest in the end: no drift of velocity, which a stochastic record easily keeps
+    velocity = np.cumsum(record.acceleration) * record.dt
+    assert abs(velocity[-1]) < 0.02 * np.abs(velocity).max()
+
+
+def test_the_data_say_that_they_are_synthetic(data):
+    assert "SYNTHETIC" in data.record.source
+    assert data.measurements.description.startswith("SYNTHETIC")
+    assert "NOT measured" in data.attributes["title"]
+    expected = dict(BRIDGE_COLUMN_MEANS) | {f"sigma_{name}": sigma for name, sigma in BRIDGE_COLUMN_NOISE.items()}
+    assert data.attributes["truth"] == pytest.approx(expected)
+
+
+def test_damage_is_noticed(tmp_path):
+    with resources.as_file(resources.files("fe_likelihoods.data") / "bridge_column_eq1.h5") as path:
+        copy = tmp_path / "copy.h5"
+        copy.write_bytes(path.read_bytes())
+    assert read_dataset(copy).record.fingerprint == bridge_column_data().record.fingerprint
+    with h5py.File(copy, "r+") as file:
+        file["measurements/values"][0, 777] += 1e-9
+    with pytest.raises(ValueError, match="checksum"):
+        read_dataset(copy)
+
+
+def test_the_base_motion_can_be_made_again(data):
+    record = make_bridge_column_eq1.base_motion()
+    # to round-off: logarithms and exponentials differ in the last digit from machine to machine
+    np.testing.assert_allclose(record.acceleration, data.record.acceleration, rtol=0, atol=1e-12 * G0)
+    assert (record.dt, record.name, record.source) == (data.record.dt, data.record.name, data.record.source)
+    assert data.attributes["seed"] == make_bridge_column_eq1.SEED
+    other = make_bridge_column_eq1.base_motion(make_bridge_column_eq1.SEED + 1)
+    assert rrmse(other.acceleration, record.acceleration) > 1.0
+
+
+@pytest.mark.slow
+def test_the_data_set_can_be_made_again(data, tmp_path, monkeypatch):
+    written = {}
+    monkeypatch.setattr(make_bridge_column_eq1, "write_dataset", lambda *arguments: written.update(all=arguments))
+    make_bridge_column_eq1.main()
+    _, record, measurements, attributes = written["all"]
+    np.testing.assert_allclose(measurements.values, data.measurements.values, rtol=0, atol=1e-6)
+    write_dataset(tmp_path / "again.h5", record, measurements, attributes)
+    again = read_dataset(tmp_path / "again.h5")
+    assert again.attributes == data.attributes
+
+
+def test_noise_of_the_data_is_white_and_of_the_published_level(data):
+    """Against the response of the finer model over the first 12 s."""
+    part = 12.0
+    response = bridge_column_measurements(data.record.trim(0.0, part), noise=False)
+    noise = data.measurements.trim(0.0, part).values - response.values
+    n = noise.shape[1]
+    for row, sigma in zip(noise, NOISE, strict=True):
+        assert row.mean() == pytest.approx(0.0, abs=4.5 * sigma / np.sqrt(n))
+        assert row.std() == pytest.approx(sigma, rel=4.5 / np.sqrt(2 * n))
+        assert abs(np.corrcoef(row[1:], row[:-1])[0, 1]) < 4.5 / np.sqrt(n)
+        assert stats.kstest(row / sigma, "norm").pvalue > 1e-5
+    assert abs(np.corrcoef(noise)[0, 1]) < 4.5 / np.sqrt(n)
+    np.testing.assert_allclose(NOISE, [7.7 * INCH, 0.09 * INCH], rtol=1e-12)
+
+
+def test_made_measurements(strong):
+    one, again, other = (bridge_column_measurements(strong, seed=seed, n_strips=40) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one.values, again.values)
+    assert (one.values != other.values).mean() > 0.99
+    silent = bridge_column_measurements(strong, noise=False)
+    assert "SYNTHETIC" in one.description and "SYNTHETIC" in silent.description
+    assert "noise" in one.description and "noise" not in silent.description
+    finer = bridge_column_measurements(strong, noise=False, n_strips=400, substeps=8)
+    coarse = RCColumn.lhpost(strong).simulate(TRUTH)
+    assert rrmse(silent.values, finer.values).max() < 0.5 * rrmse(coarse, finer.values).max()
+
+
+# --- prior and posterior ---------------------------------------------------------------------------------------------
+
+
+def test_the_prior_is_the_papers():
+    prior = bridge_column_prior()
+    cvs = dict(Ec=0.30, Es=0.20, a0=0.60, a1=0.60, ft=0.40)
+    peers = {name: stats.truncnorm(-1 / cv, np.inf, loc=1.0, scale=cv) for name, cv in cvs.items()}
+    peers["sigma_acceleration"] = stats.halfnorm(scale=0.1 * G0)
+    peers["sigma_displacement"] = stats.halfnorm(scale=1.2 * INCH)
+    assert list(prior.names) == list(peers)
+    rng = np.random.default_rng(0)
+    points = np.column_stack([peer.rvs(500, random_state=rng) for peer in peers.values()])
+    expected = sum(peer.logpdf(column) for peer, column in zip(peers.values(), points.T, strict=True))
+    np.testing.assert_allclose(prior.logpdf(points), expected, rtol=1e-10)
+    assert np.isneginf(prior.logpdf(np.where(np.eye(7, dtype=bool), -0.01, points[:7]))).all()
+
+
+def test_the_default_posterior(data):
+    posterior = bridge_column()
+    assert posterior.parameter_names == ["Ec", "Es", "a0", "a1", "ft", "sigma_acceleration", "sigma_displacement"]
+    assert posterior.fast_parameters == (5, 6)
+    nominal, truth = (posterior.likelihood.model.simulate(theta) for theta in (np.ones(5), TRUTH))
+    # about as far off as in the paper (94 and 89 %), and nothing but noise and mesh left at the truth
+    assert (rrmse(nominal, data.measurements.values) > 0.6).all()
+    assert (rrmse(truth, data.measurements.values) < 0.35).all()
+    log_likelihood = posterior.log_likelihood(np.append(TRUTH, NOISE))
+    n = data.measurements.n_steps
+    misfit = ((truth - data.measurements.values) ** 2).sum(axis=1)
+    expected = np.sum(-0.5 * misfit / NOISE**2 - n * np.log(NOISE) - 0.5 * n * np.log(2 * np.pi))
+    assert log_likelihood == pytest.approx(expected, rel=1e-10)
+    assert log_likelihood > posterior.log_likelihood(np.append(np.ones(5), NOISE)) + 1000
+
+
+def test_fewer_samples(data):
+    posterior = bridge_column(every=2, duration=10.0)
+    model, measurements = posterior.likelihood.model, posterior.likelihood.measurements
+    assert model.dt == measurements.dt == 2 * data.record.dt
+    assert model.n_steps == measurements.n_steps == 1281
+    np.testing.assert_array_equal(measurements.values, data.measurements.values[:, :2561:2])
+    assert posterior.parameter_names == bridge_column(duration=1.0).parameter_names
+    whole = RCColumn.lhpost(data.record.trim(0.0, 10.0)).simulate(TRUTH)
+    assert rrmse(model.simulate(TRUTH), whole[:, ::2]).max() < 0.1
+
+
+def test_other_records_and_models(strong):
+    posterior = bridge_column(record=strong, seed=5, mesh=20, duration=2.0)
+    model, measurements = posterior.likelihood.model, posterior.likelihood.measurements
+    assert model.mesh == 20 and model.n_steps == measurements.n_steps == 513
+    np.testing.assert_array_equal(model.loading.acceleration, strong.acceleration[:513])
+    expected = bridge_column_measurements(strong, seed=5).trim(0.0, 2.0)
+    np.testing.assert_array_equal(measurements.values, expected.values)
+    given = bridge_column(record=strong, measurements=bridge_column_measurements(strong, seed=5), duration=2.0)
+    np.testing.assert_array_equal(given.likelihood.measurements.values, expected.values)
+
+
+def test_measurements_must_fit(data, strong):
+    record, measurements = data.record.trim(0.0, 2.0), data.measurements.trim(0.0, 2.0)
+    with pytest.raises(ValueError, match="without the record .* give record="):
+        bridge_column(measurements=measurements)
+    with pytest.raises(ValueError, match="samples.*make them equal"):
+        bridge_column(record=record, measurements=data.measurements.trim(0.0, 1.5))
+    with pytest.raises(ValueError, match="step.*make them equal"):
+        bridge_column(record=record, measurements=measurements.decimate(2))
+    force = Measurements((Channel("force", "force", "kip"),), record.dt, np.zeros((1, record.n_steps)))
+    with pytest.raises(ValueError, match="channels are acceleration, displacement, the measurements' are force"):
+        bridge_column(record=record, measurements=force)
+    with pytest.raises(ValueError, match="duration"):
+        bridge_column(duration=51.0)
+    with pytest.raises(ValueError, match="factor"):
+        bridge_column(every=1.5, duration=2.0)
+    with pytest.raises(ValueError, match="geometry"):
+        bridge_column(duration=2.0, geometry="lineal")
+    assert bridge_column(record=record, measurements=measurements).ndim == 7
+
+
+def test_six_lines_of_emcee():
+    """The promise to every Bayesian client, in small."""
+    posterior = bridge_column(every=8, duration=5)
+    sampler = emcee.EnsembleSampler(16, posterior.ndim, posterior, vectorize=True)
+    sampler.run_mcmc(posterior.sample_prior(16, rng=1), 4, progress=False)
+    log_prob = sampler.get_log_prob()
+    assert sampler.get_chain().shape == (4, 16, 7)
+    assert not np.isnan(log_prob).any() and np.isfinite(log_prob).any()
+    assert sampler.acceptance_fraction.max() > 0
+    chain = sampler.get_chain(flat=True)[-5:]
+    np.testing.assert_array_equal(posterior(chain), sampler.get_log_prob(flat=True)[-5:])
+    assert posterior.report()["simulations"] > 16
+
+
+def test_posteriors_of_different_problems_are_told_apart(strong):
+    """Control: a cache must never take one base motion, or one model, for another."""
+    posteriors = [
+        bridge_column(duration=2.0),
+        bridge_column(duration=2.0, mesh=20),
+        bridge_column(record=strong, duration=2.0),
+        bridge_column(record=strong, duration=2.0, seed=2),
+        bridge_column(record=Record("x", strong.dt, 1.0001 * strong.acceleration), duration=2.0),
+    ]
+    assert len({posterior.likelihood.fingerprint for posterior in posteriors}) == len(posteriors)
+    assert bridge_column(duration=2.0).likelihood.fingerprint == posteriors[0].likelihood.fingerprint
+
+
+# --- no holes --------------------------------------------------------------------------------------------------------
+
+
+def failures(model, thetas):
+    """Reasons of the failures among `thetas`, and the response of every other finite."""
+    response, reasons = model.simulate_batch(thetas)
+    failed = np.array([bool(reason) for reason in reasons])
+    assert np.isfinite(response[~failed]).all() and np.isnan(response[failed]).all()
+    return [f"{theta}: {reason}" for theta, reason in zip(thetas, reasons, strict=True) if reason]
+
+
+def around_the_papers_posterior(n, rng):
+    return TRUTH * (1 + PAPER_CV * rng.standard_normal((n, 5)))
+
+
+def test_strong_shaking_is_survived(strong, rng):
+    draws = bridge_column_prior().rvs(100, rng)[:, :5]
+    # one in a hundred would be ten times what the slow test allows
+    told = failures(RCColumn.lhpost(strong), draws)
+    assert len(told) <= 1, told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("which", "n", "allowed"), [("prior", 5000, 4), ("posterior", 2000, 0)])
+def test_no_holes_on_the_real_record(shared, rng, which, n, allowed):
+    """A run that fails inside the bulk of the posterior is a bias, not a nuisance."""
+    record = read_csv(shared / "records" / REAL_RECORD).scale(0.85)
+    model = RCColumn.lhpost(record)
+    draws = bridge_column_prior().rvs(n, rng)[:, :5] if which == "prior" else around_the_papers_posterior(n, rng)
+    told = [reason for part in np.split(draws, range(100, n, 100)) for reason in failures(model, part)]
+    print(f"\n{len(told)} of {n} draws of the {which} failed: {told}")
+    assert len(told) <= allowed, told
+
+
+# --- the isolated bridge ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["twin", "means"])
+def test_the_bridges_data_say_what_they_are(name):
+    record, measurements, attributes = problems.isolated_bridge_data(name)
+    assert "SYNTHETIC" in record.source
+    assert measurements.description.startswith("SYNTHETIC, nominal values assumed")
+    assert "NOT measured data, nominal values assumed" in attributes["title"]
+    truth = problems.ISOLATED_BRIDGE_TRUTH[name]
+    assert attributes["truth"] == pytest.approx(dict(truth) | {"sigma": problems.ISOLATED_BRIDGE_NOISE[name]})
+    assert set(truth.values()) != {1.0}
+    assert [c.name for c in measurements.channels] == list(problems.ISOLATED_BRIDGE_OUTPUTS[name])
+    assert (record.dt, measurements.dt, measurements.n_steps) == (0.005, 0.01, 1501)
+    np.testing.assert_allclose(record.acceleration, make_isolated_bridge.table_motion().acceleration, atol=1e-11)
+
+
+def test_noise_of_the_bridges_data_is_white_and_of_its_level():
+    record, measurements, _ = problems.isolated_bridge_data()
+    clean = problems.isolated_bridge_measurements(record, noise=0.0, step=0.25e-3)
+    rms = np.sqrt(np.mean(clean.values**2, axis=1, keepdims=True))
+    noise = (measurements.values - clean.values) / (0.05 * rms)
+    n = noise.shape[1]
+    assert np.all(np.abs(noise.std(axis=1) - 1.0) < 4.0 / np.sqrt(2 * n))
+    assert np.all(np.abs(noise.mean(axis=1)) < 4.0 / np.sqrt(n))
+    assert np.all(np.abs((noise[:, 1:] * noise[:, :-1]).mean(axis=1)) < 4.0 / np.sqrt(n))
+
+
+def test_the_bridges_posterior_is_that_of_the_specification():
+    """Section 5: one sigma on channels divided by their measured root mean squares."""
+    posterior = problems.isolated_bridge(step=0.5e-3)
+    assert posterior.parameter_names[-1] == "sigma" and posterior.ndim == 11
+    x = np.append(np.full(10, 1.05), 0.07)
+    y = posterior.likelihood.measurements.values
+    residuals = posterior.likelihood.model.simulate(x[:10]) - y
+    rms = np.sqrt(np.mean(y**2, axis=1))
+    n_channels, n = y.shape
+    expected = (
+        -n_channels * n * np.log(0.07)
+        - np.sum(np.sum(residuals**2, axis=1) / rms**2) / (2 * 0.07**2)
+        - 0.5 * n_channels * n * np.log(2 * np.pi)
+        - n * np.log(rms).sum()
+    )
+    assert posterior.log_likelihood(x) == pytest.approx(expected, rel=1e-12)
+    assert posterior.log_prob(np.append(np.full(10, 1.05), 0.0005)) == -np.inf
+    assert posterior.log_prob(np.append(np.full(10, 0.19), 0.05)) == -np.inf
+    assert posterior.report()["simulations"] == 1, "nothing is simulated outside the support"
+
+
+def test_channels_and_noise_of_the_bridge_can_be_chosen():
+    assert problems.isolated_bridge(channels=5).likelihood.measurements.n_channels == 5
+    each = problems.isolated_bridge(channels=10, noise="per channel")
+    assert each.ndim == 20
+    rms = np.sqrt(np.mean(each.likelihood.measurements.values**2, axis=1))
+    shared = problems.isolated_bridge(channels=10)
+    x = np.full(10, 1.1)
+    assert each.log_likelihood(np.append(x, 0.06 * rms)) == pytest.approx(
+        shared.log_likelihood(np.append(x, 0.06)), rel=1e-12
+    )
+    assert problems.isolated_bridge(channels=("acc_p1", "Ub_2")).likelihood.model.outputs == ("acc_p1", "Ub_2")
+
+
+def test_the_means_do_not_tell_the_piers_apart():
+    posterior = problems.isolated_bridge(data="means")
+    model = posterior.likelihood.model
+    truth = np.array(list(problems.ISOLATED_BRIDGE_TRUTH["means"].values()))
+    other = model.exchanged(truth)
+    np.testing.assert_allclose(model.exchanged(other), truth, rtol=1e-14)
+    assert np.abs(other - truth).max() > 0.4
+    at = [posterior.log_likelihood(np.append(theta, 0.1)) for theta in (truth, other, 0.5 * (truth + other))]
+    assert at[0] == pytest.approx(at[1], abs=1e-6)
+    assert at[2] < at[0] - 100.0
+    one_pier = problems.isolated_bridge(channels=5)
+    at = [one_pier.log_likelihood(np.append(theta, 0.1)) for theta in (truth, other)]
+    assert abs(at[0] - at[1]) > 100.0
+
+
+def test_another_table_motion(rng):
+    motion = make_isolated_bridge.table_motion(7).trim(0.0, 3.0)
+    posterior = problems.isolated_bridge(record=motion, step=0.5e-3)
+    assert posterior.likelihood.measurements.n_channels == 10
+    assert np.isfinite(posterior.log_prob(np.append(np.ones(10), 0.1)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"data": "tests"}, "twin"),
+        ({"noise": "white"}, "per channel"),
+        ({"channels": 7}, "sets"),
+        ({"channels": ("Ub_9",)}, "Ub_9"),
+        ({"data": "means", "channels": 5}, "Ub_1"),
+        ({"step": 0.3e-3}, "divides"),
+        ({"measurements": 1}, "record"),
+    ],
+)
+def test_bad_arguments_of_the_bridge_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        problems.isolated_bridge(**arguments)
+
+
+def test_the_coarse_column_sees_the_first_part(data, tmp_path):
+    """Of the same response, nearly: it knows less but says nothing else."""
+    fine = bridge_column(every=8, duration=12.0, cache=tmp_path / "cache.db")
+    coarse = fine.coarse
+    assert coarse.parameter_names == fine.parameter_names
+    assert coarse.coarse is None
+    assert coarse.prior.distributions == fine.prior.distributions
+    assert coarse.fingerprint != fine.fingerprint
+    assert coarse.likelihood.cache is fine.likelihood.cache
+    n, measured = coarse.likelihood.measurements.n_steps, fine.likelihood.measurements
+    np.testing.assert_array_equal(coarse.likelihood.measurements.values, measured.values[:, :n])
+    intensity = np.cumsum(fine.likelihood.model.loading.acceleration**2)
+    assert intensity[n - 2] < 0.75 * intensity[-1] <= intensity[n - 1]
+    cheap, whole = (p.likelihood.model.simulate(TRUTH) for p in (coarse, fine))
+    assert np.all(rrmse(cheap, whole[:, :n]) < 5e-3)
+
+
+def test_a_coarse_column_needs_a_record_to_cut(data):
+    record = Record("two samples", data.record.dt, [0.0, 1.0])
+    posterior = bridge_column(record=record)
+    assert posterior.coarse is None
