@@ -1,251 +1,238 @@
-"""The rules of who may import whom, read from the source."""
+"""The rules of who may import whom, and what no module may contain; one case per rule, violations are listed."""
 
 import ast
+import re
 import sys
 from pathlib import Path
 
-import pytest
+from tests.architecture import ORDER, PACKAGES, ROOT, Import, imports, module_cycles, modules, package_graph
 
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("fe_likelihoods", "samplers")
-MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PLOTTING = {"arviz", "corner", "matplotlib"}
-CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "mpi4py", "openseespy"}
+CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy"}
 ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}, "pints": {"pints"}, "nautilus": {"nautilus"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
-PURE = {"ladder", "families", "resampling", "edges", "shears", "mixtures", "importance", "recycling", "coarse"}
-# in samplers, from the bottom up: a module imports only what its line names
-SAMPLERS = {
-    "ladder": set(),
-    "families": set(),
-    "resampling": set(),
-    "shears": set(),
-    "edges": set(),
-    "mixtures": {"edges", "shears"},
-    "importance": {"ladder", "mixtures"},
-    "recycling": {"edges", "importance", "ladder", "mixtures"},
-    "coarse": {"importance", "mixtures", "recycling"},
-    "journal": set(),
-    "evaluation": {"journal"},
-    "moves": {"edges", "mixtures"},
-    "fast_sweeps": {"moves"},
-    "backends": {"importance", "journal", "ladder"},
-    "alarms": {"importance", "ladder"},
-    "settings": {"resampling"},
-    "mutation": {"settings"},
-    "comparison": set(),
-    "smc": {"moves", "settings", "tempered"},
-    "tmcmc": {"moves", "settings", "tempered"},
-    "climb": {
-        "alarms",
-        "coarse",
-        "edges",
-        "families",
-        "importance",
-        "ladder",
-        "mixtures",
-        "mutation",
-        "recycling",
-        "settings",
-    },
-    "resume": {"journal", "moves", "settings"},
-    "tempered": {
-        "alarms",
-        "backends",
-        "climb",
-        "evaluation",
-        "families",
-        "fast_sweeps",
-        "importance",
-        "journal",
-        "ladder",
-        "moves",
-        "resume",
-        "settings",
-    },
-}
+WORKERS = {"orphan_reaper", "processes", "local_pool", "sandbox"}
+LONGEST_MODULE = 500
+MOST_METHODS = 30
 
 
 def name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-def imports(path: Path) -> list[tuple[str, bool]]:
-    """Every imported module by its full name, and whether the import stands at the top of the module."""
-    tree = ast.parse(path.read_text())
-    inner = {
-        node
-        for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
-        for node in ast.walk(function)
-    }
-    guarded = {
-        node
-        for branch in ast.walk(tree)
-        if isinstance(branch, ast.If) and ast.unparse(branch.test) == "TYPE_CHECKING"
-        for node in ast.walk(branch)
-    }
-    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
-    found = []
-    for node in ast.walk(tree):
-        if node in guarded:
-            continue
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
-            module = ".".join(part for part in (base, node.module) if part)
-            names = [f"{module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        found += [(module, node not in inner) for module in names]
-    return found
+def folder(path: Path) -> str:
+    """Entry at the top of the package: its folder, or the module itself."""
+    return path.relative_to(ROOT).with_suffix("").parts[1]
 
 
-@pytest.fixture(params=MODULES, ids=name)
-def module(request) -> Path:
-    return request.param
+def top(imported: Import) -> str:
+    return imported.name.split(".")[0]
 
 
-def test_the_reader_of_imports_reads(tmp_path, monkeypatch):
-    """Control: a module that breaks the rules is seen to break them."""
-    path = tmp_path / "samplers" / "bad.py"
-    path.parent.mkdir()
-    path.write_text("from ..fe_likelihoods import units\nfrom .ladder import Stage\ndef f():\n    import arviz\n")
-    monkeypatch.setitem(globals(), "ROOT", tmp_path)
-    assert imports(path) == [
-        ("fe_likelihoods.units", True),
-        ("samplers.tempering.weights.Stage", True),
+def own(path: Path) -> set[str]:
+    """The folders and top modules of its own package that a module imports from."""
+    package = path.relative_to(ROOT).parts[0]
+    return {i.name.split(".")[1] for i in imports(path) if top(i) == package and "." in i.name}
+
+
+def trees():
+    for path in modules():
+        yield path, ast.parse(path.read_text())
+
+
+def test_control_the_reader_of_imports_finds_what_breaks_the_rules(tmp_path):
+    bad = tmp_path / "samplers" / "tempering" / "bad.py"
+    bad.parent.mkdir(parents=True)
+    bad.write_text(
+        "from typing import TYPE_CHECKING\nfrom ..moves.kernels import RandomWalkMove\nfrom . import weights\n"
+        "if TYPE_CHECKING:\n    from ..smc import SMCSampler\ndef f():\n    import arviz\n"
+    )
+    (bad.parent / "weights.py").write_text("from . import bad\n")
+    (tmp_path / "samplers" / "smc.py").write_text("from .tempering.bad import f\n")
+    (tmp_path / "samplers" / "moves.py").write_text("")
+    assert imports(bad, tmp_path)[1:] == [
+        ("samplers.moves.kernels.RandomWalkMove", True),
+        ("samplers.tempering.weights", True),
+        ("samplers.smc.SMCSampler", False),
         ("arviz", False),
     ]
-
-
-def test_the_two_packages_do_not_know_each_other(module):
-    own, other = (PACKAGES if name(module).startswith("fe_") else PACKAGES[::-1])[:2]
-    assert name(module).startswith(own)
-    assert not [m for m, _ in imports(module) if m.split(".")[0] == other]
-
-
-def test_plots_and_clients_are_imported_where_used(module):
-    at_top = {m.split(".")[0] for m, top in imports(module) if top}
-    assert not at_top & (PLOTTING | CLIENTS)
-    everywhere = {m.split(".")[0] for m, _ in imports(module)}
-    if everywhere & PLOTTING:
-        assert module.stem in ("report", "figures", "predictive"), "what is shown belongs into these"
-
-
-def test_every_adapter_knows_its_client_and_the_posterior_alone(module):
-    adapts = module.parent == ROOT / "fe_likelihoods" / "adapters"
-    own = ADAPTED.get(module.stem, set()) if adapts else set()
-    everywhere = {m for m, _ in imports(module)}
-    adapted = {m.split(".")[0] for m in everywhere} & set().union(*ADAPTED.values())
-    assert adapted == own
-    if adapts and own:
-        below = {m.split(".")[1] for m in everywhere if m.startswith("fe_likelihoods.")}
-        assert below <= {"posterior", "priors"}, below
-
-
-def test_storage_has_its_places(module):
-    everywhere = {m.split(".")[0] for m, _ in imports(module)}
-    assert "h5py" not in everywhere or module.stem in ("backends", "channels", "problems", "cache_exchange")
-    assert "sqlite3" not in everywhere or module.stem in ("cache", "cache_file")
-
-
-def test_kernels_stand_on_numba_alone():
-    kernels = sorted((ROOT / "fe_likelihoods" / "kernels").glob("*.py"))
-    for path in kernels:
-        allowed = {"numpy", "numba", "math", "__future__", "typing", "collections"}
-        if path.stem == "jit":  # the disk cache of compiled kernels needs files and hashes
-            allowed |= sys.stdlib_module_names
-        for imported, _ in imports(path):
-            sibling = imported.startswith("fe_likelihoods.kernels")
-            assert sibling or imported.split(".")[0] in allowed, f"{name(path)} imports {imported}"
-
-
-def test_models_know_no_likelihood():
-    allowed = {"kernels", "records", "channels", "units", "models", "isolated", "processes"}
-    for path in sorted((ROOT / "fe_likelihoods" / "models").glob("*.py")):
-        for imported, _ in imports(path):
-            parts = imported.split(".")
-            if parts[0] == "fe_likelihoods" and len(parts) > 1:
-                drawn = path.stem == parts[1] == "figures"  # stand on units alone, see below
-                assert drawn or parts[1] in allowed, f"{name(path)} imports {imported}"
-
-
-def test_figures_know_units_and_residuals_alone():
-    """So that records, measurements and models can draw themselves; whoever draws imports its figures where used."""
-    path = ROOT / "fe_likelihoods" / "figures.py"
-    assert {m.split(".")[1] for m, _ in imports(path) if m.startswith("fe_likelihoods")} == {"units", "residuals"}
-    for path in MODULES:
-        at_top = [m for m, top in imports(path) if top and "figures" in m.split(".")]
-        assert not at_top or path.stem == "figures", f"{name(path)} imports {at_top} at its top"
-
-
-def test_noise_knows_neither_model_nor_likelihood():
-    below = {
-        "residuals": set(),
-        "noise": {"channels", "residuals"},
-        "noise_marginal": {"noise", "priors"},
-    }
-    for stem, allowed in below.items():
-        path = ROOT / "fe_likelihoods" / f"{stem}.py"
-        own = {m.split(".")[1] for m, _ in imports(path) if m.split(".")[0] == "fe_likelihoods"}
-        assert own <= allowed, f"{name(path)} imports {own - allowed}"
-
-
-def test_processes_stand_on_the_standard_library_alone():
-    """So that a worker starts at once, and waits for what its function imports only."""
-    below = {"minder": set(), "processes": {"minder"}, "isolated": {"processes"}, "local_pool": {"processes"}}
-    for stem, allowed in below.items():
-        path = ROOT / "fe_likelihoods" / f"{stem}.py"
-        for imported, _ in imports(path):
-            top, *rest = imported.split(".")
-            assert (rest[0] in allowed) if top == "fe_likelihoods" else top in sys.stdlib_module_names, imported
-
-
-def test_samplers_stand_in_storeys():
-    for path in sorted((ROOT / "samplers").glob("*.py")):
-        if path.stem not in SAMPLERS:
-            continue
-        below = {m.split(".")[1] for m, _ in imports(path) if m.split(".")[0] == "samplers"}
-        assert below <= SAMPLERS[path.stem], f"{name(path)} imports {below - SAMPLERS[path.stem]}"
-        if path.stem in PURE:
-            outside = {m.split(".")[0] for m, _ in imports(path)} - {"samplers"}
-            assert outside <= {"numpy", "scipy", *sys.stdlib_module_names}, name(path)
-
-
-def test_emcees_private_names_stay_in_tempered(module):
-    if name(module) == "samplers/tempered.py":
-        return
-    used = {n.attr for n in ast.walk(ast.parse(module.read_text())) if isinstance(n, ast.Attribute)}
-    used |= {m.split(".")[-1] for m, _ in imports(module) if m.startswith("emcee")}
-    assert not used & PRIVATE_EMCEE
-
-
-def test_public_names_are_declared(module):
-    """Every module says what it exports, and exports only what it has."""
-    tree = ast.parse(module.read_text())
-    declared = [
-        ast.literal_eval(node.value)
-        for node in tree.body
-        if isinstance(node, ast.Assign) and [ast.unparse(t) for t in node.targets] == ["__all__"]
+    graph = package_graph("samplers", tmp_path)
+    assert graph.cycles == [("smc", "tempering")] and graph.edges >= {("tempering", "moves"), ("tempering", "smc")}
+    assert module_cycles(tmp_path) == [
+        ("samplers.smc", "samplers.tempering.bad", "samplers.tempering.weights"),
     ]
-    if module.stem == "__init__" and not declared:
-        return
-    assert len(declared) == 1, f"{name(module)} needs one __all__"
-    bound = set()
-    guarded = [node for branch in tree.body if isinstance(branch, ast.If) for node in branch.body]  # imported when used
-    for node in [*tree.body, *guarded]:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            bound.add(node.name)
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            bound |= {ast.unparse(t) for t in targets}
-        elif isinstance(node, ast.ImportFrom | ast.Import):
-            bound |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
-    assert set(declared[0]) <= bound
 
 
-def test_no_prints(module):
-    calls = [n for n in ast.walk(ast.parse(module.read_text())) if isinstance(n, ast.Call)]
-    assert not [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
+def test_the_two_packages_do_not_import_each_other():
+    bad = [name(p) for p in modules() for i in imports(p) if top(i) in PACKAGES and top(i) != name(p).split("/")[0]]
+    assert not bad
+
+
+def test_folders_import_only_from_folders_below_them():
+    for package, order in ORDER.items():
+        graph = package_graph(package)
+        height = {entry: -line for line, entries in enumerate(order) for entry in entries}
+        assert set(height) == set(graph.nodes), "tests.architecture.ORDER lists every folder"
+        assert not [(a, b) for a, b in sorted(graph.edges) if height[a] <= height[b]]
+        assert not graph.cycles
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    assert not module_cycles()
+
+
+def test_the_readme_maps_every_folder():
+    text = (ROOT / "README.md").read_text()
+    for package in PACKAGES:
+        missing = [entry for entry in package_graph(package).nodes if f"{entry}" not in text]
+        assert not missing, f"not in README.md: {missing} of {package}"
+
+
+def test_plots_are_made_in_plots_and_reporting_with_libraries_imported_where_used():
+    for path in modules():
+        used = {top(i): i.at_top for i in imports(path) if top(i) in PLOTTING | CLIENTS}
+        assert not any(used.values()), f"{name(path)} imports {used} at its top"
+        for library in set(used) & PLOTTING:
+            # annotations of what a method returns
+            typed = library == "matplotlib" and all(
+                "Figure" in i.name or "Axes" in i.name for i in imports(path) if top(i) == library
+            )
+            assert folder(path) in ("plots", "reporting") or typed, f"{name(path)} imports {library}"
+
+
+def test_plots_import_units_only():
+    for path in modules():
+        if name(path).startswith("fe_likelihoods/plots/"):
+            assert own(path) <= {"plots", "units"}, name(path)
+
+
+def test_plots_are_imported_where_used():
+    for path in modules():
+        if folder(path) != "plots" and path.name != "__init__.py":
+            assert not [i for i in imports(path) if i.at_top and ".plots" in i.name], name(path)
+
+
+def test_every_adapter_imports_its_client_and_the_posterior_alone():
+    for path in modules():
+        adapts = name(path).startswith("fe_likelihoods/adapters/")
+        expected = ADAPTED.get(path.stem, set()) if adapts else set()
+        assert {top(i) for i in imports(path)} & set().union(*ADAPTED.values()) == expected, name(path)
+        assert not adapts or own(path) <= {"adapters", "probability"}, name(path)
+
+
+def test_file_formats_have_their_places():
+    for path in modules():
+        used = {top(i) for i in imports(path)}
+        if "h5py" in used:
+            places = ("fe_likelihoods/signals/", "samplers/storage/", "fe_likelihoods/simulation/cache_")
+            assert name(path).startswith(places), name(path)
+        assert "sqlite3" not in used or folder(path) == "simulation", name(path)
+
+
+def test_kernels_import_numba_numpy_and_each_other_alone():
+    allowed = {"numpy", "numba", "math", "__future__", "typing", "collections"}
+    for path in sorted((ROOT / "fe_likelihoods" / "kernels").glob("*.py")):
+        more = sys.stdlib_module_names if path.stem == "jit" else set()  # its disk cache needs files and hashes
+        bad = [i.name for i in imports(path) if top(i) not in allowed | more | {"fe_likelihoods"}]
+        assert not bad and own(path) <= {"kernels"}, f"{name(path)}: {bad}"
+
+
+def test_worker_processes_import_the_standard_library_alone():
+    """A worker starts at once, and waits only for what its function imports."""
+    for stem in WORKERS:
+        path = ROOT / "fe_likelihoods" / "simulation" / f"{stem}.py"
+        for i in imports(path):
+            sibling = i.name.startswith("fe_likelihoods.simulation.") and i.name.split(".")[2] in WORKERS
+            assert sibling or top(i) in sys.stdlib_module_names, f"{name(path)} imports {i.name}"
+    for package in ("fe_likelihoods/__init__.py", "fe_likelihoods/simulation/__init__.py"):
+        heavy = [i.name for i in imports(ROOT / package) if i.at_top and top(i) not in sys.stdlib_module_names]
+        assert not heavy, package
+
+
+def test_mathematics_of_the_samplers_needs_numpy_and_scipy_alone():
+    for path in modules(package="samplers"):
+        pure = folder(path) == "proposals" or path.stem in ("weights", "resampling", "genealogy", "evidence_check")
+        if pure:
+            outside = {top(i) for i in imports(path)} - {"samplers", "numpy", "scipy", *sys.stdlib_module_names}
+            assert not outside, f"{name(path)} imports {outside}"
+
+
+def test_private_names_of_emcee_are_used_in_one_module():
+    users = set()
+    for path, tree in trees():
+        if not name(path).startswith("samplers/"):
+            continue
+        used = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        used |= {i.name.split(".")[-1] for i in imports(path) if i.name.startswith("emcee")}
+        if used & PRIVATE_EMCEE:
+            users.add(name(path))
+    assert len(users) == 1, users
+
+
+def test_public_names_are_declared():
+    """Every module has one `__all__`, which lists only what the module defines."""
+    for path, tree in trees():
+        declared = [
+            node.value
+            for node in tree.body
+            if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["__all__"]
+        ]
+        if path.name == "__init__.py" and not declared:
+            continue
+        assert len(declared) == 1, f"{name(path)} needs one __all__"
+        bound = set()
+        guarded = [node for branch in tree.body if isinstance(branch, ast.If) for node in branch.body]
+        for node in [*tree.body, *guarded]:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                bound.add(node.name)
+            elif isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                bound |= {ast.unparse(target) for target in targets}
+            elif isinstance(node, ast.ImportFrom | ast.Import):
+                bound |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
+        assert set(ast.literal_eval(declared[0])) <= bound, name(path)
+
+
+def test_no_module_prints():
+    for path, tree in trees():
+        calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        assert not [call for call in calls if isinstance(call, ast.Name) and call.id == "print"], name(path)
+
+
+def test_public_names_are_imported_from_the_packages():
+    """Tutorials, README and pages of the documentation import what the façade has from the façade."""
+    exported = {package: set(__import__(package).__all__) for package in PACKAGES}
+    texts = [*ROOT.glob("tutorials/*.py"), ROOT / "README.md", *ROOT.glob("docs/*.rst"), *ROOT.glob("docs/*.py")]
+    for path in texts:
+        for package, inner, names in re.findall(
+            r"from (fe_likelihoods|samplers)\.([\w.]+) import ([^\n(]+)", path.read_text()
+        ):
+            found = {part.split(" as ")[0].strip() for part in names.split(",")} & exported[package]
+            assert not found, f"{name(path)}: import {', '.join(found)} from {package}, not from {package}.{inner}"
+
+
+def test_sources_cite_only_what_a_reader_has():
+    """No file outside the repository; pages of docs/theory that exist."""
+    files = [
+        *modules(),
+        *ROOT.glob("tutorials/*.py"),
+        *ROOT.glob("docs/**/*.rst"),
+        *ROOT.glob("data/*.*"),
+        ROOT / "README.md",
+    ]
+    for path in files:
+        if path.suffix not in (".py", ".rst", ".md"):
+            continue
+        text = path.read_text()
+        assert not re.search(r"specs/|papers/\w+\.(txt|md)|FE_SHARED", text), name(path)
+        for page in re.findall(r"docs/theory/(\w+)", text):
+            assert (ROOT / "docs" / "theory" / f"{page}.rst").is_file(), f"{name(path)} cites docs/theory/{page}"
+
+
+def test_modules_and_classes_keep_their_size():
+    for path, tree in trees():
+        assert len(path.read_text().splitlines()) <= LONGEST_MODULE, name(path)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                methods = sum(isinstance(inner, ast.FunctionDef) for inner in node.body)
+                assert methods <= MOST_METHODS, f"{name(path)}: {node.name} has {methods} methods"

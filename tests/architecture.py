@@ -1,0 +1,254 @@
+"""The structure of the two packages, read from their source: ``python -m tests.architecture [ROOT]``.
+
+Prints the graph of imports of each package and the sizes that grow when a package loses its shape. A node of the graph
+is an entry at the top of the package, a folder or a module. Every import counts: at the top of a module, inside a
+function, and under ``TYPE_CHECKING``. ROOT is the folder of another version of the project, for a comparison.
+"""
+
+import argparse
+import ast
+import graphlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+__all__ = [
+    "ORDER",
+    "PACKAGES",
+    "ROOT",
+    "Graph",
+    "Import",
+    "foreign_reads",
+    "imports",
+    "module_cycles",
+    "modules",
+    "package_graph",
+    "second_defaults",
+]
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("fe_likelihoods", "samplers")
+# from the top down: an entry imports only from entries on lines below its own
+ORDER = {
+    "fe_likelihoods": (
+        ("problems",),
+        ("adapters",),
+        ("prediction",),
+        ("models",),
+        ("probability",),
+        ("simulation",),
+        ("signals",),
+        ("plots",),
+        ("kernels",),
+        ("units",),
+    ),
+    "samplers": (
+        ("smc", "tmcmc"),
+        ("tempered",),
+        ("reporting",),
+        ("storage",),
+        ("presets",),
+        ("tempering",),
+        ("moves",),
+        ("proposals",),
+    ),
+}
+FOREIGN = ("hasattr", "getattr")
+
+
+class Import(NamedTuple):
+    """One imported name.
+
+    Attributes
+    ----------
+    name : str
+        Full dotted name, ``samplers.tempering.weights.Stage``.
+    at_top : bool
+        Whether it is imported when its module is: neither inside a function nor under ``TYPE_CHECKING``.
+    """
+
+    name: str
+    at_top: bool
+
+
+class Graph(NamedTuple):
+    """The imports between the entries of a package.
+
+    Attributes
+    ----------
+    nodes : tuple of str
+    edges : set of (str, str)
+        An entry, and one that it imports from.
+    layers : tuple of tuple of str
+        Entries that import only from layers before their own; empty if there is a cycle.
+    cycles : list of tuple of str
+        Entries that import each other, directly or by way of others.
+    """
+
+    nodes: tuple[str, ...]
+    edges: set[tuple[str, str]]
+    layers: tuple[tuple[str, ...], ...]
+    cycles: list[tuple[str, ...]]
+
+
+def modules(root: Path = ROOT, package: str | None = None) -> list[Path]:
+    """Source files of one package, or of both."""
+    return sorted(p for name in ([package] if package else PACKAGES) for p in (root / name).rglob("*.py"))
+
+
+def imports(path: Path, root: Path = ROOT) -> list[Import]:
+    """Every import of a module, relative ones resolved."""
+    tree = ast.parse(path.read_text())
+    late = {
+        node
+        for block in ast.walk(tree)
+        if isinstance(block, ast.FunctionDef | ast.AsyncFunctionDef)
+        or (isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING")
+        for node in ast.walk(block)
+    }
+    package = path.relative_to(root).with_suffix("").parts[:-1]
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (base, node.module) if part)
+            names = [f"{module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        found += [Import(name, node not in late) for name in names]
+    return found
+
+
+def _strong_components(nodes: list[str], edges: set[tuple[str, str]]) -> list[tuple[str, ...]]:
+    """Groups of two or more nodes that reach each other."""
+    index = {node: i for i, node in enumerate(nodes)}
+    matrix = np.zeros((len(nodes), len(nodes)), dtype=int)
+    for a, b in edges:
+        matrix[index[a], index[b]] = 1
+    _, label = connected_components(csr_array(matrix), connection="strong")
+    groups = [tuple(node for node in nodes if label[index[node]] == k) for k in range(label.max() + 1)]
+    return [group for group in groups if len(group) > 1]
+
+
+def package_graph(package: str, root: Path = ROOT) -> Graph:
+    """Imports between the folders and modules at the top of a package; the package's own ``__init__`` is left out."""
+    edges, nodes = set(), set()
+    for path in modules(root, package):
+        parts = path.relative_to(root / package).with_suffix("").parts
+        if parts == ("__init__",):
+            continue
+        nodes.add(parts[0])
+        for imported in imports(path, root):
+            names = imported.name.split(".")
+            if names[0] == package and len(names) > 1 and names[1] != parts[0]:
+                edges.add((parts[0], names[1]))
+    edges = {(a, b) for a, b in edges if b in nodes}
+    cycles = _strong_components(sorted(nodes), edges)
+    layers = []
+    if not cycles:
+        sorter = graphlib.TopologicalSorter({node: {b for a, b in edges if a == node} for node in sorted(nodes)})
+        sorter.prepare()
+        while sorter.is_active():
+            ready = tuple(sorted(sorter.get_ready()))
+            layers.append(ready)
+            sorter.done(*ready)
+    return Graph(tuple(sorted(nodes)), edges, tuple(layers), cycles)
+
+
+def module_cycles(root: Path = ROOT) -> list[tuple[str, ...]]:
+    """Groups of modules of either package that import each other."""
+    names = {".".join(path.relative_to(root).with_suffix("").parts): path for path in modules(root)}
+    names = {name: path for name, path in names.items() if not name.endswith("__init__")}
+    edges = set()
+    for name, path in names.items():
+        for imported in imports(path, root):
+            target = imported.name if imported.name in names else imported.name.rpartition(".")[0]
+            if target in names and target != name:
+                edges.add((name, target))
+    return _strong_components(sorted(names), edges)
+
+
+def _classes(root: Path) -> Iterator[tuple[str, int, int]]:
+    """Name, number of methods and number of lines of every class."""
+    for path in modules(root):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                methods = sum(isinstance(inner, ast.FunctionDef) for inner in node.body)
+                yield f"{path.relative_to(root)}: {node.name}", methods, node.end_lineno - node.lineno + 1
+
+
+def foreign_reads(root: Path = ROOT) -> dict[str, int]:
+    """Calls of hasattr and getattr, by file."""
+    counts = {}
+    for path in modules(root):
+        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        count = sum(isinstance(call.func, ast.Name) and call.func.id in FOREIGN for call in calls)
+        if count:
+            counts[str(path.relative_to(root))] = count
+    return counts
+
+
+def second_defaults(root: Path = ROOT) -> dict[str, list[str]]:
+    """Settings of the samplers whose default is written in more than one class, and those classes."""
+    places: dict[str, list[str]] = {}
+    for path in modules(root, "samplers"):
+        for cls in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(cls, ast.ClassDef):
+                continue
+            for node in cls.body:
+                names = []
+                if isinstance(node, ast.AnnAssign) and node.value is not None:
+                    names = [ast.unparse(node.target)]
+                elif isinstance(node, ast.FunctionDef) and node.name == "__init__":
+                    pairs = zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)
+                    names = [
+                        argument.arg
+                        for argument, default in pairs
+                        if default is not None and ast.unparse(default) != "None"
+                    ]
+                for name in names:
+                    places.setdefault(name, []).append(cls.name)
+    return {name: classes for name, classes in sorted(places.items()) if len(classes) > 1}
+
+
+def main() -> None:
+    """Print the graphs and the sizes."""
+    parser = argparse.ArgumentParser(prog="python -m tests.architecture", description=__doc__)
+    parser.add_argument("root", nargs="?", type=Path, default=ROOT)
+    root = parser.parse_args().root.resolve()
+    for package in PACKAGES:
+        graph = package_graph(package, root)
+        found = f"{len(graph.nodes)} nodes, {len(graph.edges)} edges, {len(graph.layers)} layers, "
+        print(f"{package}: {found}{len(graph.cycles)} cycles")
+        for i, layer in enumerate(graph.layers):
+            print(f"  layer {i}: {', '.join(layer)}")
+        for cycle in graph.cycles:
+            print(f"  cycle of {len(cycle)}: {', '.join(cycle)}")
+    cycles = module_cycles(root)
+    print(
+        f"cycles of modules: {len(cycles)}", *(f"  of {len(cycle)}: {', '.join(cycle)}" for cycle in cycles), sep="\n"
+    )
+    lengths = {str(path.relative_to(root)): len(path.read_text().splitlines()) for path in modules(root)}
+    print(f"modules: {len(lengths)}; the longest:")
+    for name, length in sorted(lengths.items(), key=lambda item: -item[1])[:8]:
+        print(f"  {length:4d} lines  {name}")
+    print("the classes with most methods:")
+    for name, methods, lines in sorted(_classes(root), key=lambda item: -item[1])[:5]:
+        print(f"  {methods:3d} methods, {lines:4d} lines  {name}")
+    print("the longest classes:")
+    for name, methods, lines in sorted(_classes(root), key=lambda item: -item[2])[:5]:
+        print(f"  {methods:3d} methods, {lines:4d} lines  {name}")
+    reads = foreign_reads(root)
+    print(f"calls of {' and '.join(FOREIGN)}: {sum(reads.values())} in {len(reads)} files")
+    doubled = second_defaults(root)
+    print(f"settings with a second default: {len(doubled)}", *(f"({', '.join(doubled)})" for _ in [0] if doubled))
+
+
+if __name__ == "__main__":
+    main()
