@@ -1,1 +1,1 @@
-"""Mutation kernels in the form of emcee moves."""
+"""Mutation kernels: emcee moves that adapt to the population of a tempering stage."""

@@ -1,9 +1,16 @@
-"""Sweeps over the parameters that cost nothing, between the moves that cost a simulation.
+"""Extra sweeps over fast parameters, made after each move that needs a simulation.
 
-Of many posteriors some parameters change the density without a new simulation: the levels of the noise, where the
-sums of squared residuals are kept. A function that knows so says it with an attribute ``fast_parameters``, the indices
-of these parameters. Each costly move is then followed by a few random walks of these parameters alone, all others held:
-Metropolis within Gibbs, so the target stays the same, and the costly move need no more wait for the noise to follow.
+In many posteriors some parameters change the density without a new simulation: the standard deviations of the noise,
+for example, when the sums of squared residuals are cached. The cosmology codes CosmoMC and Cobaya call them *fast
+parameters*. A posterior declares them by an attribute ``fast_parameters``, the indices of these parameters. After each
+expensive move the ensemble makes a few random-walk steps in the fast parameters alone, with all other parameters fixed.
+This is Metropolis within Gibbs, so the target distribution is unchanged, and the fast parameters decorrelate without
+additional simulations. The equations are in ``docs/theory/tempering``.
+
+References
+----------
+Lewis, A. (2013), Efficient sampling of fast and slow cosmological parameters, Physical Review D 87, 103529,
+doi:10.1103/PhysRevD.87.103529
 """
 
 import operator
@@ -18,11 +25,13 @@ from .kernels import Inside, RandomWalkMove
 
 __all__ = ["WithFastSweeps", "with_fast_sweeps"]
 
-TARGET_ACCEPTANCE = 0.35  # best for a walk in two dimensions (Gelman, Roberts & Gilks 1996); 0.44 in one, 0.23 in many
+# Optimal for a random walk in two dimensions; it is 0.44 in one dimension and 0.23 in many. Gelman, Roberts & Gilks
+# (1996), Efficient Metropolis jumping rules, Bayesian Statistics 5, 599-608.
+TARGET_ACCEPTANCE = 0.35
 
 
-class _FreeWalk(RandomWalkMove):
-    """Random walk of some coordinates, with their covariance given the others; the others stay as they are."""
+class _FastWalk(RandomWalkMove):
+    """Random walk in some coordinates, with their covariance conditional on the others, which stay fixed."""
 
     def __init__(self, indices: Sequence[int]):
         super().__init__(adapt=True, target=TARGET_ACCEPTANCE)
@@ -32,10 +41,11 @@ class _FreeWalk(RandomWalkMove):
         """Fit the walk to points (n, ndim) with normalised weights (n,)."""
         ndim = coords.shape[1]
         _checked(self.indices, ndim)
-        held = np.setdiff1d(np.arange(ndim), self.indices)
-        super().calibrate(coords[:, np.concatenate([held, self.indices])], weights, inside)
-        # the last block of a lower-triangular root is a root of the covariance given what comes before
-        self._root = self._root[len(held) :, len(held) :]
+        slow = np.setdiff1d(np.arange(ndim), self.indices)
+        super().calibrate(coords[:, np.concatenate([slow, self.indices])], weights, inside)
+        # The last diagonal block of a lower-triangular root of the covariance is a root of the covariance of the last
+        # coordinates, conditional on the others.
+        self._root = self._root[len(slow) :, len(slow) :]
 
     def _draw(self, coords, random):
         proposed = coords.copy()
@@ -44,77 +54,105 @@ class _FreeWalk(RandomWalkMove):
 
 
 class WithFastSweeps(Move):
-    """A move, followed by sweeps over the coordinates whose change costs no simulation.
+    """A move, followed by sweeps over the fast parameters.
 
     Parameters
     ----------
-    move : emcee move — the costly one. Its acceptance is the acceptance of the whole.
-    indices : sequence of int — the coordinates that are free.
-    sweeps : int — random walks of the whole ensemble in these coordinates after every move. Their scale is
-        2.38 / sqrt(number of free coordinates) times the root of the conditional covariance; ``tune`` steers it.
+    move : emcee.moves.Move
+        The expensive move. The reported acceptance is the acceptance of this move alone.
+    indices : sequence of int
+        Indices of the fast parameters.
+    sweeps : int
+        Number of random-walk steps of the whole ensemble in the fast parameters after each move. The initial scale of
+        the walk is 2.38 / sqrt(number of fast parameters) times a root of the conditional covariance; ``tune`` adapts
+        it.
 
     Raises
     ------
     ValueError
-        If there are no indices, one of them is no coordinate, or `sweeps` is below 1.
+        If `indices` is empty or contains an invalid index, or if `sweeps` is less than 1.
     """
 
     def __init__(self, move: Move, indices: Sequence[int], sweeps: int = 2):
         if sweeps < 1:
-            raise ValueError(f"sweeps must be at least 1; got {sweeps}: without them, use the move itself")
+            raise ValueError(f"sweeps must be at least 1, got {sweeps}; to make no fast sweeps, use the move itself")
         self.move = move
         self.sweeps = sweeps
-        self._walk = _FreeWalk(indices)
+        self._walk = _FastWalk(indices)
         self._accepted = np.empty(0)
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """The free coordinates, in ascending order."""
+        """Indices of the fast parameters, in ascending order."""
         return self._walk.indices
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit the walk, and the move if it learns, to points (n, ndim) with normalised weights (n,)."""
-        if hasattr(self.move, "calibrate"):
+        """Fit the walk, and the wrapped move if it has ``calibrate``, to points (n, ndim) with weights (n,)."""
+        if hasattr(self.move, "calibrate"):  # emcee's own moves have none
             self.move.calibrate(coords, weights, inside)
         self._walk.calibrate(coords, weights, inside)
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """The move, then the fast sweeps: the new state and which proposals (nwalkers,) of the move were accepted."""
+        """Make the move, then the fast sweeps.
+
+        Returns
+        -------
+        state : emcee.State
+            State of the ensemble after all steps.
+        accepted : ndarray of bool, shape (nwalkers,)
+            Which proposals of the expensive move were accepted.
+        """
         state, accepted = self.move.propose(model, state)
-        shares = []
+        acceptances = []
         for _ in range(self.sweeps):
-            state, free = self._walk.propose(model, state)
-            shares.append(np.mean(free))
-        self._accepted = np.array(shares)
+            state, accepted_fast = self._walk.propose(model, state)
+            acceptances.append(np.mean(accepted_fast))
+        self._accepted = np.array(acceptances)
         return state, accepted
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Tune the move, and the scale of the fast sweeps made after it."""
+        """Tune the move, and the scale of the fast sweeps that followed it."""
         self.move.tune(state, accepted)
         self._walk.tune(state, self._accepted)
 
 
 def with_fast_sweeps(moves: Sequence[Move], indices: Sequence[int], ndim: int, sweeps: int) -> list[Move]:
-    """The moves, each followed by `sweeps` over the free coordinates; as they are if none or all coordinates are free.
+    """Follow each move by sweeps over the fast parameters.
+
+    Parameters
+    ----------
+    moves : sequence of emcee.moves.Move
+        The moves to wrap.
+    indices : sequence of int
+        Indices of the fast parameters.
+    ndim : int
+        Number of parameters.
+    sweeps : int
+        Number of fast sweeps after each move.
+
+    Returns
+    -------
+    list of emcee.moves.Move
+        The wrapped moves; the moves themselves if `sweeps` is 0, or if none or all of the parameters are fast.
 
     Raises
     ------
     ValueError
-        If an index is not one of the `ndim` coordinates.
+        If an index does not lie between 0 and ``ndim - 1``.
     """
     if sweeps == 0 or len(indices) == 0:
         return list(moves)
-    free = _checked(indices, ndim)
-    return list(moves) if len(free) == ndim else [WithFastSweeps(move, free, sweeps) for move in moves]
+    fast = _checked(indices, ndim)
+    return list(moves) if len(fast) == ndim else [WithFastSweeps(move, fast, sweeps) for move in moves]
 
 
 def _checked(indices: Sequence[int], ndim: int | None = None) -> tuple[int, ...]:
-    """Different indices in ascending order, or ValueError."""
+    """Return the distinct indices in ascending order, or raise ValueError."""
     try:
-        free = tuple(sorted({operator.index(index) for index in indices}))
+        fast = tuple(sorted({operator.index(index) for index in indices}))
     except TypeError:
-        raise ValueError(f"fast_parameters must be indices of parameters, whole numbers; got {indices!r}") from None
-    if not free or free[0] < 0 or (ndim is not None and free[-1] >= ndim):
-        known = "0, 1, ..." if ndim is None else f"0 to {ndim - 1}"
-        raise ValueError(f"fast_parameters must be indices of parameters, from {known}; got {tuple(indices)}")
-    return free
+        raise ValueError(f"fast_parameters must be indices of parameters (integers); got {indices!r}") from None
+    if not fast or fast[0] < 0 or (ndim is not None and fast[-1] >= ndim):
+        valid = "0, 1, ..." if ndim is None else f"0 to {ndim - 1}"
+        raise ValueError(f"fast_parameters must be indices of parameters, from {valid}; got {tuple(indices)}")
+    return fast

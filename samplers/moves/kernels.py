@@ -1,11 +1,14 @@
 """Mutation kernels in the form of emcee moves.
 
-A tempered sampler resamples its population and then moves it at the new beta. Any emcee move can do that; the moves of
-this module also learn from the population first: they have ``calibrate(coords, weights, inside)``, called once a
-stage with the points of the last stage, their weights at the new beta, and a function that tells which points lie in
-the support of the prior; and they move the whole ensemble at once.
+A tempered sampler resamples its population and then moves it at the new beta. Any emcee move can do this. The moves of
+this module also adapt to the population: their method ``calibrate(coords, weights, inside)`` is called once per stage
+with the points of the previous stage, their weights at the new beta, and a function that returns which points lie in
+the support of the prior. They propose for all walkers at once.
 
-Fits are made per unit of the weighted standard deviations, so a parameter of 2e-4 s beside one of 3e10 Pa is no matter.
+Proposals are fitted in units of the weighted standard deviations, so parameters of very different size (2e-4 s and
+3e10 Pa, for example) cause no numerical problem.
+
+The acceptance probabilities are derived in ``docs/theory/tempering``.
 """
 
 import math
@@ -20,26 +23,44 @@ from ..proposals.mixture import (
     Mixture,
     draw,
     fit_mixture,
-    flatten,
+    from_component_space,
     invert_roots,
     location_and_root,
     log_density,
     log_responsibilities,
-    unflatten,
+    to_component_space,
 )
 from ..proposals.support_bounds import SupportBounds, find_support_bounds, log_abs_det_jacobian
 
 __all__ = ["MixtureMove", "RandomWalkMove", "StudentTMove", "describe"]
-WHOLE_DIFFERENCES = 0.1
+
+# Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
+KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
+# The same while the independence kernel has a high acceptance: it decorrelates the ensemble fastest.
+KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
+# Attempts to replace independent draws outside the support of the prior; what is left then is rejected.
 REDRAWS = 20
-SHARES = (0.5, 0.25, 0.25)
-SHARES_DOING_WELL = (0.8, 0.1, 0.1)
-Inside = Callable[[np.ndarray], np.ndarray]
+# Share of the difference steps with scale 1, which lead from mode to mode (ter Braak 2006).
+UNIT_SCALE_SHARE = 0.1
+# Crossover probabilities of the difference steps: one is chosen per sweep and walker.
 CROSSOVERS = (1.0 / 3.0, 2.0 / 3.0, 1.0)
+
+Inside = Callable[[np.ndarray], np.ndarray]
 
 
 def describe(move: Move) -> dict:
-    """A move as plain data: its class and its settings, which are its public attributes of plain type."""
+    """Describe a move as plain data: its class and its settings.
+
+    Parameters
+    ----------
+    move : emcee.moves.Move
+        The move. Its settings are its public attributes that are None, bool, int, float, str, moves or lists of moves.
+
+    Returns
+    -------
+    dict
+        ``{"class": name, setting: value, ...}``; nested moves are described in the same way.
+    """
     settings = {}
     for name, value in sorted(vars(move).items()):
         if not name.startswith("_"):
@@ -65,8 +86,16 @@ class _FittedMove(MHMove):
         self._mean, self._root = location_and_root(coords, weights)
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """One proposal for every walker: the new state and which proposals (nwalkers,) were accepted."""
-        if self._root is None:  # inside a plain EnsembleSampler nobody calibrates: fit to the ensemble as it stands
+        """Propose a new point for each walker.
+
+        Returns
+        -------
+        state : emcee.State
+            State of the ensemble after the move.
+        accepted : ndarray of bool, shape (nwalkers,)
+            Which proposals were accepted.
+        """
+        if self._root is None:  # a plain EnsembleSampler does not call calibrate: fit to the current ensemble
             n = len(state.coords)
             self.calibrate(state.coords, np.full(n, 1.0 / n))
         return super().propose(model, state)
@@ -77,15 +106,22 @@ class RandomWalkMove(_FittedMove):
 
     Parameters
     ----------
-    scale : float, optional — multiplies the root of the covariance; 2.38 / sqrt(ndim) by default (Roberts, Gelman &
-        Gilks 1997, doi:10.1214/aoap/1034625254).
-    adapt : bool — let ``tune`` steer the scale towards the acceptance `target`; what is learnt stays for later stages.
-    target : float — acceptance aimed at.
+    scale : float, optional
+        Factor of the root of the covariance; 2.38 / sqrt(ndim) by default.
+    adapt : bool
+        Whether ``tune`` adapts the scale to reach the acceptance `target`. The adapted scale is kept for later stages.
+    target : float
+        Desired acceptance; 0.234 is optimal in many dimensions.
+
+    References
+    ----------
+    Roberts, G. O., Gelman, A. & Gilks, W. R. (1997), Weak convergence and optimal scaling of random walk Metropolis
+    algorithms, Annals of Applied Probability 7(1), doi:10.1214/aoap/1034625254
     """
 
     def __init__(self, scale: float | None = None, adapt: bool = False, target: float = 0.234):
         if scale is not None and not scale > 0.0:
-            raise ValueError(f"scale multiplies the proposal's root and must be positive; got {scale}")
+            raise ValueError(f"scale multiplies the root of the covariance and must be positive; got {scale}")
         super().__init__()
         self.scale = scale
         self.adapt = adapt
@@ -98,7 +134,7 @@ class RandomWalkMove(_FittedMove):
         return coords + scale * random.standard_normal(coords.shape) @ self._root.T, np.zeros(len(coords))
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Widen the walk where too much is accepted, narrow it where too little is (if `adapt`)."""
+        """If `adapt`, increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
         if self.adapt:
             self._log_factor += float(np.mean(accepted)) - self.target
 
@@ -106,17 +142,19 @@ class RandomWalkMove(_FittedMove):
 class StudentTMove(_FittedMove):
     """Independent draws from a multivariate Student t with the weighted mean and covariance of the stage.
 
-    For a sharp, nearly Gaussian posterior one sweep renews most of the ensemble. The tails are heavier than those of a
-    Gaussian, so the ratio of target and proposal stays bounded where the posterior's own tails are not heavier still.
+    When the posterior is nearly Gaussian, one sweep replaces most of the ensemble by new points. The tails are heavier
+    than those of a Gaussian, so the ratio of target and proposal stays bounded unless the posterior has even heavier
+    tails.
 
     Parameters
     ----------
-    dof : float — degrees of freedom, above 2 for the covariance to exist.
+    dof : float
+        Degrees of freedom; above 2, so that the covariance exists.
     """
 
     def __init__(self, dof: float = 6.0):
         if not dof > 2.0:
-            raise ValueError(f"dof must be above 2, else the Student t has no covariance to fit; got {dof}")
+            raise ValueError(f"dof must be above 2, otherwise a Student t has no covariance; got {dof}")
         super().__init__()
         self.dof = dof
         self._inverse = None
@@ -140,73 +178,94 @@ class StudentTMove(_FittedMove):
 
 
 class MixtureMove(MHMove):
-    """Three kernels, drawn sweep by sweep, all from one mixture fitted to the stage (see `samplers.proposals.mixture`).
+    """Three kernels from one mixture of Student t fitted to the stage; each sweep draws one of them at random.
 
     independence
-        A draw from the mixture: crosses between modes, and renews most of an ensemble the mixture fits well. Half of
-        all sweeps, and four in five as long as more than `enough` of its draws are accepted. A draw outside the support
-        of the prior is repeated, at no evaluation: the proposal is the mixture cut off at the edges of the support.
+        Draws from the mixture (`samplers.proposals.mixture`). They cross between modes, and replace most of the
+        ensemble when the mixture fits well. Half of all sweeps use this kernel, and 80 % while more than
+        `independence_threshold` of its proposals are accepted. A draw outside the support of the prior is repeated
+        before it is evaluated: the proposal is the mixture truncated to the support.
     local walk
-        A random walk with the covariance of one component, drawn from the responsibilities of the components for the
-        point; the ratio of the responsibilities after and before makes it reversible.
+        Random walk with the covariance of one component. The component is drawn from the responsibilities of the
+        components for the current point; the acceptance contains the ratio of the responsibilities of that component
+        after and before the step, which makes the kernel reversible.
     differences
-        A step along the difference of two points of the last stage, drawn by their weights; now and then the whole
-        difference, which leads from mode to mode (after ter Braak 2006, doi:10.1007/s11222-006-8769-1). The points are
-        those the stage was calibrated on, so that the steps do not depend on the ensemble being moved.
+        Differential evolution: a step along the difference of two points of the previous stage, drawn by their weights.
+        One step in ten is the whole difference, which leads from mode to mode. The two points come from the stage that
+        the move was calibrated on, so a step does not depend on the ensemble that is being moved.
 
-    The scales of the last two are steered by ``tune`` towards the acceptance `target`.
+    The scales of the last two kernels are adapted by ``tune`` to reach the acceptance `target`.
 
     Parameters
     ----------
-    max_components : int — of the mixture.
-    enough : float — acceptance of the independent draws above which the other kernels mostly rest.
-    target : float — acceptance aimed at by the walk and the differences.
+    max_components : int
+        Largest number of components of the mixture.
+    independence_threshold : float
+        Acceptance of the independence kernel above which the other two are used less often.
+    target : float
+        Desired acceptance of the local walk and of the differences.
+
+    References
+    ----------
+    ter Braak, C. J. F. (2006), A Markov chain Monte Carlo version of the genetic algorithm differential evolution,
+    Statistics and Computing 16, doi:10.1007/s11222-006-8769-1
     """
 
-    def __init__(self, max_components: int = 6, enough: float = 0.5, target: float = 0.25):
+    def __init__(self, max_components: int = 6, independence_threshold: float = 0.5, target: float = 0.25):
         if max_components < 1:
             raise ValueError(f"max_components must be at least 1; got {max_components}")
         super().__init__(self._draw)
         self.max_components = max_components
-        self.enough = enough
+        self.independence_threshold = independence_threshold
         self.target = target
         self._mixture: Mixture | None = None
-        self._edges: SupportBounds | None = None
+        self._bounds: SupportBounds | None = None
         self._kernels = (self._independence, self._local_walk, self._differences)
         self._log_factors = [0.0, 0.0, 0.0]
-        self._turn = -1
-        self._doing_well = False
+        self._current: int | None = None  # index of the kernel of the latest sweep; None right after a calibration
+        self._independence_accepted = False
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit the mixture to weighted points (n, ndim), (n,); the next sweep is an independent one."""
-        if inside is not None and self._edges is None:
-            self._edges = find_support_bounds(inside, coords)
-        self._mixture = fit_mixture(coords, weights, self.max_components, self._edges)
+        """Fit the mixture to points (n, ndim) with normalised weights (n,).
+
+        The next sweep uses the independence kernel. The bounds of the support are determined at the first call only.
+        """
+        if inside is not None and self._bounds is None:
+            self._bounds = find_support_bounds(inside, coords)
+        self._mixture = fit_mixture(coords, weights, self.max_components, self._bounds)
         self._inside = inside
-        self._archive = flatten(self._mixture, coords)
+        self._archive = to_component_space(self._mixture, coords)
         self._cumulated = np.cumsum(weights)
-        self._turn, self._doing_well = -1, False
+        self._current, self._independence_accepted = None, False
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """One sweep of one kernel: the new state and which proposals (nwalkers,) were accepted."""
-        if self._mixture is None:  # inside a plain EnsembleSampler nobody calibrates: fit to the ensemble as it stands
+        """Make one sweep of one kernel.
+
+        Returns
+        -------
+        state : emcee.State
+            State of the ensemble after the sweep.
+        accepted : ndarray of bool, shape (nwalkers,)
+            Which proposals were accepted.
+        """
+        if self._mixture is None:  # a plain EnsembleSampler does not call calibrate: fit to the current ensemble
             n = len(state.coords)
             self.calibrate(state.coords, np.full(n, 1.0 / n))
-        # chance decides, not a counter: a run goes on the same from the same random state
-        shares = SHARES_DOING_WELL if self._doing_well else SHARES
-        self._turn = 0 if self._turn < 0 else model.random.choice(len(self._kernels), p=shares)
+        # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
+        shares = KERNEL_PROBABILITIES_IF_ACCEPTED if self._independence_accepted else KERNEL_PROBABILITIES
+        self._current = 0 if self._current is None else model.random.choice(len(self._kernels), p=shares)
         return super().propose(model, state)
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Steer the scale of the kernel made last, or see whether the independent draws do well."""
+        """Adapt the scale of the kernel used last, or record whether independent draws have a high acceptance."""
         share = float(np.mean(accepted))
-        if self._turn == 0:
-            self._doing_well = share > self.enough
+        if self._current == 0:
+            self._independence_accepted = share > self.independence_threshold
         else:
-            self._log_factors[self._turn] += share - self.target
+            self._log_factors[self._current] += share - self.target
 
     def _draw(self, coords, random):
-        return self._kernels[self._turn](coords, random)
+        return self._kernels[self._current](coords, random)
 
     def _independence(self, coords, random):
         proposed = draw(self._mixture, len(coords), random)
@@ -232,11 +291,11 @@ class MixtureMove(MHMove):
         ]
 
     def _step(self, coords, steps):
-        """Points moved by steps among the flat ones, and the ratio of volumes for it."""
-        proposed = unflatten(self._mixture, flatten(self._mixture, coords) + steps)
-        if self._mixture.edges is None:
+        """Make steps in the space of the components; also return the log ratio of volumes that the acceptance needs."""
+        proposed = from_component_space(self._mixture, to_component_space(self._mixture, coords) + steps)
+        if self._mixture.bounds is None:
             return proposed, np.zeros(len(coords))
-        before, after = (log_abs_det_jacobian(self._mixture.edges, points) for points in (coords, proposed))
+        before, after = (log_abs_det_jacobian(self._mixture.bounds, points) for points in (coords, proposed))
         possible = (before > -np.inf) & (after > -np.inf)
         return proposed, np.where(possible, np.where(possible, before, 0.0) - np.where(possible, after, 0.0), -np.inf)
 
@@ -249,6 +308,6 @@ class MixtureMove(MHMove):
         crossed = random.uniform(size=(n, ndim)) < random.choice(CROSSOVERS, size=n)[:, None]
         crossed[np.arange(n), random.randint(ndim, size=n)] = True
         scale = 2.38 / np.sqrt(2.0 * crossed.sum(axis=1)) * math.exp(self._log_factors[2])
-        scale[random.uniform(size=n) < WHOLE_DIFFERENCES] = 1.0
+        scale[random.uniform(size=n) < UNIT_SCALE_SHARE] = 1.0
         steps = crossed * scale[:, None] * (self._archive[first] - self._archive[second])
         return self._step(coords, steps)

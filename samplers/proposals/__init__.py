@@ -1,1 +1,1 @@
-"""Proposal densities: mixtures of Student t distributions on transformed parameters."""
+"""Proposal densities fitted to weighted points: mixtures of Student t and transformations of the parameters."""

@@ -1,17 +1,20 @@
-"""Mixtures of multivariate Student t, fitted to weighted points: the shape of a population, as a density to draw from.
+"""Mixtures of multivariate Student t, fitted to weighted points: an approximation of a population as a density.
 
-Few components follow a population with several modes or a bent ridge well enough to propose from it; heavy tails keep
-the ratio of target and proposal bounded where the fit is too narrow. The number of components is the one of the best
-Bayesian information criterion. The points carry weights, so the criterion counts the effective number of them.
+A few components represent a population with several modes or a curved ridge well enough for proposals. The heavy tails
+keep the ratio of target and proposal bounded where the fit is too narrow. The number of components minimises the
+Bayesian information criterion, with the effective number of weighted points as sample size.
 
-Fits are made in the coordinates that whiten the whole population: a parameter of 2e-4 s beside one of 3e10 Pa is no
-matter. They contain no chance: the same points
-and weights give the same mixture.
+Fits are made in coordinates that whiten the whole population, so parameters of very different size (2e-4 s and 3e10 Pa,
+for example) cause no numerical problem. Fits are deterministic: the same points and weights give the same mixture.
+
+Equations, constants and their reasons are in ``docs/theory/proposals``.
 
 References
 ----------
-Peel & McLachlan (2000), Statistics and Computing 10, doi:10.1023/A:1008981510081 (expectation-maximisation for t)
-Schwarz (1978), Ann. Stat. 6(2), doi:10.1214/aos/1176344136 (the criterion)
+Peel, D. & McLachlan, G. J. (2000), Robust mixture modelling using the t distribution, Statistics and Computing 10,
+doi:10.1023/A:1008981510081 (expectation-maximisation)
+
+Schwarz, G. (1978), Estimating the dimension of a model, Annals of Statistics 6(2), doi:10.1214/aos/1176344136
 """
 
 import math
@@ -20,31 +23,40 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaln
 
-from .shears import Shear, bend, find_shears, straighten
-from .support_bounds import SupportBounds, from_unbounded, log_abs_det_jacobian, only_felt, to_unbounded
+from .shears import Shear, apply_shears, find_shears, invert_shears
+from .support_bounds import SupportBounds, from_unbounded, log_abs_det_jacobian, near_bounds, to_unbounded
 
 __all__ = [
     "Mixture",
     "draw",
     "fit_mixture",
-    "flatten",
+    "from_component_space",
     "invert_roots",
     "location_and_root",
     "log_density",
     "log_responsibilities",
-    "unflatten",
+    "to_component_space",
 ]
 
+# Degrees of freedom: heavier tails than a Gaussian, and finite fourth moments.
 DOF = 6.0
-FEW_POINTS = 5.0
+# With fewer effective points per dimension, correlations are shrunk towards zero.
+MIN_POINTS_PER_DIMENSION = 5.0
+# Smallest diagonal entry accepted in the root of a correlation matrix.
 SMALLEST_PIVOT = 1e-7
+# Smallest standard deviation, for parameters that do not vary.
 SMALLEST_SD = 1e-150
+# Limits of expectation-maximisation: iterations of a fit, iterations of a trial, and the gain in mean log-likelihood
+# below which a fit stops.
 ITERATIONS = 30
-ENOUGH = 1e-3
 TRIAL_ITERATIONS = 4
+TOLERANCE = 1e-3
+# Added to the diagonal of the pooled covariance of the whitened points.
 RIDGE = 1e-10
+# Points with less than this share of the mean weight are left out of the fit.
 NEGLIGIBLE = 1e-3
-SHEAR_NUMBERS = 4
+# Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
+PARAMETERS_PER_SHEAR = 4
 
 
 class Mixture(NamedTuple):
@@ -52,13 +64,21 @@ class Mixture(NamedTuple):
 
     Attributes
     ----------
-    weights : (K,) float — sum 1.
-    means : (K, ndim) float
-    roots : (K, ndim, ndim) float — lower-triangular roots of the scale matrices (covariance times (dof - 2) / dof).
-    inverses : (K, ndim, ndim) float — of the roots.
-    dof : float — degrees of freedom.
-    shears : tuple of Shear — the components live among the points that these have straightened,
-    edges : SupportBounds, optional — after these have been moved to infinity.
+    weights : ndarray, shape (K,)
+        Weights of the components, with sum 1.
+    means : ndarray, shape (K, ndim)
+        Locations of the components.
+    roots : ndarray, shape (K, ndim, ndim)
+        Lower-triangular roots of the scale matrices (covariance times (dof - 2) / dof).
+    inverses : ndarray, shape (K, ndim, ndim)
+        Inverses of the roots.
+    dof : float
+        Degrees of freedom.
+    shears : tuple of Shear
+        Maps that remove curvature. Components are defined in the space after `bounds` and then `shears` are applied
+        (the component space).
+    bounds : SupportBounds, optional
+        Bounds that are removed by the transformation to the whole real line.
     """
 
     weights: np.ndarray
@@ -67,26 +87,40 @@ class Mixture(NamedTuple):
     inverses: np.ndarray
     dof: float
     shears: tuple[Shear, ...] = ()
-    edges: SupportBounds | None = None
+    bounds: SupportBounds | None = None
 
 
 def location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean (ndim,) and a lower-triangular root (ndim, ndim) of the weighted covariance, always regular.
+    """Weighted mean and a non-singular root of the weighted covariance.
 
-    The root is standard deviations times the root of the correlation matrix. With less than five effective points a
-    dimension the correlations are not known and are shrunk towards zero; where the matrix is singular all the same, its
-    diagonal is raised until it is not.
+    The root is the standard deviations times the root of the correlation matrix. With fewer than five effective points
+    per dimension the correlations are poorly determined and are shrunk towards zero. If the matrix is still singular,
+    its diagonal is increased until it is not.
+
+    Parameters
+    ----------
+    coords : ndarray, shape (n, ndim)
+        Points.
+    weights : ndarray, shape (n,)
+        Non-negative weights with sum 1.
+
+    Returns
+    -------
+    mean : ndarray, shape (ndim,)
+        Weighted mean.
+    root : ndarray, shape (ndim, ndim)
+        Lower-triangular root of the covariance.
     """
     mean = weights @ coords
     centred = coords - mean
     sd = np.sqrt(weights @ centred**2)
-    # a parameter without spread keeps a sliver of it, in its own unit
+    # a parameter that does not vary gets a tiny standard deviation, in its own unit
     sd = np.maximum(sd, np.maximum(1e-12 * coords.std(axis=0), np.maximum(np.spacing(np.abs(mean)), SMALLEST_SD)))
     standard = centred / sd
     correlation = (standard * weights[:, None]).T @ standard
 
     ndim = len(mean)
-    shrinkage = max(0.0, 1.0 - 1.0 / (weights @ weights) / (FEW_POINTS * ndim))
+    shrinkage = max(0.0, 1.0 - 1.0 / (weights @ weights) / (MIN_POINTS_PER_DIMENSION * ndim))
     correlation *= 1.0 - shrinkage
     np.fill_diagonal(correlation, 1.0)
     jitter = 0.0
@@ -102,7 +136,7 @@ def location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarr
 
 def invert_roots(roots: np.ndarray) -> np.ndarray:
     """Inverses of lower-triangular matrices (K, ndim, ndim)."""
-    # by substitution, for all at once: LAPACK takes milliseconds for seven rows where its threads are kept waiting
+    # Substitution for all matrices at once. LAPACK takes milliseconds for seven rows when its threads have to wait.
     ndim = roots.shape[-1]
     inverses = np.zeros_like(roots)
     for i in range(ndim):
@@ -121,7 +155,8 @@ def _distances(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     return distances
 
 
-def _from_distances(mixture: Mixture, distances: np.ndarray) -> np.ndarray:
+def _component_log_densities(mixture: Mixture, distances: np.ndarray) -> np.ndarray:
+    """Log of weight times density (n, K) of each component, from squared Mahalanobis distances (n, K)."""
     ndim, dof = mixture.means.shape[1], mixture.dof
     constant = gammaln(0.5 * (dof + ndim)) - gammaln(0.5 * dof) - 0.5 * ndim * math.log(dof * math.pi)
     log_root = np.sum(np.log(np.diagonal(mixture.roots, axis1=1, axis2=2)), axis=1)
@@ -129,20 +164,20 @@ def _from_distances(mixture: Mixture, distances: np.ndarray) -> np.ndarray:
 
 
 def log_responsibilities(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
-    """Log probability (n, K) that a point (n, ndim) came from a component."""
-    parts = _from_distances(mixture, _distances(mixture, flatten(mixture, coords)))
+    """Log of the responsibilities (n, K): probabilities that each point (n, ndim) came from each component."""
+    parts = _component_log_densities(mixture, _distances(mixture, to_component_space(mixture, coords)))
     return parts - _log_sum(parts)[:, None]
 
 
-def flatten(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
-    """Points (n, ndim) as the components see them: without edges, straightened."""
-    return straighten(mixture.shears, coords if mixture.edges is None else to_unbounded(mixture.edges, coords))
+def to_component_space(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) to the space in which the components are defined: first bounds, then shears."""
+    return apply_shears(mixture.shears, coords if mixture.bounds is None else to_unbounded(mixture.bounds, coords))
 
 
-def unflatten(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
-    """Points (n, ndim) as they are, of points as the components see them."""
-    coords = bend(mixture.shears, coords)
-    return coords if mixture.edges is None else from_unbounded(mixture.edges, coords)
+def from_component_space(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) back to the parameters: the inverse of `to_component_space`."""
+    coords = invert_shears(mixture.shears, coords)
+    return coords if mixture.bounds is None else from_unbounded(mixture.bounds, coords)
 
 
 def _log_sum(parts: np.ndarray) -> np.ndarray:
@@ -152,13 +187,17 @@ def _log_sum(parts: np.ndarray) -> np.ndarray:
 
 
 def log_density(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
-    """Log density (n,) at points (n, ndim); -inf beyond an edge."""
-    log_sum = _log_sum(_from_distances(mixture, _distances(mixture, flatten(mixture, coords))))
-    return log_sum if mixture.edges is None else log_sum + log_abs_det_jacobian(mixture.edges, coords)
+    """Log density (n,) of the mixture at points (n, ndim), in the parameters; -inf beyond a bound."""
+    log_sum = _log_sum(_component_log_densities(mixture, _distances(mixture, to_component_space(mixture, coords))))
+    return log_sum if mixture.bounds is None else log_sum + log_abs_det_jacobian(mixture.bounds, coords)
 
 
 def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
-    """Independent draws (n, ndim); the components get their shares as evenly as whole numbers allow."""
+    """Draw points (n, ndim) from the mixture, in random order.
+
+    The number of draws per component is the one of systematic resampling: it differs from ``n`` times the weight by
+    less than one.
+    """
     ndim = mixture.means.shape[1]
     cumulated = np.cumsum(mixture.weights)
     component = np.searchsorted(cumulated / cumulated[-1], (np.arange(n) + random.uniform()) / n, side="right")
@@ -168,58 +207,68 @@ def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
     for k in range(len(mixture.weights)):
         rows = component == k
         coords[rows] = mixture.means[k] + z[rows] @ mixture.roots[k].T
-    return unflatten(mixture, coords[random.permutation(n)])
+    return from_component_space(mixture, coords[random.permutation(n)])
 
 
 def fit_mixture(
     coords: np.ndarray,
     weights: np.ndarray,
     max_components: int = 6,
-    edges: SupportBounds | None = None,
+    bounds: SupportBounds | None = None,
     dof: float = DOF,
 ) -> Mixture:
-    """Mixture of the best Bayesian information criterion.
+    """Fit a mixture; the number of components minimises the Bayesian information criterion.
 
-    Components are added one by one, each by cutting one in two, as long as the criterion improves. Each covariance is
-    shrunk towards the mean one of the components, with the weight of ``ndim`` points. Where shears straighten the
-    population (see `samplers.proposals.shears`) and improve the criterion, the components are fitted to the straight points.
+    Components are added one at a time, each by splitting an existing one, as long as the criterion improves. Each
+    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. If shears
+    (`samplers.proposals.shears`) improve the criterion, the components are fitted to the transformed points.
 
     Parameters
     ----------
-    coords : (n, ndim) float
-    weights : (n,) float — non-negative, sum 1. Points that carry less than 1e-3 of the mean weight are left out.
+    coords : ndarray, shape (n, ndim)
+        Points.
+    weights : ndarray, shape (n,)
+        Non-negative weights with sum 1. Points with less than 1e-3 of the mean weight are left out.
     max_components : int
-    edges : SupportBounds, optional — of the support; those that the population feels are moved to infinity if that pays.
-    dof : float — degrees of freedom, above 2.
+        Largest number of components.
+    bounds : SupportBounds, optional
+        Bounds of the support. Those near the population are removed by a transformation if this improves the criterion.
+    dof : float
+        Degrees of freedom, above 2.
+
+    Returns
+    -------
+    Mixture
     """
-    mixture, criterion = _fit_bent(coords, weights, max_components, dof)
-    felt = None if edges is None else only_felt(edges, coords, weights)
-    if felt is not None and np.any(np.isfinite([felt.low, felt.high])):
-        opened, other = _fit_bent(to_unbounded(felt, coords), weights, max_components, dof)
+    mixture, criterion = _fit_with_shears(coords, weights, max_components, dof)
+    near = None if bounds is None else near_bounds(bounds, coords, weights)
+    if near is not None and np.any(np.isfinite([near.low, near.high])):
+        unbounded, other = _fit_with_shears(to_unbounded(near, coords), weights, max_components, dof)
+        # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
         kept = weights > 0.0
-        other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(felt, coords[kept]))
+        other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(near, coords[kept]))
         if other < criterion:
-            return opened._replace(edges=felt)
+            return unbounded._replace(bounds=near)
     return mixture
 
 
-def _fit_bent(coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float) -> tuple[Mixture, float]:
-    """The best mixture of points, straightened where that pays, and its criterion."""
+def _fit_with_shears(coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float) -> tuple[Mixture, float]:
+    """Fit a mixture, with shears if they improve the criterion; return it with its criterion."""
     shears = find_shears(coords, weights)
     if not shears:
-        return _fit_straight((), coords, weights, max_components, dof)
-    sheared, criterion = _fit_straight(shears, coords, weights, max_components, dof)
-    # to pay, doing without shears may not need many components more
+        return _fit_components((), coords, weights, max_components, dof)
+    sheared, criterion = _fit_components(shears, coords, weights, max_components, dof)
+    # a fit without shears that needs many more components has a worse criterion, so it is not tried
     most = min(max_components, len(sheared.weights) + 2)
-    plain, other = _fit_straight((), coords, weights, most, dof)
+    plain, other = _fit_components((), coords, weights, most, dof)
     return (sheared, criterion) if criterion < other else (plain, other)
 
 
-def _fit_straight(
+def _fit_components(
     shears: tuple[Shear, ...], coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float
 ) -> tuple[Mixture, float]:
-    """The best mixture of points straightened by given shears, and its criterion."""
-    coords = straighten(shears, coords)
+    """Fit a mixture to points transformed by given shears; return it with its criterion."""
+    coords = apply_shears(shears, coords)
     mean, root = location_and_root(coords, weights)
     kept = weights > NEGLIGIBLE / len(weights)
     weights = weights[kept] / weights[kept].sum()
@@ -235,7 +284,9 @@ def _fit_straight(
         starts = _splits(best, white, weights)
         if not starts:
             break
-        tried = [_maximise(white, weights, effective, shares, dof, TRIAL_ITERATIONS) for shares in starts]
+        tried = [
+            _maximise(white, weights, effective, responsibilities, dof, TRIAL_ITERATIONS) for responsibilities in starts
+        ]
         found, _ = max(tried, key=lambda trial: trial[1])
         found, log_likelihood = _maximise(white, weights, effective, np.exp(log_responsibilities(found, white)), dof)
         criterion = _criterion(len(found.weights), ndim, effective, log_likelihood)
@@ -246,20 +297,22 @@ def _fit_straight(
     roots = root @ best.roots
     mixture = Mixture(best.weights, mean + best.means @ root.T, roots, invert_roots(roots), dof, shears)
     volume = 2.0 * effective * float(np.sum(np.log(root.diagonal())))
-    return mixture, best_criterion + volume + len(shears) * SHEAR_NUMBERS * math.log(max(effective, 2.0))
+    return mixture, best_criterion + volume + len(shears) * PARAMETERS_PER_SHEAR * math.log(max(effective, 2.0))
 
 
 def _criterion(count: int, ndim: int, effective: float, log_likelihood: float) -> float:
-    numbers = count * (1 + ndim + ndim * (ndim + 1) // 2) - 1
-    return numbers * math.log(max(effective, 2.0)) - 2.0 * effective * log_likelihood
+    """Bayesian information criterion of `count` components with mean log-likelihood `log_likelihood`."""
+    n_parameters = count * (1 + ndim + ndim * (ndim + 1) // 2) - 1
+    return n_parameters * math.log(max(effective, 2.0)) - 2.0 * effective * log_likelihood
 
 
 def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
-    """Hard assignments with one component more: each component cut in two, across two directions.
+    """Starting assignments (n, K + 1) with one more component: each component is split in two, along two directions.
 
-    The directions are those of the smallest and the largest fourth moment of the component's points: two groups show in
-    the former if they are of similar size and in the latter if one is small, however many other directions there are
-    (invariant coordinate selection: Tyler et al. 2009, doi:10.1111/j.1467-9868.2009.00706.x).
+    The directions are those of the smallest and the largest fourth moment of the component's points. Two groups of
+    similar size are visible along the former, and a small group beside a large one along the latter, in any number of
+    dimensions (invariant coordinate selection: Tyler, D. E., Critchley, F., Duembgen, L. & Oja, H. (2009), J. R. Stat.
+    Soc. B 71(3), doi:10.1111/j.1467-9868.2009.00706.x).
     """
     owner = log_responsibilities(mixture, white).argmax(axis=1)
     count, ndim = len(mixture.weights), white.shape[1]
@@ -282,7 +335,7 @@ def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np
 
 
 def _cut(values: np.ndarray, weights: np.ndarray) -> float:
-    """Where to cut weighted numbers (n,) in two so that the squares within the parts are least."""
+    """Threshold that splits weighted numbers (n,) in two parts with the smallest sum of squares within the parts."""
     order = np.argsort(values, kind="stable")
     mass, moment = np.cumsum(weights[order])[:-1], np.cumsum((weights * values)[order])
     between = (moment[-1] * mass - moment[:-1]) ** 2 / (mass * np.maximum(1.0 - mass, 1e-300))
@@ -294,34 +347,39 @@ def _maximise(
     white: np.ndarray,
     weights: np.ndarray,
     effective: float,
-    shares: np.ndarray,
+    responsibilities: np.ndarray,
     dof: float,
     iterations: int = ITERATIONS,
 ) -> tuple[Mixture, float]:
-    """Expectation-maximisation from first shares (n, K): the mixture and its mean log-likelihood."""
+    """Expectation-maximisation from initial responsibilities (n, K); return the mixture and its mean log-likelihood."""
     ndim = white.shape[1]
-    stretch = np.ones_like(shares)
+    stretch = np.ones_like(responsibilities)
     last = -np.inf
     for _ in range(iterations):
-        mixture = _components(white, weights, effective, shares, stretch, dof)
+        mixture = _components(white, weights, effective, responsibilities, stretch, dof)
         distances = _distances(mixture, white)
-        parts = _from_distances(mixture, distances)
+        parts = _component_log_densities(mixture, distances)
         total = _log_sum(parts)
         log_likelihood = float(weights @ total)
-        if log_likelihood - last < ENOUGH:
+        if log_likelihood - last < TOLERANCE:
             break
         last = log_likelihood
-        shares = np.exp(parts - total[:, None])
+        responsibilities = np.exp(parts - total[:, None])
         stretch = (dof + ndim) / (dof + distances)
     return mixture, log_likelihood
 
 
 def _components(
-    white: np.ndarray, weights: np.ndarray, effective: float, shares: np.ndarray, stretch: np.ndarray, dof: float
+    white: np.ndarray,
+    weights: np.ndarray,
+    effective: float,
+    responsibilities: np.ndarray,
+    stretch: np.ndarray,
+    dof: float,
 ) -> Mixture:
-    """The maximisation step; components that hold less than one effective point are dropped."""
+    """Maximisation step. Components that hold less than one effective point are removed."""
     ndim = white.shape[1]
-    owned = weights[:, None] * shares
+    owned = weights[:, None] * responsibilities
     mass = owned.sum(axis=0)
     alive = mass * effective >= 1.0
     if not alive.any():

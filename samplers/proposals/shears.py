@@ -1,15 +1,26 @@
-"""Straightening bent ridges: shears that take the curvature out of a population, one pair of parameters at a time.
+"""Quadratic shears: triangular maps that remove the curvature of a population, one pair of parameters at a time.
 
-Where data fix only a combination of parameters, such as a product of two stiffnesses, the posterior is a bent ridge
-that no few ellipsoids cover. A shear
+If the data determine only a combination of parameters, such as the product of two stiffnesses, the posterior is a
+curved ridge that a small number of ellipsoids cannot cover. A shear
 
     x_target <- x_target - a t - b t^2,   t = (x_source - mean) / sd,
 
-makes it straight. It has unit Jacobian and is inverted by adding what was subtracted, so that densities are carried
-over as they are, and a step that is symmetric among the straight points is symmetric among the bent ones.
+removes the curvature. It is a triangular map with unit Jacobian determinant, and its inverse adds what was subtracted.
+Densities therefore carry over without a correction, and a step that is symmetric in the transformed points is symmetric
+in the original ones.
 
-Reference: Haario, Saksman & Tamminen (1999), Computational Statistics 14, doi:10.1007/s001800050022 (bananas as shears
-of Gaussians).
+The maps are those by which Haario, Saksman & Tamminen (1999) construct banana-shaped targets from Gaussians, applied in
+the opposite direction. Parno & Marzouk (2018) describe triangular maps as preconditioners for sampling in general. The
+greedy selection of pairs by the Bayesian information criterion is a choice of this project; see
+``docs/theory/proposals``.
+
+References
+----------
+Haario, H., Saksman, E. & Tamminen, J. (1999), Adaptive proposal distribution for random walk Metropolis algorithm,
+Computational Statistics 14, doi:10.1007/s001800050022
+
+Parno, M. D. & Marzouk, Y. M. (2018), Transport map accelerated Markov chain Monte Carlo, SIAM/ASA Journal on
+Uncertainty Quantification 6(2), doi:10.1137/17M1134640
 """
 
 import math
@@ -18,13 +29,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Shear", "bend", "find_shears", "straighten"]
+__all__ = ["Shear", "apply_shears", "find_shears", "invert_shears"]
 
-LEAST_CURVATURE = 0.1
+# Smallest share of the variance left by the linear term that the quadratic term must explain.
+MIN_CURVATURE = 0.1
 
 
 class Shear(NamedTuple):
-    """Subtract ``linear t + quadratic t^2`` from parameter `target`, where ``t = (x[source] - mean) / sd``."""
+    """A map that subtracts ``linear t + quadratic t^2`` from one parameter, where ``t = (x[source] - mean) / sd``.
+
+    Attributes
+    ----------
+    target : int
+        Index of the parameter that is changed.
+    source : int
+        Index of the parameter that the change depends on.
+    mean, sd : float
+        Mean and standard deviation of the source, in its unit.
+    linear, quadratic : float
+        Coefficients, in the unit of the target.
+    """
 
     target: int
     source: int
@@ -39,16 +63,16 @@ def _shift(shear: Shear, coords: np.ndarray) -> np.ndarray:
     return (shear.linear + shear.quadratic * t) * t
 
 
-def straighten(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
-    """Straight points (n, ndim) of bent ones."""
+def apply_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim): remove the curvature."""
     coords = coords.copy()
     for shear in shears:
         coords[:, shear.target] -= _shift(shear, coords)
     return coords
 
 
-def bend(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
-    """Bent points (n, ndim) of straight ones."""
+def invert_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) back: the inverse of `apply_shears`."""
     coords = coords.copy()
     for shear in reversed(shears):
         coords[:, shear.target] += _shift(shear, coords)
@@ -56,16 +80,23 @@ def bend(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
 
 
 def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
-    """Shears that straighten a population, found greedily: the most curved pair of parameters first.
+    """Find shears that remove the curvature of a population, greedily: the most curved pair of parameters first.
 
-    A pair counts as curved if the square of the source explains at least a tenth of what its linear part leaves of the
-    target, and if the gain in likelihood pays for the search over all pairs (Bayesian information criterion, with the
-    number of pairs among the costs).
+    A pair is curved if the square of the source explains at least a tenth of the variance of the target that its linear
+    term leaves, and if the gain in likelihood exceeds the penalty of the Bayesian information criterion. The penalty
+    includes the number of pairs that were searched.
 
     Parameters
     ----------
-    coords : (n, ndim) float
-    weights : (n,) float — non-negative, sum 1.
+    coords : ndarray, shape (n, ndim)
+        Points.
+    weights : ndarray, shape (n,)
+        Non-negative weights with sum 1.
+
+    Returns
+    -------
+    tuple of Shear
+        At most ``2 ndim`` shears, in the order of application; empty if nothing is curved.
     """
     effective = 1.0 / (weights @ weights)
     ndim = coords.shape[1]
@@ -81,18 +112,18 @@ def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
         third, fourth = weighted.T @ t**2, weights @ t**4
         correlation = weighted.T @ t
         own = np.diagonal(third)
-        # covariance of the target (rows) and the variance of the source's square (columns), its linear part taken out
+        # covariance of the target (rows) with the square of the source (columns), after removal of the linear term
         covariance = third - correlation * own
         left = np.maximum(fourth - 1.0 - own**2, 1e-12) * np.maximum(1.0 - correlation**2, 1e-12)
         explained = covariance**2 / left
         np.fill_diagonal(explained, 0.0)
         target, source = (int(i) for i in np.unravel_index(explained.argmax(), explained.shape))
         share = min(float(explained[target, source]), 1.0 - 1e-12)
-        if share < LEAST_CURVATURE or -effective * math.log1p(-share) < cost:
+        if share < MIN_CURVATURE or -effective * math.log1p(-share) < cost:
             break
         quadratic = covariance[target, source] / max(fourth[source] - 1.0 - own[source] ** 2, 1e-12)
         linear = correlation[target, source] - quadratic * own[source]
         shear = Shear(target, source, mean[source], sd[source], sd[target] * linear, sd[target] * quadratic)
         shears.append(shear)
-        coords = straighten([shear], coords)
+        coords = apply_shears([shear], coords)
     return tuple(shears)

@@ -1,9 +1,13 @@
-"""SupportBounds of the prior's support: found by asking, and moved to infinity where a population feels them.
+"""Bounds of the prior's support, and the transformation of bounded parameters to the whole real line.
 
-A posterior that piles up at an edge, a damping ratio near zero say, is cut off there, and no mixture of bells follows
-it in many dimensions. In the logarithm of the distance from the edge, or the logit between two, there is no edge. Which
-points lie in the support of the prior costs no simulation to ask, so the edges of each parameter are bracketed and
-bisected from several points; where these do not agree, the support is no box and the parameter is left as it is.
+A posterior that is concentrated at a bound, such as a damping ratio near zero, is truncated there, and a mixture of
+bell-shaped components cannot follow it in many dimensions. The logarithm of the distance from a single bound, or the
+logit between two bounds, has no bound.
+
+The bounds are found numerically, because a sampler knows only whether a point lies in the support. Evaluating that
+needs no simulation. For each parameter the bounds are bracketed and bisected along lines through several points. Where
+the lines disagree, the support is not a box, and the parameter is treated as unbounded. Equations and choices are in
+``docs/theory/proposals``.
 """
 
 from collections.abc import Callable
@@ -14,27 +18,34 @@ from scipy.special import expit
 
 __all__ = [
     "SupportBounds",
-    "from_unbounded",
     "find_support_bounds",
+    "from_unbounded",
     "log_abs_det_jacobian",
-    "only_felt",
+    "near_bounds",
     "to_unbounded",
 ]
 
+# Number of points through which the lines are laid.
 PROBES = 3
+# The search for a bound starts at the range of the points and doubles the distance; a factor of 2^30 means no bound.
 DOUBLINGS = 30
+# Halvings of the bracket, down to the rounding of a double.
 BISECTIONS = 55
+# Largest disagreement of the lines, as a share of the range of the points.
 AGREEMENT = 1e-9
-FELT = 4.0
+# A bound matters if it lies within so many standard deviations of the mean of the population.
+NEAR = 4.0
 
 
 class SupportBounds(NamedTuple):
-    """Where the parameters end.
+    """Bounds of the parameters.
 
     Attributes
     ----------
-    low, high : (ndim,) float — edges; -inf and inf where there is none.
-    span : (ndim,) float — a length of each parameter, so that logarithms know no unit.
+    low, high : ndarray, shape (ndim,)
+        Lower and upper bounds; -inf and inf where there is none.
+    span : ndarray, shape (ndim,)
+        Length scale of each parameter, which makes the argument of a logarithm dimensionless.
     """
 
     low: np.ndarray
@@ -43,17 +54,24 @@ class SupportBounds(NamedTuple):
 
 
 def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -> SupportBounds:
-    """SupportBounds of the support that some points (n, ndim) lie in.
+    """Find the bounds of the support from points in it.
 
     Parameters
     ----------
-    inside : function of points (m, ndim) that tells which lie in the support; called some 85 times.
-    coords : (n, ndim) float — points in the support, such as draws of the prior.
+    inside : callable
+        Function of points (m, ndim) that returns which of them (m,) lie in the support. It is called about 85 times.
+    coords : ndarray, shape (n, ndim)
+        Points in the support, for example draws from the prior.
+
+    Returns
+    -------
+    SupportBounds
+        Each finite bound lies at most one bisection step outside the support, never inside it.
     """
     ndim = coords.shape[1]
     span = np.ptp(coords, axis=0)
     rows = coords[np.linspace(0, len(coords) - 1, PROBES).astype(int)]
-    # one probe for each row, parameter and side
+    # one search for each combination of row, parameter and direction
     row, parameter, side = (a.ravel() for a in np.meshgrid(range(PROBES), range(ndim), (-1.0, 1.0), indexing="ij"))
     start = rows[row, parameter]
 
@@ -80,65 +98,81 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
         within[which[found]] = middle[found]
         beyond[which[~found]] = middle[~found]
 
-    edges = np.where(bounded, start + side * beyond, side * np.inf).reshape(PROBES, ndim, 2)
+    bounds = np.where(bounded, start + side * beyond, side * np.inf).reshape(PROBES, ndim, 2)
     with np.errstate(invalid="ignore"):
-        agree = np.ptp(edges, axis=0) <= AGREEMENT * span[:, None]
-    low = np.where(agree[:, 0], edges[:, :, 0].min(axis=0), -np.inf)
-    high = np.where(agree[:, 1], edges[:, :, 1].max(axis=0), np.inf)
+        agree = np.ptp(bounds, axis=0) <= AGREEMENT * span[:, None]
+    low = np.where(agree[:, 0], bounds[:, :, 0].min(axis=0), -np.inf)
+    high = np.where(agree[:, 1], bounds[:, :, 1].max(axis=0), np.inf)
     return SupportBounds(low, high, np.where(span > 0.0, span, 1.0))
 
 
-def only_felt(edges: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
-    """The edges within four standard deviations of the mean of a weighted population (n, ndim), (n,)."""
+def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
+    """Keep the bounds that lie within four standard deviations of the mean of a weighted population (n, ndim), (n,)."""
     mean = weights @ coords
-    reach = FELT * np.sqrt(weights @ (coords - mean) ** 2)
-    low = np.where(mean - edges.low < reach, edges.low, -np.inf)
-    high = np.where(edges.high - mean < reach, edges.high, np.inf)
-    return SupportBounds(low, high, edges.span)
+    reach = NEAR * np.sqrt(weights @ (coords - mean) ** 2)
+    low = np.where(mean - bounds.low < reach, bounds.low, -np.inf)
+    high = np.where(bounds.high - mean < reach, bounds.high, np.inf)
+    return SupportBounds(low, high, bounds.span)
 
 
-def _kinds(edges: SupportBounds) -> list[tuple[int, bool, bool]]:
-    """The parameters that have an edge: index, whether below, whether above."""
-    below, above = np.isfinite(edges.low), np.isfinite(edges.high)
+def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, bool, bool]]:
+    """List the bounded parameters: index, whether bounded below, whether bounded above."""
+    below, above = np.isfinite(bounds.low), np.isfinite(bounds.high)
     return [(int(j), bool(below[j]), bool(above[j])) for j in np.flatnonzero(below | above)]
 
 
-def to_unbounded(edges: SupportBounds, coords: np.ndarray) -> np.ndarray:
-    """Points (n, ndim) without edges; those beyond an edge are put at zero, `log_abs_det_jacobian` tells them."""
+def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) to the whole real line: ``log((x - low) / span)``, or the logit between two bounds.
+
+    Points on or beyond a bound are mapped to zero; `log_abs_det_jacobian` is -inf for them.
+    """
     coords = coords.copy()
-    for j, below, above in _kinds(edges):
+    for j, below, above in _bounded_parameters(bounds):
         x = coords[:, j]
-        from_low = np.maximum((x - edges.low[j]) / edges.span[j], 0.0) if below else 1.0
-        from_high = np.maximum((edges.high[j] - x) / edges.span[j], 0.0) if above else 1.0
+        from_low = np.maximum((x - bounds.low[j]) / bounds.span[j], 0.0) if below else 1.0
+        from_high = np.maximum((bounds.high[j] - x) / bounds.span[j], 0.0) if above else 1.0
         good = (from_low > 0.0) & (from_high > 0.0)
         coords[:, j] = np.log(np.where(good, from_low, 1.0)) - np.log(np.where(good, from_high, 1.0))
     return coords
 
 
-def from_unbounded(edges: SupportBounds, coords: np.ndarray) -> np.ndarray:
-    """Points (n, ndim) between the edges, of points without edges."""
+def from_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) back: the inverse of `to_unbounded`."""
     coords = coords.copy()
-    for j, below, above in _kinds(edges):
+    for j, below, above in _bounded_parameters(bounds):
         z = coords[:, j]
         if below and above:
-            width = edges.high[j] - edges.low[j]
-            # from the nearer edge, for the last digits
-            coords[:, j] = np.where(z < 0.0, edges.low[j] + width * expit(z), edges.high[j] - width * expit(-z))
+            width = bounds.high[j] - bounds.low[j]
+            # measured from the nearer bound, to keep the last digits
+            coords[:, j] = np.where(z < 0.0, bounds.low[j] + width * expit(z), bounds.high[j] - width * expit(-z))
         elif below:
-            coords[:, j] = edges.low[j] + edges.span[j] * np.exp(np.minimum(z, 700.0))
+            coords[:, j] = bounds.low[j] + bounds.span[j] * np.exp(np.minimum(z, 700.0))
         else:
-            coords[:, j] = edges.high[j] - edges.span[j] * np.exp(np.minimum(-z, 700.0))
+            coords[:, j] = bounds.high[j] - bounds.span[j] * np.exp(np.minimum(-z, 700.0))
     return coords
 
 
-def log_abs_det_jacobian(edges: SupportBounds, coords: np.ndarray) -> np.ndarray:
-    """Log of the determinant (n,) of `to_unbounded` at points (n, ndim); -inf beyond an edge."""
+def log_abs_det_jacobian(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+    """Logarithm of the absolute Jacobian determinant of `to_unbounded`.
+
+    Parameters
+    ----------
+    bounds : SupportBounds
+        Bounds of the parameters.
+    coords : ndarray, shape (n, ndim)
+        Points in the original parameters.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        ``log |dz / dx|``; -inf on and beyond a bound.
+    """
     total = np.zeros(len(coords))
-    for j, below, above in _kinds(edges):
-        from_low = np.maximum(coords[:, j] - edges.low[j], 0.0) if below else 1.0
-        from_high = np.maximum(edges.high[j] - coords[:, j], 0.0) if above else 1.0
+    for j, below, above in _bounded_parameters(bounds):
+        from_low = np.maximum(coords[:, j] - bounds.low[j], 0.0) if below else 1.0
+        from_high = np.maximum(bounds.high[j] - coords[:, j], 0.0) if above else 1.0
         good = (from_low > 0.0) & (from_high > 0.0)
-        width = edges.high[j] - edges.low[j] if below and above else 1.0
+        width = bounds.high[j] - bounds.low[j] if below and above else 1.0
         slope = np.log(width) - np.log(np.where(good, from_low, 1.0)) - np.log(np.where(good, from_high, 1.0))
         total = np.where(good, total + slope, -np.inf)
     return total

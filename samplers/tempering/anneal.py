@@ -214,7 +214,7 @@ def _by_recycling(
 def _check_evidence(coords: np.ndarray, tempering: Tempering) -> EvidenceCheck:
     """The evidence from fresh draws of a mixture fitted to the final population."""
     inside, wanted = tempering.inside, tempering.settings.check_draws
-    mixture = fit_mixture(coords, np.full(len(coords), 1.0 / len(coords)), edges=find_support_bounds(inside, coords))
+    mixture = fit_mixture(coords, np.full(len(coords), 1.0 / len(coords)), bounds=find_support_bounds(inside, coords))
     drawn, made = draw_inside(mixture, len(coords) if wanted is None else wanted, tempering.random, inside)
     return evidence_from_weights(tempering.evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
 

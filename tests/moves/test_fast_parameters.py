@@ -1,4 +1,4 @@
-"""Sweeps over parameters that cost no simulation: the right posterior, nothing else touched, nothing simulated."""
+"""Sweeps over fast parameters: correct posterior, other parameters unchanged, no additional simulations."""
 
 import pickle
 from multiprocessing.pool import ThreadPool
@@ -23,16 +23,16 @@ from samplers import (
     TemperedSampler,
     TMCMCSampler,
 )
-from samplers.moves.fast_parameters import WithFastSweeps, _FreeWalk
+from samplers.moves.fast_parameters import WithFastSweeps, _FastWalk
 from samplers.moves.kernels import MixtureMove, RandomWalkMove
 from tests.contract.targets import Gaussian, WithBlobs
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
 
 class NormalInverseGamma:
-    """Mean and standard deviation of a sample, under the conjugate prior: everything is known.
+    """Mean and standard deviation of a sample under the conjugate prior, with known posterior and evidence.
 
-    The variance is inverse gamma (2, 1); the mean, given it, is normal about zero with the variance itself.
+    The prior of the variance is inverse gamma (2, 1). The prior of the mean is normal with mean zero and that variance.
     """
 
     ndim = 2
@@ -46,7 +46,7 @@ class NormalInverseGamma:
         self.mean = n * self.centre / (1.0 + n)
         variance = stats.invgamma(self.shape, scale=self.scale)
         self.variance, self.median = variance.mean(), np.sqrt(variance.median())
-        # evidence by Bayes' rule, at any point
+        # evidence by Bayes' rule, evaluated at one point
         at = np.array([0.7, 0.5])
         posterior = variance.logpdf(0.25) + np.log(1.0) + stats.norm.logpdf(0.7, self.mean, 0.5 / np.sqrt(1.0 + n))
         self.log_evidence = self.log_likelihood(at) + self.log_prior(at) - np.log(2 * 0.5) - posterior
@@ -104,7 +104,7 @@ def test_conjugate_sample(mode, seed):
 
 
 class WrongMove(WithFastSweeps):
-    """Free sweeps that drift upwards, without the ratio for it."""
+    """Fast sweeps with a drift that the acceptance ratio does not contain."""
 
     def __init__(self, move, indices):
         super().__init__(move, indices, sweeps=5)
@@ -118,33 +118,35 @@ class WrongMove(WithFastSweeps):
         self._walk.get_proposal = drift
 
 
-def test_wrong_free_sweeps_are_caught(seed):
-    """Negative control: the criterion of the test above can fail."""
+def test_wrong_fast_sweeps_are_detected(seed):
+    """Negative control: the criterion of the test above fails for a wrong move."""
     posterior = NormalInverseGamma()
     samplers = []
     for k in range(8):
         sampler = SMCSampler(200, 2, posterior, vectorize=True, seed=[seed, k], recycle=False, fast_sweeps=0)
-        sampler._moves = [WrongMove(MixtureMove(), (1,))]  # its closure cannot be copied, as a sampler does with moves
+        sampler._moves = [
+            WrongMove(MixtureMove(), (1,))
+        ]  # set directly: a sampler copies its moves, and this closure cannot be copied
         sampler.run_mcmc(None, 4)
         samplers.append(sampler)
     assert not within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
 
 
 class Still(emcee.moves.Move):
-    """The costly move that never moves."""
+    """An expensive move that never moves."""
 
     def propose(self, model, state):
         return state, np.zeros(len(state.coords), dtype=bool)
 
 
 def target(x):
-    """Log density of two coordinates whose second has a spread that depends on the first, and blobs to tell points."""
+    """Log density of two coordinates, the spread of the second depending on the first; blobs identify the points."""
     return stats.norm.logpdf(x[:, 0]) + stats.norm.logpdf(x[:, 1], x[:, 0], np.exp(0.5 * x[:, 0])), x.copy()
 
 
 @pytest.fixture
 def ensemble(rng):
-    """Exact draws of `target`, and what moves them."""
+    """Exact draws of `target` as a state, and the model that moves need."""
     first = rng.normal(size=20_000)
     first[:2] = -0.0, 5e-324
     x = np.column_stack([first, rng.normal(first, np.exp(0.5 * first))])
@@ -153,14 +155,14 @@ def ensemble(rng):
     return state, Model(None, target, map, np.random.RandomState(rng.integers(2**31)))
 
 
-def test_free_sweeps_alone_keep_the_target_and_the_other_coordinates(ensemble):
-    """Exact draws stay exact draws, the held coordinate keeps every bit, and values and blobs go with their points."""
+def test_fast_sweeps_alone_keep_the_target_and_the_other_coordinates(ensemble):
+    """Exact draws remain exact, the slow coordinate keeps every bit, and values and blobs stay with their points."""
     state, model = ensemble
     start = state.coords.copy()
     move = WithFastSweeps(Still(), [1], sweeps=10)
-    move.calibrate(start[:500] * np.array([1.2, 0.7]), np.full(500, 1 / 500))  # a fit to something else makes no matter
+    move.calibrate(start[:500] * np.array([1.2, 0.7]), np.full(500, 1 / 500))  # the fit may be wrong
     state, accepted = move.propose(model, state)
-    assert not accepted.any()  # the flags are those of the costly move
+    assert not accepted.any()  # the flags are those of the expensive move
     assert state.coords[:, 0].tobytes() == start[:, 0].tobytes()
     assert np.mean(state.coords[:, 1] != start[:, 1]) > 0.9
     np.testing.assert_array_equal(state.blobs, state.coords)
@@ -173,15 +175,15 @@ def test_free_sweeps_alone_keep_the_target_and_the_other_coordinates(ensemble):
 def test_the_walk_has_the_conditional_covariance(rng):
     covariance = np.array([[1.0, 0.9, 0.2], [0.9, 1.0, 0.5], [0.2, 0.5, 2.0]]) * np.outer([1, 1e6, 1], [1, 1e6, 1])
     points = rng.multivariate_normal(np.zeros(3), covariance, size=100_000)
-    for free, held in (([1], [0, 2]), ([0, 2], [1])):
-        walk = _FreeWalk(free)
+    for fast, slow in (([1], [0, 2]), ([0, 2], [1])):
+        walk = _FastWalk(fast)
         walk.calibrate(points, np.full(len(points), 1.0 / len(points)))
-        cross = covariance[np.ix_(free, held)]
-        expected = covariance[np.ix_(free, free)] - cross @ np.linalg.solve(covariance[np.ix_(held, held)], cross.T)
+        cross = covariance[np.ix_(fast, slow)]
+        expected = covariance[np.ix_(fast, fast)] - cross @ np.linalg.solve(covariance[np.ix_(slow, slow)], cross.T)
         assert walk._root @ walk._root.T == pytest.approx(expected, rel=0.05)
 
 
-def test_the_scale_is_steered_by_tuning_alone(ensemble):
+def test_only_tuning_adapts_the_scale(ensemble):
     state, model = ensemble
     move = WithFastSweeps(RandomWalkMove(), [1])
     fixed = emcee.EnsembleSampler(64, 2, lambda x: target(x[None])[0][0], moves=move)
@@ -191,13 +193,13 @@ def test_the_scale_is_steered_by_tuning_alone(ensemble):
     for _ in range(20):
         state, accepted = move.propose(model, state)
         move.tune(state, accepted)
-    assert -3.0 < move._walk._log_factor < -1.5  # - log 10, about
+    assert -3.0 < move._walk._log_factor < -1.5  # about -log 10
     assert np.mean(move._accepted) == pytest.approx(0.35, abs=0.1)
 
 
 @pytest.mark.filterwarnings("ignore:stuck")
-def test_the_noise_moves_without_its_structure(seed):
-    """Where the costly move hardly ever accepts, the free coordinates are renewed all the same."""
+def test_fast_parameters_move_when_the_expensive_move_does_not(seed):
+    """If the expensive move is almost never accepted, the fast parameters still change."""
     moved = []
     for fast_sweeps in (0, 2):
         sampler = SMCSampler(
@@ -216,10 +218,10 @@ def test_the_noise_moves_without_its_structure(seed):
 
 
 class Recorded(Posterior):
-    """A posterior that keeps every point it was asked for."""
+    """A posterior that keeps every point that it evaluated."""
 
     def __call__(self, x):
-        self.asked = [*getattr(self, "asked", []), np.array(x)]
+        self.evaluated = [*getattr(self, "evaluated", []), np.array(x)]
         return super().__call__(x)
 
 
@@ -237,28 +239,28 @@ def oscillator(kind=Posterior, memory=100_000):
 
 
 @pytest.mark.parametrize("mode", ["recycling", "moves", "tmcmc"])
-def test_no_simulation_but_for_new_structural_parameters(mode, seed):
+def test_only_new_structural_parameters_are_simulated(mode, seed):
     posterior = oscillator(Recorded)
     kwargs = dict(MODES[mode])
     sampler = kwargs.pop("Sampler", SMCSampler)(60, 4, posterior, vectorize=True, seed=seed, **kwargs)
     sampler.run_mcmc(None, 10)
-    asked = np.concatenate(posterior.asked)
+    evaluated = np.concatenate(posterior.evaluated)
     report = posterior.report()
-    assert report["simulations"] == len(np.unique(asked[:, :2], axis=0))
-    assert sampler.evaluations == len(asked) == report["simulations"] + report["cache_hits"]
-    # control: the samplers do ask for more than they have simulated
+    assert report["simulations"] == len(np.unique(evaluated[:, :2], axis=0))
+    assert sampler.evaluations == len(evaluated) == report["simulations"] + report["cache_hits"]
+    # negative control: the samplers evaluate more points than they simulate
     sweeps = 10 + sum(stage.moves for stage in sampler.ladder)
-    assert report["cache_hits"] > 60 * sweeps  # two fast sweeps each; a few points lie outside the support
-    forgetful = oscillator(memory=0)
-    again = type(sampler)(60, 4, forgetful, vectorize=True, seed=seed, **kwargs)
+    assert report["cache_hits"] > 60 * sweeps  # two fast sweeps per sweep; a few points lie outside the support
+    without_cache = oscillator(memory=0)
+    again = type(sampler)(60, 4, without_cache, vectorize=True, seed=seed, **kwargs)
     again.run_mcmc(None, 10)
     np.testing.assert_array_equal(again.get_chain(), sampler.get_chain())
-    # equal rows of one batch are simulated once with and without memory
-    assert forgetful.report()["simulations"] > 1.5 * report["simulations"]
+    # equal rows of one batch are simulated once, with and without the cache
+    assert without_cache.report()["simulations"] > 1.5 * report["simulations"]
 
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
-def test_stages_count_costly_sweeps(Sampler):
+def test_stages_count_expensive_sweeps(Sampler):
     posterior = Noisy()
     kwargs = {"recycle": False} if Sampler is SMCSampler else {}
     sampler = Sampler(40, 3, posterior, vectorize=True, seed=1, fast_sweeps=3, **kwargs)
@@ -268,11 +270,11 @@ def test_stages_count_costly_sweeps(Sampler):
     assert sampler.evaluations == posterior.calls
 
 
-# ---------------------------------------------------------------- where it is not wanted
+# ---------------------------------------------------------------- when it is off
 
 
 @pytest.mark.parametrize("preset", [CHING_CHEN_2007, RAMANCHA_2022_LITERAL, RAMANCHA_2022_CONSTANT])
-def test_presets_are_untouched(preset, seed):
+def test_presets_make_no_fast_sweeps(preset, seed):
     Sampler = TMCMCSampler if preset is CHING_CHEN_2007 else SMCSampler
     chains, calls = [], []
     for posterior in (Gaussian(), Noisy()):
@@ -288,7 +290,7 @@ def kinds(posterior, Sampler=SMCSampler, **kwargs):
     return {type(move) for move in Sampler(50, 3, posterior, log_prior_fn=Gaussian().log_prior, **kwargs)._moves}
 
 
-def test_only_where_there_is_something_free():
+def test_only_if_some_parameters_are_fast():
     assert kinds(Noisy()) == kinds(Noisy(), TMCMCSampler) == kinds(Noisy(), TemperedSampler) == {WithFastSweeps}
     assert kinds(Noisy(), moves=[(emcee.moves.DEMove(), 0.8), (RandomWalkMove(), 0.2)]) == {WithFastSweeps}
     assert kinds(Noisy(), fast_sweeps=0) == kinds(Gaussian()) == kinds(Noisy().__call__) == {MixtureMove}
@@ -299,21 +301,21 @@ def test_only_where_there_is_something_free():
     assert kinds(everything) == kinds(nothing) == {MixtureMove}
 
 
-def test_workers_that_forget_make_nothing_free():
+def test_not_with_a_pool_of_workers_without_a_cache():
     with ThreadPool(1) as pool:
         assert kinds(Noisy(), pool=pool) == {MixtureMove}
         assert kinds(Noisy(), pool=pool, vectorize=True) == {WithFastSweeps}
 
 
-@pytest.mark.parametrize("free", [(3,), (-1,), (0, 7), (0.5,), ("sigma",)])
-def test_indices_that_are_none(free):
+@pytest.mark.parametrize("fast", [(3,), (-1,), (0, 7), (0.5,), ("sigma",)])
+def test_invalid_indices(fast):
     posterior = Noisy()
-    posterior.fast_parameters = free
+    posterior.fast_parameters = fast
     with pytest.raises(ValueError, match="fast_parameters must be indices of parameters"):
         SMCSampler(50, 3, posterior)
 
 
-def test_impossible_free_sweeps():
+def test_invalid_fast_sweeps():
     with pytest.raises(ValueError, match="sweeps must be at least 1"):
         WithFastSweeps(RandomWalkMove(), [0], sweeps=0)
     with pytest.raises(ValueError, match="fast_parameters"):
@@ -330,7 +332,7 @@ def test_impossible_free_sweeps():
 
 
 @pytest.mark.parametrize("vectorize", [False, True])
-def test_blobs_go_with_their_points(vectorize):
+def test_blobs_stay_with_their_points(vectorize):
     posterior = NoisyWithBlobs()
     sampler = SMCSampler(40, 3, posterior, vectorize=vectorize, seed=1)
     sampler.run_mcmc(None, 4)
@@ -340,7 +342,7 @@ def test_blobs_go_with_their_points(vectorize):
     assert np.allclose(sampler.get_log_prob(flat=True), Gaussian()(sampler.get_chain(flat=True)), rtol=1e-13)
 
 
-def test_pickled_samplers_go_on_bit_by_bit():
+def test_pickled_samplers_continue_identically():
     sampler = SMCSampler(40, 3, Noisy(), vectorize=True, seed=1)
     sampler.run_mcmc(None, 3)
     copy = pickle.loads(pickle.dumps(sampler))
@@ -349,8 +351,8 @@ def test_pickled_samplers_go_on_bit_by_bit():
     np.testing.assert_array_equal(first.log_prob, second.log_prob)
 
 
-def test_a_reopened_file_goes_on(tmp_path):
-    """The moves of a new process fit themselves to the ensemble; two of them do so alike."""
+def test_a_reopened_file_continues(tmp_path):
+    """The moves of a new sampler fit themselves to the ensemble; two new samplers do so identically."""
 
     def reopen(name):
         sampler = SMCSampler(40, 3, Noisy(), vectorize=True, seed=1, backend=emcee.backends.HDFBackend(tmp_path / name))

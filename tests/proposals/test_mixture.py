@@ -1,4 +1,4 @@
-"""Mixtures and shears: densities that are drawn from as stated, fits that find what is there and follow units."""
+"""Mixtures, shears and support bounds: draws follow the stated density, and fits do not depend on units."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.special import logsumexp
 
 from samplers.moves.kernels import MixtureMove
 from samplers.proposals.mixture import draw, fit_mixture, log_density, log_responsibilities
-from samplers.proposals.shears import bend, find_shears, straighten
+from samplers.proposals.shears import apply_shears, find_shears, invert_shears
 from samplers.proposals.support_bounds import (
     SupportBounds,
     find_support_bounds,
@@ -28,7 +28,7 @@ def banana(rng, n=2000):
 
 
 def groups(rng, n=2000):
-    """Two groups apart in one direction of eight: no principal component shows them."""
+    """Two groups separated in one direction of eight, which is not a principal component."""
     x = rng.standard_normal((n, 8))
     second = rng.uniform(size=n) < 0.3
     x[:, 4] = 0.2 * x[:, 4] + np.where(second, 2.0, -1.0)
@@ -50,7 +50,7 @@ def test_a_gaussian_is_one_component(rng):
 
 
 def test_weights_count_as_points(rng):
-    """Weighted points give the mixture of the population they stand for."""
+    """Weighted points give the mixture of the population that they represent."""
     x = 2.0 * rng.standard_normal((40000, 2))
     log_weights = -0.5 * np.sum((x - 1.0) ** 2, axis=1) + 0.5 * np.sum((x / 2.0) ** 2, axis=1)
     weights = np.exp(log_weights - logsumexp(log_weights))
@@ -64,26 +64,26 @@ def test_draws_follow_the_stated_density(rng, population):
     x = population(rng)
     mixture = fit_mixture(x, uniform(len(x)))
     drawn = draw(mixture, 100_000, rng)
-    # importance sampling of a known density, a Gaussian inside a component: mean weight one, moments right
+    # importance sampling of a known density, a Gaussian narrower than a component: mean weight 1, correct moments
     mean, root = mixture.means[0], 0.7 * mixture.roots[0]
-    straight = straighten(mixture.shears, drawn)
-    log_reference = stats.multivariate_normal(mean, root @ root.T).logpdf(straight)
+    transformed = apply_shears(mixture.shears, drawn)
+    log_reference = stats.multivariate_normal(mean, root @ root.T).logpdf(transformed)
     weights = np.exp(log_reference - log_density(mixture, drawn))
     assert abs(weights.mean() - 1.0) < 4.5 * weights.std() / np.sqrt(len(drawn))
-    errors = weights[:, None] * (straight - mean)
+    errors = weights[:, None] * (transformed - mean)
     assert np.all(np.abs(errors.mean(axis=0)) < 4.5 * errors.std(axis=0) / np.sqrt(len(drawn)))
-    # control: the density of another mixture does not pass
+    # negative control: the density of another mixture fails the same test
     wrong = np.exp(log_reference - log_density(mixture._replace(means=mixture.means + 0.1 * x.std(axis=0)), drawn))
     assert abs(wrong.mean() - 1.0) > 4.5 * wrong.std() / np.sqrt(len(drawn))
 
 
-def test_shears_straighten_and_bend_back(rng):
+def test_shears_remove_curvature_and_are_inverted(rng):
     x = banana(rng)
     shears = find_shears(x, uniform(len(x)))
     assert [(s.target, s.source) for s in shears] == [(1, 0)]
-    straight = straighten(shears, x)
-    assert np.allclose(bend(shears, straight), x, rtol=0, atol=1e-12)
-    assert straight[:, 1].std() < 0.15
+    transformed = apply_shears(shears, x)
+    assert np.allclose(invert_shears(shears, transformed), x, rtol=0, atol=1e-12)
+    assert transformed[:, 1].std() < 0.15
     assert fit_mixture(x, uniform(len(x))).shears == shears
 
 
@@ -116,11 +116,11 @@ def test_degenerate_populations(points, rng):
 
 @pytest.mark.parametrize("kernel", [0, 1, 2], ids=["independence", "local walk", "differences"])
 def test_each_kernel_keeps_the_target(kernel, rng):
-    """Exact draws of a bent, two-group target stay such draws; a proposal fitted to something else makes no matter."""
+    """Exact draws of a curved target with two groups remain exact, even if the proposal was fitted to other points."""
 
     def log_target(x):
-        bent = stats.norm.logpdf(x[:, 1] - x[:, 0] ** 2, 0, 0.5)
-        return np.logaddexp(stats.norm.logpdf(x[:, 0], -1, 0.3), stats.norm.logpdf(x[:, 0], 1.5, 0.5)) + bent
+        curved = stats.norm.logpdf(x[:, 1] - x[:, 0] ** 2, 0, 0.5)
+        return np.logaddexp(stats.norm.logpdf(x[:, 0], -1, 0.3), stats.norm.logpdf(x[:, 0], 1.5, 0.5)) + curved
 
     n = 40_000
     first = np.where(rng.uniform(size=n) < 0.5, rng.normal(-1, 0.3, n), rng.normal(1.5, 0.5, n))
@@ -131,7 +131,7 @@ def test_each_kernel_keeps_the_target(kernel, rng):
     random = np.random.RandomState(rng.integers(2**31))
     start = x.copy()
     for _ in range(5):
-        move._turn = kernel
+        move._current = kernel
         proposed, factors = move._draw(x, random)
         accepted = np.log(random.uniform(size=n)) < log_target(proposed) - log_target(x) + factors
         x = np.where(accepted[:, None], proposed, x)
@@ -147,7 +147,7 @@ def test_impossible_mixtures():
         MixtureMove(max_components=0)
 
 
-# ---------------------------------------------------------------- edges
+# ---------------------------------------------------------------- support bounds
 
 
 def box(low, high):
@@ -155,47 +155,49 @@ def box(low, high):
 
 
 @pytest.mark.parametrize("unit", [1e-11, 1.0, 1e11])
-def test_edges_are_found(rng, unit):
+def test_bounds_are_found(rng, unit):
     low, high = np.array([0.0, -3.0, -np.inf, -np.inf]) * unit, np.array([np.inf, 7.0, 5.0, np.inf]) * unit
     points = rng.uniform(-1, 1, size=(100, 4)) * unit + np.array([1.5, 2.0, 3.0, 0.0]) * unit
-    edges = find_support_bounds(box(low, high), points)
-    assert np.array_equal(np.isfinite(edges.low), np.isfinite(low))
-    assert np.array_equal(np.isfinite(edges.high), np.isfinite(high))
+    bounds = find_support_bounds(box(low, high), points)
+    assert np.array_equal(np.isfinite(bounds.low), np.isfinite(low))
+    assert np.array_equal(np.isfinite(bounds.high), np.isfinite(high))
     finite = np.isfinite(low)
-    assert np.allclose(edges.low[finite], low[finite], rtol=0, atol=1e-14 * unit)
-    assert np.all(edges.low <= low) and np.all(edges.high >= high)  # a point in the support is never beyond
+    assert np.allclose(bounds.low[finite], low[finite], rtol=0, atol=1e-14 * unit)
+    assert np.all(bounds.low <= low) and np.all(bounds.high >= high)  # points in the support never lie beyond a bound
 
 
-def test_a_triangle_has_no_edges_where_they_depend_on_the_rest(rng):
+def test_bounds_that_depend_on_other_parameters_are_not_used(rng):
     points = np.sort(rng.uniform(size=(200, 2)), axis=1)
-    edges = find_support_bounds(lambda x: (0 <= x[:, 0]) & (x[:, 0] <= x[:, 1]) & (x[:, 1] <= 1), points)
-    assert edges.high[0] == np.inf and edges.low[1] == -np.inf
-    assert edges.low[0] == pytest.approx(0, abs=1e-12) and edges.high[1] == pytest.approx(1)
+    bounds = find_support_bounds(lambda x: (0 <= x[:, 0]) & (x[:, 0] <= x[:, 1]) & (x[:, 1] <= 1), points)
+    assert bounds.high[0] == np.inf and bounds.low[1] == -np.inf
+    assert bounds.low[0] == pytest.approx(0, abs=1e-12) and bounds.high[1] == pytest.approx(1)
 
 
-def test_points_open_up_and_close(rng):
-    edges = SupportBounds(np.array([0.0, -3.0, -np.inf, -np.inf]), np.array([np.inf, 7.0, 5.0, np.inf]), np.ones(4))
+def test_transformation_is_inverted_and_its_jacobian_is_right(rng):
+    bounds = SupportBounds(np.array([0.0, -3.0, -np.inf, -np.inf]), np.array([np.inf, 7.0, 5.0, np.inf]), np.ones(4))
     x = np.array([1.0, 2.0, 4.0, 0.0]) + 0.9 * rng.uniform(-1, 1, size=(50, 4))
-    assert np.allclose(from_unbounded(edges, to_unbounded(edges, x)), x, rtol=1e-12)
+    assert np.allclose(from_unbounded(bounds, to_unbounded(bounds, x)), x, rtol=1e-12)
     step = 1e-6
     slopes = [
-        (to_unbounded(edges, x + step * e) - to_unbounded(edges, x - step * e))[:, j] for j, e in enumerate(np.eye(4))
+        (to_unbounded(bounds, x + step * e) - to_unbounded(bounds, x - step * e))[:, j] for j, e in enumerate(np.eye(4))
     ]
-    assert np.allclose(log_abs_det_jacobian(edges, x), np.sum(np.log(np.array(slopes) / (2 * step)), axis=0), atol=1e-6)
-    assert np.all(log_abs_det_jacobian(edges, x - [10, 0, 0, 0]) == -np.inf)
+    assert np.allclose(
+        log_abs_det_jacobian(bounds, x), np.sum(np.log(np.array(slopes) / (2 * step)), axis=0), atol=1e-6
+    )
+    assert np.all(log_abs_det_jacobian(bounds, x - [10, 0, 0, 0]) == -np.inf)
 
 
 def corner(rng, n):
     return rng.exponential(size=(n, 3)) * np.array([1e-3, 1.0, 1e3])
 
 
-def test_a_corner_is_followed_to_the_edge(rng):
-    """The density of a mixture at an exponential corner is the one drawn from, and it is nearly that of the corner."""
+def test_mixture_fits_a_density_at_its_bounds(rng):
+    """At the corner of an exponential density, draws follow the density of the mixture, and it fits closely."""
     scale = np.array([1e-3, 1.0, 1e3])
     x = corner(rng, 2000)
-    edges = find_support_bounds(box(np.zeros(3), np.full(3, np.inf)), x)
-    mixture = fit_mixture(x, uniform(2000), edges=edges)
-    assert np.all(np.isfinite(mixture.edges.low))
+    bounds = find_support_bounds(box(np.zeros(3), np.full(3, np.inf)), x)
+    mixture = fit_mixture(x, uniform(2000), bounds=bounds)
+    assert np.all(np.isfinite(mixture.bounds.low))
     drawn = draw(mixture, 20_000, rng)
     assert drawn.min() > -1e-12
     weights = np.exp(-np.sum(drawn / scale, axis=1) - np.sum(np.log(scale)) - log_density(mixture, drawn))
@@ -204,18 +206,18 @@ def test_a_corner_is_followed_to_the_edge(rng):
 
 
 @pytest.mark.parametrize("kernel", [0, 1, 2], ids=["independence", "local walk", "differences"])
-def test_each_kernel_keeps_a_target_at_an_edge(kernel, rng):
+def test_each_kernel_keeps_a_target_at_a_bound(kernel, rng):
     n = 20_000
     x = corner(rng, n)
     scale = np.array([1e-3, 1.0, 1e3])
     inside = box(np.zeros(3), np.full(3, np.inf))
     move = MixtureMove()
     move.calibrate(x[:300] * np.array([1.1, 0.9, 1.0]), uniform(300), inside)
-    assert move._mixture.edges is not None
+    assert move._mixture.bounds is not None
     random = np.random.RandomState(rng.integers(2**31))
     start = x.copy()
     for _ in range(5):
-        move._turn = kernel
+        move._current = kernel
         proposed, factors = move._draw(x, random)
         change = np.where(inside(proposed), -np.sum((proposed - x) / scale, axis=1), -np.inf)
         accepted = np.log(random.uniform(size=n)) < change + factors

@@ -69,7 +69,7 @@ def test_conjugate_gaussian(mode, seed):
         StudentTMove(),
         [(StudentTMove(dof=5.0), 0.5), (RandomWalkMove(), 0.5)],
         emcee.moves.StretchMove(),
-        MixtureMove(enough=1.0),
+        MixtureMove(independence_threshold=1.0),
     ],
     ids=["walk", "adaptive walk", "t", "weighted", "stretch", "mixture"],
 )
