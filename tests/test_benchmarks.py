@@ -1,4 +1,4 @@
-"""The tables of the benchmarks never pass over a run without an answer, and score weighted samples as they should."""
+"""Tables of the benchmarks: runs without a result have a row, and weighted samples are scored correctly."""
 
 import json
 
@@ -26,7 +26,7 @@ ANSWER = {
 STOPPED = {"evaluations": 900, "reason": "stopped at 150 s"}
 
 
-def test_row_scores_the_answers_and_names_the_runs_without_one():
+def test_row_scores_the_results_and_names_the_runs_without_one():
     row = as_row("peer", "T1", [ANSWER, STOPPED, ANSWER | {"z": 0.4, "evidence": 0.5, "warned": True}])
     assert row.value == pytest.approx(1100 / 3)
     assert row.note == (
@@ -40,7 +40,7 @@ def test_row_of_runs_that_all_failed_is_still_there():
 
 
 def test_peer_that_is_not_installed_has_a_row(monkeypatch, tmp_path):
-    monkeypatch.setattr(peers, "PEERS", {"absent": peers._Peer("no_such_module", peers._emcee)})
+    monkeypatch.setattr(peers, "PEERS", {"absent": peers.Peer("no_such_module", peers.run_emcee)})
     (row,) = peers.rows(1)
     assert row == Row("absent: evaluations", "", None, "", "not installed: pip install '.[peers]'")
     assert as_table([row]).splitlines()[-1].split()[:3] == ["absent:", "evaluations", "-"]
@@ -50,7 +50,7 @@ def test_peer_that_is_not_installed_has_a_row(monkeypatch, tmp_path):
 
 def test_run_is_stopped_at_the_limit(monkeypatch):
     monkeypatch.setattr(peers, "LIMIT", 0.1)  # less than the imports of a new process take
-    assert peers._run("emcee, stretch move", "T3", 1) == {"evaluations": 0, "reason": "stopped at 0 s"}
+    assert peers.run_peer("emcee, stretch move", "T3", 1) == {"evaluations": 0, "reason": "stopped at 0 s"}
 
 
 def test_errors_of_weighted_samples_are_those_of_repeated_ones(shared, rng):
@@ -69,7 +69,7 @@ def test_target_counts_every_point_of_the_likelihood_and_none_outside_the_prior(
     assert target.evaluations == 6
 
 
-def test_table_parts_its_groups_and_shows_whole_numbers_in_full():
+def test_table_separates_its_groups_and_shows_whole_numbers_in_full():
     table = as_table([Row("runs", "a", 234567.0, "", "x")], [Row("time", "b", 0.0012345, "s")]).splitlines()
     assert [line.split() for line in table[2:]] == [["runs", "a", "234567", "x"], [], ["time", "b", "0.00123", "s"]]
 
@@ -104,21 +104,21 @@ def test_exponent_of_a_power_law():
 def test_run_over_its_limit_is_stopped_and_has_a_row():
     rows = job.job(1, limit=0.2)  # less than the imports take
     assert [row.value for row in rows] == [None, None]
-    assert all(row.note == "stopped at 0.2 s, before its first stage was done" for row in rows)
+    assert all(row.note == "stopped at 0.2 s, before the end of its first stage" for row in rows)
 
 
-def test_stopped_run_tells_how_far_it_came(tmp_path):
+def test_row_of_a_stopped_run_gives_the_stage_reached(tmp_path):
     target = Gaussian(2)
     backend = emcee.backends.HDFBackend(tmp_path / "chain.h5")
     sampler = SMCSampler(50, 2, target, vectorize=True, seed=1, backend=backend)
     sampler.run_mcmc(None, 1)
     evaluations = sum(stage.evaluations for stage in sampler.ladder)
-    assert job._how_far(tmp_path / "chain.h5") == (
+    assert job.stage_reached(tmp_path / "chain.h5") == (
         f"after {len(sampler.ladder)} stages and {evaluations} evaluations, at beta = 1"
     )
 
 
-def test_two_settings_are_told_apart_by_cost_and_answer():
+def test_two_settings_are_compared_in_cost_and_result():
     default = {"simulations": 10, "seconds": 2.0, "cpu": 2.0, "mean": [1.0, 5.0], "sd": [1.0, 2.0]}
     paper = {"simulations": 40, "seconds": 6.0, "cpu": 4.0, "mean": [1.5, 4.0], "sd": [1.1, 1.0]}
-    assert [row.value for row in job._beside(default, paper, "")] == pytest.approx([4.0, 3.0, 2.0, 0.5, 50.0])
+    assert [row.value for row in job.compare_settings(default, paper, "")] == pytest.approx([4.0, 3.0, 2.0, 0.5, 50.0])

@@ -1,5 +1,5 @@
-"""Speed, measured: ``python -m tests.benchmarks`` prints one table and keeps it in ``results/benchmarks.json``.
+"""Benchmarks: ``python -m tests.benchmarks`` prints one table and stores it in ``results/benchmarks.json``.
 
-A benchmark is a function of the number of repeats that returns `Row`s; `__main__` holds the list of them. Nothing here
-asserts a time: machines differ and are shared, tests must not depend on that.
+A benchmark is a function of the number of repeats that returns a list of `Row`; `__main__` lists all of them. No time
+is asserted, because machines differ and are shared.
 """

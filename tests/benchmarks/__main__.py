@@ -27,16 +27,16 @@ BENCHMARKS = {
 
 
 def main() -> None:
-    """Run the benchmarks that were asked for, print their table and keep it."""
+    """Run the selected benchmarks, print their table and store it."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", help=f"some of {', '.join(BENCHMARKS)}; all by default")
-    parser.add_argument("--repeats", type=int, default=3, help="of which the median is taken (default 3)")
+    parser.add_argument("--repeats", type=int, default=3, help="number of repeats; the median is reported (default 3)")
     parser.add_argument("--out", type=Path, default=Path("results") / "benchmarks.json")
     parser.add_argument(
-        "--compare", nargs=2, type=Path, metavar=("BEFORE", "AFTER"), help="two such files; runs nothing"
+        "--compare", nargs=2, type=Path, metavar=("BEFORE", "AFTER"), help="compare two stored files; runs no benchmark"
     )
-    parser.add_argument("--every", type=int, default=job.EVERY, help="of job: one sample in so many; 1: full record")
-    parser.add_argument("--limit", type=float, default=job.LIMIT, help="of job: seconds for each run; 0: none")
+    parser.add_argument("--every", type=int, default=job.EVERY, help="job: use one sample in EVERY; 1: full record")
+    parser.add_argument("--limit", type=float, default=job.LIMIT, help="job: time limit of each run [s]; 0: none")
     arguments = parser.parse_args()
     if arguments.compare:
         try:
@@ -45,9 +45,9 @@ def main() -> None:
             parser.error(str(error))
         return
     if unknown := set(arguments.names) - set(BENCHMARKS):
-        parser.error(f"expected names out of {', '.join(BENCHMARKS)}; got {', '.join(unknown)}")
+        parser.error(f"expected names among {', '.join(BENCHMARKS)}; got {', '.join(unknown)}")
     if arguments.repeats < 1:
-        parser.error(f"expected one repeat or more; got {arguments.repeats}")
+        parser.error(f"expected at least one repeat; got {arguments.repeats}")
     if arguments.every < 1 or arguments.limit < 0:
         parser.error(f"expected --every of 1 or more, --limit not below 0; got {arguments.every}, {arguments.limit:g}")
     benchmarks = BENCHMARKS | {"job": partial(job.job, every=arguments.every, limit=arguments.limit)}
@@ -58,7 +58,7 @@ def main() -> None:
     print(" before and ".join(str(m["load_average"][:1]) for m in machines), "after")
     print(as_table(*groups))
     write_json(arguments.out, [row for rows in groups for row in rows], machines)
-    print(f"kept in {arguments.out}")
+    print(f"stored in {arguments.out}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""The isolated bridge beside OpenSees at the same law and step, and beside scipy's solvers: 15 s at 200 samples/s.
+"""Time per simulation of the isolated bridge, compared with OpenSees and with the solvers of scipy.
 
-Errors are those of the worst of twelve channels, relative to its peak, against solvers at tight tolerances. OpenSees
-runs the elastic-plastic law of its sliders without the rubber's half loop, and the model does the same beside it.
+The record has 15 s at 200 samples/s. Errors are those of the worst of twelve channels, relative to its peak, against
+solvers with tight tolerances. OpenSees uses an elastic-plastic law for the sliders and no half loop of the rubber; the
+model uses the same law and the same step in that comparison.
 """
 
 import time
@@ -21,14 +22,17 @@ __all__ = ["simulation"]
 
 DT, N_STEPS = 0.005, 3001
 STEPS = (5e-4, 2.5e-4)  # s; the second is the default
-TOLERANCE = 1e-8  # OpenSees': norm of the last increment [m and rad]; less does not change its error
+TOLERANCE = 1e-8  # norm of the last increment in OpenSees [m and rad]; a smaller one does not change its error
 SOLVERS = (("LSODA", 1e-6), ("LSODA", 1e-8), ("DOP853", 1e-6), ("Radau", 1e-6))
 NO_LOOP = (0.0, 0.0, 0.0)
 NOMINAL = np.ones(10)
 
 
 def _ground() -> np.ndarray:
-    """Stationary noise through a soil of 2.5 Hz, damped by .6, growing for a second and dying out; peak 5.5 m/s2."""
+    """Synthetic ground acceleration (n_steps,): white noise through a soil filter of 2.5 Hz with 60 % damping.
+
+    The envelope rises for one second and decays after five; the peak is 5.5 m/s².
+    """
     t = np.arange(N_STEPS) * DT
     frequency, damping = 2.0 * np.pi * 2.5, 0.6
     soil = ([2.0 * damping * frequency, frequency**2], [1.0, 2.0 * damping * frequency, frequency**2])
@@ -45,7 +49,7 @@ def _timed(function: Callable[[], np.ndarray]) -> tuple[float, np.ndarray]:
 
 
 def _models(record: Record) -> dict[tuple[str, float], Callable[[], np.ndarray]]:
-    """The model's simulations by law and step."""
+    """Functions that run one simulation, for each friction law and step."""
     from fe_likelihoods.models.isolated_bridge import IsolatedBridge, Rubber
 
     laws = {"bouc-wen": {}, "elastic-plastic": {"friction": "elastic-plastic", "rubber": Rubber(half_loop=NO_LOOP)}}
@@ -58,7 +62,7 @@ def _models(record: Record) -> dict[tuple[str, float], Callable[[], np.ndarray]]
 
 
 def simulation(repeats: int) -> list[Row]:
-    """CPU time of one simulation on one core, all codes in turns, with the error of each beside its time."""
+    """CPU time of one simulation on one core and its error; the codes run in alternation."""
     ground = _ground()
     plain = Definition(loop=NO_LOOP)
     reference = {
@@ -67,7 +71,7 @@ def simulation(repeats: int) -> list[Row]:
     }
     ours = _models(Record("noise", DT, ground))
     for function in ours.values():
-        function()  # compiled from here on
+        function()  # compile before the measurement
     seconds, errors = {}, {}
 
     def note(key: tuple, law: str, cost: float, response: np.ndarray) -> None:
@@ -77,7 +81,7 @@ def simulation(repeats: int) -> list[Row]:
 
     for _ in range(repeats):
         for key, function in ours.items():
-            for _ in range(5):  # short: several, or the clock's resolution shows
+            for _ in range(5):  # one run is too short for the resolution of the clock
                 note(key, key[0], *_timed(function))
         for step in STEPS:
             done = run(plain, ground, DT, step=step, tolerance=TOLERANCE)
@@ -90,7 +94,7 @@ def simulation(repeats: int) -> list[Row]:
 
 
 def _rows(seconds: dict[tuple, list[float]], errors: dict[tuple, float | None]) -> list[Row]:
-    """Times, errors and ratios: with OpenSees at the same law and step, with scipy at its own tolerance."""
+    """Rows of times, errors and ratios: to OpenSees at the same law and step, to scipy at its own tolerance."""
 
     def spread(key: tuple) -> str:
         error = "did not finish" if errors[key] is None else f"worst peak error {errors[key]:.1e}"
@@ -114,7 +118,7 @@ def _rows(seconds: dict[tuple, list[float]], errors: dict[tuple, float | None]) 
         case = f"bouc-wen, {key[0]} {key[1]:g}"
         rows.append(Row("scipy, CPU time", case, median(seconds[key]), "s", spread(key)))
         for step in STEPS:
-            note = "right-hand side compiled in scipy's"
+            note = "scipy has a compiled right-hand side"
             beside = f"{1e3 * step:g} ms beside {key[0]} {key[1]:g}"
             rows.append(Row("IsolatedBridge, times faster", beside, ratio(key, ("bouc-wen", step)), "", note))
     return rows

@@ -1,4 +1,4 @@
-"""What it costs to be told a simulation instead of running it, and to keep it: microseconds a row."""
+"""Time to read a simulation from the cache and to store it, in microseconds per row."""
 
 import pickle
 import tempfile
@@ -27,14 +27,14 @@ def _seconds(function: Callable, *arguments) -> float:
 
 
 def _fresh(likelihood: FELikelihood, path: Path) -> FELikelihood:
-    """A likelihood that remembers nothing, beside a file that is open."""
+    """A likelihood with an empty memory cache and an open file."""
     other = FELikelihood(likelihood.model, likelihood.measurements, cache=path)
     other.cache.look_up("", np.zeros((1, 5)), 2, 1)
     return other
 
 
 def cache(repeats: int) -> list[Row]:
-    """Rows of the bridge column, out of a file of a hundred thousand."""
+    """Times per row of the bridge column, with a file of 100 000 rows."""
     rng = np.random.default_rng(1)
     thetas = rng.uniform(0.5, 1.5, size=(STORED, 5))
     rows = []
@@ -58,15 +58,25 @@ def cache(repeats: int) -> list[Row]:
                 memory.append(median(_seconds(other.misfit, thetas[batch]) for batch in batches) / size)
                 if other.simulations or other.disk_hits != 20 * size:
                     raise RuntimeError(f"expected {20 * size} rows from disk, got {other.disk_hits}")
-                thetas[batches] += 1.0  # not yet known
+                thetas[batches] += 1.0  # not yet in the cache
                 stored.append(median(_seconds(store, batch) for batch in batches) / size)
             case = f"batches of {size}"
             rows += [
                 Row(
-                    "cache, wall a row", f"from memory, {case}", 1e6 * median(memory), "us", f"at most {LIMIT_MEMORY:g}"
+                    "cache, wall time per row",
+                    f"from memory, {case}",
+                    1e6 * median(memory),
+                    "us",
+                    f"at most {LIMIT_MEMORY:g}",
                 ),
-                Row("cache, wall a row", f"from disk, {case}", 1e6 * median(disk), "us", f"at most {LIMIT_DISK:g}"),
-                Row("cache, wall a row", f"stored, {case}", 1e6 * median(stored), "us"),
+                Row(
+                    "cache, wall time per row",
+                    f"from disk, {case}",
+                    1e6 * median(disk),
+                    "us",
+                    f"at most {LIMIT_DISK:g}",
+                ),
+                Row("cache, wall time per row", f"stored, {case}", 1e6 * median(stored), "us"),
             ]
         likelihood.cache.close()
         size = path.stat().st_size
@@ -75,6 +85,6 @@ def cache(repeats: int) -> list[Row]:
         reopened = median(_seconds(copy.misfit, thetas[:1]) for copy in copies)
     return [
         *rows,
-        Row("cache, opened and checked", f"{STORED} rows", 1e3 * opened, "ms", f"{size / STORED:.0f} bytes a row"),
+        Row("cache, opened and checked", f"{STORED} rows", 1e3 * opened, "ms", f"{size / STORED:.0f} bytes per row"),
         Row("cache, first row in another process", f"{STORED} rows", 1e3 * reopened, "ms"),
     ]

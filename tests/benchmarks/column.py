@@ -1,4 +1,4 @@
-"""The bridge column beside OpenSees: 50 s at 1/256 s, 88 fibers in each of six sections."""
+"""Time per simulation of the bridge column, compared with OpenSees: 50 s at 1/256 s, six sections of 88 fibers."""
 
 import importlib.util
 import time
@@ -35,7 +35,7 @@ def _cpu_seconds(function, *arguments) -> float:
 
 
 def simulation(repeats: int) -> list[Row]:
-    """CPU time of one simulation on one thread, the two codes in turns, with equal tolerances; and their agreement."""
+    """CPU time of one simulation on one thread with equal tolerances, and the difference of the responses."""
     rows = []
     for case, (theta, scale) in CASES.items():
         record = bridge_column_data().record.scale(scale)
@@ -43,7 +43,7 @@ def simulation(repeats: int) -> list[Row]:
         model = RCColumn.lhpost(record, tolerance=TOLERANCE * INCH, element_tolerance=1e-12 * KIP * INCH)
         fibers = sum(map(len, model.section()))
         peer = peer_of(model, theta)
-        response = model.simulate(theta)  # compiled from here on
+        response = model.simulate(theta)  # compile before the measurement
         ours, defaults, theirs = [], [], []
         for _ in range(repeats):
             ours.append(_cpu_seconds(model.simulate, theta))
@@ -65,7 +65,7 @@ def simulation(repeats: int) -> list[Row]:
 
 
 def batch(repeats: int) -> list[Row]:
-    """Wall time of 64 draws of the prior on one thread and on more, then on two processes."""
+    """Wall time of 64 draws of the prior on one and more threads, and on two processes."""
     model = RCColumn.lhpost(bridge_column_data().record)
     thetas = bridge_column_prior().rvs(64, 1)[:, :5]
     model.simulate(thetas[0])
@@ -84,10 +84,10 @@ def batch(repeats: int) -> list[Row]:
     ]
     numba.set_num_threads(1)
     for name, pool, close in _pools():
-        engine, times = as_executor(pool, model), {1: [], 2: []}
-        misfit_batch(model, thetas, np.zeros((2, model.n_steps)), engine)  # workers start and compile nothing
+        executor, times = as_executor(pool, model), {1: [], 2: []}
+        misfit_batch(model, thetas, np.zeros((2, model.n_steps)), executor)  # start the workers
         for _ in range(repeats):
-            for n, used in ((1, None), (2, engine)):
+            for n, used in ((1, None), (2, executor)):
                 start = time.perf_counter()
                 misfit_batch(model, thetas, np.zeros((2, model.n_steps)), used)
                 times[n].append(time.perf_counter() - start)
@@ -98,7 +98,7 @@ def batch(repeats: int) -> list[Row]:
 
 
 def _pools() -> Iterator[tuple[str, Any, Callable[[], None]]]:
-    """Engines of two processes, and how to end them."""
+    """Pools of two processes, and the function that ends each."""
     local = LocalPool(2)
     yield "2 processes, local pool", local, local.close
     if importlib.util.find_spec("distributed"):

@@ -1,4 +1,4 @@
-"""Two versions beside one another: ``python -m tests.benchmarks --compare before.json after.json``."""
+"""Compare two versions: ``python -m tests.benchmarks --compare before.json after.json``."""
 
 import json
 from pathlib import Path
@@ -11,12 +11,12 @@ CHANGED = 1.1
 
 
 def _read(path: Path) -> tuple[dict, dict[tuple[str, str], dict]]:
-    """The machine, and the rows by what and case.
+    """The machine, and the rows by their columns "what" and "case".
 
     Raises
     ------
     ValueError
-        If the file is not there, or is none that the benchmarks wrote.
+        If the file does not exist or was not written by the benchmarks.
     """
     try:
         kept = json.loads(path.read_text())
@@ -26,10 +26,10 @@ def _read(path: Path) -> tuple[dict, dict[tuple[str, str], dict]]:
 
 
 def compare(before: Path, after: Path) -> str:
-    """One table of two files: both values and their ratio, a star where it is more than 10 % from one.
+    """One table of two files: both values and their ratio, with a star where it differs from 1 by more than 10 %.
 
-    Rows that only one of the files has are there with a dash for the other. Figures of two machines, or of times at
-    which others were at work, do not compare: what each file says of that stands above the table.
+    Rows that only one file has show a dash for the other. Figures of different machines, or measured under other load,
+    cannot be compared: processor and load average of both files are printed above the table.
     """
     (machine_before, old), (machine_after, new) = _read(before), _read(after)
     lines = [
@@ -38,7 +38,7 @@ def compare(before: Path, after: Path) -> str:
         for name, machine in (("before", machine_before), ("after", machine_after))
     ]
     if machine_before.get("cpu") != machine_after.get("cpu"):
-        lines.append("the processors differ: ratios of times are those of the machines too")
+        lines.append("the processors differ: ratios of times compare the machines as well")
     cells = [("what", "case", "before", "after", "unit", "after / before", "")]
     for key in [*new, *(key for key in old if key not in new)]:
         values = [None if row is None else row["value"] for row in (old.get(key), new.get(key))]

@@ -1,7 +1,7 @@
-"""What the samplers themselves cost per evaluation, beside a vectorised likelihood that costs next to nothing.
+"""Overhead of the samplers per evaluation, measured with a vectorised likelihood of negligible cost.
 
-CPU time in process for plain moves, mixtures and recycling. What a file costs is in `storage`, how these figures grow
-with walkers and parameters in `growth`.
+CPU time of the process for plain moves, mixture moves and recycling. The overhead of a file is measured in `storage`,
+the growth with walkers and parameters in `growth`.
 """
 
 import tempfile
@@ -25,7 +25,7 @@ NDIM, STEPS, LIMIT_PLAIN, LIMIT_MIXTURE = 7, 200, 5.0, 150.0
 
 
 def run_emcee(nwalkers: int, backend: emcee.backends.Backend | None = None) -> int:
-    """A run of emcee's stretch move; evaluations."""
+    """Run emcee's stretch move; returns the number of evaluations."""
     posterior = Gaussian(NDIM, sd=0.01)
     sampler = emcee.EnsembleSampler(nwalkers, NDIM, posterior, vectorize=True, backend=backend)
     sampler.run_mcmc(posterior.sample_prior(nwalkers, np.random.default_rng(1)), STEPS)
@@ -35,7 +35,7 @@ def run_emcee(nwalkers: int, backend: emcee.backends.Backend | None = None) -> i
 def run_smc(
     nwalkers: int, backend: emcee.backends.Backend | None = None, ndim: int = NDIM, steps: int = STEPS, **settings
 ) -> int:
-    """A run of `SMCSampler`; evaluations."""
+    """Run `SMCSampler`; returns the number of evaluations."""
     posterior = Gaussian(ndim, sd=0.01)
     sampler = SMCSampler(nwalkers, ndim, posterior, vectorize=True, seed=1, backend=backend, **settings)
     sampler.run_mcmc(None, steps)
@@ -43,12 +43,12 @@ def run_smc(
 
 
 def run_walk(nwalkers: int, backend: emcee.backends.Backend | None = None) -> int:
-    """A run of `SMCSampler` by random walks; evaluations."""
+    """Run `SMCSampler` with random-walk moves; returns the number of evaluations."""
     return run_smc(nwalkers, backend, moves=RandomWalkMove())
 
 
 def per_evaluation(run: Callable, nwalkers: int, in_file: bool, clock: Callable[[], float], repeats: int) -> float:
-    """Median seconds an evaluation."""
+    """Median seconds per evaluation."""
     values = []
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as folder:
@@ -60,7 +60,7 @@ def per_evaluation(run: Callable, nwalkers: int, in_file: bool, clock: Callable[
 
 
 def cost(repeats: int) -> list[Row]:
-    """Microseconds an evaluation."""
+    """CPU time per evaluation [µs]."""
     rows = []
     kinds = {
         "plain moves (random walk)": (run_walk, f"at most {LIMIT_PLAIN:g}"),
@@ -70,5 +70,5 @@ def cost(repeats: int) -> list[Row]:
     }
     for name, (run, note) in kinds.items():
         value = 1e6 * per_evaluation(run, 500, False, time.process_time, repeats)
-        rows.append(Row("sampler, CPU an evaluation", f"{name}, 500 walkers", value, "us", note))
+        rows.append(Row("sampler, CPU time per evaluation", f"{name}, 500 walkers", value, "us", note))
     return rows

@@ -1,9 +1,9 @@
-"""How cost grows: of a simulation with fibers and steps, of a run with particles and parameters.
+"""Growth of cost: of a simulation with fibers and steps, of a run with particles and parameters.
 
-Each quantity is doubled a few times while everything else stays, all sizes in turns; the last row of each gives the
-exponent p of cost ~ size^p over the last doubling, as small sizes may go another way (with few particles the default
-SMC gives up recycling and moves). Simulations are of the column and the bridge at nominal
-values; runs are of the default SMC on a Gaussian of seven parameters, a hundredth as wide as its prior.
+Each quantity is doubled a few times while all others stay constant, and the sizes are run in alternation. The last row
+of each group is the exponent p of cost ~ size^p over the last doubling, because small sizes may use another algorithm
+(with few particles the default SMC uses moves instead of recycling). Simulations are of the column and the bridge at
+nominal values; runs are of the default SMC on a Gaussian of seven parameters, a hundredth as wide as its prior.
 """
 
 import math
@@ -37,12 +37,12 @@ def _timed(function: Callable[[], int | None]) -> _Cost:
 
 
 def exponent(sizes: list[float], costs: list[float]) -> float:
-    """p of cost ~ size^p between the last two."""
+    """Exponent p of cost ~ size^p between the last two sizes."""
     return math.log(costs[-1] / costs[-2]) / math.log(sizes[-1] / sizes[-2])
 
 
 def _in_turns(functions: Mapping[float, Callable[[], int | None]], repeats: int) -> dict[float, _Cost]:
-    """Median cost of each size; the sizes take turns, so that a busy minute meets all of them."""
+    """Median cost of each size. The sizes alternate, so that other load on the machine affects all of them."""
     costs = {size: [] for size in functions}
     for _ in range(repeats):
         for size, function in functions.items():
@@ -55,7 +55,7 @@ def _simulate(model: RCColumn | IsolatedBridge) -> None:
 
 
 def _simulations() -> dict[str, dict[float, Callable]]:
-    """Simulations by their sizes: 12.5 s of the column, 15 s of the bridge."""
+    """Functions that run one simulation, by size: 12.5 s of the column, 15 s of the bridge."""
     record = bridge_column_data().record.trim(0.0, 12.5)
     ground = isolated_bridge_data().record
     models = {
@@ -76,7 +76,7 @@ def _simulations() -> dict[str, dict[float, Callable]]:
 
 
 def _runs() -> dict[str, dict[float, Callable]]:
-    """Runs by their sizes."""
+    """Functions that run the sampler, by size."""
     return {
         "particles": {n: partial(run_smc, n, steps=1) for n in (125, 250, 500, 1000, 2000)},
         "parameters": {n: partial(run_smc, 500, ndim=n, steps=1) for n in (2, 4, 8, 16)},
@@ -84,17 +84,17 @@ def _runs() -> dict[str, dict[float, Callable]]:
 
 
 def growth(repeats: int) -> list[Row]:
-    """CPU time by size, and the exponent."""
+    """CPU time for each size, and the exponent."""
     rows = []
     for what, functions in _simulations().items():
-        next(iter(functions.values()))()  # compiled from here on
+        next(iter(functions.values()))()  # compile before the measurement
         costs = _in_turns(functions, repeats)
         rows += [Row(f"growth, {what}", f"{size}", 1e3 * cost.seconds, "ms", "CPU") for size, cost in costs.items()]
         rows.append(_exponent(what, list(costs), [cost.seconds for cost in costs.values()]))
     for what, functions in _runs().items():
         costs = _in_turns(functions, repeats)
         for size, cost in costs.items():
-            note = f"{1e6 * cost.seconds / cost.evaluations:.0f} us CPU an evaluation"
+            note = f"{1e6 * cost.seconds / cost.evaluations:.0f} us CPU per evaluation"
             rows.append(Row(f"growth, evaluations of a run: {what}", f"{size}", cost.evaluations, "", note))
         rows.append(_exponent(f"evaluations of a run: {what}", list(costs), [c.evaluations for c in costs.values()]))
     return rows
@@ -102,4 +102,4 @@ def growth(repeats: int) -> list[Row]:
 
 def _exponent(what: str, sizes: list[float], costs: list[float]) -> Row:
     case = f"exponent, {sizes[-2]} to {sizes[-1]}"
-    return Row(f"growth, {what}", case, exponent(sizes, costs), "", "1: in proportion")
+    return Row(f"growth, {what}", case, exponent(sizes, costs), "", "1: proportional")

@@ -1,10 +1,10 @@
-"""The whole job: simulations, time and memory from the prior to the column's posterior, by default and as in the paper.
+"""Simulations, time and memory of a whole update of the column, with the default settings and with those of the paper.
 
-Seven parameters of the bridge column are updated by the default SMC and by the paper's setting (1000 particles, ten
-Metropolis steps a stage, its ladder read literally), on the same data, each in a process of its own that keeps its
-chain in a file, as the tutorial does. The paper's setting costs some 235 000 simulations: by default the record is
-reduced to one sample in sixteen, and a run that takes longer than its limit is stopped, and its row says how far it
-came; nothing is extrapolated. ``--every 4`` takes the tutorial's reduced setting, ``--every 1`` the full record.
+Seven parameters of the bridge column are updated by the default SMC and by the settings of the paper (1000 particles,
+ten Metropolis steps per stage, literal reading of its ladder) on the same data. Each run has its own process and stores
+its chain in a file, as the tutorial does. The settings of the paper need about 235 000 simulations, so by default the
+record is reduced to one sample in sixteen. A run that exceeds its time limit is stopped and its row reports the stage
+reached; nothing is extrapolated. ``--every 4`` is the reduced setting of the tutorial, ``--every 1`` the full record.
 
 One run: ``python -m tests.benchmarks.job SETTING EVERY FILE``.
 """
@@ -21,26 +21,26 @@ import numpy as np
 
 from .rows import Row
 
-__all__ = ["EVERY", "LIMIT", "job", "memory"]
+__all__ = ["EVERY", "LIMIT", "compare_settings", "job", "memory", "stage_reached"]
 
 ROOT = Path(__file__).resolve().parents[2]
 EVERY, LIMIT = 16, 900.0
-SETTINGS = {"default": "SMC, default, 500 walkers", "paper": "SMC, the paper's, 1000 particles x 10 moves a stage"}
+SETTINGS = {"default": "SMC, default, 500 walkers", "paper": "SMC, paper, 1000 particles x 10 moves per stage"}
 SEED = 1
 BATCH = 500
 
 
 def _peak() -> float:
-    """Most memory that this program ever held [MiB]."""
+    """Peak resident memory of this process [MiB]."""
     status = Path("/proc/self/status")
-    if status.exists():  # ru_maxrss includes that of the process which started this one
+    if status.exists():  # ru_maxrss includes the peak of the parent process
         return int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**10
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
 def _run(setting: str, every: int, path: str) -> dict:
-    """One run; its cost and its posterior."""
+    """Cost and posterior of one run."""
     from emcee.backends import HDFBackend
 
     from fe_likelihoods.problems import bridge_column
@@ -48,7 +48,7 @@ def _run(setting: str, every: int, path: str) -> dict:
 
     walkers, sweeps, settings = {"default": (500, 4, {}), "paper": (1000, 1, RAMANCHA_2022_LITERAL)}[setting]
     posterior = bridge_column(every=every)
-    posterior(posterior.sample_prior(1, 1))  # compiled from here on; counted, and one more
+    posterior(posterior.sample_prior(1, 1))  # compile before the measurement; this simulation is subtracted below
     start, cpu = time.perf_counter(), time.process_time()
     sampler = SMCSampler(
         walkers, posterior.ndim, posterior, vectorize=True, seed=SEED, backend=HDFBackend(path), **settings
@@ -69,7 +69,7 @@ def _run(setting: str, every: int, path: str) -> dict:
 
 
 def _memory() -> dict:
-    """Peak so far, after each thing that a job does on the full record [MiB]."""
+    """Peak memory [MiB] after each step of a run on the full record."""
     peaks = {"interpreter and NumPy": _peak()}
     from fe_likelihoods.problems import bridge_column
     from samplers import SMCSampler  # noqa: F401
@@ -85,19 +85,19 @@ def _memory() -> dict:
 
 
 def _ask(*arguments: str, limit: float | None = None) -> dict | None:
-    """What one process says, None if it was stopped at `limit` seconds."""
+    """Result that one process prints; None if it was stopped after `limit` seconds."""
     command = [sys.executable, "-m", "tests.benchmarks.job", *arguments]
     try:
         run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=limit)
-    except subprocess.TimeoutExpired:  # it is killed
+    except subprocess.TimeoutExpired:
         return None
     if run.returncode:
         raise RuntimeError(f"{' '.join(arguments)} ended with code {run.returncode}: {run.stderr[-2000:]}")
     return json.loads(run.stdout.splitlines()[-1])
 
 
-def _how_far(path: Path) -> str:
-    """What the file of a run that was killed tells of it."""
+def stage_reached(path: Path) -> str:
+    """Stage and evaluations reached by a run that was killed, read from its file."""
     from emcee.backends import HDFBackend
 
     from samplers import read_ladder
@@ -105,50 +105,52 @@ def _how_far(path: Path) -> str:
 
     ladder = read_ladder(JournaledBackend.of(HDFBackend(str(path)))) if path.exists() else ()
     if not ladder:
-        return "before its first stage was done"
+        return "before the end of its first stage"
     evaluations = sum(stage.evaluations for stage in ladder)
     return f"after {len(ladder)} stages and {evaluations} evaluations, at beta = {ladder[-1].beta:.3g}"
 
 
 def job(repeats: int, every: int = EVERY, limit: float = LIMIT) -> list[Row]:
-    """Both settings on one sample in `every`, once each (`repeats` is of no effect), within `limit` seconds each."""
+    """Both settings on one sample in `every`, one run each with a limit of `limit` seconds; `repeats` has no effect."""
     kept = "full record" if every == 1 else f"1 sample in {every}"
     rows, done = [], {}
     for setting, what in SETTINGS.items():
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "chain.h5"
             found = _ask(setting, str(every), str(path), limit=limit or None)
-            told = "" if found else f"stopped at {limit:g} s, {_how_far(path)}"
+            note = "" if found else f"stopped at {limit:g} s, {stage_reached(path)}"
         case = f"{what}, {kept}"
         if found is None:
-            rows.append(Row("job: simulations", case, None, "", told))
+            rows.append(Row("job: simulations", case, None, "", note))
             continue
         done[setting] = found
         evidence, error = found["log_evidence"]
         note = f"{found['stages']} stages, {found['failures']} failed; log Z {evidence:.2f} +- {error:.2f}; seed {SEED}"
         rows += [
             Row("job: simulations", case, found["simulations"], "", note),
-            Row("job: wall time", case, found["seconds"], "s", "compiled before"),
+            Row("job: wall time", case, found["seconds"], "s", "kernels compiled before"),
             Row("job: CPU time", case, found["cpu"], "s"),
             Row("job: peak memory", case, found["peak"], "MiB", "resident"),
         ]
-    return rows + (_beside(done["default"], done["paper"], kept) if len(done) == len(SETTINGS) else [])
+    return rows + (compare_settings(done["default"], done["paper"], kept) if len(done) == len(SETTINGS) else [])
 
 
-def _beside(default: dict, paper: dict, kept: str) -> list[Row]:
-    """The default beside the paper's setting: cost, and whether the two answers agree."""
+def compare_settings(default: dict, paper: dict, kept: str) -> list[Row]:
+    """Rows that compare the default with the settings of the paper: cost and difference of the posteriors."""
     means, sds = ([np.array(run[key]) for run in (default, paper)] for key in ("mean", "sd"))
     return [
         Row("job: paper / default, simulations", kept, paper["simulations"] / default["simulations"], ""),
         Row("job: paper / default, wall time", kept, paper["seconds"] / default["seconds"], ""),
         Row("job: paper / default, CPU time", kept, paper["cpu"] / default["cpu"], ""),
-        Row("job: means apart", kept, np.abs((means[1] - means[0]) / sds[0]).max(), "sd", "largest of the seven"),
-        Row("job: sds apart", kept, 100 * np.abs(sds[1] / sds[0] - 1.0).max(), "%", "largest of the seven"),
+        Row(
+            "job: difference of means", kept, np.abs((means[1] - means[0]) / sds[0]).max(), "sd", "largest of the seven"
+        ),
+        Row("job: difference of sds", kept, 100 * np.abs(sds[1] / sds[0] - 1.0).max(), "%", "largest of the seven"),
     ]
 
 
 def memory(repeats: int) -> list[Row]:
-    """Peak resident memory of the main job on the full record, as it grows; once (`repeats` is of no effect)."""
+    """Peak resident memory after each step of the update on the full record, measured once; `repeats` has no effect."""
     return [Row("memory, peak resident", case, value, "MiB") for case, value in _ask("memory").items()]
 
 

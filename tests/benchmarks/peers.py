@@ -1,20 +1,21 @@
-"""Other samplers on the same targets, counted and scored as ours are; the library itself never imports them.
+"""Other samplers on the same targets, counted and scored in the same way. The library itself never imports them.
 
-Every run has a process of its own and ``LIMIT`` seconds of wall time, imports and compilation included (a busy machine
-stops more of them); a run that is stopped, fails or has no peer to run says so in its row, one that warns is marked.
-The whole takes about twenty minutes for each of the ``--repeats``. Settings are the peer's own defaults, but for these:
+Every run has its own process and ``LIMIT`` seconds of wall time, which include imports and compilation (on a busy
+machine more runs are stopped). A row says so if a run was stopped, failed or warned, or if the sampler is not
+installed. All runs take about twenty minutes for each of the ``--repeats``. Settings are the defaults of the other
+sampler, except:
 
 * emcee and zeus: 100 walkers from the prior, 1000 steps of which the second half counts; no evidence.
 * PyMC ``sample_smc``: one chain of 2000 draws in one process (2000 is its default, and what our chains hold).
 * pocomc: defaults (256 active particles, 512 effective, 4096 samples), with its normalising flow and without.
 * dynesty: the static sampler, 500 live points (its default).
 
-emcee, zeus and pocomc get the likelihood of a whole batch, PyMC and dynesty ask point by point: their CPU time per
-evaluation contains as many calls from Python, and PyMC's its compilation.
+emcee, zeus and pocomc evaluate the likelihood in batches, PyMC and dynesty point by point: their CPU time per
+evaluation includes one call from Python each, and that of PyMC its compilation.
 
-On Python 3.11 with numpy 2.4 all of them live in one environment. What to know: PyMC holds numba back (pytensor 2.38
-wants 0.65.1 at most), so that the times of compiled kernels belong to that older numba; pocomc wants torch even without
-its flow, by default gigabytes with CUDA, and is therefore not in the extra: install the CPU build of torch (see
+On Python 3.11 with numpy 2.4 all of them can share one environment. PyMC limits numba (pytensor 2.38 needs 0.65.1 or
+older), so the times of compiled kernels are those of an older numba. pocomc needs torch even without its flow, by
+default gigabytes with CUDA, and is therefore not in the extra: install the CPU build of torch (see
 https://pytorch.org/get-started) and then ``pip install pocomc``.
 """
 
@@ -33,7 +34,7 @@ import numpy as np
 from .rows import Row
 from .targets import Target, as_row, errors, target_named, target_names
 
-__all__ = ["rows"]
+__all__ = ["PEERS", "Peer", "rows", "run_emcee", "run_peer"]
 
 LIMIT = 150.0  # s of wall time for one run
 WALKERS, STEPS = 100, 1000
@@ -49,11 +50,12 @@ class _Outcome(NamedTuple):
 
 
 def _prior_stream(seed: int) -> np.random.RandomState:
-    """Random numbers of our own beside a peer that seeds its stream with `seed`: the two must not be the same."""
+    """Random numbers independent of those of a sampler that is seeded with `seed`."""
     return np.random.RandomState([seed, 1])
 
 
-def _emcee(target: Target, seed: int) -> _Outcome:
+def run_emcee(target: Target, seed: int) -> _Outcome:
+    """Run emcee's stretch move from draws of the prior."""
     stream = np.random.RandomState(seed)
     start = target.sample_prior(WALKERS, stream)
     sampler = emcee.EnsembleSampler(WALKERS, target.ndim, target, vectorize=True)
@@ -120,7 +122,7 @@ def _dynesty(target: Target, seed: int) -> _Outcome:
 
 
 class _PocoPrior:
-    """The prior as pocomc wants it."""
+    """The prior in the form that pocomc needs."""
 
     def __init__(self, target: Target, seed: int):
         self.bounds = np.array([(a, b) if kind == "u" else (0.0, np.inf) for kind, a, b in target.prior])
@@ -152,7 +154,9 @@ def _pocomc_no_flow(target: Target, seed: int) -> _Outcome:
     return _pocomc(target, seed, flow=False)
 
 
-class _Peer(NamedTuple):
+class Peer(NamedTuple):
+    """Module of another sampler, the function that runs it, and how to install it."""
+
     module: str
     run: Callable[[Target, int], _Outcome]
     install: str = "pip install '.[peers]'"
@@ -160,17 +164,17 @@ class _Peer(NamedTuple):
 
 _POCOMC = "pip install torch (its CPU build is small), then pocomc"
 PEERS = {
-    "emcee, stretch move": _Peer("emcee", _emcee),
-    "zeus": _Peer("zeus", _zeus),
-    "PyMC, sample_smc": _Peer("pymc", _pymc),
-    "dynesty": _Peer("dynesty", _dynesty),
-    "pocomc": _Peer("pocomc", _pocomc, _POCOMC),
-    "pocomc, no flow": _Peer("pocomc", _pocomc_no_flow, _POCOMC),
+    "emcee, stretch move": Peer("emcee", run_emcee),
+    "zeus": Peer("zeus", _zeus),
+    "PyMC, sample_smc": Peer("pymc", _pymc),
+    "dynesty": Peer("dynesty", _dynesty),
+    "pocomc": Peer("pocomc", _pocomc, _POCOMC),
+    "pocomc, no flow": Peer("pocomc", _pocomc_no_flow, _POCOMC),
 }
 
 
 def _work(peer: str, name: str, seed: int, count, answer) -> None:
-    """In the process of a run: its cost and errors, or why there are none, into the pipe `answer`."""
+    """Run a sampler in its own process and send cost and errors, or the reason for a failure, through `answer`."""
     target = target_named(name)
     target.count = count
     try:
@@ -186,36 +190,36 @@ def _work(peer: str, name: str, seed: int, count, answer) -> None:
         if outcome.log_evidence_error is not None:
             run["error"] = outcome.log_evidence_error
         run["warned"] = any(issubclass(warning.category, UserWarning) for warning in caught)
-    except Exception as error:  # whatever a peer raises belongs into its row
+    except Exception as error:  # any exception of the other sampler is reported in its row
         run = {"reason": f"failed: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}"}
     answer.send(run)
 
 
-def _run(peer: str, name: str, seed: int) -> dict:
-    """One run in a process of its own, stopped at the limit."""
+def run_peer(peer: str, name: str, seed: int) -> dict:
+    """One run in its own process, stopped after the time limit."""
     context = multiprocessing.get_context("spawn")  # a fork would inherit numba's threads
     count = context.RawValue("q", 0)
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(peer, name, seed, count, sender), daemon=True)
     process.start()
-    sender.close()  # the child's end alone is open: its death ends the wait
+    sender.close()  # only the child holds this end: the wait ends when the child dies
     try:
         run = receiver.recv() if receiver.poll(LIMIT) else {"reason": f"stopped at {LIMIT:.0f} s"}
     except EOFError:
         process.join()
-        run = {"reason": f"ended without an answer, exit code {process.exitcode}"}
+        run = {"reason": f"ended without a result, exit code {process.exitcode}"}
     process.kill()
     process.join()
     return {"evaluations": count.value} | run
 
 
 def rows(repeats: int) -> list[Row]:
-    """One row for every peer and target, as `samplers.rows` has them; one for a peer that is not installed."""
+    """One row for each sampler and target, in the form of `samplers.rows`; one row for a sampler not installed."""
     table = []
     for peer, (module, _, install) in PEERS.items():
         if importlib.util.find_spec(module) is None:
             table.append(Row(f"{peer}: evaluations", "", None, "", f"not installed: {install}"))
             continue
         for name in target_names():
-            table.append(as_row(peer, name, [_run(peer, name, seed) for seed in range(1, repeats + 1)]))
+            table.append(as_row(peer, name, [run_peer(peer, name, seed) for seed in range(1, repeats + 1)]))
     return table

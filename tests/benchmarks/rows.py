@@ -1,4 +1,4 @@
-"""What a benchmark returns, and how it is printed and kept."""
+"""Rows that a benchmark returns, and functions that print and store them."""
 
 import datetime
 import json
@@ -14,7 +14,7 @@ __all__ = ["Row", "aligned", "as_table", "machine", "number", "write_json"]
 
 
 class Row(NamedTuple):
-    """One figure: what was measured, on which case, its value (None: not measured) and unit, and what else to know."""
+    """One figure: what was measured, the case, its value (None: not measured), its unit and a note."""
 
     what: str
     case: str
@@ -24,7 +24,7 @@ class Row(NamedTuple):
 
 
 def _commit() -> str:
-    """Of the working tree, with a plus if it was edited since; empty where there is none."""
+    """Commit of the working tree, with a plus if files were edited since; empty without a repository."""
     git = ["git", "-C", str(Path(__file__).parent)]
     try:
         commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
@@ -35,7 +35,7 @@ def _commit() -> str:
 
 
 def machine() -> dict[str, str | int | list[float]]:
-    """Where and with what the figures were measured; the load average tells whether others were at work."""
+    """Machine and versions of the measurement; the load average shows whether other processes were running."""
     cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -56,14 +56,14 @@ def machine() -> dict[str, str | int | list[float]]:
 
 
 def number(value: float | None) -> str:
-    """Three significant digits, whole numbers in full, a dash for none."""
+    """Format a number with three significant digits, large ones in full, and a dash for None."""
     if value is None:
         return "-"
     return f"{value:.0f}" if 1000.0 <= abs(value) < 1e9 else f"{value:.3g}"
 
 
 def aligned(lines: Sequence[Sequence[str]], right: Sequence[int]) -> str:
-    """Cells below one another, the first line as the head, the columns `right` flush right."""
+    """Align the cells of a table. The first line is the header; the columns `right` are aligned to the right."""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     out = []
     for line in lines:
@@ -77,7 +77,7 @@ def aligned(lines: Sequence[Sequence[str]], right: Sequence[int]) -> str:
 
 
 def as_table(*groups: Sequence[Row]) -> str:
-    """The rows as aligned text, an empty line between groups."""
+    """Rows as aligned text, with an empty line between groups."""
     cells = [("what", "case", "value", "unit", "note")]
     for i, rows in enumerate(groups):
         cells += [("",) * 5] * (i > 0)
@@ -86,7 +86,7 @@ def as_table(*groups: Sequence[Row]) -> str:
 
 
 def write_json(path: Path, rows: Sequence[Row], machines: Sequence[dict]) -> None:
-    """Keep the rows, and the machine before and after, in a file."""
+    """Store the rows, and the machine before and after, in a JSON file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = {"machine": machines[0], "load_average_after": machines[-1]["load_average"]}
     path.write_text(json.dumps(kept | {"rows": [row._asdict() for row in rows]}, indent=1) + "\n")

@@ -1,7 +1,7 @@
-"""Every mode of the samplers on the targets: evaluations, how wrong the answer is, and whether the run warned.
+"""Every mode of the samplers on the targets: evaluations, errors of the result, and whether the run warned.
 
-TMCMC by default and SMC by moves only give equal figures: a coefficient of variation of 1 is an effective sample of
-half the walkers, and everything else is common to the two.
+The default TMCMC and SMC without recycling give equal figures: a coefficient of variation of 1 is an effective sample
+size of half the walkers, and everything else is the same.
 """
 
 import time
@@ -33,7 +33,7 @@ MODES = {
 
 
 def _run(mode: str, name: str, seed: int) -> dict:
-    """One run: its cost, its errors, and whether it warned."""
+    """Cost and errors of one run, and whether it warned."""
     Sampler, nwalkers, nsteps, settings = MODES[mode]
     target = target_named(name)
     start = time.process_time()
@@ -53,7 +53,7 @@ def _run(mode: str, name: str, seed: int) -> dict:
 
 
 def rows(repeats: int) -> list[Row]:
-    """One row for every mode and target: evaluations (mean over `repeats` seeds), the errors in the note."""
+    """One row for each mode and target: evaluations (mean over `repeats` seeds), with the errors in the note."""
     return [
         as_row(mode, name, [_run(mode, name, seed) for seed in range(1, repeats + 1)])
         for mode in MODES

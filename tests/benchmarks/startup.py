@@ -1,4 +1,4 @@
-"""What a user waits for before the first simulation: imports, compilation, compiled kernels read from disk."""
+"""Waiting time before the first simulation: imports, compilation, compiled kernels read from disk."""
 
 import json
 import os
@@ -47,7 +47,7 @@ print(json.dumps([*first, time.perf_counter() - start, len(compiled.buffer) / 2]
 
 
 def _run(code: str, cache: str | None = None) -> list[float]:
-    """Seconds that `code` prints, run by a fresh interpreter, with its own folder of compiled kernels if given."""
+    """Seconds that `code` prints in a new interpreter, with the folder `cache` for compiled kernels if given."""
     environment = dict(os.environ) | ({} if cache is None else {"FE_LIKELIHOODS_CACHE": cache})
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     if run.returncode:
@@ -56,7 +56,7 @@ def _run(code: str, cache: str | None = None) -> list[float]:
 
 
 def imports(repeats: int) -> list[Row]:
-    """Wall time of the imports in fresh interpreters, all in turns, beside what they stand on."""
+    """Wall time of imports in new interpreters, in alternation, together with their dependencies."""
     seconds = {code: [] for code in IMPORTS}
     for _ in range(repeats):
         for code in IMPORTS:
@@ -70,7 +70,7 @@ def imports(repeats: int) -> list[Row]:
 
 
 def compilation(repeats: int) -> list[Row]:
-    """Wall time of the first likelihood of both posteriors: kernels compiled, then read from disk; no compilation."""
+    """Wall time of the first likelihood of both posteriors, with compilation and with kernels read from disk."""
     rows = []
     for name in ("bridge_column", "isolated_bridge"):
         with tempfile.TemporaryDirectory() as cache:
@@ -78,9 +78,9 @@ def compilation(repeats: int) -> list[Row]:
             found = [_run(FIRST_EVALUATION.format(name), cache) for _ in range(repeats)]
             size = sum(file.stat().st_size for file in Path(cache).rglob("*") if file.is_file())
         warm, cpu, again, compiled = (median(column) for column in zip(*found, strict=True))
-        told = f"CPU {cold[1]:.1f} s, {cold[3]:.0f} kernels; once for each version; at most {LIMIT_COMPILATION:g}"
+        note = f"CPU {cold[1]:.1f} s, {cold[3]:.0f} kernels; once for each version; at most {LIMIT_COMPILATION:g}"
         rows += [
-            Row("first likelihood, wall time", f"{name}, nothing compiled", cold[0], "s", told),
+            Row("first likelihood, wall time", f"{name}, nothing compiled", cold[0], "s", note),
             Row(
                 "first likelihood, wall time",
                 f"{name}, kernels on disk",

@@ -1,7 +1,8 @@
-"""What it costs to keep a run in a file and to read it back: chain, ladder and journal, beside emcee's own backend.
+"""Time to store a run in a file and to read it back, compared with emcee's own HDF5 backend.
 
-Writing is the wall time of the run less that of the same run in memory. What is read was written by 500 walkers in 200
-steps at beta = 1; opening it for a run includes the comparison of the chain with its journal.
+The time of writing is the wall time of the run minus that of the same run in memory. The files that are read contain
+500 walkers and 200 steps at beta = 1. Opening a file to continue a run includes the check of the chain against its
+journal.
 """
 
 import tempfile
@@ -27,7 +28,7 @@ READ = 500
 
 
 def _milliseconds(function: Callable[[], Any], repeats: int) -> float:
-    """Median wall time; what was opened is let go before the next time."""
+    """Median wall time [ms] of a function; its result is released before the next call."""
     values = []
     for _ in range(max(5, repeats)):
         start = time.perf_counter()
@@ -37,14 +38,14 @@ def _milliseconds(function: Callable[[], Any], repeats: int) -> float:
 
 
 def storage(repeats: int) -> list[Row]:
-    """Writing by the evaluation, the size of what was written, reading by the file."""
+    """Time of writing per evaluation, size of the files, time of reading per file."""
     rows = []
     for nwalkers in (40, 100, 500):
         for name, run in KINDS.items():
             kept, memory = (per_evaluation(run, nwalkers, f, time.perf_counter, repeats) for f in (True, False))
             note = f"at most {LIMIT:g}" if run is run_walk else ""
             case = f"{name}, {nwalkers} walkers"
-            rows.append(Row("storage: written, wall an evaluation", case, 1e6 * (kept - memory), "us", note))
+            rows.append(Row("storage: writing, wall time per evaluation", case, 1e6 * (kept - memory), "us", note))
     with tempfile.TemporaryDirectory() as folder:
         files = {name: Path(folder) / name.split(",")[0] / "run.h5" for name in KINDS}
         for name, run in KINDS.items():
@@ -53,14 +54,16 @@ def storage(repeats: int) -> list[Row]:
             sizes = {path.suffix: path.stat().st_size for path in files[name].parent.iterdir()}
             parts = ", ".join(f"{size / 2**20:.1f} MiB of {kind}" for kind, size in sorted(sizes.items()))
             note = f"{evaluations} evaluations: {parts}"
-            rows.append(Row("storage: size, an evaluation", name, sum(sizes.values()) / evaluations, "B", note))
+            rows.append(Row("storage: size per evaluation", name, sum(sizes.values()) / evaluations, "B", note))
         case = f"{READ} walkers, {STEPS} steps"
         for name, path in files.items():
             seconds = _milliseconds(lambda path=path: HDFBackend(str(path), read_only=True).get_chain(), repeats)
-            rows.append(Row("storage: chain read, wall", f"{name}, {case}", seconds, "ms"))
+            rows.append(Row("storage: reading the chain, wall time", f"{name}, {case}", seconds, "ms"))
         ours = str(files["SMC, random walk"])
         seconds = _milliseconds(lambda: read_ladder(HDFBackend(ours, read_only=True)), repeats)
-        rows.append(Row("storage: ladder read, wall", f"SMC, {case}", seconds, "ms"))
+        rows.append(Row("storage: reading the ladder, wall time", f"SMC, {case}", seconds, "ms"))
         seconds = _milliseconds(lambda: JournaledBackend.of(HDFBackend(ours)), repeats)
-        rows.append(Row("storage: opened to go on, wall", f"SMC, {case}", seconds, "ms", "checked against its journal"))
+        rows.append(
+            Row("storage: opening to continue, wall time", f"SMC, {case}", seconds, "ms", "checked against its journal")
+        )
     return rows

@@ -1,9 +1,9 @@
-"""Four targets with known answers, what a sampler costs on them, and how wrong its answer is.
+"""Four targets with known answers: cost of a sampler on them, and the errors of its result.
 
 The targets are those of ``benchmarks/sampler_targets.py`` in the reference material (``FE_SHARED``): a mimic of the
-column paper's posterior (T1), two modes in eleven dimensions (T2), two bananas (T3), a two-storey building (T4).
-Evaluations are counted at the likelihood, whoever asks for them. Errors of means are in posterior standard deviations,
-those of standard deviations relative, both root mean square over dimensions and seeds.
+posterior of the bridge column (T1), two modes in eleven dimensions (T2), two bananas (T3), a two-storey building (T4).
+Evaluations are counted in the likelihood. Errors of means are in posterior standard deviations, errors of standard
+deviations are relative; both are root mean squares over dimensions and seeds.
 """
 
 import importlib.util
@@ -21,7 +21,7 @@ SHARED = Path(os.environ.get("FE_SHARED", Path(__file__).resolve().parents[3] / 
 
 
 class Target:
-    """A target as a posterior, and as the separate functions that some peers want; it counts what it is asked for."""
+    """A target as a posterior and as the separate functions that some samplers need; it counts its evaluations."""
 
     def __init__(self, target: dict, log_density, transform):
         self.prior, self._log_likelihood = target["prior"], target["log_likelihood"]
@@ -29,11 +29,11 @@ class Target:
         self.log_evidence = target["log_evidence"]
         self._log_density, self._transform = log_density, transform
         self.ndim = len(self.prior)
-        self.count = RawValue("q", 0)  # can be shared with the process that watches a run
+        self.count = RawValue("q", 0)  # shared with the process that monitors a run
 
     @property
     def evaluations(self) -> int:
-        """Points at which the likelihood was asked for."""
+        """Points at which the likelihood was evaluated."""
         return self.count.value
 
     def log_prior(self, x: np.ndarray) -> np.ndarray:
@@ -53,7 +53,7 @@ class Target:
         return log_prob
 
     def prior_transform(self, u: np.ndarray) -> np.ndarray:
-        """Unit cube to parameters, (..., ndim) -> (..., ndim)."""
+        """Map the unit cube to parameters, (..., ndim) -> (..., ndim)."""
         return self._transform(self.prior, u)
 
     def sample_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
@@ -72,12 +72,12 @@ def _module():
 
 
 def target_names() -> list[str]:
-    """T1 ... T4."""
+    """Names of the targets, T1 to T4."""
     return list(_module().TARGETS)
 
 
 def target_named(name: str) -> Target:
-    """The target of this name, its count at zero."""
+    """Target of a name, with its counter at zero."""
     module = _module()
     return Target(module.TARGETS[name](), module.prior_log_density, module.prior_transform)
 
@@ -96,11 +96,11 @@ def errors(target: Target, samples: np.ndarray, weights: np.ndarray | None = Non
 
 
 def as_row(what: str, case: str, runs: list[dict]) -> Row:
-    """One row of several runs: mean evaluations, the errors of those runs that gave an answer in the note.
+    """One row for several runs: the mean number of evaluations, with the errors in the note.
 
-    Every run has ``evaluations``. One that gave an answer has ``microseconds`` of CPU per evaluation, the `errors`,
-    whether it ``warned``, and perhaps ``evidence`` and ``error`` (of log Z: how wrong, and what the sampler says); one
-    that did not, a ``reason``.
+    Every run has ``evaluations``. A run with a result has ``microseconds`` of CPU time per evaluation, the `errors`,
+    whether it ``warned``, and optionally ``evidence`` (error of log Z) and ``error`` (standard error of log Z that the
+    sampler reports). A run without a result has a ``reason``.
     """
     note = []
     answers = [run for run in runs if "reason" not in run]
@@ -109,7 +109,7 @@ def as_row(what: str, case: str, runs: list[dict]) -> Row:
         note.append(f"z {np.sqrt(np.mean(column['z'] ** 2)):.3f}")
         note.append(f"sd {100 * np.sqrt(np.mean(column['sd'] ** 2)):.1f} %")
     if "weight" in column:
-        note.append(f"mode's weight {np.max(np.abs(column['weight'])):.3f} at most")
+        note.append(f"error of the mode's weight at most {np.max(np.abs(column['weight'])):.3f}")
     if "evidence" in column:
         reported = [f"({run['error']:.2f})" if "error" in run else "" for run in answers]
         pairs = zip(column["evidence"], reported, strict=True)
