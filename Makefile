@@ -1,4 +1,4 @@
-# Every target sets itself up: a virtual environment in .venv, the install, then the job.
+# Each target makes the virtual environment .venv and installs the project first if needed.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 .PHONY: help update test test-slow clients tutorials bench docs figures lint format data clean
 
-help:            ## this list
+help:            ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/'
 
 $(READY): pyproject.toml
@@ -14,36 +14,36 @@ $(READY): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@touch $(READY)
 
-update: $(READY) ## update the bridge column on the bundled data (reduced setting); tables and figures into results/
+update: $(READY) ## update the bridge column on the bundled data (reduced setting); writes tables and figures to results/
 	$(BIN)/python tutorials/02_bridge_column.py --preset reduced --out results
 
-test: $(READY)   ## the quick tests, on all cores
+test: $(READY)   ## run the quick tests on all cores
 	$(BIN)/python -m pytest -n auto
 
-test-slow: $(READY) ## the slow tests
+test-slow: $(READY) ## run the slow tests
 	$(BIN)/python -m pytest -m slow --timeout 7200
 
-clients:         ## every client on one posterior, against quadrature (two environments of their own, 3 GB)
+clients:         ## run every client on one posterior and compare with quadrature (makes two environments, 3 GB)
 	PYTHON=$(PYTHON) .ci/clients
 
-tutorials: $(READY) ## every tutorial from top to bottom, with all data
-	for t in tutorials/[0-9]*.py; do $(BIN)/python $$t || exit 1; done
+tutorials: $(READY) ## run every tutorial that needs no other data than the bundled ones
+	for t in tutorials/0[1-5]*.py; do $(BIN)/python $$t || exit 1; done
 
-bench: $(READY)  ## speed beside the peers, one table
+bench: $(READY)  ## measure speed against OpenSees, scipy and other samplers; prints one table
 	$(BIN)/python -m tests.benchmarks
 
-docs: $(READY)   ## the pages of docs/ with the API reference, into docs/_build/html; a warning is an error
+docs: $(READY)   ## build the documentation into docs/_build/html; warnings are errors
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	$(BIN)/python -m sphinx -b html -W --keep-going -q docs docs/_build/html
 
-figures: $(READY) ## the pictures of README and docs/, by tutorial 01 and the models themselves
+figures: $(READY) ## make the figures of README and docs again
 	$(BIN)/python docs/make_figures.py
 
-lint: $(READY)   ## ruff, format and rules
+lint: $(READY)   ## check format and rules with ruff
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 
-format: $(READY) ## let ruff mend what it can
+format: $(READY) ## format and fix with ruff
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
@@ -51,5 +51,5 @@ data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_bridge_column_eq1.py
 	$(BIN)/python data/make_isolated_bridge.py
 
-clean:           ## remove the environment and the results
+clean:           ## remove the environments, the built documentation and the results
 	rm -rf $(VENV) .venv-clients .venv-uqpy docs/_build results results-*
