@@ -1,4 +1,7 @@
-"""Figures of a finished run: the climb, and the posterior by pairs of parameters. matplotlib is imported where used."""
+"""Figures of a finished run: the tempering stages, and the posterior of pairs of parameters.
+
+matplotlib is imported inside the functions.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,7 +20,25 @@ BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 
 
 def ladder_plot(sampler: Any) -> "Figure":
-    """Figure of the climb: beta, effective sample size and distinct points, acceptance and moves against the stage."""
+    """Plot the tempering stages of a run.
+
+    The panels show, per stage, the exponent beta; the effective sample size and the number of distinct points after the
+    resampling; and the acceptance with the number of sweeps.
+
+    Parameters
+    ----------
+    sampler : TemperedSampler
+        A sampler that has run.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ValueError
+        If the sampler has no stages.
+    """
     import matplotlib.pyplot as plt
     from matplotlib.ticker import MaxNLocator
 
@@ -35,13 +56,13 @@ def ladder_plot(sampler: Any) -> "Figure":
             fontsize="medium",
         )
     middle.plot(number, column["effective_sample_size"], "o-", color=BLUE, markersize=4, label="effective sample size")
-    middle.plot(number, column["distinct_ancestors"], "s--", color=ORANGE, markersize=4, label="distinct survivors")
+    middle.plot(number, column["distinct_ancestors"], "s--", color=ORANGE, markersize=4, label="distinct points")
     middle.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
     middle.set_ylim(0, 1.08 * sampler.nwalkers)
     middle.set_ylabel("points")
     middle.legend(frameon=False, fontsize="small", ncols=3, loc="lower left")
     bottom.bar(number, column["moves"], color=GREY, alpha=0.35, width=0.7)
-    bottom.set_ylabel("sweeps a stage (bars)")
+    bottom.set_ylabel("sweeps per stage (bars)")
     bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
     share = bottom.twinx()
     share.plot(number, column["acceptance"], "o-", color=BLUE, markersize=4)
@@ -56,7 +77,7 @@ def ladder_plot(sampler: Any) -> "Figure":
 
 
 def _kde(values: np.ndarray) -> gaussian_kde | None:
-    """Kernel density of (n,) or (k, n) values; None where they have no spread."""
+    """Kernel density of (n,) or (k, n) values; None if they do not vary."""
     try:
         return gaussian_kde(values)
     except np.linalg.LinAlgError:
@@ -70,18 +91,33 @@ def pair_plot(
     max_points: int = 2000,
     grid: int = 60,
 ) -> "Figure":
-    """Pair plot in the manner of Ramancha et al. (2022), Fig. 4.
+    """Plot the posterior of all pairs of parameters, in the style of Ramancha et al. (2022), Fig. 4.
 
-    Diagonal: histogram and kernel density, the coefficient of variation on top. Above it the samples, below it
-    contours of the kernel density with Pearson's r.
+    The diagonal shows the histogram and the kernel density, with the coefficient of variation as title; the upper
+    triangle shows the samples; the lower triangle shows contours of the kernel density that hold 20, 40, 60, 80 and
+    95 % of the samples, with Pearson's correlation coefficient r.
 
     Parameters
     ----------
-    samples : (n, ndim) float
-    labels : one a parameter, with its unit.
-    truth : (ndim,) float, optional — marked by lines, where the truth is known.
-    max_points : int — at most so many samples are drawn, and used for the two-dimensional densities.
-    grid : int — points a side of the density grids.
+    samples : array_like, shape (n, ndim)
+        Samples of the posterior.
+    labels : sequence of str, optional
+        One label per parameter, with its unit.
+    truth : sequence of float, shape (ndim,), optional
+        True parameters, where they are known; marked by lines.
+    max_points : int
+        Largest number of samples that are plotted and used for the two-dimensional densities.
+    grid : int
+        Number of points per side of the grids of the densities.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    References
+    ----------
+    Ramancha, M. K., Astroza, R., Conte, J. P., Restrepo, J. I. & Todd, M. D. (2022), Bayesian nonlinear finite element
+    model updating of a full-scale bridge-column using sequential Monte Carlo
     """
     import matplotlib.pyplot as plt
     from matplotlib.ticker import MaxNLocator
@@ -123,7 +159,7 @@ def pair_plot(
                 ax.axvline(truth[j], color=ORANGE, linewidth=1)
                 if i != j:
                     ax.axhline(truth[i], color=ORANGE, linewidth=1)
-            _dress(ax, MaxNLocator, bottom=i == ndim - 1, left=j == 0 and i > 0)
+            _format_axes(ax, MaxNLocator, bottom=i == ndim - 1, left=j == 0 and i > 0)
             if i == ndim - 1:
                 ax.set_xlabel(moments.names[j])
             if j == 0:
@@ -133,7 +169,7 @@ def pair_plot(
 
 
 def _density_contours(ax, x, y, xlim, ylim, grid):
-    """Contours that hold 20, 40, 60, 80 and 95 % of the samples."""
+    """Draw contours that hold 20, 40, 60, 80 and 95 % of the samples."""
     density = _kde(np.stack([x, y])) if np.ptp(x) > 0.0 and np.ptp(y) > 0.0 else None
     if density is None:
         return
@@ -145,8 +181,8 @@ def _density_contours(ax, x, y, xlim, ylim, grid):
     ax.contour(u, v, height, levels, colors=BLUE, linewidths=0.5)
 
 
-def _dress(ax, locator, bottom, left):
-    """Few ticks, labelled at the outer edges only."""
+def _format_axes(ax, locator, bottom, left):
+    """Set few ticks, with labels on the outer axes only."""
     ax.xaxis.set_major_locator(locator(3, prune="both"))
     if ax.get_yticks().size:
         ax.yaxis.set_major_locator(locator(3, prune="both"))

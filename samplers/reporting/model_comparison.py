@@ -1,9 +1,14 @@
-"""Which model the data prefer: posterior probabilities of models from their evidences.
+"""Model comparison: posterior probabilities of models from their evidences.
 
-With prior probabilities pi_k and evidences Z_k the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j. The
-evidences of samplers are estimates; their errors go through to first order, which holds while the errors of the
-logarithms are well below one. Intervals are made for the log-odds, where the first order reaches further, and stay
-between zero and one.
+With prior probabilities pi_k and evidences Z_k, the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j. The
+evidences are estimates, and their errors are propagated to first order, which is accurate as long as the errors of the
+log-evidences are well below one. Intervals are computed for the log-odds, for which the first order is more accurate,
+and transformed to probabilities between zero and one. See ``docs/theory/evidence``.
+
+References
+----------
+Kass, R. E. & Raftery, A. E. (1995), Bayes factors, Journal of the American Statistical Association 90(430),
+doi:10.1080/01621459.1995.10476572
 """
 
 import math
@@ -14,26 +19,38 @@ import numpy as np
 from scipy.special import expit, logsumexp
 from scipy.stats import norm
 
+from .inspection import data_fingerprint_of
+
 __all__ = ["ModelComparison", "compare_models"]
 
+# Error of the log-odds above which probabilities are reported as rough.
 _LARGE_ERROR = 0.5
 
 
 class ModelComparison(NamedTuple):
-    """Models side by side, one entry a model, in the order given.
+    """Comparison of models, one entry per model, in the order given. ``str`` gives a table.
 
     Attributes
     ----------
     names : tuple of str
-    log_evidence, log_evidence_error : (n,) float
-    prior : (n,) float — probabilities before the data.
-    probability : (n,) float — and after them.
-    probability_error : (n,) float — standard error, to first order in the errors of the log-evidences.
-    lower, upper : (n,) float — 95 % interval, from the log-odds.
-    log_bayes_factor : (n,) float — log-evidence less that of the best model, the one with the largest evidence.
-    log_bayes_factor_error : (n,) float — zero for the best model itself.
-    rough : bool — whether an error of the log-odds exceeds one half: then `probability_error` is no more than an order
-        of magnitude, and longer runs are needed.
+        Names of the models.
+    log_evidence, log_evidence_error : ndarray, shape (n,)
+        Log-evidences and their standard errors.
+    prior : ndarray, shape (n,)
+        Prior probabilities of the models.
+    probability : ndarray, shape (n,)
+        Posterior probabilities of the models.
+    probability_error : ndarray, shape (n,)
+        Standard errors of the probabilities, to first order in the errors of the log-evidences.
+    lower, upper : ndarray, shape (n,)
+        95 % intervals of the probabilities, from the log-odds.
+    log_bayes_factor : ndarray, shape (n,)
+        Log-evidence minus that of the best model, the one with the largest evidence.
+    log_bayes_factor_error : ndarray, shape (n,)
+        Standard error of `log_bayes_factor`; zero for the best model itself.
+    rough : bool
+        Whether the error of any log-odds exceeds 0.5. In that case `probability_error` is only an order of magnitude,
+        and longer runs are needed.
     """
 
     names: tuple[str, ...]
@@ -55,11 +72,11 @@ class ModelComparison(NamedTuple):
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """Posterior probabilities by name, as model averaging takes them."""
+        """Posterior probabilities by name, as `fe_likelihoods.average_predictions` takes them."""
         return dict(zip(self.names, self.probability.tolist(), strict=True))
 
     def table(self) -> str:
-        """The comparison as text, one line a model, the most probable first."""
+        """Table with one line per model, the most probable first."""
         width = max(len("model"), *(len(name) for name in self.names))
         head = f"{'model':<{width}} {'log evidence':>20} {'log Bayes factor':>20} {'prior':>7} "
         rows = [head + f"{'probability':>22} {'95 % interval':>22}"]
@@ -71,7 +88,7 @@ class ModelComparison(NamedTuple):
             row = f"{self.names[k]:<{width}} {evidence:>20} {factor:>20} {self.prior[k]:>7.3g} "
             rows.append(row + f"{probability:>22} {interval:>22}")
         if self.rough:
-            rows.append("the errors of the log-evidences are large: probabilities are rough, make longer runs")
+            rows.append("the errors of the log-evidences are large, so the probabilities are rough: make longer runs")
         return "\n".join(rows)
 
     def __str__(self) -> str:
@@ -83,9 +100,11 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
 
     Parameters
     ----------
-    models : by name, each a sampler that has run (anything with ``log_evidence`` and ``log_evidence_error``) or a pair
-        (log_evidence, error). The evidence must be of a normalised prior and a normalised likelihood.
-    prior : probabilities of the models before the data, by the same names; by default all the same.
+    models : mapping of str to (sampler or tuple of float)
+        For each name a sampler that has run (any object with ``log_evidence`` and ``log_evidence_error``), or a pair
+        (log-evidence, standard error). The evidence must be that of a normalised prior and a normalised likelihood.
+    prior : mapping of str to float, optional
+        Prior probabilities of the models, by the same names; equal by default.
 
     Returns
     -------
@@ -94,18 +113,20 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     Raises
     ------
     ValueError
-        For fewer than two models, evidences or errors that are no finite numbers, priors of other names or that do not
-        sum to one, and samplers whose posteriors have different measurements (evidences of different data cannot be
+        If there are fewer than two models, if a log-evidence or its error is not finite, if the prior has other names
+        or does not sum to one, or if the posteriors have different measurements (evidences of different data cannot be
         compared).
 
     Examples
     --------
-    >>> print(compare_models({"elastic": sampler_1, "inelastic": sampler_2}))
+    >>> comparison = compare_models({"elastic": (-120.3, 0.1), "inelastic": (-118.9, 0.1)})
+    >>> comparison.best
+    'inelastic'
     """
     if not isinstance(models, Mapping) or len(models) < 2:
-        raise ValueError(f"compare_models needs two models or more, by name; got {models!r}")
+        raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")
     names = tuple(models)
-    _same_data(models)
+    _check_same_data(models)
     pairs = [_evidence(name, model) for name, model in models.items()]
     log_evidence, error = np.array(pairs).T
     before = _prior(names, prior)
@@ -154,12 +175,12 @@ def _evidence(name: str, model: Any) -> tuple[float, float]:
         value, error = (float(each) for each in pair)
     except (TypeError, ValueError) as reason:
         raise ValueError(
-            f"model {name!r}: expected a sampler with log_evidence and log_evidence_error, or these two numbers; got "
+            f"model {name!r}: expected a sampler with log_evidence and log_evidence_error, or a pair of numbers; got "
             f"{model!r}"
         ) from reason
     if not (math.isfinite(value) and math.isfinite(error) and error >= 0.0):
         raise ValueError(
-            f"model {name!r}: log-evidence and its error must be finite, the error not negative; got {pair}"
+            f"model {name!r}: the log-evidence and its error must be finite, and the error not negative; got {pair}"
         )
     return value, error
 
@@ -168,24 +189,19 @@ def _prior(names: tuple[str, ...], prior: Mapping[str, float] | None) -> np.ndar
     if prior is None:
         return np.full(len(names), 1.0 / len(names))
     if not isinstance(prior, Mapping) or set(prior) != set(names):
-        raise ValueError(f"one prior probability for each of {', '.join(names)} is needed; got {prior!r}")
+        raise ValueError(f"expected one prior probability for each of {', '.join(names)}; got {prior!r}")
     values = np.array([prior[name] for name in names], dtype=float)
     if not (np.all(values >= 0.0) and abs(values.sum() - 1.0) < 1e-9):
         raise ValueError(f"prior probabilities must be non-negative and sum to one; got {dict(prior)}")
     return values
 
 
-def _same_data(models: Mapping[str, Any]) -> None:
-    """ValueError if posteriors behind the samplers have different measurements; others are not looked into."""
-    seen: dict[str, str] = {}
-    for name, model in models.items():
-        posterior = getattr(getattr(model, "log_prob_fn", None), "f", None)
-        measurements = getattr(getattr(posterior, "likelihood", None), "measurements", None)
-        if hasattr(measurements, "fingerprint"):
-            # two models may have the same channels in another order
-            seen[name] = measurements.select(sorted(channel.name for channel in measurements.channels)).fingerprint
-    if len(set(seen.values())) > 1:
+def _check_same_data(models: Mapping[str, Any]) -> None:
+    """Raise ValueError if the posteriors state different measurements; those that state none are not checked."""
+    fingerprints = {name: data_fingerprint_of(model) for name, model in models.items()}
+    known = {name: fingerprint for name, fingerprint in fingerprints.items() if fingerprint is not None}
+    if len(set(known.values())) > 1:
         raise ValueError(
-            f"the evidences of {', '.join(seen)} are of different measurements and cannot be compared: give all models "
-            "the same measurements"
+            f"the evidences of {', '.join(known)} are of different measurements and cannot be compared: give all "
+            "models the same measurements"
         )

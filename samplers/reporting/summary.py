@@ -1,6 +1,7 @@
-"""From a finished run to what one reads: a summary, arviz data, the ladder as a table, samplers side by side.
+"""Results of finished runs as tables and arviz data.
 
-Samples come in as arrays (n, ndim), ladders from the sampler. arviz is imported where it is used. Figures are drawn in
+`summary` gives the moments of the posterior, `ladder_table` the tempering stages of a run, `comparison_table` the cost
+of several samplers, and `to_arviz` the samples in the format of arviz (imported only there). Figures are in
 `samplers.reporting.figures`.
 """
 
@@ -11,19 +12,24 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..tempering.weights import Stage
+from .inspection import is_tempered, parameter_names_of
 
-__all__ = ["Comparison", "Summary", "comparison_table", "finished_ladder", "ladder_table", "summary", "to_arviz"]
+__all__ = ["SamplerComparison", "Summary", "comparison_table", "finished_ladder", "ladder_table", "summary", "to_arviz"]
 
 
 class Summary(NamedTuple):
-    """Moments of the posterior, one entry a parameter.
+    """Moments of the posterior, one entry per parameter. ``str`` gives a table.
 
     Attributes
     ----------
     names : tuple of str
-    mean, sd : (ndim,) float — in the parameters' units.
-    cv : (ndim,) float — ``sd / |mean|`` [-]; inf where the mean is zero and the sd is not.
-    mean_error : (ndim,) float, or None — Monte-Carlo standard error of `mean`, in the parameters' units.
+        Names of the parameters.
+    mean, sd : ndarray, shape (ndim,)
+        Mean and standard deviation, in the units of the parameters.
+    cv : ndarray, shape (ndim,)
+        Coefficient of variation ``sd / |mean|`` [-]; inf where the mean is zero and the standard deviation is not.
+    mean_error : ndarray, shape (ndim,), or None
+        Monte Carlo standard error of `mean`, in the units of the parameters.
     """
 
     names: tuple[str, ...]
@@ -44,7 +50,7 @@ class Summary(NamedTuple):
 def _names(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
     names = tuple(f"theta_{i}" for i in range(ndim)) if names is None else tuple(names)
     if len(names) != ndim:
-        raise ValueError(f"one name a parameter is needed: {ndim} parameters, {len(names)} names {names}")
+        raise ValueError(f"expected one name per parameter: {ndim} parameters, but {len(names)} names {names}")
     return names
 
 
@@ -52,7 +58,7 @@ def _samples(samples: np.ndarray) -> np.ndarray:
     samples = np.asarray(samples, dtype=float)
     if samples.ndim != 2 or len(samples) < 2:
         raise ValueError(
-            f"samples must be an array (n, ndim) of draws, as get_chain(flat=True) gives; got {samples.shape}"
+            f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
         )
     return samples
 
@@ -63,28 +69,44 @@ def summary(
     weights: np.ndarray | None = None,
     mean_error: np.ndarray | None = None,
 ) -> Summary:
-    """Posterior mean, its Monte-Carlo error, standard deviation and coefficient of variation.
+    """Posterior mean, its Monte Carlo error, standard deviation and coefficient of variation.
 
     Parameters
     ----------
-    samples : (n, ndim) float
-    names : one name a parameter.
-    weights : (n,) float, optional — non-negative, need not sum to one.
-    mean_error : (ndim,) float, optional — ``sampler.mean_error()`` of the chain that the samples are; samples alone do
-        not tell which of them are copies.
+    samples : array_like, shape (n, ndim)
+        Samples of the posterior.
+    names : sequence of str, optional
+        One name per parameter; theta_0, theta_1, ... by default.
+    weights : array_like, shape (n,), optional
+        Non-negative weights of the samples; they need not sum to one.
+    mean_error : array_like, shape (ndim,), optional
+        Standard error of the mean, as ``sampler.mean_error()`` returns it for the same chain. It cannot be computed
+        from the samples alone, because copies made by resampling are correlated.
+
+    Returns
+    -------
+    Summary
+
+    Raises
+    ------
+    ValueError
+        If shapes do not match, or weights or errors are negative.
     """
     samples = _samples(samples)
     if mean_error is not None:
         mean_error = np.asarray(mean_error, dtype=float)
         if mean_error.shape != samples.shape[1:] or not np.all(mean_error >= 0.0):
             raise ValueError(
-                f"mean_error must be {samples.shape[1]} non-negative numbers, as sampler.mean_error() gives"
+                f"mean_error must be {samples.shape[1]} non-negative numbers, as sampler.mean_error() returns; "
+                f"got {mean_error}"
             )
     if weights is None:
         weights = np.full(len(samples), 1.0)
     weights = np.asarray(weights, dtype=float)
     if weights.shape != (len(samples),) or not np.all(weights >= 0.0) or not 0.0 < weights.sum() < np.inf:
-        raise ValueError(f"weights must be {len(samples)} non-negative numbers with a positive sum")
+        raise ValueError(
+            f"weights must be {len(samples)} non-negative numbers with a positive sum; got shape {weights.shape}"
+        )
     weights = weights / weights.sum()
     mean = weights @ samples
     sd = np.sqrt(weights @ (samples - mean) ** 2)
@@ -93,21 +115,29 @@ def summary(
 
 
 def to_arviz(sampler: Any, parameter_names: Sequence[str] | None = None) -> Any:
-    """arviz data of one run or of several independent ones.
+    """Convert one run, or several independent runs, to arviz data.
 
-    A chain is an independent run: the walkers of one run share their proposals and ancestors, and are draws of one
-    chain. (`arviz.from_emcee` makes every walker a chain.) The log-probability is ``lp`` in ``sample_stats``, whose
-    attributes carry ``log_evidence`` and ``log_evidence_error``, one number a run, and ``ladder``: JSON, for each run a
-    list of stages.
+    Each run is one chain, because the walkers of one run share proposals and ancestors and are not independent chains.
+    (`arviz.from_emcee` makes each walker a chain.) The log-probability is ``lp`` in ``sample_stats``. The attributes of
+    ``sample_stats`` contain ``log_evidence`` and ``log_evidence_error``, with one number per run, and ``ladder``, the
+    stages of each run as JSON.
 
     Parameters
     ----------
-    sampler : a sampler that has run, or a sequence of them with equally long chains; `emcee.EnsembleSampler` too.
-    parameter_names : one a parameter; by default those of ``log_prob_fn``, else theta_0, theta_1, ...
+    sampler : sampler or sequence of samplers
+        Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
+    parameter_names : sequence of str, optional
+        One name per parameter; by default those of ``log_prob_fn``, or else theta_0, theta_1, ...
 
     Returns
     -------
-    arviz.InferenceData (a DataTree from arviz 1.0 on); ``.to_netcdf(path)`` writes it.
+    arviz.InferenceData
+        A DataTree from arviz 1.0 on. Its method ``to_netcdf(path)`` writes it to a file.
+
+    Raises
+    ------
+    ValueError
+        If the chains have different shapes, or the number of names is wrong.
     """
     import inspect
 
@@ -115,21 +145,21 @@ def to_arviz(sampler: Any, parameter_names: Sequence[str] | None = None) -> Any:
 
     runs = list(sampler) if isinstance(sampler, Sequence) else [sampler]
     if parameter_names is None:
-        parameter_names = getattr(runs[0].log_prob_fn.f, "parameter_names", None)
+        parameter_names = parameter_names_of(runs[0])
     names = _names(parameter_names, runs[0].ndim)
     chains = [run.get_chain(flat=True) for run in runs]
     if len({chain.shape for chain in chains}) > 1:
-        raise ValueError(f"runs must have chains of one shape to stand side by side; got {[c.shape for c in chains]}")
+        raise ValueError(f"all runs must have chains of the same shape; got {[c.shape for c in chains]}")
     draws = np.stack(chains)
     groups = {
         "posterior": {name: draws[:, :, i] for i, name in enumerate(names)},
         "sample_stats": {"lp": np.stack([run.get_log_prob(flat=True) for run in runs])},
     }
-    # arviz 1.0 takes the groups as one dictionary, its predecessors as keywords
+    # arviz 1.0 takes the groups as one dictionary, earlier versions as keywords
     by_keyword = "posterior" in inspect.signature(arviz.from_dict).parameters
     data = arviz.from_dict(**groups) if by_keyword else arviz.from_dict(groups)
 
-    if all(getattr(run, "ladder", ()) for run in runs):
+    if all(is_tempered(run) and run.ladder for run in runs):
         data["sample_stats"].attrs.update(
             log_evidence=np.array([run.log_evidence for run in runs]),
             log_evidence_error=np.array([run.log_evidence_error for run in runs]),
@@ -139,48 +169,80 @@ def to_arviz(sampler: Any, parameter_names: Sequence[str] | None = None) -> Any:
 
 
 def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
-    """The ladder of a sampler; an error where there is none yet."""
+    """Return the stages of a tempered sampler, or raise ValueError if there are none."""
+    if not is_tempered(sampler):
+        raise ValueError(f"expected a tempered sampler (SMCSampler or TMCMCSampler); got {type(sampler).__name__}")
     if not sampler.ladder:
-        raise ValueError("the sampler has no ladder yet: call run_mcmc first")
+        raise ValueError("the sampler has no tempering stages yet: call run_mcmc first")
     return sampler.ladder
 
 
 def ladder_table(sampler: Any) -> str:
-    """The ladder as text: one line a stage, the evidence, and the two estimates it was chosen from."""
-    head = f"{'stage':>5} {'beta':>10} {'ESS':>7} {'accept':>7} {'moves':>6} {'distinct':>9} {'dlogZ':>10} "
-    rows = [head + f"{'evaluations':>12} {'seconds':>9}"]
-    for number, s in enumerate(finished_ladder(sampler), start=1):
+    """Table of the tempering stages, followed by the evidence and the two estimates it was chosen from.
+
+    The columns are the fields of `samplers.tempering.weights.Stage`: exponent, effective sample size, acceptance,
+    sweeps of the ensemble, distinct points after the resampling, increment of the log-evidence, evaluations, and wall
+    time [s].
+
+    Parameters
+    ----------
+    sampler : TemperedSampler
+        A sampler that has run.
+
+    Returns
+    -------
+    str
+        One line per stage.
+
+    Raises
+    ------
+    ValueError
+        If the sampler has no stages.
+    """
+    stages = finished_ladder(sampler)
+    rows = [
+        f"{'stage':>5} {'beta':>10} {'ESS':>7} {'acceptance':>10} {'sweeps':>6} {'distinct':>8} {'d log Z':>10} "
+        f"{'evaluations':>11} {'time [s]':>9}"
+    ]
+    for number, s in enumerate(stages, start=1):
         rows.append(
-            f"{number:>5} {s.beta:>10.3e} {s.effective_sample_size:>7.0f} {s.acceptance:>7.3f} {s.moves:>6} "
-            f"{s.distinct_ancestors:>9} {s.log_evidence_increment:>10.3f} {s.evaluations:>12} {s.seconds:>9.3g}"
+            f"{number:>5} {s.beta:>10.3e} {s.effective_sample_size:>7.0f} {s.acceptance:>10.3f} {s.moves:>6} "
+            f"{s.distinct_ancestors:>8} {s.log_evidence_increment:>10.3f} {s.evaluations:>11} {s.seconds:>9.3g}"
         )
-    total = sum(s.evaluations for s in sampler.ladder), sum(s.seconds for s in sampler.ladder)
+    evaluations, seconds = sum(s.evaluations for s in stages), sum(s.seconds for s in stages)
     rows.append(
         f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "
-        f"{total[0]} evaluations in {total[1]:.3g} s"
+        f"{evaluations} evaluations in {seconds:.3g} s"
     )
-    if coarse := getattr(sampler, "coarse_evaluations", 0):
-        rows.append(f"{coarse} evaluations of the coarse model, in the first stage's seconds")
+    if sampler.coarse_evaluations:
+        rows.append(
+            f"{sampler.coarse_evaluations} evaluations of the coarse model, their time included in the first stage"
+        )
     check = sampler.log_evidence_check
     if check is not None:
         rows.append(
-            f"by the ladder {sampler.log_evidence_ladder:.3f} +- {sampler.ladder[-1].log_evidence_error:.3f}; "
-            f"by {check.evaluations} independent draws {check.log_evidence:.3f} +- {check.error:.3f} "
-            f"(worth {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
+            f"log evidence of the ladder {sampler.log_evidence_ladder:.3f} +- {stages[-1].log_evidence_error:.3f}; "
+            f"of {check.evaluations} independent draws {check.log_evidence:.3f} +- {check.error:.3f} "
+            f"(effective sample size {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
         )
     return "\n".join(rows)
 
 
-class Comparison(NamedTuple):
-    """Samplers side by side, one entry a sampler; None where a figure is not known.
+class SamplerComparison(NamedTuple):
+    """Cost and results of several samplers, one entry per sampler. ``str`` gives a table.
 
     Attributes
     ----------
     names : tuple of str
-    evaluations : tuple of int — points handed to ``log_prob_fn``.
-    seconds : tuple of float — wall time [s].
-    effective_sample_size : tuple of float — independent draws that the mean of the worst parameter is worth.
-    log_evidence, log_evidence_error : tuple of float
+        Names of the samplers.
+    evaluations : tuple of int
+        Number of points for which ``log_prob_fn`` was called.
+    seconds : tuple of (float or None)
+        Wall time [s]; None if it was not measured.
+    effective_sample_size : tuple of float
+        Number of independent draws with the same error of the mean, for the parameter where it is smallest.
+    log_evidence, log_evidence_error : tuple of (float or None)
+        Log-evidence and its standard error; None for samplers that give no evidence.
     """
 
     names: tuple[str, ...]
@@ -208,37 +270,46 @@ class Comparison(NamedTuple):
 
 def comparison_table(
     samplers: Mapping[str, Any], seconds: Mapping[str, float] | None = None, discard: int = 0
-) -> Comparison:
-    """What several samplers cost on one posterior, and what they gave for it.
+) -> SamplerComparison:
+    """Compare the cost and the effective sample size of several samplers on one posterior.
 
-    The effective sample size is that of the parameter for which it is smallest: (sd / Monte-Carlo error)^2 for our
-    samplers, and for a chain of emcee's own sampler its length over its autocorrelation time, which a short chain
-    underestimates. It says nothing about modes that were never found.
+    The effective sample size is that of the parameter for which it is smallest: (standard deviation / Monte Carlo
+    error)^2 for tempered samplers, and the length of the chain divided by its autocorrelation time for emcee's own
+    sampler. The autocorrelation time of a short chain is underestimated. The effective sample size contains no
+    information about modes that were never visited.
 
     Parameters
     ----------
-    samplers : samplers that have run in this process, by name; `emcee.EnsembleSampler` too, whose evaluations are
-        counted as iterations times walkers (a chain not thinned, moves that propose once a walker).
-    seconds : wall times [s] of samplers that do not measure their own, by name.
-    discard : int — first iterations left out of the chains of emcee's own sampler: its burn-in.
+    samplers : mapping of str to sampler
+        Samplers that have run in this process, by name. For `emcee.EnsembleSampler`, evaluations are counted as
+        iterations times walkers, which holds for chains that are not thinned and moves with one proposal per walker.
+    seconds : mapping of str to float, optional
+        Wall times [s] of samplers that do not measure their own, by name.
+    discard : int
+        Burn-in of emcee's own sampler: number of initial iterations that are left out.
+
+    Returns
+    -------
+    SamplerComparison
 
     Raises
     ------
     ValueError
-        If a sampler has not run here, or a time is given for a name that is not there.
+        If a sampler has not run in this process, or a time is given for an unknown name.
     """
     given = {} if seconds is None else dict(seconds)
     if not samplers:
-        raise ValueError("no samplers to compare: give them by name")
+        raise ValueError("no samplers to compare: pass a mapping of names to samplers")
     if unknown := set(given) - set(samplers):
-        raise ValueError(f"seconds are given for {sorted(unknown)}, the samplers are {list(samplers)}")
+        raise ValueError(f"seconds are given for {sorted(unknown)}, but the samplers are {list(samplers)}")
     columns = []
     for name, sampler in samplers.items():
-        tempered = hasattr(sampler, "mean_error")
+        tempered = is_tempered(sampler)
         evaluations = sampler.evaluations if tempered else sampler.iteration * sampler.nwalkers
         if evaluations == 0 or sampler.iteration == 0:
             raise ValueError(
-                f"sampler {name!r} has made no chain here: run it first (what a chain on file has cost is not kept)"
+                f"sampler {name!r} has made no chain in this process: run it first (the cost of a chain that was read "
+                "from a file is not known)"
             )
         if tempered:
             spread, error = sampler.get_chain(flat=True).std(axis=0), sampler.mean_error()
@@ -247,15 +318,14 @@ def comparison_table(
             chain = sampler.get_chain(discard=discard)
             time = sampler.get_autocorr_time(discard=discard, tol=0)
             ess = chain.shape[0] * chain.shape[1] / float(np.max(time))
-        known = getattr(sampler, "seconds", None)
         columns.append(
             (
                 name,
                 evaluations,
-                given.get(name, known),
+                given.get(name, sampler.seconds if tempered else None),
                 ess if np.isfinite(ess) else 0.0,
                 sampler.log_evidence if tempered else None,
                 sampler.log_evidence_error if tempered else None,
             )
         )
-    return Comparison(*zip(*columns, strict=True))
+    return SamplerComparison(*zip(*columns, strict=True))

@@ -528,7 +528,7 @@ def test_to_arviz_writes_netcdf(tmp_path):
     plain = emcee.EnsembleSampler(N, 3, Gaussian())
     plain.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 2)
     assert to_arviz(plain, ["a", "b", "c"])["posterior"]["a"].shape == (1, 2 * N)
-    with pytest.raises(ValueError, match="one name a parameter"):
+    with pytest.raises(ValueError, match="one name per parameter"):
         to_arviz(plain, ["a"])
 
 
@@ -606,7 +606,7 @@ def test_samplers_side_by_side():
         comparison_table(samplers, seconds={"dynesty": 1.0})
     again = SMCSampler(N, 3, posterior, backend=tmcmc.backend)
     for nothing in (again, SMCSampler(N, 3, posterior)):
-        with pytest.raises(ValueError, match="has made no chain here"):
+        with pytest.raises(ValueError, match="has made no chain in this process"):
             comparison_table({"nothing": nothing})
 
 
