@@ -1,9 +1,9 @@
-"""The posterior in the words of clients that have a class of their own for it.
+"""Adapters for Bayesian clients that need objects of their own classes.
 
-Most clients take a function, so they take the posterior or its bound methods as they are. bilby, PyMC, pints and
-nautilus (where it is to name the parameters) want objects of their own: each has one function here, which maps the
-priors to the client's and leaves the likelihood a black box. A client is imported when its function is called, so
-none of them is needed to import this package.
+Most clients accept a function, so the posterior or one of its bound methods is passed to them directly. bilby, PyMC,
+pints and (for named parameters) nautilus need objects of their own classes. Each has one function here, which
+translates the priors and passes the likelihood as a black box. A client is imported inside its function, so this
+package can be imported without it.
 """
 
 from .bilby import to_bilby

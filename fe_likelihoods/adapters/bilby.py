@@ -1,8 +1,8 @@
-"""A posterior as what `bilby.run_sampler` asks for: a likelihood of named parameters and a dictionary of priors.
+"""Adapter for bilby: a likelihood of named parameters and a dictionary of priors, as `bilby.run_sampler` needs them.
 
-bilby's own classes of priors are used, not wrappers of ours, so that its results are saved, loaded and plotted as any
-other. Their distribution functions are computed by differences of error functions, which a truncation far from the
-mean exhausts, so every translated prior is compared with the original before it is handed out.
+The priors are instances of bilby's own classes, so bilby can save, load and plot its results as usual. bilby computes
+distribution functions by differences of error functions, which lose all digits for a truncation far from the mean.
+Each translated prior is therefore compared with the original one before it is returned.
 """
 
 from __future__ import annotations
@@ -22,37 +22,49 @@ if TYPE_CHECKING:
 
 __all__ = ["BilbyProblem", "to_bilby"]
 
+# Probabilities at which translated priors are compared with the original ones, and the largest difference of quantiles
+# (in standard deviations) and of log densities.
 _LEVELS = np.linspace(0.001, 0.999, 21)
-_TOLERANCE = 1e-7  # of quantiles in sd, and of logarithms of densities
+_TOLERANCE = 1e-7
 
 
 class BilbyProblem(NamedTuple):
-    """What `bilby.run_sampler` takes first: the likelihood and the priors."""
+    """The first two arguments of `bilby.run_sampler`.
+
+    Attributes
+    ----------
+    likelihood : bilby.Likelihood
+        Log-likelihood of named parameters; it can be pickled.
+    priors : bilby.core.prior.PriorDict
+        Priors in the order of the parameters.
+    """
 
     likelihood: bilby.Likelihood
     priors: bilby.core.prior.PriorDict
 
 
 def to_bilby(posterior: Posterior) -> BilbyProblem:
-    """The posterior for bilby.
+    """Convert a posterior for bilby.
 
-    The likelihood stays zero outside the support of the posterior's own prior, whatever the priors given to bilby.
-    Zero is here a log-likelihood of -1e100: of an infinite one bilby draws the live point again, and the evidence would
-    be too large by the share of the prior in which simulations fail.
+    The likelihood is zero outside the support of the prior of `posterior`, even if other priors are passed to bilby. A
+    likelihood of zero is returned as a log-likelihood of -1e100. bilby would replace a live point with an infinite
+    log-likelihood, and its evidence would be too large: the logarithm of the share of the prior in which simulations
+    succeed would be missing.
 
     Parameters
     ----------
     posterior : Posterior
+        The posterior.
 
     Returns
     -------
     BilbyProblem
-        The likelihood (it pickles, under spawn too) and the priors, in the order of the parameters.
+        The likelihood (it can be pickled, also with the start method spawn) and the priors.
 
     Raises
     ------
     ValueError
-        If bilby has no prior equal to one of the posterior's.
+        If bilby has no prior that is equal to one of the posterior.
 
     Examples
     --------
@@ -66,7 +78,7 @@ def to_bilby(posterior: Posterior) -> BilbyProblem:
 
 
 def _make_likelihood(posterior: Posterior) -> bilby.Likelihood:
-    """What a pickle calls: the class is made at run time, so its instances are too."""
+    """Construct the likelihood; pickles refer to this function because the class is created at run time."""
     return _likelihood_class()(posterior)
 
 
@@ -87,20 +99,21 @@ def _likelihood_class() -> type:
             missing = [name for name in names if name not in parameters]
             if missing:
                 raise ValueError(
-                    f"the likelihood needs {', '.join(names)}; bilby's parameters lack {', '.join(missing)}: keep "
-                    "the names of to_bilby's priors, and fix a parameter with a DeltaFunction"
+                    f"the likelihood needs the parameters {', '.join(names)}, but bilby's parameters lack "
+                    f"{', '.join(missing)}: keep the names of the priors that to_bilby returned, and fix a parameter "
+                    "with a DeltaFunction"
                 )
-            # bilby's own conversions may have added others
+            # other names are ignored: bilby's conversions may have added parameters
             return self.posterior.finite_log_likelihood(np.array([parameters[name] for name in names], dtype=float))
 
     return BlackBoxLikelihood
 
 
 def _translated(name: str, distribution: Distribution) -> bilby.core.prior.Prior:
-    """bilby's prior equal to `distribution`, or ValueError."""
+    """Return bilby's prior that is equal to `distribution`, or raise ValueError."""
     from bilby.core import prior
 
-    # the type itself: a class derived from one of these is another distribution
+    # the exact type: a derived class is a different distribution
     kind = type(distribution)
     if kind is TruncatedNormal:
         translated = prior.TruncatedNormal(distribution.mean, distribution.sd, *distribution.bounds, name=name)
@@ -112,7 +125,7 @@ def _translated(name: str, distribution: Distribution) -> bilby.core.prior.Prior
         translated = prior.LogNormal(math.log(distribution.median), distribution.log_sd, name=name)
     else:
         raise ValueError(
-            f"to_bilby knows TruncatedNormal, HalfNormal, Uniform and LogNormal; {name!r} is a {kind.__name__}: "
+            f"to_bilby supports TruncatedNormal, HalfNormal, Uniform and LogNormal; {name!r} is a {kind.__name__}: "
             "replace it by one of them"
         )
     ours = distribution.ppf(_LEVELS)
@@ -121,8 +134,8 @@ def _translated(name: str, distribution: Distribution) -> bilby.core.prior.Prior
         densities = np.abs(np.log(translated.prob(ours)) - distribution.logpdf(ours))
     if not max(quantiles.max(), densities.max()) < _TOLERANCE:
         raise ValueError(
-            f"bilby's prior for {name!r} differs from {distribution!r}, by {quantiles.max():.2g} sd in a quantile and "
-            f"{densities.max():.2g} in a log-density: its bounds leave too little of the distribution for bilby's "
-            "arithmetic; move the mean towards the bounds or raise the sd"
+            f"bilby's prior for {name!r} differs from {distribution!r} by {quantiles.max():.2g} standard deviations in "
+            f"a quantile and {densities.max():.2g} in a log density, because the bounds truncate it too far from its "
+            "mean for bilby's arithmetic: move the mean towards the bounds or increase the standard deviation"
         )
     return translated

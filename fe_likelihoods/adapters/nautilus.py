@@ -1,4 +1,4 @@
-"""The prior of a posterior as a `nautilus.Prior`, which names the parameters."""
+"""Adapter for nautilus: the prior as a `nautilus.Prior`, with named parameters."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ __all__ = ["nautilus_prior"]
 
 
 def nautilus_prior(posterior: Posterior) -> nautilus.Prior:
-    """The posterior's prior for nautilus, parameters under their names and in their order.
+    """Convert the prior of a posterior for nautilus, with the names and the order of the parameters.
 
-    With this prior nautilus hands the likelihood a dictionary, which the posterior understands. Without names no
-    adapter is needed: ``nautilus.Sampler(posterior.prior_transform, posterior.log_likelihood, n_dim=posterior.ndim,
-    vectorized=True)``.
+    With this prior, nautilus calls the likelihood with a dictionary, which ``posterior.log_likelihood`` accepts. No
+    adapter is needed for parameters without names: ``nautilus.Sampler(posterior.prior_transform,
+    posterior.log_likelihood, n_dim=posterior.ndim, vectorized=True)``.
 
     Parameters
     ----------
     posterior : Posterior
+        The posterior.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A posterior as a `pints.LogPosterior`: a log-likelihood and a log-prior in the classes of pints."""
+"""Adapter for pints: a `pints.LogPosterior` made of a log-likelihood and a log-prior."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ __all__ = ["to_pints"]
 
 
 def to_pints(posterior: Posterior) -> pints.LogPosterior:
-    """The posterior for the Markov chains and the optimisers of pints.
+    """Convert a posterior for the Markov chains and optimisers of pints.
 
-    Priors are those of the posterior itself, not translated. No gradients: the methods of pints that need
-    ``evaluateS1`` (MALA, Hamiltonian) refuse it. For an evidence take another client: the ellipsoidal nested sampling
-    of pints 0.6.1 draws uniformly in parameter space, whatever the prior, and its evidence is wrong unless they are
-    all uniform.
+    The priors of the posterior are used directly. There are no gradients, so the methods of pints that need
+    ``evaluateS1`` (MALA, Hamiltonian Monte Carlo) cannot be used. Use another client for the evidence: the ellipsoidal
+    nested sampling of pints 0.6.1 draws uniformly in parameter space for any prior, so its evidence is wrong unless all
+    priors are uniform.
 
     Parameters
     ----------
     posterior : Posterior
+        The posterior.
 
     Returns
     -------
     pints.LogPosterior
-        It pickles, and so do its ``log_likelihood()`` and its ``log_prior()``.
+        It can be pickled, and so can its ``log_likelihood()`` and its ``log_prior()``.
 
     Examples
     --------
@@ -42,7 +43,7 @@ def to_pints(posterior: Posterior) -> pints.LogPosterior:
 
 
 def _make(name: str, posterior: Posterior) -> object:
-    """What a pickle calls: the classes are made at run time, so their instances are too."""
+    """Construct one of the classes; pickles refer to this function because the classes are created at run time."""
     return _classes()[name](posterior)
 
 

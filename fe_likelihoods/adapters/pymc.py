@@ -1,7 +1,8 @@
-"""A posterior as a `pymc.Model`: PyMC's distributions for the priors, the log-likelihood as a black box.
+"""Adapter for PyMC: a `pymc.Model` with PyMC's distributions as priors and the log-likelihood as a black box.
 
-A finite-element model has no gradients, so of PyMC's samplers those that need none apply: `pymc.sample_smc`, which
-gives the evidence, and `pymc.sample` with a step of `pymc.DEMetropolisZ`, `pymc.Metropolis` or `pymc.Slice`.
+A finite-element model has no gradients, so only the samplers of PyMC that need none can be used: `pymc.sample_smc`,
+which gives the evidence, and `pymc.sample` with the step method `pymc.DEMetropolisZ`, `pymc.Metropolis` or
+`pymc.Slice`.
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ __all__ = ["to_pymc"]
 
 
 def to_pymc(posterior: Posterior) -> pymc.Model:
-    """The posterior as a model of PyMC, with one free variable for each parameter, under its name.
+    """Convert a posterior to a PyMC model, with one free variable per parameter, of the same name.
 
-    The log-likelihood is a Potential named ``log_likelihood``. PyMC evaluates point by point: vectorised and compiled
-    models gain nothing of their batches there.
+    The log-likelihood is a Potential named ``log_likelihood``. PyMC evaluates one point at a time, so models that
+    simulate batches of points in parallel gain nothing from it.
 
     Parameters
     ----------
     posterior : Posterior
+        The posterior.
 
     Returns
     -------
@@ -38,14 +40,14 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
     Raises
     ------
     ValueError
-        If a prior is none of `fe_likelihoods.probability.priors`, or a parameter is named ``log_likelihood``.
+        If a prior is not one of `fe_likelihoods.probability.priors`, or a parameter is named ``log_likelihood``.
 
     Examples
     --------
     >>> with to_pymc(posterior):
     ...     trace = pymc.sample_smc(2000)
 
-    Chains start where the posterior is not zero, which PyMC's own starting point need not be:
+    Pass starting points where the posterior is not zero; the default starting point of PyMC may be elsewhere:
 
     >>> starts = [dict(zip(posterior.parameter_names, x)) for x in posterior.sample_start(4)]
     >>> with to_pymc(posterior):
@@ -55,7 +57,9 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
     import pytensor.tensor
 
     if "log_likelihood" in posterior.parameter_names:
-        raise ValueError("to_pymc: a parameter cannot be named 'log_likelihood', which is the name of the likelihood")
+        raise ValueError(
+            "a parameter is named 'log_likelihood', which to_pymc uses for the likelihood: rename the parameter"
+        )
     with pymc.Model() as model:
         parameters = [_translated(name, d) for name, d in posterior.prior.distributions.items()]
         pymc.Potential("log_likelihood", _op_class()(posterior)(pytensor.tensor.stack(parameters)))
@@ -63,7 +67,7 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
 
 
 def _make_op(posterior: Posterior) -> object:
-    """What a pickle calls: the class is made at run time, so its instances are too."""
+    """Construct the operator; pickles refer to this function because the class is created at run time."""
     return _op_class()(posterior)
 
 
@@ -89,10 +93,10 @@ def _op_class() -> type:
 
 
 def _translated(name: str, distribution: Distribution) -> object:
-    """PyMC's variable with this prior, in the model whose context is open."""
+    """Create the variable with this prior in the current PyMC model, or raise ValueError."""
     import pymc
 
-    # the type itself: a class derived from one of these is another distribution
+    # the exact type: a derived class is a different distribution
     kind = type(distribution)
     if kind is TruncatedNormal:
         low, high = (bound if math.isfinite(bound) else None for bound in distribution.bounds)
@@ -104,6 +108,6 @@ def _translated(name: str, distribution: Distribution) -> object:
     if kind is LogNormal:
         return pymc.LogNormal(name, math.log(distribution.median), distribution.log_sd)
     raise ValueError(
-        f"to_pymc knows TruncatedNormal, HalfNormal, Uniform and LogNormal; {name!r} is a {kind.__name__}: "
+        f"to_pymc supports TruncatedNormal, HalfNormal, Uniform and LogNormal; {name!r} is a {kind.__name__}: "
         "replace it by one of them"
     )

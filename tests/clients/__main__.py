@@ -1,6 +1,6 @@
-"""``python -m tests.clients [client ...]``: runs the clients that are installed, one Markdown row for each.
+"""``python -m tests.clients [client ...]``: run the clients that are installed and print one Markdown row per client.
 
-The errors are the largest of the four parameters; wall time is that of the machine at hand, imports included.
+The errors are those of the worst of the four parameters. The wall time includes imports.
 """
 
 import os
@@ -20,7 +20,7 @@ def main() -> None:
         "evaluations | wall s | CPU s |\n|---|---|---|---|---|---|---|\n"
     )
     names = sys.argv[1:] or list(CLIENTS)
-    # a process for each: what one client imports may keep another from starting
+    # one process per client: modules that one client imports can prevent another from starting
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         for row in pool.map(table.row, names, repeat(seed)):
             sys.stdout.write(row + "\n")

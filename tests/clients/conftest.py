@@ -1,4 +1,4 @@
-"""What the tests of clients share: the exact answer, and a client or a skip that says how to get it."""
+"""Fixtures of the tests of clients: the exact answer, and a client, or a skip that says how to install it."""
 
 import importlib.util
 import logging
@@ -18,15 +18,16 @@ def answer() -> Exact:
 
 @pytest.fixture(autouse=True)
 def quiet(caplog):
-    """The failures of the oscillator are meant to be."""
+    """Hide the failed simulations of the oscillator, which are intended."""
     caplog.set_level(logging.ERROR, logger="fe_likelihoods")
 
 
 @pytest.fixture
 def client_named():
-    """Function from a name of `runs.CLIENTS` to the client; skips the test where it is not installed.
+    """Function from a name of `runs.CLIENTS` to the client; it skips the test if the client is not installed.
 
-    ``REQUIRED_CLIENTS``, modules separated by commas, makes a failure of what would be a skip.
+    The environment variable ``REQUIRED_CLIENTS``, a list of modules separated by commas, turns such a skip into a
+    failure.
     """
 
     def find(name: str) -> Client:

@@ -1,13 +1,13 @@
-"""A posterior that every client can finish in seconds, and its exact moments and evidence.
+"""A posterior that every client can sample in seconds, and its exact moments and evidence.
 
-A strongly damped linear oscillator with four parameters, each with another kind of prior, chosen so that whatever a
-client gets wrong shows: thirty samples leave the posterior wide, skewed and cut by the damping's lower bound; and in
-three fifths of the prior the simulation fails (the oscillator is overdamped), so that every client meets -inf, and one
-that drops such points instead of counting them has an evidence too large by 0.9.
+The model is a strongly damped linear oscillator with four parameters, each with a different kind of prior. It is chosen
+so that errors of a client are visible. Thirty samples leave the posterior wide, skewed and truncated by the lower bound
+of the damping. In three fifths of the prior the simulation fails (the oscillator is overdamped), so every client
+meets -inf; a client that drops such points instead of counting them has a log-evidence that is too large by 0.9.
 
-The answer comes by another way than the library's: distributions of `scipy.stats`, the likelihood written out, and
-quadrature. Given stiffness and damping the two noises are independent, so four nested integrals become a grid of
-products of two.
+The exact answer is computed independently of the library: with distributions of `scipy.stats`, an explicit likelihood
+and quadrature. Given stiffness and damping, the two noise parameters are independent, so four nested integrals reduce
+to a grid of products of two.
 """
 
 import functools
@@ -16,18 +16,24 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, LogNormal, Prior, TruncatedNormal, Uniform
-from fe_likelihoods.signals.channels import Measurements
-from fe_likelihoods.signals.records import Record
+from fe_likelihoods import (
+    FELikelihood,
+    HalfNormal,
+    LinearOscillator,
+    LogNormal,
+    Measurements,
+    Posterior,
+    Prior,
+    Record,
+    TruncatedNormal,
+    Uniform,
+)
 from fe_likelihoods.signals.sdof import respond
 
 __all__ = ["CRITICAL", "PRIOR", "Exact", "exact", "make_posterior", "reference_log_prob"]
 
 PERIOD, DAMPING_RATIO, DT, N_STEPS = 0.8, 0.5, 0.05, 30
-CRITICAL = 1.0 / DAMPING_RATIO  # multiple of the nominal damping from which no simulation succeeds
+CRITICAL = 1.0 / DAMPING_RATIO  # multiple of the nominal damping above which all simulations fail
 TRUTH, NOISE = (1.2, 0.8), (1.0, 0.012)
 PRIOR = {
     "stiffness": Uniform(0.4, 2.4),
@@ -44,7 +50,7 @@ DENSITIES = (
 
 
 class Exact(NamedTuple):
-    """Of the posterior: mean and sd of every parameter (4,), and the logarithm of the evidence."""
+    """Mean and standard deviation of each parameter (4,), and the log-evidence, of the posterior."""
 
     mean: np.ndarray
     sd: np.ndarray
@@ -65,14 +71,14 @@ def _simulate(base: np.ndarray, stiffness: float, damping: float) -> np.ndarray:
 
 
 def make_posterior(prior: dict | None = None) -> Posterior:
-    """The posterior, anew: nothing is remembered or counted yet."""
+    """Make a new posterior, with an empty cache and no simulations counted."""
     base, measured = _data()
     model = LinearOscillator(Record("noise", DT, base), PERIOD, DAMPING_RATIO)
     return Posterior(FELikelihood(model, Measurements(model.channels, DT, measured)), Prior(prior or PRIOR))
 
 
 def reference_log_prob(x: np.ndarray) -> float:
-    """Log-prior plus log-likelihood of one point (4,), with nothing of the library but the oscillator."""
+    """Log-prior plus log-likelihood of one point (4,), which uses only the oscillator of the library."""
     log_prior = sum(density.logpdf(value) for density, value in zip(DENSITIES, x, strict=True))
     if not np.isfinite(log_prior) or x[1] >= CRITICAL:
         return -np.inf
@@ -83,7 +89,7 @@ def reference_log_prob(x: np.ndarray) -> float:
 
 @functools.cache
 def exact(nodes: int = 60) -> Exact:
-    """Moments and evidence by Gauss-Legendre quadrature with so many nodes in every direction."""
+    """Moments and evidence by Gauss-Legendre quadrature with the given number of nodes per dimension."""
     base, measured = _data()
     unit, weight = np.polynomial.legendre.leggauss(nodes)
 
@@ -96,7 +102,7 @@ def exact(nodes: int = 60) -> Exact:
 
     log_plane = np.log(np.outer(stiffness_weight, damping_weight))
     log_plane += DENSITIES[0].logpdf(stiffness)[:, None] + DENSITIES[1].logpdf(damping)
-    means, squares = [], []  # of each noise, given stiffness and damping
+    means, squares = [], []  # of each noise parameter, given stiffness and damping
     for channel, (low, high) in enumerate([(0.2, 4.0), (0.002, 0.1)]):
         log_sigma, sigma_weight = rule(np.log(low), np.log(high))
         sigma = np.exp(log_sigma)

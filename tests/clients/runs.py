@@ -1,7 +1,7 @@
-"""Every client on the posterior of `problem`, as its user would write it: what the README's table promises, in code.
+"""Runs of all clients on the posterior of `problem`, in the form that the table of clients documents.
 
-Settings are small, so that a run takes seconds; starts are drawn where the posterior is not zero, because several
-clients refuse others. Clients are imported by the runs alone.
+Settings are small, so that a run takes seconds. Starting points are drawn where the posterior is not zero, because
+several clients refuse others. Each client is imported inside its function.
 """
 
 import logging
@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods import Posterior, nautilus_prior, to_bilby, to_pints, to_pymc
 
 from .scoring import Found, chains, replicates, weighted
 
@@ -114,7 +113,7 @@ def _ultranest(posterior: Posterior, seed: int) -> Found:
     sampler = ultranest.ReactiveNestedSampler(
         posterior.parameter_names, posterior.finite_log_likelihood, posterior.prior_transform, vectorized=True
     )
-    logging.getLogger("ultranest").setLevel(logging.WARNING)  # its constructor has set it to all there is
+    logging.getLogger("ultranest").setLevel(logging.WARNING)  # its constructor sets the most detailed level
     result = sampler.run(min_num_live_points=250, show_status=False, viz_callback=False)
     found = result["weighted_samples"]
     return weighted(np.array(found["points"]), np.array(found["weights"]), result["logz"], result["logzerr"])
@@ -124,7 +123,7 @@ def _pocomc(posterior: Posterior, seed: int) -> Found:
     import pocomc
 
     runs = []
-    for repetition in range(6):  # without its flow pocomc gives no error of the evidence: that of what runs differ by
+    for repetition in range(6):  # without its flow, pocomc gives no error of the evidence: use the scatter of runs
         np.random.seed(10 * seed + repetition)  # noqa: NPY002 - the prior is drawn from the global stream
         sampler = pocomc.Sampler(
             posterior.prior,
@@ -133,7 +132,7 @@ def _pocomc(posterior: Posterior, seed: int) -> Found:
             random_state=10 * seed + repetition,
             n_active=64,
             n_effective=256,
-            precondition=False,  # the training of a flow takes minutes, and gains nothing in four dimensions
+            precondition=False,  # training a flow takes minutes, and gains nothing in four dimensions
         )
         sampler.run(n_total=1024, progress=False)
         samples, weights, _, _ = sampler.posterior()
@@ -150,9 +149,9 @@ def _pymc_smc(posterior: Posterior, seed: int) -> Found:
         )
     samples = np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1)
     runs = []
-    evidences = trace.sample_stats["log_marginal_likelihood"].values.ravel()  # a list of its stages for each chain
+    evidences = trace.sample_stats["log_marginal_likelihood"].values.ravel()  # one list of stages per chain
     for draws, stages in zip(samples, evidences, strict=True):
-        stages = np.array(stages, dtype=float)  # NaN before the last
+        stages = np.array(stages, dtype=float)  # NaN before the last stage
         runs.append(weighted(draws, np.ones(len(draws)), stages[np.isfinite(stages)][-1], np.nan))
     return replicates(runs)
 
@@ -191,7 +190,7 @@ def _uqpy(posterior: Posterior, seed: int) -> Found:
 
 
 class Client(NamedTuple):
-    """What to import, what distribution it comes from, how to install it, and how it is run."""
+    """The module to import, the distribution that provides it, the command that installs it, and the run."""
 
     module: str
     distribution: str

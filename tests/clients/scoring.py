@@ -1,4 +1,4 @@
-"""What a client found, held against the exact answer with tolerances from its own errors."""
+"""Comparison of the result of a client with the exact answer, with tolerances from its own standard errors."""
 
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ from .problem import Exact
 
 __all__ = ["Found", "Score", "chains", "check", "replicates", "score", "weighted"]
 
-STANDARD_ERRORS = 5.0  # of a moment: the errors come from sizes of a few hundred draws, uncertain themselves
+STANDARD_ERRORS = 5.0  # of a moment: the errors come from a few hundred draws and are uncertain themselves
 EVIDENCE_ERRORS = 4.0
 
 
 class Found(NamedTuple):
-    """What a client found: moments and their standard errors (4,), in the parameters' units, and maybe an evidence."""
+    """Result of a client: moments and their standard errors (4,), in the units of the parameters, and the evidence."""
 
     mean: np.ndarray
     mean_error: np.ndarray
@@ -25,7 +25,7 @@ class Found(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Errors: of means in sd and in standard errors, of sd as ratios and in standard errors, of the evidence."""
+    """Errors of means, standard deviations (sd, as ratios) and evidence; z are errors in standard errors."""
 
     mean: np.ndarray
     mean_z: np.ndarray
@@ -52,7 +52,7 @@ def _found(samples, weights, mean_size, square_size, log_evidence=None, log_evid
 
 
 def chains(samples: np.ndarray) -> Found:
-    """From chains (n_chains, n_draws, 4): sizes by arviz, of the values and of the squares."""
+    """Result from chains (n_chains, n_draws, 4), with effective sample sizes of values and squares by arviz."""
     mean = samples.mean(axis=(0, 1))
     sizes = [
         np.array([arviz.ess(values[:, :, i], method="mean") for i in range(samples.shape[2])])
@@ -63,14 +63,14 @@ def chains(samples: np.ndarray) -> Found:
 
 
 def weighted(samples: np.ndarray, weights: np.ndarray, log_evidence: float, log_evidence_error: float) -> Found:
-    """From draws (n, 4) with weights (n,), otherwise independent: their size is that of Kish."""
+    """Result from independent draws (n, 4) with weights (n,), with Kish's effective sample size."""
     weights = weights / weights.sum()
     size = 1.0 / (weights @ weights)
     return _found(samples, weights, size, size, float(log_evidence), float(log_evidence_error))
 
 
 def replicates(runs: list[Found]) -> Found:
-    """From independent runs whose own errors are not to be trusted: errors from what the runs differ by."""
+    """Result from independent runs without reliable errors of their own: errors from the scatter of the runs."""
     mean, sd, log_evidence = (np.array([getattr(run, name) for run in runs]) for name in ("mean", "sd", "log_evidence"))
     root = np.sqrt(len(runs))
     return Found(
@@ -84,7 +84,7 @@ def replicates(runs: list[Found]) -> Found:
 
 
 def score(found: Found, exact: Exact) -> Score:
-    """How far `found` is from `exact`."""
+    """Errors of `found`."""
     evidence = None if found.log_evidence is None else float(found.log_evidence - exact.log_evidence)
     return Score(
         (found.mean - exact.mean) / exact.sd,
@@ -97,12 +97,12 @@ def score(found: Found, exact: Exact) -> Score:
 
 
 def check(found: Found, exact: Exact) -> None:
-    """AssertionError unless all is within its standard errors, and these are small enough to tell."""
+    """Raise AssertionError unless all errors are within tolerance and the standard errors are small enough."""
     result = score(found, exact)
-    assert np.all(found.mean_error < 0.1 * exact.sd), f"too few draws to tell: {found}"
+    assert np.all(found.mean_error < 0.1 * exact.sd), f"too few draws for a comparison: {found}"
     assert np.all(np.abs(result.mean_z) < STANDARD_ERRORS), f"means: {result}"
     assert np.all(np.abs(result.sd_z) < STANDARD_ERRORS), f"standard deviations: {result}"
     if found.log_evidence is not None:
-        # an evidence that forgets the points of probability zero is too large by 0.9: more than four errors
+        # a log-evidence that ignores points of probability zero is too large by 0.9, more than four of these errors
         assert 0.0 < found.log_evidence_error < 0.22, f"an evidence without a usable error: {found}"
         assert abs(result.log_evidence_z) < EVIDENCE_ERRORS, f"evidence: {result}"

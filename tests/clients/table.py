@@ -1,4 +1,4 @@
-"""A row of the table of clients. It runs in a process of its own (see `__main__`)."""
+"""One row of the table of clients, made in a process of its own (see `__main__`)."""
 
 import importlib.metadata
 import importlib.util
@@ -13,7 +13,7 @@ from .scoring import score
 
 
 def row(name: str, seed: int) -> str:
-    """Run one client and score it against quadrature: a row in Markdown."""
+    """Run one client, compare it with quadrature, and return a row in Markdown."""
     logging.getLogger("fe_likelihoods").setLevel(logging.ERROR)
     client = CLIENTS[name]
     if importlib.util.find_spec(client.module) is None:

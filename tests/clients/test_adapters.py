@@ -1,4 +1,4 @@
-"""Adapters map priors exactly, keep the likelihood, and say what they cannot do; no sampling."""
+"""Adapters translate priors exactly, keep the likelihood, and refuse what they do not support; no sampling."""
 
 import dataclasses
 import pickle
@@ -6,8 +6,16 @@ import pickle
 import numpy as np
 import pytest
 
-from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
-from fe_likelihoods.probability.priors import HalfNormal, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods import (
+    HalfNormal,
+    LogNormal,
+    TruncatedNormal,
+    Uniform,
+    nautilus_prior,
+    to_bilby,
+    to_pints,
+    to_pymc,
+)
 
 from .problem import PRIOR, make_posterior
 
@@ -26,7 +34,7 @@ VARIANTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Triangle(Uniform):
-    """A distribution that no client knows."""
+    """A distribution that no client supports."""
 
 
 @pytest.fixture(params=VARIANTS, ids=str)
@@ -36,7 +44,7 @@ def posterior(request):
 
 @pytest.fixture
 def points(posterior):
-    """Quantiles into both tails, and draws."""
+    """Quantiles in both tails, and random draws."""
     edge = np.array([1e-6, 1e-3, 0.5, 0.999, 1.0 - 1e-6])[:, None] * np.ones(4)
     return posterior.prior_transform(np.concatenate([edge, np.random.default_rng(5).random((20, 4))]))
 
@@ -54,7 +62,7 @@ def test_bilby_has_our_priors(client_named, posterior, points):
     assert likelihood.log_likelihood(dict(zip(NAMES, outside, strict=True))) == -1e100
 
 
-def test_bilby_likelihood_takes_names_in_any_order_and_more(client_named):
+def test_bilby_likelihood_takes_names_in_any_order_and_ignores_others(client_named):
     client_named("bilby")
     posterior = make_posterior()
     likelihood, _ = to_bilby(posterior)
@@ -68,7 +76,7 @@ def test_bilby_likelihood_takes_names_in_any_order_and_more(client_named):
         likelihood.log_likelihood(parameters)
 
 
-def test_bilby_refuses_a_prior_that_its_arithmetic_cannot_hold(client_named):
+def test_bilby_refuses_a_prior_beyond_its_arithmetic(client_named):
     client_named("bilby")
     far = make_posterior(PRIOR | {"damping": TruncatedNormal(0.0, 0.1, lower=0.9)})
     with pytest.raises(ValueError, match="'damping' differs from TruncatedNormal"):
@@ -79,7 +87,7 @@ def test_pymc_has_our_priors_and_likelihood(client_named, posterior, points):
     client_named("pymc-smc")
     model = to_pymc(posterior)
     assert [variable.name for variable in model.free_RVs] == NAMES
-    # without the Jacobians of PyMC's transformations: the density in our parameters
+    # without the Jacobians of PyMC's transformations: densities in the original parameters
     log_prior = model.compile_fn(model.varlogp_nojac, inputs=model.value_vars, point_fn=False)
     log_likelihood = model.compile_fn(model.datalogp, inputs=model.value_vars, point_fn=False)
     for point in points:
@@ -126,7 +134,7 @@ def test_pints_has_our_prior_and_likelihood(client_named, posterior, points):
     assert log_prior.mean()[3] == posterior.prior.distributions["sigma_displacement"].moments[0]
 
 
-def test_nautilus_prior_is_ours_and_hands_over_names(client_named, posterior):
+def test_nautilus_has_our_prior_and_passes_names(client_named, posterior):
     client_named("nautilus")
     prior = nautilus_prior(posterior)
     assert prior.keys == NAMES and prior.dimensionality() == 4

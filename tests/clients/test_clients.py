@@ -1,10 +1,10 @@
-"""Every client samples a posterior of this library and finds the moments and the evidence that quadrature has."""
+"""Every client samples a posterior of this library and reproduces the moments and the evidence of quadrature."""
 
 import numpy as np
 import pytest
 from scipy import optimize
 
-from fe_likelihoods.probability.priors import TruncatedNormal
+from fe_likelihoods import TruncatedNormal
 
 from .problem import CRITICAL, PRIOR, exact, make_posterior, reference_log_prob
 from .runs import CLIENTS
@@ -28,21 +28,21 @@ def test_client_agrees_with_quadrature(name, client_named, answer, seed):
     check(client_named(name).run(make_posterior(), seed), answer)
 
 
-def test_wrong_prior_is_caught(client_named, answer, seed):
-    """Control: had an adapter lost the mean and the upper bound of one prior, the check would tell."""
+def test_wrong_prior_is_detected(client_named, answer, seed):
+    """Negative control: a prior with another mean and without its upper bound fails the check."""
     wrong = make_posterior(PRIOR | {"damping": TruncatedNormal(1.0, 0.8, lower=0.7)})
     with pytest.raises(AssertionError, match="means|standard deviations"):
         check(client_named("emcee").run(wrong, seed), answer)
 
 
-def test_evidence_without_the_failed_runs_is_caught(answer):
-    """Control: failures are three fifths of the prior; who leaves them out is caught at the largest error."""
+def test_evidence_without_the_failed_runs_is_detected(answer):
+    """Negative control: an evidence without the failed three fifths of the prior fails, even at the largest error."""
     shares = make_posterior().prior.distributions["damping"].ppf(np.linspace(0.0, 1.0, 10_001)) < CRITICAL
     small = 0.01 * answer.sd
-    forgetful = Found(answer.mean, small, answer.sd, small, answer.log_evidence - np.log(shares.mean()), 0.21)
+    without_failures = Found(answer.mean, small, answer.sd, small, answer.log_evidence - np.log(shares.mean()), 0.21)
     with pytest.raises(AssertionError, match="evidence"):
-        check(forgetful, answer)
-    check(forgetful._replace(log_evidence=answer.log_evidence), answer)
+        check(without_failures, answer)
+    check(without_failures._replace(log_evidence=answer.log_evidence), answer)
 
 
 @pytest.mark.parametrize("method", ["Nelder-Mead", "Powell", "L-BFGS-B"])

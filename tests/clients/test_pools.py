@@ -1,4 +1,4 @@
-"""Clients with pools of their own: the posterior goes to spawned processes, as it must where there is no fork."""
+"""Clients with pools of their own: the posterior is sent to spawned processes, as on systems without fork."""
 
 import multiprocessing
 import pickle
@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 
-from fe_likelihoods.adapters import to_bilby
+from fe_likelihoods import to_bilby
 
 from .problem import make_posterior
 
@@ -60,7 +60,7 @@ def test_dynesty_through_a_pool(client_named, pool):
     )
     sampler.run_nested(maxiter=60, print_progress=False, add_live=False)
     found = sampler.results
-    assert posterior.report()["simulations"] == 0, "all of them in the processes"
+    assert posterior.report()["simulations"] == 0, "all simulations run in the processes"
     expected = posterior.finite_log_likelihood(found.samples)
     possible = expected > -1e99
     np.testing.assert_array_equal(found.logl[possible], expected[possible])

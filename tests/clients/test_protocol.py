@@ -1,9 +1,9 @@
-"""What the posterior offers to clients besides its densities: starts, finite values, and errors that help."""
+"""Other methods of the posterior for clients: starting points, finite densities, and clear errors."""
 
 import numpy as np
 import pytest
 
-from fe_likelihoods.probability.priors import TruncatedNormal, Uniform
+from fe_likelihoods import TruncatedNormal, Uniform
 
 from .problem import CRITICAL, PRIOR, make_posterior
 
@@ -16,13 +16,13 @@ def posterior():
 def test_starts_are_draws_of_the_prior_where_simulations_succeed(posterior):
     starts = posterior.sample_start(2000, 1)
     assert starts.shape == (2000, 4) and np.isfinite(posterior(starts)).all()
-    # given the damping below critical, still the prior: its mean there, by quantiles
+    # below critical damping the starts follow the prior: compare with its mean there, from quantiles
     damping = posterior.prior.distributions["damping"]
     quantiles = damping.ppf(np.linspace(0.0, 1.0, 100_001))
     inside = quantiles[quantiles < CRITICAL]
     assert abs(starts[:, 1].mean() - inside.mean()) < 4.0 * inside.std() / np.sqrt(2000)
     np.testing.assert_array_equal(starts[:5], posterior.sample_start(2000, np.random.default_rng(1))[:5])
-    np.random.seed(3)  # noqa: NPY002 - the global stream is what None stands for
+    np.random.seed(3)  # noqa: NPY002 - None means the global stream
     first = posterior.sample_start(3)
     assert not np.array_equal(first, posterior.sample_start(3))
 
@@ -34,7 +34,7 @@ def test_starts_where_everything_fails_are_refused():
     assert hopeless.report()["failure_count"] >= 4000
 
 
-def test_finite_values_differ_where_the_posterior_is_zero_alone(posterior):
+def test_finite_densities_differ_only_where_the_posterior_is_zero(posterior):
     points = np.array([posterior.sample_start(1, 1)[0], [1.0, 3.0, 1.0, 0.01], [9.0, 1.0, 1.0, 0.01], [np.nan] * 4])
     assert np.isfinite(posterior(points)).tolist() == [True, False, False, False]
     finite, negative = posterior.finite_log_likelihood(points), posterior.negative_log_prob(points)
@@ -47,7 +47,7 @@ def test_finite_values_differ_where_the_posterior_is_zero_alone(posterior):
 
 @pytest.mark.parametrize("density", ["log_prob", "log_likelihood", "finite_log_likelihood", "negative_log_prob"])
 @pytest.mark.parametrize("shape", [(), (3,), (2, 5), (1, 2, 4)])
-def test_wrong_shapes_are_answered_with_the_names(posterior, density, shape):
+def test_errors_of_wrong_shapes_name_the_parameters(posterior, density, shape):
     with pytest.raises(ValueError, match="4 parameters stiffness, damping, sigma_acceleration, sigma_displacement"):
         getattr(posterior, density)(np.ones(shape))
 

@@ -9,22 +9,26 @@ import pytest
 from emcee.model import Model
 from scipy import stats
 
-from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal
-from fe_likelihoods.signals.channels import Measurements
-from fe_likelihoods.signals.records import Record
+from fe_likelihoods import (
+    FELikelihood,
+    HalfNormal,
+    LinearOscillator,
+    Measurements,
+    Posterior,
+    Record,
+    TruncatedNormal,
+)
 from samplers import (
     CHING_CHEN_2007,
     RAMANCHA_2022_CONSTANT,
     RAMANCHA_2022_LITERAL,
+    MixtureMove,
+    RandomWalkMove,
     SMCSampler,
     TemperedSampler,
     TMCMCSampler,
 )
 from samplers.moves.fast_parameters import WithFastSweeps, _FastWalk
-from samplers.moves.kernels import MixtureMove, RandomWalkMove
 from tests.contract.targets import Gaussian, WithBlobs
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from samplers.moves.kernels import MixtureMove
+from samplers import MixtureMove
 from samplers.proposals.mixture import draw, fit_mixture, log_density, log_responsibilities
 from samplers.proposals.shears import apply_shears, find_shears, invert_shears
 from samplers.proposals.support_bounds import (
