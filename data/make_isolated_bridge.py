@@ -16,14 +16,13 @@ from pathlib import Path
 
 from fe_likelihoods.data.ground_motion import stochastic_motion
 
+from fe_likelihoods import Record, write_dataset
 from fe_likelihoods.problems import (
     ISOLATED_BRIDGE_NOISE,
     ISOLATED_BRIDGE_OUTPUTS,
     ISOLATED_BRIDGE_TRUTH,
     isolated_bridge_measurements,
 )
-from fe_likelihoods.signals.channels import write_dataset
-from fe_likelihoods.signals.records import Record
 
 SEED = 1994
 NOISE_SEED = 1999
