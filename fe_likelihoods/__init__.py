@@ -58,11 +58,12 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         SteelCoupon,
     )
     from .plots.histories import (
-        plot_bands,
-        plot_fragility,
         plot_histories,
         plot_loop,
-        plot_residuals,
+    )
+    from .plots.predictions import (
+        plot_bands,
+        plot_fragility,
     )
     from .prediction.averaging import (
         AveragedPrediction,
@@ -109,24 +110,32 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     )
     from .probability.residuals import (
         ResidualChecks,
+        plot_residuals,
         residual_checks,
     )
     from .signals.channels import (
         Channel,
-        Dataset,
-        ImposedTest,
         Measurements,
-        read_columns,
+    )
+    from .signals.datasets import (
+        Dataset,
         read_dataset,
-        read_imposed_test,
         write_dataset,
+    )
+    from .signals.error_measures import (
+        rrmse,
+    )
+    from .signals.readers import (
+        ImposedTest,
+        read_at2,
+        read_columns,
+        read_csv,
+        read_imposed_test,
+        read_v2,
     )
     from .signals.records import (
         DisplacementHistory,
         Record,
-        read_at2,
-        read_csv,
-        read_v2,
     )
     from .signals.response_spectrum import (
         ResponseSpectrum,
@@ -220,6 +229,7 @@ __all__ = [
     "read_v2",
     "residual_checks",
     "response_spectrum",
+    "rrmse",
     "to_bilby",
     "to_pints",
     "to_pymc",
@@ -260,11 +270,12 @@ _EXPORTS = {
     ),
     "models.steel_coupon": ("SteelCoupon",),
     "plots.histories": (
-        "plot_bands",
-        "plot_fragility",
         "plot_histories",
         "plot_loop",
-        "plot_residuals",
+    ),
+    "plots.predictions": (
+        "plot_bands",
+        "plot_fragility",
     ),
     "prediction.averaging": (
         "AveragedPrediction",
@@ -305,24 +316,30 @@ _EXPORTS = {
     ),
     "probability.residuals": (
         "ResidualChecks",
+        "plot_residuals",
         "residual_checks",
     ),
     "signals.channels": (
         "Channel",
-        "Dataset",
-        "ImposedTest",
         "Measurements",
-        "read_columns",
+    ),
+    "signals.datasets": (
+        "Dataset",
         "read_dataset",
-        "read_imposed_test",
         "write_dataset",
+    ),
+    "signals.error_measures": ("rrmse",),
+    "signals.readers": (
+        "ImposedTest",
+        "read_at2",
+        "read_columns",
+        "read_csv",
+        "read_imposed_test",
+        "read_v2",
     ),
     "signals.records": (
         "DisplacementHistory",
         "Record",
-        "read_at2",
-        "read_csv",
-        "read_v2",
     ),
     "signals.response_spectrum": (
         "ResponseSpectrum",

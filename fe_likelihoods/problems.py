@@ -27,7 +27,8 @@ from .probability.likelihood import FELikelihood
 from .probability.noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
 from .probability.posterior import Posterior
 from .probability.priors import HalfNormal, Prior, TruncatedNormal, Uniform
-from .signals.channels import Channel, Dataset, Measurements, read_dataset
+from .signals.channels import Channel, Measurements
+from .signals.datasets import Dataset, read_dataset
 from .signals.records import Record
 from .simulation.disk_cache import SimulationCache
 from .units import to_si

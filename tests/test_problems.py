@@ -19,8 +19,10 @@ from fe_likelihoods.problems import (
     bridge_column_measurements,
     bridge_column_prior,
 )
-from fe_likelihoods.signals.channels import Channel, Measurements, read_dataset, write_dataset
-from fe_likelihoods.signals.records import Record, read_csv
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.datasets import read_dataset, write_dataset
+from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0, to_si
 
 INCH = to_si(1.0, "in").item()

@@ -28,7 +28,7 @@ from scipy.special import logsumexp
 
 from fe_likelihoods import problems
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.plots.histories import plot_bands
+from fe_likelihoods.plots.predictions import plot_bands
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak
 from fe_likelihoods.probability.likelihood import FELikelihood

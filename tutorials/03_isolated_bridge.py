@@ -36,7 +36,7 @@ from scipy.stats import gaussian_kde
 
 from fe_likelihoods import problems
 from fe_likelihoods.models.isolated_bridge import Bearing
-from fe_likelihoods.plots.histories import plot_bands, plot_fragility
+from fe_likelihoods.plots.predictions import plot_bands, plot_fragility
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.quantities import peak
 from fe_likelihoods.prediction.reliability import exceedance, fragility

@@ -36,14 +36,15 @@ from real_data import COLOURS, FAST, NOISES
 
 from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import BridgeDeck
-from fe_likelihoods.plots.histories import plot_bands, plot_residuals
+from fe_likelihoods.plots.predictions import plot_bands
 from fe_likelihoods.prediction.propagation import Prediction, propagate
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.probability.priors import HalfNormal, Uniform
-from fe_likelihoods.probability.residuals import residual_checks
+from fe_likelihoods.probability.residuals import plot_residuals, residual_checks
 from fe_likelihoods.signals.channels import Channel, Measurements
-from fe_likelihoods.signals.records import Record, read_v2
+from fe_likelihoods.signals.readers import read_v2
+from fe_likelihoods.signals.records import Record
 from samplers.reporting.model_comparison import compare_models
 
 SOURCE = "https://www.strongmotioncenter.org (CESMD), processed data of that station"

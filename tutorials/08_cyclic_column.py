@@ -48,7 +48,8 @@ from cyclic_tests import (
 
 from fe_likelihoods.models.rc_column import Bars, Concrete, Hoops, RCColumn, Steel
 from fe_likelihoods.probability.priors import TruncatedNormal
-from fe_likelihoods.signals.channels import Channel, Measurements, read_imposed_test
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.readers import read_imposed_test
 from fe_likelihoods.signals.records import DisplacementHistory
 from fe_likelihoods.units import from_si, to_si
 

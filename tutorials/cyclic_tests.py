@@ -21,13 +21,18 @@ import numpy as np
 from matplotlib.figure import Figure
 from real_data import find
 
-from fe_likelihoods.plots.histories import plot_residuals
 from fe_likelihoods.prediction.propagation import Prediction, propagate
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import HalfNormal, Prior, Uniform
-from fe_likelihoods.probability.residuals import ResidualChecks, effective_samples, innovations, residual_checks
+from fe_likelihoods.probability.residuals import (
+    ResidualChecks,
+    effective_samples,
+    innovations,
+    plot_residuals,
+    residual_checks,
+)
 from fe_likelihoods.signals.channels import Measurements
 from samplers import SMCSampler
 from samplers.reporting.summary import summary

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..signals.channels import Channel
+from ..signals.channels import Channel, Measurements, plot_response
 from ..simulation.model import SimulationFailed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..signals.channels import Measurements
 
 __all__ = ["CheckedModel", "positive"]
 
@@ -118,10 +117,8 @@ class CheckedModel:
         return response
 
     def plot_response(self, theta: np.ndarray, measurements: "Measurements | None" = None) -> "Figure":
-        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
-        from ..plots.structures import plot_response
-
-        return plot_response(self, theta, measurements)
+        """Plot the response at `theta`, beside measurements if there are any."""
+        return plot_response(Measurements(self.channels, self.dt, self.simulate(theta)), measurements)
 
     def _checked(self, response: Any) -> np.ndarray:
         expected = (len(self.channels), self.n_steps)

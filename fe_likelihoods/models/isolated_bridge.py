@@ -35,7 +35,7 @@ from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC
 from ..kernels.exponential import matrix_exponential
 from ..kernels.isolated_bridge import N_OUT, N_STATES, step_isolated
 from ..kernels.jit import KERNEL_HASH
-from ..signals.channels import Channel
+from ..signals.channels import Channel, Measurements, plot_response
 from ..signals.records import Record
 from ..simulation.model import MisfitBatch, SimulationBatch, SimulationFailed
 from ..simulation.threads import map_threads
@@ -45,7 +45,6 @@ from .validation import channel_rows, number, refuse, theta_row, theta_rows, who
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..signals.channels import Measurements
 
 __all__ = ["CHANNEL_SETS", "Bearing", "BridgeHistory", "Damper", "IsolatedBridge", "Pier", "Rubber"]
 
@@ -266,13 +265,11 @@ class IsolatedBridge:
         return physical[..., [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]] / nominal
 
     def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
-        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
-        from ..plots.structures import plot_response
-
-        return plot_response(self, theta, measurements)
+        """Plot the response at `theta`, beside measurements if there are any."""
+        return plot_response(Measurements(self.channels, self.dt, self.simulate(theta)), measurements)
 
     def plot_hysteresis(self, theta: np.ndarray) -> Figure:
-        """Isolator force against bearing displacement of both piers (`models.figures.plot_bearing_loops`)."""
+        """Isolator force against bearing displacement of both piers."""
         from ..plots.structures import plot_bearing_loops
 
         return plot_bearing_loops(replace(self, every=1).history(theta))

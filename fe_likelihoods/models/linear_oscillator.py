@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..signals.channels import Channel
+from ..signals.channels import Channel, Measurements, plot_response
 from ..signals.records import Record
 from ..signals.sdof import respond
 from ..simulation.model import SimulationFailed
@@ -27,7 +27,6 @@ from ..simulation.model import SimulationFailed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..signals.channels import Measurements
 
 __all__ = ["LinearOscillator"]
 
@@ -92,10 +91,8 @@ class LinearOscillator:
         return type(self)(record, self.period, self.damping_ratio)
 
     def plot_response(self, theta: np.ndarray, measurements: "Measurements | None" = None) -> "Figure":
-        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
-        from ..plots.structures import plot_response
-
-        return plot_response(self, theta, measurements)
+        """Plot the response at `theta`, beside measurements if there are any."""
+        return plot_response(Measurements(self.channels, self.dt, self.simulate(theta)), measurements)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response at one set of parameters.

@@ -29,7 +29,8 @@ from scipy.linalg import eigh
 from ..kernels.complex_modes import superpose_modes
 from ..kernels.jit import KERNEL_HASH
 from ..signals.channels import Channel
-from ..signals.records import Record, sample_window
+from ..signals.records import Record
+from ..signals.sampling import sample_window
 from ..signals.sdof import hold_integrals
 from ..simulation.model import SimulationFailed
 from .external import CheckedModel

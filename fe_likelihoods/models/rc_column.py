@@ -36,7 +36,7 @@ from ..kernels.frame import Column, allocate
 from ..kernels.jit import KERNEL_HASH
 from ..kernels.newmark import HISTORY_ROWS, newmark
 from ..kernels.static import impose_displacement
-from ..signals.channels import Channel
+from ..signals.channels import Channel, Measurements, plot_response
 from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import MisfitBatch, SimulationBatch, SimulationFailed
 from ..simulation.threads import map_threads
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ..signals.channels import Measurements
 
 __all__ = ["Bars", "ColumnHistory", "Concrete", "Hoops", "Patches", "RCColumn", "Steel"]
 
@@ -285,7 +284,11 @@ class RCColumn:
             core, cover = circular_patches(radius, core_radius, m.wedges, m.core_rings, m.cover_rings)
         else:
             core, cover = circular_strips(radius, core_radius, self.mesh)
-        return core, cover, bar_circle(self._bar_radius, self.bars.number, self.bars.area_each, self.bars.first_angle)
+        return (
+            core,
+            cover,
+            bar_circle(self.bar_circle_radius, self.bars.number, self.bars.area_each, self.bars.first_angle),
+        )
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (n_channels, n_steps) [SI] at multiples `theta` (n_parameters,) of the nominal parameters.
@@ -319,19 +322,20 @@ class RCColumn:
         return MisfitBatch(*map_threads(misfit, theta_rows(thetas, self.parameters), (len(rows),)))
 
     def plot_section(self, axes: Axes | None = None) -> Axes:
-        """Cover, core, mesh and bars of the section (`models.figures.plot_section`)."""
+        """Cover, core, mesh and bars of the section (`fe_likelihoods.plots.structures.plot_section`)."""
         from ..plots.structures import plot_section
 
         return plot_section(self, axes)
 
     def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
-        """Histories of the channels at `theta`, and what was measured (`models.figures.plot_response`)."""
-        from ..plots.structures import plot_response
-
-        return plot_response(self, theta, measurements)
+        """Plot the response at `theta`, beside measurements if there are any."""
+        response = Measurements(self.channels, self.dt, self.simulate(theta))
+        return plot_response(
+            response, measurements, time_label="time [s]" if isinstance(self.loading, Record) else "step"
+        )
 
     def plot_hysteresis(self, theta: np.ndarray) -> Figure:
-        """Base moment against curvature, force against displacement of the top (`models.figures.plot_column_loops`)."""
+        """Base moment against curvature, force against displacement of the top."""
         from ..plots.structures import plot_column_loops
 
         return plot_column_loops(self, self.history(theta))
@@ -340,7 +344,8 @@ class RCColumn:
         return [_CHANNEL_ROWS[c.name] for c in self.channels]
 
     @property
-    def _bar_radius(self) -> float:
+    def bar_circle_radius(self) -> float:
+        """Radius of the circle through the centres of the longitudinal bars [m]."""
         return 0.5 * self.diameter - self.cover - self.hoops.diameter - 0.5 * self.bars.diameter
 
     def _confinement(self, fc: float) -> Confinement:
@@ -485,10 +490,10 @@ def _check(m: RCColumn) -> None:
 
     if m.core_diameter <= 0.0:
         refuse(f"a cover smaller than the radius {m.diameter / 2:.4g} m less hoops", m.cover, "cover is clear, in m")
-    chord = 2.0 * m._bar_radius * math.sin(math.pi / m.bars.number)
-    if m._bar_radius <= 0.0 or chord < m.bars.diameter:
+    chord = 2.0 * m.bar_circle_radius * math.sin(math.pi / m.bars.number)
+    if m.bar_circle_radius <= 0.0 or chord < m.bars.diameter:
         refuse(
-            f"bars that fit on their circle of radius {m._bar_radius:.4g} m",
+            f"bars that fit on their circle of radius {m.bar_circle_radius:.4g} m",
             f"{m.bars.number} bars of {m.bars.diameter:.4g} m, {chord:.4g} m apart",
             "take fewer or thinner bars, or less cover",
         )

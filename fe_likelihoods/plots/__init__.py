@@ -1,1 +1,1 @@
-"""Figures of records, measurements, responses and structures."""
+"""Figures of records, measurements, responses, residuals, predictions and structures."""

@@ -1,104 +1,73 @@
-"""What a model can show of itself: its response beside the data, its section, its hysteresis loops.
+"""Figures of structures: the section of a column, and hysteresis loops.
 
-Each function draws what a model or its history holds; those models have methods of one line that call them. Histories
-and single loops are drawn by `fe_likelihoods.plots.histories`. Everything is in the display units of the channels; a moment is
-in units of force times length, a curvature in one over length.
+The functions draw what a model or the history of one simulation holds. The models have methods that call them. Values
+are drawn in the display units of the model. Moments have units of force times length, curvatures one over length.
 """
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..models.rc_column_parts import Patches
-from ..signals.channels import Measurements
-from ..signals.records import Record
 from ..units import from_si
-from .histories import BLUE, ORANGE, plot_histories, plot_loop
+from .histories import plot_loop
+from .protocols import ColumnLike, HistoryLike, PatchesLike
+from .style import BLUE, ORANGE, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ..models.isolated_bridge import BridgeHistory
-    from ..models.rc_column import ColumnHistory, RCColumn
-    from ..simulation.model import Model
-
-__all__ = ["plot_bearing_loops", "plot_column_loops", "plot_response", "plot_section"]
+__all__ = ["plot_bearing_loops", "plot_column_loops", "plot_section"]
 
 _CORE = "#b9cfe4"
 
 
-def plot_response(model: Model, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
-    """Response of a model at one set of parameters, channel by channel, and what was measured.
+def plot_section(column: ColumnLike, axes: Axes | None = None) -> Axes:
+    """Plot a circular section to scale: cover, core inside the hoops, mesh of the concrete, and bars.
+
+    The horizontal axis is the direction of loading. Positions on it are the coordinates `y` of the fibers.
 
     Parameters
     ----------
-    model : Model
-        Any with `channels`, `dt` and `simulate`.
-    theta : (n_parameters,) float
-    measurements : Measurements, optional
-        Drawn below the response; its channels are those that are shown.
-
-    Returns
-    -------
-    matplotlib Figure
-
-    Raises
-    ------
-    SimulationFailed
-        As ``model.simulate``.
-    ValueError
-        If the measurements name a channel of the model that measures something else.
-    """
-    response = Measurements(model.channels, model.dt, model.simulate(theta))
-    shaken = isinstance(getattr(model, "loading", None), Record | None)
-    return plot_histories(measurements, response, time_label="time [s]" if shaken else "step")
-
-
-def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
-    """Circular section: cover, core inside the hoops, mesh of the concrete, and bars, to scale.
-
-    The direction of loading is horizontal: positions on that axis are the `y` of the fibers.
-
-    Parameters
-    ----------
-    column : RCColumn
+    column : ColumnLike
+        The column, such as `fe_likelihoods.RCColumn`.
     axes : matplotlib Axes, optional
-        Where to draw; by default a new figure.
+        Where to draw. Default: a new figure.
 
     Returns
     -------
     matplotlib Axes
+        The axes with the figure.
     """
-    import matplotlib.pyplot as plt
     from matplotlib.collections import LineCollection, PatchCollection
     from matplotlib.patches import Circle, Patch
 
-    if axes is None:
-        _, axes = plt.subplots(figsize=(6.4, 6.6), layout="constrained")
+    axes = new_axes(axes, (6.4, 6.6))
     unit = _length_unit(column)
     radius, core_radius = (float(from_si(0.5 * d, unit)) for d in (column.diameter, column.core_diameter))
     cover = axes.add_patch(Circle((0.0, 0.0), radius, facecolor="#d7dade", edgecolor="0.35", label="cover concrete"))
     hoops = column.hoops
-    ring = f"core concrete, in hoops of {from_si(hoops.diameter, unit):.3g} {unit} every "
-    ring += f"{from_si(hoops.spacing, unit):.3g} {unit}"
+    ring = (
+        f"core concrete, hoops {from_si(hoops.diameter, unit):.3g} {unit} at {from_si(hoops.spacing, unit):.3g} {unit}"
+    )
     core = axes.add_patch(Circle((0.0, 0.0), core_radius, facecolor=_CORE, edgecolor=BLUE, linewidth=2.0, label=ring))
-    kind = "rings and wedges" if isinstance(column.mesh, Patches) else f"{column.mesh} strips"
+    kind = f"{column.mesh} strips" if isinstance(column.mesh, Integral) else "rings and wedges"
     lines = _mesh_lines(column.mesh, radius, core_radius)
     axes.add_collection(LineCollection(lines, colors="white", linewidths=0.9))
     mesh = Patch(facecolor=_CORE, edgecolor="white", hatch="|||", label=kind)
     bars = column.bars
     angles = bars.first_angle + 2.0 * np.pi * np.arange(bars.number) / bars.number
-    place = float(from_si(column._bar_radius, unit))
+    place = float(from_si(column.bar_circle_radius, unit))
     circles = [Circle((place * np.cos(a), place * np.sin(a)), from_si(0.5 * bars.diameter, unit)) for a in angles]
-    text = f"{bars.number} bars of {from_si(bars.diameter, unit):.3g} {unit}"
+    text = f"{bars.number} bars, diameter {from_si(bars.diameter, unit):.3g} {unit}"
     steel = PatchCollection(circles, facecolor=ORANGE, edgecolor="0.25", linewidth=0.7, label=text, zorder=3)
     axes.add_collection(steel)
     axes.set_aspect("equal")
     axes.set(xlim=(-1.06 * radius, 1.06 * radius), ylim=(-1.06 * radius, 1.06 * radius))
-    axes.set(xlabel=f"position in the direction of loading [{unit}]", ylabel=f"across it [{unit}]")
+    axes.set(xlabel=f"position in the direction of loading [{unit}]", ylabel=f"position across it [{unit}]")
     title = f"diameter {2.0 * radius:.4g} {unit}, clear cover {from_si(column.cover, unit):.3g} {unit}"
     axes.set_title(title, fontsize="medium")
     handles = [cover, core, mesh, steel]
@@ -108,19 +77,21 @@ def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
     return axes
 
 
-def plot_column_loops(column: RCColumn, history: ColumnHistory) -> Figure:
-    """Base moment against curvature, and restoring force against displacement of the top.
+def plot_column_loops(column: ColumnLike, history: HistoryLike) -> Figure:
+    """Plot base moment against curvature, and restoring force against displacement of the top.
 
     Parameters
     ----------
-    column : RCColumn
-        For its display units.
-    history : ColumnHistory
-        Of ``column.history(theta)``, under base acceleration or imposed displacement.
+    column : ColumnLike
+        The column, for its display units and the name of its loading.
+    history : HistoryLike
+        Histories by name [SI], the result of ``column.history(theta)``: "base curvature", "base moment", "force", and
+        "displacement" (imposed) or "relative displacement" (base acceleration).
 
     Returns
     -------
     matplotlib Figure
+        The figure, with two axes.
     """
     import matplotlib.pyplot as plt
 
@@ -149,17 +120,18 @@ def plot_column_loops(column: RCColumn, history: ColumnHistory) -> Figure:
     return figure
 
 
-def plot_bearing_loops(history: BridgeHistory) -> Figure:
-    """Isolator force (friction, rubber and dampers) against bearing displacement, at both piers on common axes.
+def plot_bearing_loops(history: HistoryLike) -> Figure:
+    """Plot the isolator force (friction, rubber and dampers) against the bearing displacement of both piers.
 
     Parameters
     ----------
-    history : BridgeHistory
-        Of ``bridge.history(theta)``.
+    history : HistoryLike
+        Histories by name [SI], the result of ``bridge.history(theta)``: "Ub_1", "Ub_2" and "Fb_1", "Fb_2".
 
     Returns
     -------
     matplotlib Figure
+        The figure, with two axes of the same scale.
     """
     import matplotlib.pyplot as plt
 
@@ -176,13 +148,13 @@ def plot_bearing_loops(history: BridgeHistory) -> Figure:
     return figure
 
 
-def _length_unit(column: RCColumn) -> str:
+def _length_unit(column: ColumnLike) -> str:
     return dict(column.units).get("displacement", "m")
 
 
-def _mesh_lines(mesh: int | Patches, radius: float, core_radius: float) -> list[np.ndarray]:
-    """Lines between fibers, each (n, 2): chords of the strips, or circles and radii of the patches."""
-    if not isinstance(mesh, Patches):
+def _mesh_lines(mesh: int | PatchesLike, radius: float, core_radius: float) -> list[np.ndarray]:
+    """Return the lines between fibers, each (n, 2): chords for strips, circles and radii for rings and wedges."""
+    if isinstance(mesh, Integral):
         edges = np.linspace(-radius, radius, mesh + 1)[1:-1]
         return [np.array([[y, -h], [y, h]]) for y, h in zip(edges, np.sqrt(radius**2 - edges**2), strict=True)]
     around = np.linspace(0.0, 2.0 * np.pi, 200)

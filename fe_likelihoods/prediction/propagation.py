@@ -25,6 +25,8 @@ import numpy as np
 from tqdm import tqdm
 
 from ..signals.channels import Channel, Measurements
+from ..signals.error_measures import rrmse, sum_of_squares
+from ..signals.sampling import same_sampling
 from ..simulation.model import SimulationFailed, simulate_batch
 from .accumulator import Gathered, distinct_rows, members_of, parts_of, split_samples
 from .quantities import Quantity, evaluator
@@ -118,8 +120,7 @@ class Prediction:
             measured channel is zero.
         """
         measured = self._measured(measurements)[:, part]
-        power = _power(measured, self.channels)
-        return np.sqrt(np.square(self.mean[:, part] - measured).sum(axis=1) / power)
+        return rrmse(self.mean[:, part], measured, [channel.name for channel in self.channels])
 
     def coverage(
         self, measurements: Measurements, lower: float = 0.05, upper: float = 0.95, part: slice = slice(None)
@@ -135,6 +136,16 @@ class Prediction:
         inside = (self.quantile(lower) <= measured) & (measured <= self.quantile(upper))
         return inside[:, part].mean(axis=1)
 
+    def check_sampling(self, measurements: Measurements) -> None:
+        """Raise ValueError if measurements have another time step or number of samples than the histories."""
+        self._need_histories()
+        n_steps = self.mean.shape[1]
+        if not same_sampling(self.dt, n_steps, measurements.dt, measurements.n_steps):
+            raise ValueError(
+                f"the prediction has {n_steps} samples at {self.dt} s, the measurements have {measurements.n_steps} at "
+                f"{measurements.dt} s; make them equal with Measurements.trim and Measurements.decimate"
+            )
+
     def _need_histories(self) -> None:
         if self.dt is None:
             raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
@@ -148,11 +159,7 @@ class Prediction:
                 raise ValueError(
                     f"channel {ours.name!r} is {ours.quantity!r} here, {theirs.quantity!r} in the measurements"
                 )
-        if chosen.values.shape != self.mean.shape or abs(chosen.dt - self.dt) > 1e-9 * self.dt:
-            raise ValueError(
-                f"the prediction has {self.mean.shape[1]} samples at {self.dt} s, the measurements have "
-                f"{chosen.n_steps} at {chosen.dt} s; make them equal with Measurements.trim and Measurements.decimate"
-            )
+        self.check_sampling(measurements)
         return chosen.values
 
 
@@ -338,7 +345,8 @@ def fit_measures(posterior: Any, samples: Any) -> np.ndarray:
     likelihood = getattr(posterior, "likelihood", posterior)
     if not hasattr(likelihood, "measurements"):
         raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")
-    power = _power(likelihood.measurements.values, likelihood.measurements.channels)
+    measurements = likelihood.measurements
+    power = sum_of_squares(measurements.values, [channel.name for channel in measurements.channels])
     model, noise, _ = parts_of(posterior, None)
     thetas, _ = split_samples(model, noise, samples, False)
     return likelihood.misfit(thetas) / power
@@ -352,11 +360,3 @@ def _probabilities(quantiles: Sequence[float]) -> tuple[float, ...]:
     if not all(0.0 < p < 1.0 for p in probabilities) or len(set(probabilities)) != len(probabilities):
         raise ValueError(f"quantiles must be different probabilities between 0 and 1; got {quantiles!r}")
     return probabilities
-
-
-def _power(measured: np.ndarray, channels: Sequence[Channel]) -> np.ndarray:
-    power = np.square(measured).sum(axis=1)
-    if not power.all():
-        zero = [channel.name for channel, value in zip(channels, power, strict=True) if not value]
-        raise ValueError(f"an error relative to the measured channel needs one that is not zero; {zero} are")
-    return power

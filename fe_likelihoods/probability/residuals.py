@@ -11,9 +11,15 @@ to `fe_likelihoods.probability.noise.GaussianNoise`, and `innovations` whether o
     noise = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+from ..signals.channels import Channel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     "ResidualChecks",
@@ -21,6 +27,7 @@ __all__ = [
     "effective_samples",
     "innovations",
     "lag_one_sums",
+    "plot_residuals",
     "residual_checks",
 ]
 
@@ -178,7 +185,7 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     The lag-one correlation of n white residuals is normal with a standard deviation of 1 / sqrt(n). The test of
     normality is that of Jarque and Bera, with the effective number of samples in the place of n: independence is
     another question, and takes none of its significance. Probabilities below a hundredth are worth a look at
-    `fe_likelihoods.plots.histories.plot_residuals`.
+    `plot_residuals`.
     """
     from scipy import stats  # where used: half a second, and whoever has a noise imports this module
 
@@ -195,6 +202,36 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
         white=2.0 * stats.norm.sf(np.sqrt(n) * np.abs(lag_one)),
         normal=stats.chi2.sf(score, 2),
     )
+
+
+def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float) -> "Figure":
+    """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
+
+    The shaded band holds 95 % of the autocorrelation coefficients of white residuals. The quantiles of normal
+    residuals follow the straight line.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (n_channels, n_steps)
+        Measured minus simulated response [SI], such as the result of `FELikelihood.residuals`.
+    channels : sequence of Channel
+        The channels, one per row of `residuals`.
+    dt : float
+        Time step [s].
+
+    Returns
+    -------
+    matplotlib Figure
+        The figure, with axes of shape (n_channels, 3).
+
+    Raises
+    ------
+    ValueError
+        If the number of channels differs from the number of rows, and as `residual_checks`.
+    """
+    from ..plots.histories import plot_residual_checks
+
+    return plot_residual_checks(residuals, channels, dt, residual_checks(residuals), autocorrelation(residuals))
 
 
 def _checked(residuals: np.ndarray) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Ground motions, measured channels, file formats and response spectra."""
+"""Ground motions, measured channels, file formats, data sets and response spectra."""

@@ -1,14 +1,14 @@
-"""Elastic response spectrum of a ground motion: the largest response of linear oscillators, against their period.
+r"""Elastic response spectrum of a ground motion: the largest response of linear oscillators against their period.
 
-Each oscillator is solved exactly for the motion that a `Record` is, a straight line between its samples
-(`models.linear_oscillator.respond`). Peaks are looked for at forty instants or more of every period, so a peak between
-two of them is missed by less than 1 - cos(pi/40) = .3 % of what oscillates; that the ground then rests does not end
-the response, so one period of free vibration is looked at too.
+Each oscillator is solved exactly for a ground acceleration that is linear between its samples
+(`fe_likelihoods.signals.sdof.respond`). The response is evaluated at 40 instants or more per period, so that a peak
+between two of them is underestimated by less than :math:`1 - \cos(\pi / 40) = 0.3\,\%` of the oscillating part. The
+response is followed for one period of free vibration after the end of the motion, because the peak may occur there.
 
 References
 ----------
-N. C. Nigam, P. C. Jennings, Calculation of response spectra from strong-motion earthquake records, Bulletin of the
-Seismological Society of America 59(2), 1969, 909-922.
+N. C. Nigam, P. C. Jennings (1969), Calculation of response spectra from strong-motion earthquake records, Bulletin of
+the Seismological Society of America 59(2), 909-922.
 """
 
 import math
@@ -17,28 +17,30 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .records import Record
+from .sampling import check_samples, check_step
 from .sdof import respond
 
 __all__ = ["ResponseSpectrum", "response_spectrum"]
 
-_INSTANTS = 40  # of a period, at which its peak is looked for
-_SHORTEST = 0.1  # period, in steps of the record
+_INSTANTS = 40  # instants per period at which the response is evaluated
+_SHORTEST = 0.1  # shortest period, in steps of the motion
 
 
 class ResponseSpectrum(NamedTuple):
-    """Peaks of oscillators with one damping ratio.
+    r"""Peak responses of oscillators with one damping ratio.
 
     Attributes
     ----------
-    periods : (n_periods,) float
+    periods : ndarray, shape (n_periods,)
         Undamped periods [s].
     damping_ratio : float
-        Fraction of critical damping.
-    displacement : (n_periods,) float
+        Fraction of critical damping [-].
+    displacement : ndarray, shape (n_periods,)
         Largest displacement relative to the ground, SD [m].
-    pseudo_velocity, pseudo_acceleration : (n_periods,) float
-        omega SD [m/s] and omega² SD [m/s²]: the latter times the mass is the largest force of the spring.
+    pseudo_velocity : ndarray, shape (n_periods,)
+        Pseudo-velocity, :math:`\omega` SD [m/s].
+    pseudo_acceleration : ndarray, shape (n_periods,)
+        Pseudo-acceleration, :math:`\omega^2` SD [m/s²]. Multiplied by the mass, it is the largest force of the spring.
     """
 
     periods: NDArray[np.float64]
@@ -49,52 +51,57 @@ class ResponseSpectrum(NamedTuple):
 
 
 def response_spectrum(
-    record: Record, periods: ArrayLike | None = None, damping_ratio: float = 0.05
+    acceleration: ArrayLike, dt: float, periods: ArrayLike | None = None, damping_ratio: float = 0.05
 ) -> ResponseSpectrum:
-    """Elastic response spectrum of a record.
+    """Compute the elastic response spectrum of a ground acceleration.
 
     Parameters
     ----------
-    record : Record
+    acceleration : (n_steps,) array_like
+        Ground acceleration [m/s²], linear between its samples.
+    dt : float
+        Time step of the samples [s].
     periods : (n_periods,) array_like, optional
-        Undamped periods [s], at least a tenth of the record's step. By default 120 from twice the step (or .02 s, if
-        that is longer) to 10 s, equally spaced in their logarithms.
+        Undamped periods [s], each at least a tenth of the step. Default: 120 periods, equally spaced on a logarithmic
+        scale, from twice the step (at least 0.02 s) to 10 s.
     damping_ratio : float
         Fraction of critical damping, 0 <= damping_ratio < 1.
 
     Returns
     -------
     ResponseSpectrum
+        Periods and peak responses.
 
     Raises
     ------
     ValueError
-        If the periods are not one-dimensional, finite and long enough, or the damping ratio is out of range.
+        If the samples are not a one-dimensional finite array, the step is not positive, the periods are not
+        one-dimensional, finite and long enough, or the damping ratio is out of range.
     """
+    acceleration, dt = check_samples(acceleration, "acceleration", "the motion"), check_step(dt, "the motion")
     if periods is None:
-        periods = np.geomspace(max(0.02, 2.0 * record.dt), max(10.0, 4.0 * record.dt), 120)
+        periods = np.geomspace(max(0.02, 2.0 * dt), max(10.0, 4.0 * dt), 120)
     periods = np.array(periods, dtype=float)
     if periods.ndim != 1 or not periods.size or not np.all(np.isfinite(periods) & (periods > 0.0)):
         raise ValueError(f"periods must be positive numbers of seconds in one dimension; got {periods}")
-    if periods.min() < _SHORTEST * record.dt:
+    if periods.min() < _SHORTEST * dt:
         raise ValueError(
-            f"periods must be at least {_SHORTEST * record.dt:g} s, {_SHORTEST:g} steps of {record.name!r}, which "
-            f"tells nothing of faster motion; got {periods.min():g} s"
+            f"periods must be at least {_SHORTEST * dt:g} s, {_SHORTEST:g} steps of the motion, because the motion has "
+            f"no information on shorter periods; got {periods.min():g} s"
         )
     if not 0.0 <= damping_ratio < 1.0:
         raise ValueError(f"damping_ratio must be in [0, 1) (0.05 is 5 %); got {damping_ratio!r}")
     frequencies = 2.0 * math.pi / periods
-    displacement = np.array([_largest(record, omega, damping_ratio) for omega in frequencies])
+    displacement = np.array([_peak_displacement(acceleration, dt, omega, damping_ratio) for omega in frequencies])
     velocity = frequencies * displacement
     return ResponseSpectrum(periods, float(damping_ratio), displacement, velocity, frequencies * velocity)
 
 
-def _largest(record: Record, omega: float, damping_ratio: float) -> float:
-    """Largest relative displacement [m], of the record and one period after it."""
+def _peak_displacement(acceleration: NDArray[np.float64], dt: float, omega: float, damping_ratio: float) -> float:
+    """Return the largest relative displacement [m] during the motion and one period of free vibration after it."""
     period = 2.0 * math.pi / omega
-    parts = max(1, math.ceil(_INSTANTS * record.dt / period))
-    dt = record.dt / parts
-    rest = math.ceil(period / record.dt) + 1
-    samples = np.concatenate([record.acceleration, np.zeros(rest)])
+    parts = max(1, math.ceil(_INSTANTS * dt / period))
+    rest = math.ceil(period / dt) + 1
+    samples = np.concatenate([acceleration, np.zeros(rest)])
     finer = np.interp(np.arange((samples.size - 1) * parts + 1) / parts, np.arange(samples.size), samples)
-    return float(np.abs(respond(finer, dt, omega, damping_ratio).displacement).max())
+    return float(np.abs(respond(finer, dt / parts, omega, damping_ratio).displacement).max())

@@ -1,14 +1,18 @@
-"""Exact response of a linear oscillator to a base acceleration.
+r"""Exact response of a linear single-degree-of-freedom oscillator to a base acceleration.
 
-The relative displacement u of a mass on a spring and a dashpot, whose base has the acceleration a, satisfies ::
+The displacement :math:`u` of a mass relative to its base, carried by a spring and a dashpot, satisfies
 
-    u'' + 2 zeta omega u' + omega^2 u = -a(t)
+.. math:: \ddot u + 2 \zeta \omega \dot u + \omega^2 u = -a(t)
 
-Between two samples a is linear in time, so the response at the samples has a closed form and no time-stepping error
-(Nigam & Jennings 1969). In the complex modal coordinate q = u' - conj(lam) u with the eigenvalue
-lam = omega (-zeta + i sqrt(1 - zeta^2)), the equation is of first order, q' = lam q - a, and ::
+for the base acceleration :math:`a`. Between two samples :math:`a` is linear in time, so that the response at the
+samples has a closed form without time-stepping error (Nigam & Jennings 1969). With the eigenvalue
+:math:`\lambda = \omega (-\zeta + i \sqrt{1 - \zeta^2})` and the complex modal coordinate
+:math:`q = \dot u - \bar\lambda u` the equation is of first order, and
 
-    u = Im(q) / omega_d,    u' = Im(lam q) / omega_d,    omega_d = omega sqrt(1 - zeta^2)
+.. math:: \dot q = \lambda q - a, \qquad u = \frac{\mathrm{Im}\, q}{\omega_d}, \qquad
+          \dot u = \frac{\mathrm{Im}(\lambda q)}{\omega_d}, \qquad \omega_d = \omega \sqrt{1 - \zeta^2} .
+
+See ``docs/theory/time_integration.rst``.
 """
 
 import cmath
@@ -21,8 +25,17 @@ __all__ = ["OscillatorResponse", "hold_integrals", "respond"]
 
 
 class OscillatorResponse(NamedTuple):
-    """Response of an oscillator, each (n_steps,): `displacement` [m] and `velocity` [m/s] relative to the base,
-    absolute `acceleration` [m/s²]."""
+    """Response of an oscillator.
+
+    Attributes
+    ----------
+    displacement : ndarray, shape (n_steps,)
+        Displacement relative to the base [m].
+    velocity : ndarray, shape (n_steps,)
+        Velocity relative to the base [m/s].
+    acceleration : ndarray, shape (n_steps,)
+        Absolute acceleration [m/s²].
+    """
 
     displacement: np.ndarray
     velocity: np.ndarray
@@ -30,11 +43,24 @@ class OscillatorResponse(NamedTuple):
 
 
 def hold_integrals(z: complex) -> tuple[complex, complex]:
-    """(e^z - 1) / z and (e^z - 1 - z) / z^2: one step of q' = z q + 1 and of q' = z q + t, from q = 0 to t = 1."""
+    r"""Integrals of a first-order equation over one step, for a constant and for a linear load.
+
+    Parameters
+    ----------
+    z : complex
+        Eigenvalue times step, :math:`\lambda \Delta t` [-].
+
+    Returns
+    -------
+    constant : complex
+        :math:`(e^z - 1) / z`, the value at t = 1 of q' = z q + 1 with q(0) = 0.
+    slope : complex
+        :math:`(e^z - 1 - z) / z^2`, the value at t = 1 of q' = z q + t with q(0) = 0.
+    """
     if abs(z) >= 1.0:
         constant = (cmath.exp(z) - 1.0) / z
         return constant, (constant - 1.0) / z
-    # both differences cancel at small z: the series of the second, 1/2 + z/3! + ..., to less than round-off
+    # Both differences cancel at small z. The series of the second one, 1/2 + z/3! + ..., is exact to round-off.
     series = 1.0 + 0.0j
     for k in range(20, 2, -1):
         series = 1.0 + z / k * series
@@ -49,31 +75,34 @@ def respond(
     displacement: float = 0.0,
     velocity: float = 0.0,
 ) -> OscillatorResponse:
-    """Exact response to a base acceleration that is linear between its samples.
+    """Compute the exact response to a base acceleration that is linear between its samples.
 
     Parameters
     ----------
-    base_acceleration : (n_steps,) float
-        [m/s²]
+    base_acceleration : ndarray, shape (n_steps,)
+        Base acceleration [m/s²].
     dt : float
         Time step of the samples [s].
     angular_frequency : float
-        Undamped, > 0 [rad/s].
+        Undamped angular frequency, positive [rad/s].
     damping_ratio : float
         Fraction of critical damping, 0 <= damping_ratio < 1.
-    displacement, velocity : float
-        Relative to the base at the first sample [m], [m/s].
+    displacement : float
+        Displacement relative to the base at the first sample [m].
+    velocity : float
+        Velocity relative to the base at the first sample [m/s].
 
     Returns
     -------
     OscillatorResponse
+        The response at the samples.
 
     References
     ----------
-    N. C. Nigam, P. C. Jennings, Calculation of response spectra from strong-motion earthquake records, Bulletin of the
-    Seismological Society of America 59(2), 1969, 909-922.
+    N. C. Nigam, P. C. Jennings (1969), Calculation of response spectra from strong-motion earthquake records, Bulletin
+    of the Seismological Society of America 59(2), 909-922.
     """
-    from scipy.signal import lfilter  # takes longer to start than all else here
+    from scipy.signal import lfilter  # imported here because scipy.signal takes longer to import than this package
 
     damped_frequency = angular_frequency * math.sqrt(1.0 - damping_ratio**2)
     eigenvalue = complex(-damping_ratio * angular_frequency, damped_frequency)

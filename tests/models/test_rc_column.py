@@ -21,7 +21,8 @@ from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
 from fe_likelihoods.signals.channels import Measurements
-from fe_likelihoods.signals.records import DisplacementHistory, Record, read_csv
+from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.records import DisplacementHistory, Record
 from fe_likelihoods.simulation.model import SimulationFailed
 from fe_likelihoods.units import G0, to_si
 from tests.opensees_column import CORE, COVER, INCH, KIP, KSI, STEEL, peer_of

@@ -66,7 +66,7 @@ def test_spectrum(record):
     assert axes.get_ylabel() == "displacement [in]"
     with pytest.raises(ValueError, match="expected a unit of displacement"):
         record.plot_spectrum(periods, quantity="displacement", unit="g")
-    with pytest.raises(ValueError, match="a quantity of pseudo_acceleration"):
+    with pytest.raises(ValueError, match="one of the quantities pseudo_acceleration"):
         plot_spectra([record.spectrum(periods)], quantity="acceleration")
     with pytest.raises(ValueError, match="one spectrum or more"):
         plot_spectra([])
@@ -165,4 +165,4 @@ def test_section(record, mesh):
         assert np.all(np.bincount(inside, minlength=40) <= 1), "no strip holds two fibers of the core"
     else:
         assert len(lines.get_segments()) == 9 + 1 + 20
-    assert axes.get_aspect() == 1.0 and "18 bars of 1.41 in" in texts(axes)
+    assert axes.get_aspect() == 1.0 and "18 bars, diameter 1.41 in" in texts(axes)

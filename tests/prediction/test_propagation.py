@@ -10,7 +10,7 @@ from scipy import stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.plots.histories import plot_bands
+from fe_likelihoods.plots.predictions import plot_bands
 from fe_likelihoods.prediction.averaging import average_predictions
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.plots.histories import plot_fragility
+from fe_likelihoods.plots.predictions import plot_fragility
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak
 from fe_likelihoods.prediction.reliability import exceedance, fit_fragility, fragility

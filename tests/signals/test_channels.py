@@ -4,15 +4,10 @@ import h5py
 import numpy as np
 import pytest
 
-from fe_likelihoods.signals.channels import (
-    Channel,
-    Measurements,
-    read_columns,
-    read_dataset,
-    read_imposed_test,
-    write_dataset,
-)
-from fe_likelihoods.signals.records import Record, read_v2
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.datasets import read_dataset, write_dataset
+from fe_likelihoods.signals.readers import read_columns, read_imposed_test, read_v2
+from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0, to_si
 
 TOP = Channel("top", "absolute acceleration", "g")

@@ -11,7 +11,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from fe_likelihoods.signals.records import DisplacementHistory, Record, read_at2, read_csv, read_v2
+from fe_likelihoods.signals.readers import read_at2, read_csv, read_v2
+from fe_likelihoods.signals.records import DisplacementHistory, Record
 from fe_likelihoods.units import G0, to_si
 
 # Peak ground acceleration [g], number of samples and step [s]: the table of records/README.md.
@@ -160,11 +161,11 @@ class TestResample:
 
     def test_refusals(self):
         record = Record("r", 0.02, np.arange(100))
-        with pytest.raises(ValueError, match="ratio of whole numbers up to 1000; the nearest such step is"):
+        with pytest.raises(ValueError, match="ratio of integers up to 1000; the nearest such step is"):
             record.resample(0.02 * np.sqrt(2))
         with pytest.raises(ValueError, match="must fit twice"):
             record.resample(1.5)
-        with pytest.raises(ValueError, match="ratio of whole numbers"):
+        with pytest.raises(ValueError, match="ratio of integers"):
             record.resample(1e-7)
         with pytest.raises(ValueError, match="positive number of seconds"):
             record.resample(0)

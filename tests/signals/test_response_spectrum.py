@@ -26,7 +26,7 @@ def test_harmonic_motion_reaches_its_steady_state(damping_ratio):
     periods = np.array([0.3, 0.8, 1.0, 1.3])
     ratio = periods / period  # of the forcing frequency to the oscillator's
     steady = 1.0 / np.hypot(1.0 - ratio**2, 2.0 * damping_ratio * ratio)
-    spectrum = response_spectrum(record, periods, damping_ratio)
+    spectrum = response_spectrum(record.acceleration, record.dt, periods, damping_ratio)
     # instants: .3 %; straight lines between 200 samples of a period: .01 %; what is left of the start: less
     np.testing.assert_allclose(spectrum.pseudo_acceleration, amplitude * steady, rtol=4e-3)
 
@@ -38,7 +38,7 @@ def test_undamped_oscillator_under_a_pulse_peaks_in_free_vibration():
     periods = np.array([0.5, 1.0, 2.0])
     omega = 2 * math.pi / periods
     expected = 2 * height / omega**2 * np.sin(omega * n * dt / 2)
-    spectrum = response_spectrum(record, periods, 0.0)
+    spectrum = response_spectrum(record.acceleration, record.dt, periods, 0.0)
     np.testing.assert_allclose(spectrum.displacement, expected, rtol=0.01)
     during = [np.abs(respond(record.acceleration, dt, w, 0.0).displacement).max() for w in omega]
     assert np.all(spectrum.displacement > 1.5 * np.array(during)), "the free vibration is what counts here"
@@ -84,7 +84,7 @@ def test_the_three_quantities_belong_together(noise):
         ([], 0.05, "periods must be positive"),
         ([[1.0]], 0.05, "in one dimension"),
         ([np.nan], 0.05, "periods must be positive"),
-        ([0.001], 0.05, r"at least 0.002 s, 0.1 steps of 'noise'"),
+        ([0.001], 0.05, r"at least 0.002 s, 0.1 steps of the motion"),
         ([1.0], 1.0, r"damping_ratio must be in \[0, 1\) \(0.05 is 5 %\); got 1.0"),
         ([1.0], -0.1, "damping_ratio"),
     ],

@@ -16,7 +16,8 @@ from scipy import stats
 from fe_likelihoods import problems
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import TruncatedNormal
-from fe_likelihoods.signals.records import Record, read_csv
+from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.records import Record
 from samplers import SMCSampler
 
 pytestmark = pytest.mark.slow

@@ -1,0 +1,124 @@
+"""Figures of predictions: bands of histories, and fragility curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..units import from_si
+from .protocols import ChannelHistories, FragilityLike, PredictionLike
+from .style import BLUE, GREY, ORANGE, channel_label, select_names, set_time_axis, stack_axes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_bands", "plot_fragility"]
+
+
+def plot_bands(
+    prediction: PredictionLike,
+    measurements: ChannelHistories | None = None,
+    channels: Sequence[str] | None = None,
+) -> Figure:
+    """Plot the mean of predicted histories, the band between the outermost quantiles, and measurements.
+
+    Parameters
+    ----------
+    prediction : PredictionLike
+        Prediction of histories, such as the result of `fe_likelihoods.propagate`.
+    measurements : ChannelHistories, optional
+        Measurements with the step and the length of the prediction. Channels that were not measured are drawn without
+        measurements.
+    channels : sequence of str, optional
+        Names of the channels to draw. Default: all channels of the prediction.
+
+    Returns
+    -------
+    matplotlib Figure
+        The figure, one axes per channel.
+
+    Raises
+    ------
+    ValueError
+        If the prediction has no histories, a channel does not exist, or the measurements have another step or length.
+    """
+    time = prediction.time
+    names = [channel.name for channel in prediction.channels]
+    wanted = select_names(channels, names, names)
+    measured = set()
+    if measurements is not None:
+        prediction.check_sampling(measurements)
+        measured = {channel.name for channel in measurements.channels}
+    low, high = (min(prediction.probabilities), max(prediction.probabilities)) if prediction.probabilities else (0, 0)
+
+    figure, rows = stack_axes(len(wanted))
+    for axes, name in zip(rows, wanted, strict=True):
+        k = names.index(name)
+        channel = prediction.channels[k]
+        if low < high:
+            band = [from_si(prediction.quantile(p)[k], channel.unit) for p in (low, high)]
+            label = f"{100 * low:g}-{100 * high:g} %" + (" with noise" if prediction.noise else "")
+            axes.fill_between(time, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
+        if name in measured:
+            values = from_si(measurements.channel(name), channel.unit)
+            axes.plot(time, values, color=ORANGE, linewidth=2.2, alpha=0.6, label="measured")
+        axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
+        axes.set_ylabel(channel_label(channel))
+        axes.grid(alpha=0.25)
+    rows[0].legend(frameon=False, fontsize="small", ncols=3, loc="upper right")
+    set_time_axis(rows, time[-1])
+    return figure
+
+
+def plot_fragility(
+    fragility: FragilityLike, label: str = "peak ground acceleration", unit: str | None = "g", si_unit: str = "m/s2"
+) -> Figure:
+    """Plot the probability of exceedance against intensity: one point with its interval per record, and the curve.
+
+    Parameters
+    ----------
+    fragility : FragilityLike
+        Result of `fe_likelihoods.fragility`.
+    label : str
+        Name of the intensity measure.
+    unit : str or None
+        Unit of the intensity in the figure, a name in `fe_likelihoods.units.UNITS`. None: values are drawn as they
+        are, in `si_unit`.
+    si_unit : str
+        Unit of the intensity values, for the label if `unit` is None.
+
+    Returns
+    -------
+    matplotlib Figure
+        The figure, with one axes.
+    """
+    import matplotlib.pyplot as plt
+
+    def shown(values):
+        return values if unit is None else from_si(values, unit)
+
+    figure, axes = plt.subplots(figsize=(6.0, 4.0), layout="constrained")
+    reach = np.stack([fragility.probability - fragility.lower, fragility.upper - fragility.probability])
+    axes.errorbar(
+        shown(fragility.intensity),
+        fragility.probability,
+        yerr=np.maximum(reach, 0.0),
+        fmt="o",
+        color=BLUE,
+        markersize=4,
+        linewidth=1,
+        label="records",
+    )
+    if fragility.curve is not None:
+        curve = fragility.curve
+        x = np.geomspace(0.7 * fragility.intensity.min(), 1.2 * fragility.intensity.max(), 200)
+        text = f"median {shown(curve.median):.3g}, dispersion {curve.dispersion:.2g}"
+        axes.plot(shown(x), curve.probability(x), color=GREY, label=text)
+    axes.set_xlabel(f"{label} [{si_unit if unit is None else unit}]")
+    axes.set_ylabel("probability of exceedance [-]")
+    axes.set_ylim(-0.02, 1.02)
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False, fontsize="small")
+    return figure

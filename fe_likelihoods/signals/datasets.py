@@ -1,0 +1,165 @@
+"""Data sets in HDF5: an excitation, the response measured under it, and how both were made.
+
+A data set is one file with a `Record`, `Measurements` and free attributes, such as the true parameters of synthetic
+data. It carries a checksum over all of them, because a posterior from damaged data gives no sign of the damage.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..units import DIMENSIONS
+from .channels import Channel, Measurements
+from .records import Record
+
+__all__ = ["Dataset", "read_dataset", "write_dataset"]
+
+SCHEMA = "fe_likelihoods.dataset"
+SCHEMA_VERSION = 1
+
+
+class Dataset(NamedTuple):
+    """An excitation and the response measured under it.
+
+    Attributes
+    ----------
+    record : Record
+        The excitation.
+    measurements : Measurements
+        The response.
+    attributes : dict
+        Free attributes, such as the true parameters of synthetic data.
+    """
+
+    record: Record
+    measurements: Measurements
+    attributes: dict
+
+
+def write_dataset(path: str | Path, record: Record, measurements: Measurements, attributes: dict | None = None) -> None:
+    """Write a data set to an HDF5 file.
+
+    The file is written under a temporary name and then renamed, so that it is never incomplete. An existing file is
+    replaced.
+
+    Parameters
+    ----------
+    path : str or path
+        The file to write.
+    record : Record
+        The excitation.
+    measurements : Measurements
+        The response.
+    attributes : dict, optional
+        Values that JSON can represent exactly: text, finite numbers, lists, and dicts with text as keys. Arrays are
+        written as lists.
+
+    Raises
+    ------
+    ValueError
+        If the attributes have other values, or the folder does not exist.
+    """
+    import h5py  # imported here because it takes longer to import than this package
+
+    path = Path(path)
+    text = _attributes_text(attributes or {})
+    if not path.parent.is_dir():
+        raise ValueError(f"cannot write {path}: there is no folder {path.parent}; make it first")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with h5py.File(temporary, "w") as file:
+            file.attrs["schema"] = SCHEMA
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs["attributes"] = text
+            file.attrs["checksum"] = _checksum(record, measurements, text)
+            samples = file.create_dataset("record/acceleration", data=record.acceleration, dtype="<f8")
+            samples.attrs.update({"name": record.name, "source": record.source, "dt": record.dt})
+            samples.attrs.update({"units": DIMENSIONS["acceleration"], "dt_units": "s"})
+            values = file.create_dataset("measurements/values", data=measurements.values, dtype="<f8")
+            values.attrs.update({"description": measurements.description, "dt": measurements.dt, "dt_units": "s"})
+            for key, column in _channel_columns(measurements.channels).items():
+                values.attrs.create(key, column, dtype=h5py.string_dtype())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_dataset(path: str | Path) -> Dataset:
+    """Read a data set written by `write_dataset`.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    Dataset
+        Record, measurements and attributes.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist, is not a data set, has another version, is incomplete, or does not match its
+        checksum.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            schema, version = file.attrs.get("schema"), file.attrs.get("schema_version")
+            if schema != SCHEMA or version != SCHEMA_VERSION:
+                raise ValueError(
+                    f"{path}: expected schema {SCHEMA!r} version {SCHEMA_VERSION}, got {schema!r} version {version}; "
+                    f"write the data set again with this release"
+                )
+            samples, values = file["record/acceleration"], file["measurements/values"]
+            text, checksum = file.attrs["attributes"], file.attrs["checksum"]
+            record = Record(samples.attrs["name"], samples.attrs["dt"], samples[()], samples.attrs["source"])
+            columns = [values.attrs[key] for key in ("channel_names", "quantities", "display_units")]
+            channels = tuple(Channel(*map(str, each)) for each in zip(*columns, strict=True))
+            measurements = Measurements(channels, values.attrs["dt"], values[()], values.attrs["description"])
+            units = [samples.attrs["units"], *values.attrs["units"]]
+    except (OSError, KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path}: not a complete data set ({error}); make it or download it again") from error
+    if units != [DIMENSIONS["acceleration"], *(channel.si_unit for channel in channels)]:
+        raise ValueError(
+            f"{path}: expected SI units, got {units}; the file is damaged or was written by another program"
+        )
+    if checksum != _checksum(record, measurements, text):
+        raise ValueError(
+            f"{path}: the contents do not match their checksum; the file is damaged, make it or download it again"
+        )
+    return Dataset(record, measurements, json.loads(text))
+
+
+def _channel_columns(channels: Sequence[Channel]) -> dict[str, list[str]]:
+    return {
+        "channel_names": [channel.name for channel in channels],
+        "quantities": [channel.quantity for channel in channels],
+        "units": [channel.si_unit for channel in channels],
+        "display_units": [channel.unit for channel in channels],
+    }
+
+
+def _attributes_text(attributes: dict) -> str:
+    def plain(value):
+        if isinstance(value, (np.ndarray, np.generic)):
+            return value.tolist()
+        raise TypeError(f"{type(value).__name__} {value!r}")
+
+    try:
+        return json.dumps(attributes, default=plain, allow_nan=False, sort_keys=True)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"attributes must be text, finite numbers, lists and dicts of them, got {error}") from None
+
+
+def _checksum(record: Record, measurements: Measurements, attributes: str) -> str:
+    names = json.dumps([record.name, record.source, measurements.description, _channel_columns(measurements.channels)])
+    parts = (record.fingerprint, measurements.fingerprint, names, attributes)
+    return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()

@@ -1,0 +1,76 @@
+"""Measures of the difference between a predicted and a measured history."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["rrmse", "sum_of_squares"]
+
+
+def rrmse(
+    predicted: ArrayLike, measured: ArrayLike, names: Sequence[str] | None = None
+) -> NDArray[np.float64] | np.float64:
+    r"""Relative root mean square error of predicted histories.
+
+    .. math:: \mathrm{RRMSE} = \sqrt{\frac{\sum_k (\hat y_k - y_k)^2}{\sum_k y_k^2}}
+
+    Parameters
+    ----------
+    predicted : (..., n_steps) array_like
+        Predicted values :math:`\hat y`.
+    measured : (..., n_steps) array_like
+        Measured values :math:`y` in the same unit, of the same shape.
+    names : sequence of str, optional
+        Names of the histories, for the message of an error.
+
+    Returns
+    -------
+    ndarray, shape (...,)
+        The error of each history [-]: 0 for a perfect prediction, 1 for a prediction of zero.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or a measured history is zero at all samples.
+
+    Examples
+    --------
+    >>> float(rrmse([1.1, 2.2], [1.0, 2.0]))
+    0.1
+    """
+    predicted, measured = np.asarray(predicted, dtype=float), np.asarray(measured, dtype=float)
+    if predicted.shape != measured.shape or not measured.ndim:
+        raise ValueError(f"expected histories of one shape, (..., n_steps); got {predicted.shape} and {measured.shape}")
+    return np.sqrt(np.square(predicted - measured).sum(axis=-1) / sum_of_squares(measured, names))
+
+
+def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> NDArray[np.float64] | np.float64:
+    """Sum of squares of each measured history, the denominator of relative errors.
+
+    Parameters
+    ----------
+    measured : (..., n_steps) array_like
+        Measured values.
+    names : sequence of str, optional
+        Names of the histories, for the message of an error.
+
+    Returns
+    -------
+    ndarray, shape (...,)
+        The sums [unit of the values, squared].
+
+    Raises
+    ------
+    ValueError
+        If a history is zero at all samples, so that no error relative to it exists.
+    """
+    sums = np.square(np.asarray(measured, dtype=float)).sum(axis=-1)
+    if not np.all(sums):
+        rows = np.flatnonzero(np.ravel(sums) == 0.0)
+        zero = ", ".join(f"row {row}" if names is None else repr(names[row]) for row in rows)
+        raise ValueError(
+            f"an error relative to a measured history needs a history that is not zero; {zero} is zero at all samples: "
+            "leave it out"
+        )
+    return sums

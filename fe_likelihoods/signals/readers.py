@@ -1,0 +1,252 @@
+"""Readers of ground motions and measured responses: PEER AT2, CSMIP and COSMOS V2 (also in zip archives), and CSV.
+
+Every reader converts to SI units. It takes the unit and the time step from the file or from its arguments, and raises
+ValueError if neither states them or if they disagree. The formats themselves are in
+`fe_likelihoods.signals.file_formats` (AT2, V2) and `fe_likelihoods.signals.tables` (CSV).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..units import to_si
+from . import file_formats, tables
+from .channels import Channel, Measurements
+from .records import DisplacementHistory, Record
+from .text_files import Series, agree_on_unit, read_text
+
+__all__ = ["ImposedTest", "read_at2", "read_columns", "read_csv", "read_imposed_test", "read_v2"]
+
+
+class ImposedTest(NamedTuple):
+    """A laboratory test with an imposed displacement.
+
+    Attributes
+    ----------
+    history : DisplacementHistory
+        The imposed displacement.
+    measurements : Measurements
+        The channels measured at its steps. ``measurements.dt`` is 1, one step.
+    """
+
+    history: DisplacementHistory
+    measurements: Measurements
+
+
+def read_at2(path: str | Path, units: str | None = None) -> Record:
+    """Read a ground motion from a PEER AT2 file.
+
+    Both forms of the header are understood, the new one (``NPTS=  4096, DT=  .0100 SEC``) and the old one
+    (``4096 .0100 NPTS, DT``).
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    units : str, optional
+        Unit of the samples, needed if the header has no ``UNITS OF ...``. If it has, the two must agree.
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the file.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist, has no header or no unit, contains another quantity than acceleration, has another
+        number of samples than NPTS, or has a sample that is not a finite number.
+    """
+    series = file_formats.parse_at2(read_text(path), str(path))
+    return _record(series, units, path, Path(path).stem)
+
+
+def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:
+    """Read the corrected acceleration of one channel from a CSMIP or COSMOS V2 file, or from a zip archive of them.
+
+    Archives may contain archives, as downloads of whole stations do. The unit is taken from the file, which must state
+    it.
+
+    Parameters
+    ----------
+    path : str or path
+        A V2 file, with one channel or several, or a zip archive.
+    channel : int, optional
+        The channel number of the station (``STA CHN``), or of the recorder if the file has no other. Needed if there
+        is more than one channel.
+    member : str, optional
+        End of the name of a file in the archive, such as ``"CHAN12.V2"`` or ``"Free Field.zip/CHAN012.V2"``. Needed if
+        the archive contains a channel more than once.
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the label of the channel.
+
+    Raises
+    ------
+    ValueError
+        If the file or the channel does not exist, several channels match (the message lists them), or the file is
+        damaged.
+    """
+    candidates = file_formats.find_v2_channels(path, member)
+    chosen = [each for each in candidates if channel is None or each.channel == channel]
+    if len(chosen) != 1:
+        listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
+        raise ValueError(
+            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; choose "
+            f"with channel= and member= among\n  {listing}"
+        )
+    series = file_formats.parse_v2(chosen[0])
+    record = _record(series, None, chosen[0].file, series.title)
+    return replace(record, source=chosen[0].file.removeprefix(f"{Path(path).parent}/"))
+
+
+def read_csv(path: str | Path, units: str | None = None, dt: float | None = None, column: str | None = None) -> Record:
+    """Read a ground motion from a CSV file with a header line such as ``time_s,acc_g``.
+
+    The unit is the suffix of the name of the column (``acc_g``, ``acc_cm_s2``, ``acc [m/s2]``), the comment
+    ``# units: g``, or `units`. If more than one of them is given, they must agree. Times must be uniform within the
+    rounding of their printed digits. The comments ``# dt = 0.02 s`` and ``# npts = 1559`` are checked if present.
+
+    Parameters
+    ----------
+    path : str or path
+        The file. Without a header line it must have a single column. Lines that start with ``#`` are comments.
+    units : str, optional
+        Unit of the samples.
+    dt : float, optional
+        Time step [s], needed for a file without times.
+    column : str, optional
+        Name of the column, needed if there is more than one besides the time.
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the file.
+
+    Raises
+    ------
+    ValueError
+        If the file or the column does not exist, unit or step are missing or contradictory, a cell is not a finite
+        number, or a time step is irregular (the message names the first one).
+    """
+    series = tables.csv_series(tables.read_table(path), column, dt)
+    return _record(series, units, path, Path(path).stem)
+
+
+def read_columns(
+    path: str | Path,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None = None,
+    dt: float | None = None,
+    description: str = "",
+) -> Measurements:
+    """Read measured responses from the columns of a CSV file with a header line (see `read_csv`).
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    channels : sequence of Channel
+        The measured channels.
+    columns : sequence of str
+        Names of the columns in the header line, one per channel.
+    units : str or sequence of str, optional
+        Unit of the numbers, one for all columns or one per column. Not needed if the names of the columns end with the
+        unit (``disp_in``). If both are given, they must agree.
+    dt : float, optional
+        Time step [s], needed for a file without times.
+    description : str, optional
+        Description of the measurements.
+
+    Returns
+    -------
+    Measurements
+        The channels.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, a unit is missing or has another dimension than its channel, the times are not uniform,
+        or a cell is not a finite number.
+    """
+    table = tables.read_table(path)
+    values = _channel_values(table, channels, columns, units)
+    return Measurements(tuple(channels), tables.table_step(table, dt), values, description)
+
+
+def read_imposed_test(
+    path: str | Path,
+    displacement: str,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None = None,
+    displacement_unit: str | None = None,
+    description: str = "",
+) -> ImposedTest:
+    """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    displacement : str
+        Name of the column with the imposed displacement.
+    channels : sequence of Channel
+        The measured channels, as in `read_columns`.
+    columns : sequence of str
+        Names of the columns in the header line, one per channel.
+    units : str or sequence of str, optional
+        Unit of the numbers, as in `read_columns`.
+    displacement_unit : str, optional
+        Unit of the displacement, if the name of its column does not end with it.
+    description : str, optional
+        Description of the measurements.
+
+    Returns
+    -------
+    ImposedTest
+        The history, named after the file, and the measurements.
+
+    Raises
+    ------
+    ValueError
+        As `read_columns`, except for times, which the test does not have.
+    """
+    table = tables.read_table(path)
+    imposed = Channel(displacement, "displacement", displacement_unit or "m")
+    (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit)
+    values = _channel_values(table, channels, columns, units)
+    measurements = Measurements(tuple(channels), 1.0, values, description)
+    return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
+
+
+def _record(series: Series, units: str | None, file: str | Path, name: str) -> Record:
+    unit = agree_on_unit(series.unit, units, "acceleration", file)
+    # The source has the name of the file without its folder, because it is written into data sets that are shared.
+    source = Path(file).name + (f": {series.title}" if series.title else "")
+    return Record(name, series.dt, to_si(series.values, unit, "acceleration"), source)
+
+
+def _channel_values(
+    table: tables.Table, channels: Sequence[Channel], columns: Sequence[str], units: str | Sequence[str] | None
+) -> NDArray[np.float64]:
+    """Return columns of a table in SI units, shape (n_channels, n_rows)."""
+    given = [units] * len(columns) if units is None or isinstance(units, str) else list(units)
+    if isinstance(columns, str) or not len(channels) == len(columns) == len(given):
+        raise ValueError(
+            f"expected one column and one unit for each of {len(channels)} channels, got columns {columns!r}, "
+            f"units {units!r}"
+        )
+    rows = []
+    for channel, column, unit in zip(channels, columns, given, strict=True):
+        samples = table.values[:, tables.value_column(table, column)]
+        where = f"{table.file}, column {column!r}"
+        rows.append(to_si(samples, agree_on_unit(tables.column_unit(column), unit, channel.dimension, where)))
+    return np.array(rows)

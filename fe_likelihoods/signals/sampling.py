@@ -1,0 +1,115 @@
+"""Checks of time steps, sample arrays and time windows, shared by records, measurements and predictions."""
+
+import hashlib
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["array_digest", "check_samples", "check_step", "same_sampling", "sample_window"]
+
+_TIME_TOLERANCE = 1e-9  # in steps: round-off of times that are multiples of the step
+_STEP_TOLERANCE = 1e-9  # relative difference up to which two steps are equal
+
+
+def check_samples(values: ArrayLike, what: str, name: str) -> NDArray[np.float64]:
+    """Return a read-only float64 copy of a one-dimensional array of at least two finite samples.
+
+    Parameters
+    ----------
+    values : (n_steps,) array_like
+        The samples.
+    what : str
+        The quantity, for messages.
+    name : str
+        Name of the record or test, for messages.
+
+    Returns
+    -------
+    ndarray, shape (n_steps,)
+        The copy.
+
+    Raises
+    ------
+    ValueError
+        If the array has another shape, fewer than two samples, or a sample that is not a finite number.
+    """
+    try:
+        samples = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} of {name!r} must be an array of numbers: {error}") from None
+    if samples.ndim != 1 or samples.size < 2:
+        raise ValueError(
+            f"{what} of {name!r} must be one-dimensional with 2 samples or more, got shape {samples.shape}"
+        )
+    bad = np.flatnonzero(~np.isfinite(samples))
+    if bad.size:
+        raise ValueError(
+            f"{what} of {name!r} must be finite: {bad.size} of {samples.size} samples are not, the first is sample "
+            f"{bad[0]} ({samples[bad[0]]}); repair or cut the data"
+        )
+    samples.flags.writeable = False
+    return samples
+
+
+def check_step(dt: float, name: str) -> float:
+    """Return the time step [s] as a float; raise ValueError unless it is positive and finite."""
+    try:
+        step = float(dt)
+    except (TypeError, ValueError):
+        step = math.nan
+    if not (math.isfinite(step) and step > 0):
+        raise ValueError(f"time step of {name!r} must be a positive number of seconds, got {dt!r}")
+    return step
+
+
+def same_sampling(dt: float, n_steps: int, other_dt: float, other_n_steps: int) -> bool:
+    """Return whether two series have the same number of samples and, within round-off, the same step [s]."""
+    return n_steps == other_n_steps and not abs(dt - other_dt) > _STEP_TOLERANCE * dt
+
+
+def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float | None) -> slice:
+    """Return the slice of the samples whose times lie between `start` and `stop` [s], both included.
+
+    Parameters
+    ----------
+    name : str
+        Name of the series, for messages.
+    n_steps : int
+        Number of samples. The first sample is at time zero.
+    dt : float
+        Time step [s].
+    start, stop : float
+        Times [s] with 0 <= start < stop <= duration. A `stop` of None is the end of the series.
+
+    Returns
+    -------
+    slice
+        The window, at least two samples long.
+
+    Raises
+    ------
+    ValueError
+        If the times are out of order or outside of the series, or fewer than two samples remain.
+    """
+    duration = (n_steps - 1) * dt
+    stop = duration if stop is None else stop
+    slack = _TIME_TOLERANCE * dt
+    if not (-slack <= start < stop <= duration * (1 + 1e-12) + slack):
+        raise ValueError(
+            f"expected 0 <= start < stop <= {duration:g} s, the duration of {name!r}, got start = {start}, "
+            f"stop = {stop}"
+        )
+    first = max(math.ceil(start / dt - _TIME_TOLERANCE), 0)
+    last = min(math.floor(stop / dt + _TIME_TOLERANCE), n_steps - 1)
+    if last - first < 1:
+        raise ValueError(f"{start} ... {stop} s keeps fewer than 2 samples of {name!r}, whose step is {dt:g} s")
+    return slice(first, last + 1)
+
+
+def array_digest(*arrays: NDArray[np.float64]) -> str:
+    """Return a hex digest (BLAKE2b, 128 bits) of arrays of float64, equal on every machine (little-endian bytes)."""
+    state = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        state.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    return state.hexdigest()

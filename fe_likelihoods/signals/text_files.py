@@ -1,0 +1,120 @@
+"""What the readers of text files share: reading, numbers, units and series of samples."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..units import find_unit
+
+__all__ = [
+    "NUMBER",
+    "Series",
+    "agree_on_unit",
+    "check_count",
+    "is_number",
+    "parse_number",
+    "read_bytes",
+    "read_text",
+]
+
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+"""Regular expression of a decimal number."""
+
+
+class Series(NamedTuple):
+    """Samples as they are in a file, before any conversion.
+
+    Attributes
+    ----------
+    title : str
+        Title in the file, or an empty string.
+    dt : float
+        Time step [s].
+    unit : str or None
+        Unit of the values as the file states it, None if it does not.
+    values : ndarray, shape (n_steps,)
+        The samples, in `unit`.
+    """
+
+    title: str
+    dt: float
+    unit: str | None
+    values: NDArray[np.float64]
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the content of a file; raise ValueError if it cannot be read."""
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}; check the path") from error
+
+
+def read_text(path: str | Path) -> str:
+    """Return the text of a file; raise ValueError if it cannot be read."""
+    return read_bytes(path).decode("latin-1")  # decodes every byte; the formats read here are plain ASCII
+
+
+def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: str | Path) -> str:
+    """Return the canonical name of the unit that a file states, or that the caller gives.
+
+    Parameters
+    ----------
+    stated : str or None
+        Unit in the file.
+    given : str or None
+        Unit given by the caller.
+    dimension : str
+        Dimension of the quantity.
+    file : str or path
+        The file, for messages.
+
+    Returns
+    -------
+    str
+        The unit.
+
+    Raises
+    ------
+    ValueError
+        If both are None, the two disagree, or a unit is unknown or of another dimension.
+    """
+    names = [name for name in (stated, given) if name is not None]
+    if not names:
+        raise ValueError(f"{file} does not state the unit of its {dimension}: give units=, for instance 'g'")
+    try:
+        units = [find_unit(name, dimension) for name in names]
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    if any(unit.factor != units[0].factor for unit in units):
+        raise ValueError(f"{file} states the unit {stated!r} but units = {given!r} was given; correct one of them")
+    return units[0].name
+
+
+def check_count(found: int, stated: int, where: str) -> None:
+    """Raise ValueError if a file has another number of samples than it announces."""
+    if found != stated:
+        raise ValueError(f"{where} announces {stated} samples, the file has {found}; it is truncated or damaged")
+
+
+def parse_number(field: str, where: str) -> float:
+    """Return the finite number in a field of a file; raise ValueError for anything else."""
+    try:
+        value = float(field)
+    except ValueError:
+        raise ValueError(f"{where}: expected a number, got {field!r}") from None
+    if not math.isfinite(value):
+        raise ValueError(f"{where}: expected a finite number, got {field!r}")
+    return value
+
+
+def is_number(field: str) -> bool:
+    """Return whether a field of a file is a number."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
