@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from .models.isolated_bridge_parts import CHANNEL_SETS
+from .models.isolated_bridge_channels import CHANNEL_SETS
 from .probability.likelihood import FELikelihood
 from .probability.noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
 from .probability.posterior import Posterior

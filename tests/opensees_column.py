@@ -92,7 +92,7 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
     peak = 2.0 * fc / ec if concrete.peak_strain is None else concrete.peak_strain
     core_peak = peak * confinement.strain_ratio
     tension = (ec, ft, ft / ec + concrete.softening_strain, concrete.softening_ratio)
-    core, cover, bars = model.section()
+    core, cover, bars = model.section.fibers()
     fibers = [
         np.column_stack([part[:, 0] / INCH, part[:, 1] / INCH**2, np.full(len(part), tag)])
         for part, tag in ((core, CORE), (cover, COVER), (bars, STEEL))

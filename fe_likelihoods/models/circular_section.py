@@ -1,14 +1,20 @@
-"""Circular reinforced-concrete section: fibers, and the strength that hoops give to the core.
+"""Geometry of a circular reinforced-concrete section: fibers, confinement of the core, and Gauss-Lobatto points.
 
-**Strips, the default mesh.** The circle is cut into strips of equal height; the part of a strip inside the hoops is a
-core fiber, the rest a cover fiber. Each stands at its radius of gyration about the axis of bending, y = sqrt(I/A), so
-that area and second moment of the section are exact with any number of strips. Circular patches (rings and wedges),
-the usual mesh, are available too; they are the poorer quadrature by far: with 20 wedges the acceleration of the tested
-column is off by 10-18 % against .6 % for 40 strips (specs/bridge_column.md, section 8).
+The default mesh consists of strips of equal height. The part of a strip inside the hoops is a core fiber, the rest is a
+cover fiber. Each fiber is at its radius of gyration about the axis of bending, y = sqrt(I/A), so that area and second
+moment of area of the section are exact for any number of strips. Circular patches (rings and wedges), the usual mesh,
+are also available, but integrate much less accurately: with 20 wedges the error of the acceleration of the tested
+column is 10 to 18 %, with 40 strips 0.6 % (``docs/theory/fiber_section.rst``).
 
-**Confinement** after Mander, Priestley & Park (1988), J. Struct. Eng. 114(8): effective lateral pressure of circular
-hoops or spirals, strength and strain at the peak, and the ultimate strain of the energy balance in its usual
-approximation (Priestley, Seible & Calvi 1996).
+Confinement follows Mander et al. (1988): effective lateral pressure of circular hoops or spirals, then strength and
+strain at the peak. The ultimate strain is the approximation of the energy balance by Priestley et al. (1996).
+
+References
+----------
+J. B. Mander, M. J. N. Priestley, R. Park, Theoretical stress-strain model for confined concrete, Journal of Structural
+Engineering 114(8), 1988, 1804-1826, doi:10.1061/(ASCE)0733-9445(1988)114:8(1804).
+
+M. J. N. Priestley, F. Seible, G. M. Calvi, Seismic Design and Retrofit of Bridges, Wiley, 1996.
 """
 
 from __future__ import annotations
@@ -22,7 +28,7 @@ __all__ = ["Confinement", "circular_strips", "circular_patches", "bar_circle", "
 
 
 def _slice_moments(radius: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Integrals of the chord 2 sqrt(r^2 - y^2) and of y^2 times it from 0 to `y` (clipped to the circle)."""
+    """Integrals of the chord 2 sqrt(r^2 - y^2), and of y^2 times the chord, from 0 to `y` (clipped to the circle)."""
     z = np.clip(y / radius, -1.0, 1.0)
     root = np.sqrt(1.0 - z * z)
     angle = np.arcsin(z)
@@ -32,19 +38,19 @@ def _slice_moments(radius: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def circular_strips(radius: float, core_radius: float, n_strips: int) -> tuple[np.ndarray, np.ndarray]:
-    """Core and cover fibers of `n_strips` strips of equal height.
+    """Make core and cover fibers from strips of equal height.
 
     Parameters
     ----------
     radius, core_radius : float
-        Of the section and of the confined core [m].
+        Radius of the section and of the confined core [m].
     n_strips : int
-        Even, so that no strip straddles the axis of bending.
+        Number of strips; even, so that no strip crosses the axis of bending.
 
     Returns
     -------
-    core, cover : ndarray (n, 2)
-        Position y and area of each fiber; strips that hold no core have no core fiber.
+    core, cover : ndarray[n, 2]
+        Position y [m] and area [m²] of each fiber. Strips outside the core have no core fiber.
     """
     edges = np.linspace(-radius, radius, n_strips + 1)
     core_area, core_second = (np.diff(m) for m in _slice_moments(core_radius, edges))
@@ -61,12 +67,21 @@ def circular_strips(radius: float, core_radius: float, n_strips: int) -> tuple[n
 def circular_patches(
     radius: float, core_radius: float, n_wedges: int, n_core_rings: int, n_cover_rings: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Core and cover fibers of rings and wedges at the centroids of their cells, mirror cells merged.
+    """Make core and cover fibers at the centroids of cells between rings and wedges; mirrored cells are merged.
+
+    Parameters
+    ----------
+    radius, core_radius : float
+        Radius of the section and of the confined core [m].
+    n_wedges : int
+        Number of wedges.
+    n_core_rings, n_cover_rings : int
+        Number of rings in the core and in the cover.
 
     Returns
     -------
-    core, cover : ndarray (n, 2)
-        Position y and area of each fiber.
+    core, cover : ndarray[n, 2]
+        Position y [m] and area [m²] of each fiber.
     """
     a = math.pi / n_wedges
     angles = a + 2.0 * a * np.arange(n_wedges)
@@ -82,24 +97,55 @@ def circular_patches(
 
 
 def bar_circle(radius: float, n_bars: int, area: float, first_angle: float = 0.0) -> np.ndarray:
-    """Bars evenly on a circle, the first at `first_angle` [rad] from the y axis; (n, 2) y and area, equal y merged."""
+    """Make the fibers of bars that are evenly spaced on a circle; bars with the same position y are merged.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of the circle [m].
+    n_bars : int
+        Number of bars.
+    area : float
+        Area of one bar [m²].
+    first_angle : float
+        Angle between the y axis and the first bar [rad].
+
+    Returns
+    -------
+    ndarray[n, 2]
+        Position y [m] and area [m²] of each fiber.
+    """
     y = radius * np.cos(first_angle + 2.0 * math.pi * np.arange(n_bars) / n_bars)
     return _merge(y, np.full(n_bars, area), radius)
 
 
 def _merge(y: np.ndarray, area: np.ndarray, scale: float) -> np.ndarray:
-    """Fibers of the same position as one: the section cannot tell them apart."""
+    """Merge fibers with the same position, which have the same strain."""
     _, first, where = np.unique(np.round(y / scale, 12), return_index=True, return_inverse=True)
     return np.column_stack([y[first], np.bincount(where, weights=area)])
 
 
 class Confinement(NamedTuple):
-    """Confined concrete."""
+    """Properties of confined concrete.
 
-    effectiveness: float  # ke
-    lateral_pressure: float  # effective, fl' [Pa]
-    strength_ratio: float  # fcc/fc
-    strain_ratio: float  # eps_cc/eps_c0
+    Attributes
+    ----------
+    effectiveness : float
+        Confinement effectiveness ke.
+    lateral_pressure : float
+        Effective lateral pressure fl' [Pa].
+    strength_ratio : float
+        Confined strength divided by the unconfined strength, fcc/fc.
+    strain_ratio : float
+        Strain at the confined strength divided by that at the unconfined strength, eps_cc/eps_c0.
+    ultimate_strain : float
+        Compressive strain at the fracture of the hoops.
+    """
+
+    effectiveness: float
+    lateral_pressure: float
+    strength_ratio: float
+    strain_ratio: float
     ultimate_strain: float
 
 
@@ -115,22 +161,26 @@ def mander_confinement(
     ultimate_hoop_strain: float,
     spiral: bool,
 ) -> Confinement:
-    """Mander's model for circular hoops or a spiral.
+    """Compute the confinement by circular hoops or a spiral after Mander et al. (1988).
 
     Parameters
     ----------
     fc : float
         Strength of the unconfined concrete, positive [Pa].
     core_diameter : float
-        Between the centre lines of the hoops [m].
+        Diameter of the core, between the centre lines of the hoops [m].
     steel_ratio : float
-        Area of the longitudinal bars over that of the core.
+        Area of the longitudinal bars divided by the area of the core.
     hoop_area, spacing, clear_spacing : float
-        Area of one set of hoops [m2], its spacing and the clear distance between sets [m].
+        Area of one set of hoops [m²], distance between the centres of sets and clear distance between sets [m].
     fyh, ultimate_hoop_strain : float
         Yield strength [Pa] and strain at fracture of the hoops.
     spiral : bool
-        A spiral (one power of the arching reduction) instead of hoops (two).
+        Whether the reinforcement is a spiral, for which the arching reduction enters once, or hoops (squared).
+
+    Returns
+    -------
+    Confinement
     """
     volumetric_ratio = 4.0 * hoop_area / (core_diameter * spacing)
     arch = 1.0 - clear_spacing / (2.0 * core_diameter)
@@ -147,7 +197,7 @@ def mander_confinement(
 
 
 def gauss_lobatto(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and weights of the Gauss-Lobatto rule with `n` points on [0, 1] (both ends included)."""
+    """Compute points and weights of the Gauss-Lobatto rule with `n` points on [0, 1], both ends included."""
     legendre = np.polynomial.legendre.Legendre.basis(n - 1)
     x = np.concatenate([[-1.0], np.sort(legendre.deriv().roots().real), [1.0]])
     x = 0.5 * (x - x[::-1])  # exactly symmetric

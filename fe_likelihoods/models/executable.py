@@ -1,8 +1,10 @@
-"""A model that is a program: input files with the parameters in them, a run, an output file.
+"""Model defined by an external program: it reads input files that contain the parameters, and writes an output file.
 
-Each run has a temporary folder of its own. A program that hangs, crashes, floods its disk or answers nonsense is a
-failed simulation with its reason and the last words of its standard error; the folder can be kept to look at.
+Each run has its own temporary folder. A program that hangs, crashes, writes too much or returns an unusable response is
+a failed simulation, with a reason and the last lines of its standard error. The folders of failed runs can be kept.
 """
+
+from __future__ import annotations
 
 import os
 import shutil
@@ -22,52 +24,63 @@ from ..signals.channels import Channel
 from ..simulation.code_digest import code_digest
 from ..simulation.model import SimulationFailed
 from ..simulation.processes import RunFailed, Started, TemporaryFolder, ending, last_lines
-from .external import CheckedModel, positive
+from .external import ExternalModel
+from .validation import positive_float
 
 __all__ = ["ExecutableModel"]
 
 
-class ExecutableModel(CheckedModel):
-    """An external program as a model.
+class ExecutableModel(ExternalModel):
+    """External program as a model.
 
-    ``$name`` or ``${name}`` in the templates and in the command's arguments is the value of a parameter, with all its
-    digits; ``$$`` is a dollar sign (`string.Template`). The program is started in its folder, without a shell and
-    without standard input. When it has ended, or is stopped, its process group is killed; when it is stopped, so is
-    (on Linux) whatever else carries its environment, such as programs that went into the background.
+    ``$name`` or ``${name}`` in the templates and in the arguments of the command is replaced by the value of a
+    parameter, with all its digits; ``$$`` is a dollar sign (`string.Template`). The program is started in the folder of
+    the run, without a shell and without standard input. After it has ended or was stopped, its process group is killed.
+    If it was stopped, all other processes with its environment are killed too (on Linux), such as programs that it
+    started in the background.
 
     Parameters
     ----------
     command : sequence of str
-        The program and its arguments.
+        Program and its arguments.
     templates : mapping of str to str or Path
-        Name in the run's folder, and the text with placeholders, or the file (a Path) that holds it.
-    output : str, or callable of a Path
-        Name of the file in the run's folder that holds the response: a column for each channel, by blanks or commas,
-        in SI, lines with # skipped. Or a function of the folder that returns the response (n_channels, n_steps).
-    parameter_names, channels, dt, n_steps : as in `CheckedModel`
+        Input files: name in the folder of the run, and text with placeholders, or a Path of a file that contains it.
+    output : str or callable
+        Name of the file in the folder of the run that contains the response [SI]: one column per channel, separated by
+        blanks or commas; text after # is ignored. Or a function of the folder (a Path) that returns the response
+        (n_channels, n_steps).
+    parameter_names : sequence of str
+        Names of the structural parameters, in the order of theta.
+    channels : sequence of Channel
+        Channels of the response, in the order of its rows.
+    dt : float
+        Time step of the response [s].
+    n_steps : int
+        Number of samples of the response.
     time_limit : float
-        A run that takes longer [s] is stopped and has failed.
+        Longest duration of a run [s]. A longer run is stopped and counts as failed.
     columns : sequence of int, optional
-        The columns of the output file that are the channels, from 0; by default it has no others.
+        Columns of the output file that are the channels, counted from 0. By default the file has one column per channel
+        and no others.
     files : mapping of str to Path, optional
-        Further files for the run's folder, copied as they are.
+        Further files, copied into the folder of the run under the given names.
     keep_failures : path, optional
         Folder into which the folders of failed runs are moved, each with a file ``reason.txt``.
     max_kept : int
-        The most folders that are kept there.
+        Largest number of folders that are kept there.
     max_output : int
-        The most that a run may write into its folder and to standard output and error [bytes].
+        Largest amount that a run may write into its folder and to standard output and error [bytes].
     hash_executable : bool
-        Whether the content of the program enters the fingerprint, and that of files named by an absolute path among
-        the arguments. Large installations are told apart better by `version`.
+        Whether the fingerprint contains the content of the program, and of files that an argument names by an absolute
+        path. For large installations use `version` instead.
     version : str, optional
-        Enters the fingerprint; takes the place of the code where `output` is a function.
+        Text that enters the fingerprint. If `output` is a function, it replaces the code of the function.
 
     Raises
     ------
     ValueError
-        If the program or a file does not exist, a placeholder is no parameter, a parameter has no placeholder, a limit
-        is not positive, or what `CheckedModel` refuses.
+        If the program or a file does not exist, a placeholder is not a parameter, a parameter has no placeholder, a
+        limit is not positive, or another argument is wrong.
 
     Examples
     --------
@@ -97,33 +110,36 @@ class ExecutableModel(CheckedModel):
         version: str | None = None,
     ) -> None:
         super().__init__(parameter_names, channels, dt, n_steps)
-        self.time_limit = positive(time_limit, "ExecutableModel: time_limit", "seconds")
-        self.max_output = int(positive(max_output, "ExecutableModel: max_output", "bytes"))
-        self.max_kept = int(positive(max_kept, "ExecutableModel: max_kept", "folders"))
+        self.time_limit = positive_float(time_limit, "ExecutableModel: time_limit", "seconds")
+        self.max_output = int(positive_float(max_output, "ExecutableModel: max_output", "bytes"))
+        self.max_kept = int(positive_float(max_kept, "ExecutableModel: max_kept", "folders"))
         if isinstance(command, str | Path) or not command:
             raise ValueError(
-                f"ExecutableModel: command must be a list of the program and its arguments; got {command!r}"
+                f"ExecutableModel: command must be a list with the program and its arguments; got {command!r}"
             )
         self.command = (_executable(str(command[0])), *map(str, command[1:]))
         self.templates = {_inside(name): _text(name, source) for name, source in templates.items()}
         self.files = {_inside(name): _file(source).resolve() for name, source in (files or {}).items()}
         if repeated := set(self.templates) & set(self.files):
-            raise ValueError(f"ExecutableModel: {', '.join(repeated)} is both a template and a file")
+            raise ValueError(
+                f"ExecutableModel: {', '.join(repeated)} is both a template and a file; rename one of them"
+            )
         self._check_placeholders()
         if not callable(output) and not isinstance(output, str):
             raise ValueError(f"ExecutableModel: output must be a file name or a function of a folder; got {output!r}")
         self.output = output if callable(output) else _inside(output)
         self.columns = tuple(range(len(self.channels))) if columns is None else tuple(int(c) for c in columns)
-        self._exactly = columns is None
+        self._no_other_columns = columns is None
         if len(self.columns) != len(self.channels) or min(self.columns) < 0:
             raise ValueError(
-                f"ExecutableModel: expected a column, 0 or more, for each of the {len(self.channels)} channels; "
+                f"ExecutableModel: expected one column, 0 or more, for each of the {len(self.channels)} channels; "
                 f"got {columns}"
             )
         self.keep_failures = None if keep_failures is None else Path(keep_failures).resolve()
         self.fingerprint = self._fingerprint(hash_executable, version)
 
     def _fingerprint(self, hash_executable: bool, version: str | None) -> str:
+        """Digest of everything that a response depends on."""
         named = [Path(part) for part in self.command if Path(part).is_absolute() and Path(part).is_file()]
         contents = [_hash(path) for path in named] if hash_executable else []
         copied = {name: _hash(path) for name, path in sorted(self.files.items())}
@@ -133,12 +149,13 @@ class ExecutableModel(CheckedModel):
                 parse = version if version is not None else code_digest(self.output)
             except ValueError as error:
                 raise ValueError(
-                    f"ExecutableModel: the fingerprint needs version= here, a text to be changed with the function "
-                    f"output: {error}"
+                    "ExecutableModel: no digest of the function output can be computed; give version=, a text to be "
+                    f"changed whenever the function changes: {error}"
                 ) from error
         return self._digest(self.command, contents, sorted(self.templates.items()), copied, parse, version)
 
     def _check_placeholders(self) -> None:
+        """Raise ValueError unless every placeholder is a parameter and every parameter has a placeholder."""
         sources = {f"template {name}": text for name, text in self.templates.items()}
         sources |= {f"argument {part!r} of the command": part for part in self.command[1:]}
         used: set[str] = set()
@@ -146,19 +163,19 @@ class ExecutableModel(CheckedModel):
             template = string.Template(text)
             if not template.is_valid():
                 raise ValueError(
-                    f"ExecutableModel: a dollar sign in {where} begins no placeholder; write $$ for a dollar sign"
+                    f"ExecutableModel: a dollar sign in {where} starts no placeholder; write $$ for a dollar sign"
                 )
             names = set(template.get_identifiers())
             if unknown := sorted(names - set(self.parameter_names)):
                 raise ValueError(
-                    f"ExecutableModel: {where} asks for {', '.join(unknown)}; the parameters are "
+                    f"ExecutableModel: {where} has placeholders for {', '.join(unknown)}; the parameters are "
                     f"{', '.join(self.parameter_names)}"
                 )
             used |= names
         if unused := [name for name in self.parameter_names if name not in used]:
             raise ValueError(
                 f"ExecutableModel: no template and no argument has a placeholder for {', '.join(unused)}, so it would "
-                f"change nothing; write ${{{unused[0]}}} where its value belongs"
+                f"have no effect; write ${{{unused[0]}}} where its value belongs"
             )
 
     def _respond(self, theta: np.ndarray) -> Any:
@@ -170,12 +187,13 @@ class ExecutableModel(CheckedModel):
             try:
                 self._write(folder, values)
                 self._execute(place, [string.Template(part).substitute(values) for part in self.command[1:]])
-                return self._checked(self._read(folder))
+                return self._check_response(self._read(folder))
             except Exception as error:
                 self._keep(place, values, error, time.monotonic() - start)
                 raise
 
     def _write(self, folder: Path, values: dict[str, str]) -> None:
+        """Write the input files into the folder of the run."""
         for name, text in self.templates.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -186,7 +204,7 @@ class ExecutableModel(CheckedModel):
             shutil.copyfile(source, path)
 
     def _execute(self, place: Path, arguments: list[str]) -> None:
-        """Run the program in the folder ``run`` of `place`; RunFailed unless it ends well."""
+        """Run the program in the folder ``run`` of `place`; raise RunFailed unless it succeeds."""
         start = time.monotonic()
         with open(place / "stdout.txt", "wb") as stdout, open(place / "stderr.txt", "w+b") as stderr:
             program = Started(
@@ -197,13 +215,13 @@ class ExecutableModel(CheckedModel):
                 stderr=stderr,
             )
             try:
-                looked = start
+                checked = start
                 while not program.ended():
                     now = time.monotonic()
                     if now - start > self.time_limit:
                         raise RunFailed(f"stopped at the time limit of {self.time_limit:g} s", now - start)
-                    if now - looked > 0.1:
-                        looked = now
+                    if now - checked > 0.1:
+                        checked = now
                         if _size(place) > self.max_output:
                             raise RunFailed(f"stopped because it wrote more than {self.max_output} bytes", now - start)
                     time.sleep(min(0.02, 0.001 + 0.05 * (now - start)))
@@ -212,64 +230,73 @@ class ExecutableModel(CheckedModel):
                 raise
             exit_code = program.kill(everywhere=False)
             if exit_code:
-                words = filter(None, [ending(exit_code, "the program"), last_lines(stderr, 3)])
-                raise RunFailed(": ".join(words), time.monotonic() - start)
+                reasons = filter(None, [ending(exit_code, "the program"), last_lines(stderr, 3)])
+                raise RunFailed(": ".join(reasons), time.monotonic() - start)
             if _size(place) > self.max_output:
                 raise RunFailed(f"the program wrote more than {self.max_output} bytes", time.monotonic() - start)
 
     def _read(self, folder: Path) -> Any:
+        """Read the response from the folder of the run."""
         if callable(self.output):
             return self.output(folder)
         path = folder / self.output
         if not path.is_file():
-            raise SimulationFailed(f"the program ended well and left no file {self.output}")
+            raise SimulationFailed(f"the program succeeded but wrote no file {self.output}")
         text = path.read_text().replace(",", " ").splitlines()
         if not any(line.partition("#")[0].strip() for line in text):
             raise SimulationFailed(f"{self.output} is empty")
         try:
             table = np.loadtxt(text, ndmin=2)
         except ValueError as error:
-            raise SimulationFailed(f"{self.output} is no table of numbers: {error}") from error
-        if table.shape[1] <= max(self.columns) or (self._exactly and table.shape[1] != len(self.columns)):
-            wanted = f"{len(self.columns)} columns" if self._exactly else f"columns {', '.join(map(str, self.columns))}"
+            raise SimulationFailed(f"{self.output} is not a table of numbers: {error}") from error
+        if table.shape[1] <= max(self.columns) or (self._no_other_columns and table.shape[1] != len(self.columns)):
+            wanted = (
+                f"{len(self.columns)} columns"
+                if self._no_other_columns
+                else f"columns {', '.join(map(str, self.columns))}"
+            )
             raise SimulationFailed(f"{self.output} has {table.shape[1]} columns, expected {wanted}")
         return table[:, self.columns].T
 
     def _keep(self, place: Path, values: dict[str, str], error: Exception, seconds: float) -> None:
+        """Move the folder of a failed run to `keep_failures`."""
         if self.keep_failures is None:
             return
-        with suppress(OSError):  # a full disk must not hide the failure itself
+        with suppress(OSError):  # a full disk must not hide the reason of the failure
             self.keep_failures.mkdir(parents=True, exist_ok=True)
             if len(list(self.keep_failures.glob("failure_*"))) >= self.max_kept:
                 return
-            told = f"{getattr(error, 'reason', None) or error}\nafter {seconds:.3g} s\n"
-            (place / "reason.txt").write_text(told + "".join(f"{name} = {value}\n" for name, value in values.items()))
+            reason = error.reason if isinstance(error, RunFailed | SimulationFailed) else error
+            text = f"{reason}\nafter {seconds:.3g} s\n" + "".join(
+                f"{name} = {value}\n" for name, value in values.items()
+            )
+            (place / "reason.txt").write_text(text)
             kept = tempfile.mkdtemp(prefix="failure_", dir=self.keep_failures)
             for path in place.iterdir():
                 shutil.move(path, kept)
 
 
 def _executable(name: str) -> str:
-    """Absolute path of a program: it must not depend on the folder in which it is started."""
+    """Absolute path of a program, so that it can be started in another folder."""
     found = shutil.which(name)
     if found is None:
         raise ValueError(
-            f"ExecutableModel: there is no program {name!r} that can be executed, neither as a path nor in the folders "
-            "of PATH"
+            f"ExecutableModel: expected an executable program, as a path or in the folders of PATH; got {name!r}"
         )
     return os.path.abspath(found)
 
 
 def _inside(name: str) -> str:
+    """Normalised name of a file; raise ValueError if it is not inside the folder of the run."""
     path = Path(name)
     if not name or path.is_absolute() or ".." in path.parts:
-        raise ValueError(f"ExecutableModel: expected the name of a file inside the run's folder; got {name!r}")
+        raise ValueError(f"ExecutableModel: expected the name of a file inside the folder of the run; got {name!r}")
     return path.as_posix()
 
 
 def _file(path: Path) -> Path:
     if not isinstance(path, Path) or not path.is_file():
-        raise ValueError(f"ExecutableModel: expected the Path of a file that exists; got {path!r}")
+        raise ValueError(f"ExecutableModel: expected the Path of an existing file; got {path!r}")
     return path
 
 
@@ -279,7 +306,7 @@ def _text(name: str, source: str | Path) -> str:
     try:
         return _file(source).read_text()
     except UnicodeDecodeError as error:
-        raise ValueError(f"ExecutableModel: the template of {name} is no text: {error}") from error
+        raise ValueError(f"ExecutableModel: the template of {name} is not a text file: {error}") from error
 
 
 def _hash(path: Path) -> str:
@@ -291,7 +318,7 @@ def _hash(path: Path) -> str:
 
 
 def _size(folder: Path) -> int:
-    """Bytes in a folder; what vanishes meanwhile does not count."""
+    """Size of the files in a folder [bytes]; files that are removed in the meantime do not count."""
     total = 0
     for path in folder.rglob("*"):
         with suppress(OSError):

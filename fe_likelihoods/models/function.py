@@ -1,9 +1,10 @@
-"""A model that is any Python function of the parameters.
+"""Model defined by a Python function of the parameters.
 
-The function may be trusted or not. One that may hang, crash or eat the memory runs in a process of its own, where that
-is a failed simulation like any other; the process is kept for the next run, so that this costs a fraction of a
-millisecond a run.
+A function that may hang, crash or use too much memory can run in a separate process, where such a run is a failed
+simulation. The process is reused for the next run, which adds a fraction of a millisecond per run.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,36 +14,45 @@ import numpy as np
 from ..signals.channels import Channel
 from ..simulation.code_digest import code_digest
 from ..simulation.sandbox import Sandbox
-from .external import CheckedModel, positive
+from .external import ExternalModel
+from .validation import positive_float
 
 __all__ = ["FunctionModel"]
 
 
-class FunctionModel(CheckedModel):
-    """A Python function as a model.
+class FunctionModel(ExternalModel):
+    """Python function as a model.
 
     Parameters
     ----------
-    function : callable theta -> (n_channels, n_steps)
-        Of the parameters (n_parameters,); returns the response in SI. It may raise what it likes, best
-        `SimulationFailed` with a reason. For a pool of processes, or isolated, it must be picklable: defined at the top
-        level of a module.
-    parameter_names, channels, dt, n_steps : as in `CheckedModel`
+    function : callable
+        Function of theta (n_parameters,) that returns the response (n_channels, n_steps) in SI units. It may raise any
+        exception, preferably `SimulationFailed` with a reason. For a pool of processes, or with `isolated`, it must be
+        picklable: defined at the top level of a module.
+    parameter_names : sequence of str
+        Names of the structural parameters, in the order of theta.
+    channels : sequence of Channel
+        Channels of the response, in the order of its rows.
+    dt : float
+        Time step of the response [s].
+    n_steps : int
+        Number of samples of the response.
     version : str, optional
-        Takes the place of the code in the fingerprint: change it whenever the function computes something else. By
-        default a digest of the code is taken, and of all that it uses (see `fe_likelihoods.simulation.code_digest`).
+        Text that replaces the code in the fingerprint; change it whenever the function computes something else. By
+        default the fingerprint contains a digest of the code and of everything it uses
+        (`fe_likelihoods.simulation.code_digest`).
     isolated : bool
-        Run in a process of its own; limits below imply it.
+        Run the function in a separate process. A limit below implies it.
     time_limit : float, optional
-        A run that takes longer [s] is stopped and has failed.
+        Longest duration of a run [s]. A longer run is stopped and counts as failed.
     memory_limit : int, optional
-        The most address space of the process [bytes]: beyond it allocations fail.
+        Largest address space of the process [bytes]. Allocations beyond it fail.
 
     Raises
     ------
     ValueError
-        If the function cannot be called, a limit is not positive, there is no stable digest of the code and no version,
-        or what `CheckedModel` refuses.
+        If the function cannot be called, a limit is not positive, no stable digest of the code can be computed and
+        `version` is not given, or another argument is wrong.
 
     Examples
     --------
@@ -69,23 +79,24 @@ class FunctionModel(CheckedModel):
             raise ValueError(f"{kind}: expected a function of the parameters; got {function!r}")
         self.function = function
         self.version = version
-        self.time_limit = None if time_limit is None else positive(time_limit, f"{kind}: time_limit", "seconds")
+        self.time_limit = None if time_limit is None else positive_float(time_limit, f"{kind}: time_limit", "seconds")
         self.memory_limit = (
-            None if memory_limit is None else int(positive(memory_limit, f"{kind}: memory_limit", "bytes"))
+            None if memory_limit is None else int(positive_float(memory_limit, f"{kind}: memory_limit", "bytes"))
         )
         self.isolated = bool(isolated) or time_limit is not None or memory_limit is not None
         self.fingerprint = self._digest(self._version_of(function))
         self._run = Sandbox(function, self.time_limit, self.memory_limit or 0) if self.isolated else function
 
     def _version_of(self, function: Callable) -> list[str]:
+        """Texts that identify what the function computes."""
         if self.version is not None:
             return ["version", str(self.version)]
         try:
             return ["code", code_digest(function)]
         except ValueError as error:
             raise ValueError(
-                f"{type(self).__name__}: the fingerprint needs version= here, a text to be changed with the function: "
-                f"{error}"
+                f"{type(self).__name__}: no digest of the function can be computed; give version=, a text to be "
+                f"changed whenever the function changes: {error}"
             ) from error
 
     def _respond(self, theta: np.ndarray) -> Any:

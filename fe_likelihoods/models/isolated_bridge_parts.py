@@ -1,7 +1,8 @@
-"""What an isolated bridge is made of: piers and devices, each checked when it is made; and its sets of channels.
+"""Parts of the isolated bridge: piers, bearings, dampers and rubber devices. Arguments are checked when a part is made.
 
-The defaults are the quarter-scale bridge of NCEER 94-0002 as far as it could be reconstructed; most values are
-**assumed** or recalled from sister reports (specs/isolated_bridge.md, section 4, says which).
+The defaults are those of the quarter-scale bridge of Tsopelas et al., NCEER 94-0002 (1994), as far as it could be
+reconstructed. Most values are **assumed**, or taken from related reports without verification;
+``docs/theory/isolated_bridge.rst`` says which.
 """
 
 from __future__ import annotations
@@ -10,32 +11,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .validation import number, refuse, whole_number
+from .validation import check_fields, check_finite, check_integer, invalid
 
-__all__ = ["CHANNEL_SETS", "Bearing", "Damper", "Pier", "Rubber"]
-
-_PIER_1 = ("Ub_1", "Fb_1", "drift_1", "shear_1", "acc_p1")
-_PIER_2 = ("Ub_2", "Fb_2", "drift_2", "shear_2", "acc_p2")
-CHANNEL_SETS = {5: _PIER_1, 6: (*_PIER_1, "Ub_2"), 10: _PIER_1 + _PIER_2}
-"""The sets of measured channels: the paper's five of pier 1, six (its figure of the fit), and both piers."""
+__all__ = ["Bearing", "Damper", "Pier", "Rubber"]
 
 
 @dataclass(frozen=True)
 class Pier:
-    """A cantilever fixed to the table, massless, with a rigid block at its tip that carries the isolators.
+    """Massless cantilever, fixed to the table, with a rigid block at its tip that carries the isolators.
 
     Attributes
     ----------
     modulus, inertia, length : float
-        Of the cantilever [Pa], [m4], [m].
+        Elastic modulus [Pa], second moment of area [m⁴] and length [m] of the cantilever.
     height : float
-        Of the block [m]; the isolators stand on its top.
+        Height of the block [m]; the isolators are on its top.
     center : float
         Height of the block's centre of mass above its bottom [m].
     mass, rotary_inertia : float
-        Of the block [kg], [kg m2], the latter about its centre of mass.
+        Mass of the block [kg], and its rotary inertia about its centre of mass [kg m²].
     damping_ratio : float
-        Of the pier alone in its first mode; damping is proportional to the stiffness.
+        Damping ratio of the pier alone in its first mode; damping is proportional to the stiffness.
     """
 
     modulus: float = 200e9
@@ -48,14 +44,12 @@ class Pier:
     damping_ratio: float = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("modulus", "inertia", "length", "mass", "rotary_inertia"):
-            number(f"{name} of a pier", getattr(self, name))
-        for name in ("height", "center", "damping_ratio"):
-            number(f"{name} of a pier", getattr(self, name), zero=True)
+        positive = ("modulus", "inertia", "length", "mass", "rotary_inertia")
+        check_fields(self, positive=positive, non_negative=("height", "center", "damping_ratio"), of="of a pier")
 
     @property
     def stiffness(self) -> np.ndarray:
-        """Of the tip in translation and rotation, (2, 2) [N/m, N, N m]."""
+        """Stiffness of the tip in translation and rotation, (2, 2) [N/m, N, N m]."""
         length = self.length
         return (
             self.modulus
@@ -66,18 +60,21 @@ class Pier:
 
     @property
     def mass_matrix(self) -> np.ndarray:
-        """Of the block, moved by translation and rotation of its bottom, (2, 2) [kg, kg m, kg m2]."""
+        """Mass matrix of the block for translation and rotation of its bottom, (2, 2) [kg, kg m, kg m²]."""
         first = self.mass * self.center
         return np.array([[self.mass, first], [first, self.rotary_inertia + first * self.center]])
 
     @property
     def damping(self) -> np.ndarray:
-        """Proportional to the stiffness, (2, 2)."""
+        """Damping matrix, proportional to the stiffness, (2, 2) [N s/m, N s, N m s]."""
         lowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(self.mass_matrix, self.stiffness)).real.min())
         return 2.0 * self.damping_ratio / lowest * self.stiffness
 
     def geometric_stiffness(self, load: float, gravity: float) -> np.ndarray:
-        """P-delta of the `load` on the block [N] and of the block itself, slider on the block, (2, 2), to be added."""
+        """Geometric stiffness (2, 2) to be added, for the `load` [N] on the block and the weight of the block itself.
+
+        The slider is on the block, and the sliding plate on the deck.
+        """
         length, axial = self.length, load + self.mass * gravity
         matrix = -axial / (30.0 * length) * np.array([[36.0, -3.0 * length], [-3.0 * length, 4.0 * length**2]])
         matrix[1, 1] -= load * self.height + self.mass * gravity * self.center
@@ -86,21 +83,21 @@ class Pier:
 
 @dataclass(frozen=True)
 class Bearing:
-    """A flat sliding bearing: ``mu(v) = f_min + df (1 - exp(-a |v|))``.
+    """Flat sliding bearing with the coefficient of friction ``mu(v) = f_min + df (1 - exp(-a |v|))``.
 
     Attributes
     ----------
     load : float
-        Weight that it carries [N].
+        Weight on the bearing [N].
     f_min, df : float
-        Coefficient of friction at rest, and what a high velocity adds to it.
+        Coefficient of friction at rest, and its increase at high velocity.
     a : float
-        How fast it is added [s/m].
+        Rate of the increase with velocity [s/m].
     yield_displacement : float
-        Over which the regularised laws let the friction turn round [m]. It is physics, not numerics: peak pier
-        accelerations differ by a third between .13 mm and none.
+        Displacement over which the regularised laws reverse the friction force [m]. It is a physical property, not a
+        numerical setting: peak pier accelerations differ by a third between 0.13 mm and zero.
     gamma : float
-        Of the Bouc-Wen law with A = 1, exponent 2 and beta = 1 - gamma: between .5 and 1.
+        Constant of the Bouc-Wen law with A = 1, exponent 2 and beta = 1 - gamma; above 0.5, at most 1.
     """
 
     load: float = 70e3
@@ -111,43 +108,50 @@ class Bearing:
     gamma: float = 0.9
 
     def __post_init__(self) -> None:
-        for name in ("load", "f_min", "yield_displacement"):
-            number(f"{name} of a bearing", getattr(self, name))
-        for name in ("df", "a"):
-            number(f"{name} of a bearing", getattr(self, name), zero=True)
-        number("gamma of a bearing", self.gamma)
+        positive = ("load", "f_min", "yield_displacement", "gamma")
+        check_fields(self, positive=positive, non_negative=("df", "a"), of="of a bearing")
         if not 0.5 < self.gamma <= 1.0:
-            refuse("a gamma of a bearing above .5, up to 1", self.gamma, ".9 is the default")
+            raise invalid("a gamma of a bearing above 0.5, at most 1", self.gamma, "the default is 0.9")
 
 
 @dataclass(frozen=True)
 class Damper:
-    """`count` linear fluid dampers at a pier, each a spring `stiffness` [N/m] and a dashpot `viscosity` [N s/m]."""
+    """Linear fluid dampers at a pier, each a spring and a dashpot in series (Maxwell element).
+
+    Attributes
+    ----------
+    stiffness : float
+        Stiffness of the spring of one damper [N/m].
+    viscosity : float
+        Coefficient of the dashpot of one damper [N s/m].
+    count : int
+        Number of dampers at the pier.
+    """
 
     stiffness: float = 2575e3
     viscosity: float = 15.45e3
     count: int = 2
 
     def __post_init__(self) -> None:
-        number("stiffness of a damper", self.stiffness)
-        number("viscosity of a damper", self.viscosity)
-        whole_number("count of dampers", self.count, 1, 1000)
+        check_fields(self, positive=("stiffness", "viscosity"), of="of a damper")
+        check_integer("count of dampers", self.count, 1, 1000)
 
 
 @dataclass(frozen=True)
 class Rubber:
-    """A rubber restoring-force device, the same at both piers, with s = displacement / scale.
+    """Rubber restoring-force device, the same at both piers, with s = displacement / scale.
 
     Attributes
     ----------
-    skeleton : 6 floats
-        A_1, A_3 ... A_11 [N]: force sum A_n s^n.
-    half_loop : 3 floats
-        B_0, B_2, B_4 [N]: half the distance of the branches of loading and unloading, sum B_m s^m.
+    skeleton : tuple of 6 floats
+        Coefficients A_1, A_3, ..., A_11 [N] of the skeleton curve, sum of A_n s^n.
+    half_loop : tuple of 3 floats
+        Coefficients B_0, B_2, B_4 [N] of half the difference between the branches of loading and unloading, sum of
+        B_m s^m.
     scale : float
-        [m]
+        Displacement at s = 1 [m].
     limit : float
-        Beyond \\|s\\| = limit the skeleton goes on along its tangent.
+        Value of abs(s) beyond which the skeleton curve continues along its tangent.
     """
 
     skeleton: tuple[float, ...] = (8500.0, 250.0, 100.0, 150.0, 1500.0, 7500.0)
@@ -156,20 +160,28 @@ class Rubber:
     limit: float = 1.2
 
     def __post_init__(self) -> None:
-        for name, count in (("skeleton", 6), ("half_loop", 3)):
-            values = tuple(getattr(self, name))
+        for name, given, count in (("skeleton", self.skeleton, 6), ("half_loop", self.half_loop, 3)):
+            values = tuple(given)
             if len(values) != count:
-                refuse(
-                    f"{count} coefficients of the {name} of rubber", values, "give zeros for those that are not used"
-                )
+                raise invalid(f"{count} coefficients of the {name} of rubber", values, "set unused ones to zero")
             for value in values:
-                number(f"coefficient of the {name} of rubber", value, any_sign=True)
+                check_finite(f"coefficient of the {name} of rubber", value)
             object.__setattr__(self, name, values)
-        number("scale of rubber", self.scale)
-        number("limit of rubber", self.limit)
+        check_fields(self, positive=("scale", "limit"), of="of rubber")
         s = np.linspace(0.0, self.limit, 200)
         tangent = sum(a * n * s ** (n - 1) for a, n in zip(self.skeleton, range(1, 12, 2), strict=True))
         if tangent.min() < 0.0:
-            refuse("a skeleton of rubber that rises up to its limit", self.skeleton, "a falling one has no one answer")
+            raise invalid(
+                "a skeleton of rubber that increases up to its limit",
+                self.skeleton,
+                "with a decreasing one the response would not be unique",
+            )
         if sum(b * s**m for b, m in zip(self.half_loop, (0, 2, 4), strict=True)).min() < 0.0:
-            refuse("a half loop of rubber that is nowhere negative", self.half_loop, "it would give energy away")
+            raise invalid(
+                "a half loop of rubber that is nowhere negative", self.half_loop, "a negative one would create energy"
+            )
+
+    @property
+    def linear_stiffness(self) -> float:
+        """Stiffness of the linear term of the skeleton curve [N/m]."""
+        return self.skeleton[0] / self.scale

@@ -1,17 +1,17 @@
 """Linear structures on several moving supports, solved exactly.
 
-Supports that move by different amounts carry a structure along: displacements x of its degrees of freedom are R g under
-support displacements g that grow slowly, with the influence matrix R. What is left, u = x - R g, vibrates ::
+Slowly growing support displacements g cause displacements R g of the degrees of freedom, with the influence matrix R.
+The total displacements are x = R g + u, and the dynamic part u satisfies ::
 
     M u'' + C u' + K u = -M R a(t),        x'' = u'' + R a = -M^-1 (C u' + K u)
 
-with the accelerations a of the supports (Chopra 2012, section 9.7; damping forces of the slow part are left
-out, as usual). C need not have the modes of M and K. Of first order, in the state (u, u'), the equations come apart in
-the complex modes, each q' = lam q + f(t), and with accelerations that are straight lines between their samples each has
-a closed form: no time-stepping error, as in `linear_oscillator`.
+with the accelerations a of the supports (Chopra 2012, section 9.7; damping forces of the quasi-static part are
+neglected, as usual). C need not be diagonalised by the modes of M and K. In the state (u, u') the equations are of
+first order and uncouple in the complex modes, q' = lam q + f(t). With accelerations that are linear between their
+samples, each mode has a closed-form solution without time-stepping error (``docs/theory/time_integration.rst``).
 
-`LinearStructure` makes a model of anything that turns parameters into these matrices; `linear_parts` has a bridge deck
-and a frame.
+`LinearStructure` is a model of any object that computes these matrices from parameters. Two such objects are a bridge
+deck and a frame (`fe_likelihoods.models.linear_structure_parts`).
 
 References
 ----------
@@ -33,7 +33,7 @@ from ..signals.records import Record
 from ..signals.sampling import sample_window
 from ..signals.sdof import hold_integrals
 from ..simulation.model import SimulationFailed
-from .external import CheckedModel
+from .external import ExternalModel
 
 __all__ = [
     "LinearStructure",
@@ -44,17 +44,22 @@ __all__ = [
     "respond_structure",
 ]
 
-_LARGEST_CONDITION = 1e8  # of the complex modes: half of the digits
+_LARGEST_CONDITION = 1e8  # condition number of the complex modes at which half of the digits are lost
 
 
 class LinearSystem(NamedTuple):
-    """Matrices of a linear structure with n degrees of freedom, and what its sensors measure.
+    """Matrices of a linear structure with n degrees of freedom, and the positions of its sensors.
 
-    mass, damping, stiffness : (n, n) float — in any units that agree: only M^-1 C [1/s] and M^-1 K [1/s²] matter.
-    influence : (n, n_supports) float — displacements under unit displacements of the supports, slowly; a structure that
-        stands on one support and is not sheared by it has ones [-].
-    shape : (n_channels, n) float — share of each degree of freedom's absolute acceleration in each channel [-].
-    direct : (n_channels, n_supports) float — and of each support's acceleration [-].
+    Attributes
+    ----------
+    mass, damping, stiffness : ndarray[n, n]
+        Matrices in any consistent units: only M^-1 C [1/s] and M^-1 K [1/s²] matter.
+    influence : ndarray[n, n_supports]
+        Static displacements under unit displacements of the supports [-]; ones for a structure on a single support.
+    shape : ndarray[n_channels, n]
+        Weight of the absolute acceleration of each degree of freedom in each channel [-].
+    direct : ndarray[n_channels, n_supports]
+        Weight of the acceleration of each support in each channel [-].
     """
 
     mass: np.ndarray
@@ -66,8 +71,17 @@ class LinearSystem(NamedTuple):
 
 
 class StructureResponse(NamedTuple):
-    """Response of the degrees of freedom, each (n, n_steps): `displacement` [m] and `velocity` [m/s] relative to R g,
-    absolute `acceleration` [m/s²]."""
+    """Response of the degrees of freedom.
+
+    Attributes
+    ----------
+    displacement : ndarray[n, n_steps]
+        Displacement relative to R g [m].
+    velocity : ndarray[n, n_steps]
+        Velocity relative to R g [m/s].
+    acceleration : ndarray[n, n_steps]
+        Absolute acceleration [m/s²].
+    """
 
     displacement: np.ndarray
     velocity: np.ndarray
@@ -75,7 +89,10 @@ class StructureResponse(NamedTuple):
 
 
 class Parts(Protocol):
-    """What `LinearStructure` needs to know of a structure. Its repr tells everything that the matrices depend on."""
+    """Interface of the structures that `LinearStructure` simulates.
+
+    The ``repr`` of the object must contain everything that the matrices depend on, because it enters the fingerprint.
+    """
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -87,16 +104,31 @@ class Parts(Protocol):
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels, all of them absolute accelerations."""
+        """Names of the channels, which are absolute accelerations."""
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Matrices at the parameters (n_parameters,); `SimulationFailed` where there are none."""
+        """Matrices at the parameters (n_parameters,); raises `SimulationFailed` if they describe no structure."""
 
 
 def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-    """Damping matrix (n, n) that gives the undamped modes, slowest first, these fractions (n,) of critical damping.
+    """Compute the damping matrix from modal damping ratios: C = M Phi diag(2 zeta omega) Phi^T M.
 
-    M Phi diag(2 zeta omega) Phi^T M with mass-normalised modes Phi; M and K symmetric, M positive definite.
+    Parameters
+    ----------
+    mass, stiffness : ndarray[n, n]
+        Symmetric matrices, positive definite.
+    ratios : ndarray[n]
+        Fractions zeta of critical damping of the undamped modes Phi, lowest frequency first.
+
+    Returns
+    -------
+    ndarray[n, n]
+        Damping matrix.
+
+    Raises
+    ------
+    SimulationFailed
+        If the stiffness is not positive definite.
     """
     squares, modes = eigh(stiffness, mass)
     if not squares[0] > 0.0:
@@ -107,13 +139,14 @@ def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -
 
 
 def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt: float) -> StructureResponse:
-    """Exact response, from rest, to accelerations of the supports that are linear between their samples.
+    """Compute the exact response, from rest, to support accelerations that are linear between their samples.
 
     Parameters
     ----------
     system : LinearSystem
-    support_acceleration : (n_supports, n_steps) float
-        [m/s²]
+        Matrices of the structure.
+    support_acceleration : ndarray[n_supports, n_steps]
+        Absolute accelerations of the supports [m/s²].
     dt : float
         Time step of the samples [s].
 
@@ -124,8 +157,8 @@ def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt
     Raises
     ------
     SimulationFailed
-        If two complex modes coincide (a mode with exactly critical damping, or without stiffness): they do not come
-        apart then; and if the mass is singular.
+        If two complex modes coincide, so that the equations do not uncouple (a mode with exactly critical damping, or
+        without stiffness), or if the mass is singular.
     """
     modes = _modes(system)
     n, n_steps = len(system.mass), support_acceleration.shape[1]
@@ -135,11 +168,16 @@ def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt
 
 
 class _Modes(NamedTuple):
-    """Complex modes, of conjugate ones only one, which counts twice.
+    """Complex modes; of each conjugate pair only one is stored, with doubled shapes.
 
-    eigenvalues : (m,) complex [1/s]
-    participation : (m, n_supports) complex — forcing of the mode under unit accelerations of the supports.
-    shapes : (m, 3, n) complex — in displacement, velocity and absolute acceleration.
+    Attributes
+    ----------
+    eigenvalues : ndarray[m]
+        Eigenvalues [1/s].
+    participation : ndarray[m, n_supports]
+        Forcing of the mode under unit accelerations of the supports.
+    shapes : ndarray[m, 3, n]
+        Shapes in displacement, velocity and absolute acceleration.
     """
 
     eigenvalues: np.ndarray
@@ -152,17 +190,17 @@ def _modes(system: LinearSystem) -> _Modes:
     try:
         lower = -np.linalg.solve(system.mass, np.hstack([system.stiffness, system.damping]))
         eigenvalues, vectors = np.linalg.eig(np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower]))
-        # displacements and velocities differ in size by the frequencies, which is no matter of coinciding modes
+        # scaled, because displacements and velocities differ by the size of the frequencies
         rows = np.repeat([max(1.0, np.abs(eigenvalues).max()), 1.0], n)[:, None]
         condition = np.linalg.cond(rows * vectors / np.linalg.norm(rows * vectors, axis=0))
     except np.linalg.LinAlgError as error:
         raise SimulationFailed(f"the complex modes cannot be found: {error}") from error
     if not condition < _LARGEST_CONDITION:
         raise SimulationFailed(
-            f"two complex modes coincide (condition {condition:.1e}): is a damping critical, or a stiffness zero?"
+            f"two complex modes coincide (condition {condition:.1e}): a damping is critical, or a stiffness is zero"
         )
     participation = np.linalg.solve(vectors, np.vstack([np.zeros_like(system.influence), -system.influence]))
-    # displacement phi, velocity lam phi; absolute acceleration lam^2 phi, as that is what M^-1 K and C leave
+    # displacement phi, velocity lam phi, and absolute acceleration -M^-1 (C lam + K) phi = lam^2 phi
     shapes = np.stack([vectors[:n], vectors[n:], eigenvalues * vectors[n:]]).transpose(2, 0, 1)
     kept = eigenvalues.imag >= 0.0
     twice = np.where(eigenvalues.imag > 0.0, 2.0, 1.0)[:, None, None]
@@ -184,26 +222,26 @@ def _superpose(modes: _Modes, shapes: np.ndarray, support_acceleration: np.ndarr
     )
 
 
-class LinearStructure(CheckedModel):
-    """A linear structure under recorded accelerations of its supports, at rest at their first sample.
+class LinearStructure(ExternalModel):
+    """Linear structure under recorded accelerations of its supports, at rest at their first sample.
 
     Parameters
     ----------
-    parts : BridgeDeck, ShearFrame, or another object of the kind of `Parts`
-        What the structure is made of.
+    parts : BridgeDeck, ShearFrame, or an object with the interface `Parts`
+        Parameters and matrices of the structure.
     supports : Record or sequence of Record
-        Absolute accelerations of the supports, of one step and length; in the order that `parts` states.
+        Absolute accelerations of the supports, with the same step and length, in the order that `parts` documents.
     unit : str
         Display unit of the channels.
     lead : float
-        Time [s] before the first sample of the channels: the supports' motion in it only brings the structure into the
-        state that it has there. So a part of a record can be measured, without starting it from rest.
+        Time before the first sample of the channels [s]. The motion of the supports during this time is simulated but
+        not compared with measurements, so that a part of a record need not start from rest.
 
     Raises
     ------
     ValueError
-        If there are no supports, they differ in step or length, `parts` has no place for so many, or the lead leaves
-        fewer than two samples.
+        If there are no supports, their steps or lengths differ, `parts` has another number of supports, or the lead
+        leaves fewer than two samples.
 
     Examples
     --------
@@ -214,19 +252,21 @@ class LinearStructure(CheckedModel):
     def __init__(self, parts: Parts, supports: Record | Sequence[Record], unit: str = "g", lead: float = 0.0) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
         if not supports or not all(isinstance(support, Record) for support in supports):
-            raise ValueError(f"LinearStructure: expected the Records of the supports' accelerations; got {supports!r}")
+            raise ValueError(
+                f"LinearStructure: expected Records of the accelerations of the supports; got {supports!r}"
+            )
         first = supports[0]
         for support in supports[1:]:
             if support.n_steps != first.n_steps or abs(support.dt - first.dt) > 1e-9 * first.dt:
                 raise ValueError(
-                    f"LinearStructure: expected supports of one step and length; got {first.n_steps} samples at "
-                    f"{first.dt} s ({first.name}) and {support.n_steps} at {support.dt} s ({support.name}): use "
+                    f"LinearStructure: expected supports with the same step and length; got {first.n_steps} samples at "
+                    f"{first.dt} s ({first.name}) and {support.n_steps} at {support.dt} s ({support.name}); use "
                     "Record.resample and Record.trim"
                 )
         if len(supports) != parts.n_supports:
             raise ValueError(
-                f"LinearStructure: {type(parts).__name__} stands on {parts.n_supports} supports; "
-                f"got {len(supports)} records"
+                f"LinearStructure: expected one record for each of the {parts.n_supports} supports of "
+                f"{type(parts).__name__}; got {len(supports)}"
             )
         channels = tuple(Channel(name, "absolute acceleration", unit) for name in parts.channel_names)
         self._window = sample_window("the supports", first.n_steps, first.dt, lead, None)
@@ -239,7 +279,7 @@ class LinearStructure(CheckedModel):
         self.fingerprint = self._digest(KERNEL_HASH, repr(parts), self._window.start, [s.fingerprint for s in supports])
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
-        """The same structure under other accelerations of its supports; ValueError as for a new one."""
+        """Return the same structure under other accelerations of its supports; errors as for a new one."""
         return type(self)(self.parts, record, self.unit, self.lead)
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:

@@ -1,51 +1,52 @@
-"""Two linear structures of few parameters: the deck of a short bridge, and a frame with one floor a storey.
+"""Two linear structures with few parameters: the deck of a short bridge, and a shear frame.
 
-Each is a frozen description, whose matrices `fe_likelihoods.models.linear_structure.LinearStructure` simulates. Neither
-knows its mass: accelerations of supports cannot tell it from the stiffness.
+Each is a frozen dataclass that computes the matrices which `fe_likelihoods.models.linear_structure.LinearStructure`
+simulates. Masses are relative, because accelerations of supports identify only the ratio of stiffness to mass.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..simulation.model import SimulationFailed
 from .linear_structure import LinearSystem, modal_damping
-from .validation import number
+from .validation import check_positive
 
 __all__ = ["BridgeDeck", "ShearFrame"]
 
 
 @dataclass(frozen=True)
 class BridgeDeck:
-    """Transverse motion of a two-span deck, as one vibrating shape between a column in the middle and the two ends.
+    """Transverse vibration of a two-span deck in one shape, on a column in the middle and on its two ends.
 
-    With the acceleration a_c of the column's base and a_1, a_2 of the ends, the middle of the deck has the absolute
-    acceleration y ::
+    With the acceleration a_c of the base of the column and a_1, a_2 of the ends, the absolute acceleration y of the
+    middle of the deck is ::
 
         x'' + 2 zeta omega x' + omega^2 x = -[w (a_1 + a_2) / 2 + (1 - w) a_c],    y = -2 zeta omega x' - omega^2 x
 
-    w is the share of the ends in what carries the middle: their stiffness, by way of the deck, over that and the
-    column's together. A place within the first (second) span has (1 - s) a_1 + s y (with a_2): s = 1/2 half way if the
-    halves of the deck stay straight, sin(pi / 4) if the deck swings as half a sine.
+    w is the share of the ends in the stiffness that supports the middle: the stiffness of the ends through the deck,
+    divided by the sum of this stiffness and that of the column. A point in the first span has the acceleration
+    (1 - s) a_1 + s y, a point in the second span (1 - s) a_2 + s y. At the middle of a span, s = 1/2 if the halves of
+    the deck remain straight, and s = sin(pi / 4) if the deck vibrates as half a sine.
 
-    Supports: the base of the column, the first end, the second end. Parameters: ``frequency`` omega / 2 pi [Hz],
-    ``damping`` zeta, and ``share`` w and ``shape`` s unless they are given here.
+    The supports are the base of the column, the first end and the second end. The parameters are ``frequency``
+    omega / 2 pi [Hz], ``damping`` zeta, and ``share`` w and ``shape`` s unless they are given here.
 
     Parameters
     ----------
     middle : str
         Name of the channel in the middle, or "" if there is none.
     first_span, second_span : str
-        Names of the channels within the spans, or "".
+        Names of the channels in the spans, or "" if there is none.
     share, shape : float, optional
-        Fixed values, from 0 to 1; share=1 is a deck on its ends only, share=0 one on its column only.
+        Fixed values, from 0 to 1. With share=1 the deck is supported by its ends only, with share=0 by its column only.
 
     Raises
     ------
     ValueError
-        If there is no channel, or a fixed value is not from 0 to 1.
+        If there is no channel, or a fixed value is not between 0 and 1.
     """
 
     middle: str = "middle"
@@ -58,27 +59,31 @@ class BridgeDeck:
 
     def __post_init__(self) -> None:
         if not self.channel_names:
-            raise ValueError("BridgeDeck: expected the name of a channel in the middle or within a span; got none")
-        for name in ("share", "shape"):
-            value = getattr(self, name)
+            raise ValueError("BridgeDeck: expected the name of a channel in the middle or in a span; got none")
+        for name, value in (("share", self.share), ("shape", self.shape)):
             if value is not None and not 0.0 <= value <= 1.0:
                 raise ValueError(f"BridgeDeck: {name} must be a number from 0 to 1, or None if unknown; got {value!r}")
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``frequency``, ``damping``, and ``share`` and ``shape`` where unknown."""
+        """``frequency``, ``damping``, and those of ``share`` and ``shape`` that are not given."""
         free = ["share"] if self.share is None else []
         free += ["shape"] if self.shape is None and (self.first_span or self.second_span) else []
         return ("frequency", "damping", *free)
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """Those of the first span, the middle and the second span that have a name."""
+        """Names of the channels that exist, in the order first span, middle, second span."""
         return tuple(name for name in (self.first_span, self.middle, self.second_span) if name)
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Matrices at the parameters; `SimulationFailed` for a frequency or damping that is not positive, or shares
-        that are not from 0 to 1."""
+        """Compute the matrices at the parameters (n_parameters,).
+
+        Raises
+        ------
+        SimulationFailed
+            If the frequency or the damping is not positive, or share or shape is not between 0 and 1.
+        """
         values = dict(share=self.share, shape=self.shape) | dict(zip(self.parameter_names, theta.tolist(), strict=True))
         frequency, damping, share = (values[name] for name in ("frequency", "damping", "share"))
         shape = 0.0 if values["shape"] is None else values["shape"]
@@ -104,28 +109,29 @@ class BridgeDeck:
 
 @dataclass(frozen=True)
 class ShearFrame:
-    """A frame with rigid floors, one above the other, each held by the storey below and the storey above.
+    """Frame with rigid floors, each connected to the storey below and the storey above.
 
-    Storey i below floor i has the shear stiffness theta_i k_i, floor i the mass m_i; the modes have the stated ratios
-    of critical damping, slowest first. Parameters: ``stiffness_1`` ..., multiples of the nominal stiffnesses;
-    ``damping_1`` ..., ratios [-]; ``mass_i`` of the floors in `free_masses`, multiples of their nominal masses. One
-    floor's mass must stay fixed: only ratios of stiffness and mass show in accelerations.
+    Storey i, below floor i, has the shear stiffness theta_i k_i; floor i has the mass m_i. The modes have the given
+    ratios of critical damping, lowest frequency first. The parameters are ``stiffness_1``, ``stiffness_2``, ...,
+    multiples of the nominal stiffnesses; ``damping_1``, ``damping_2``, ..., ratios [-]; and ``mass_i`` of the floors in
+    `free_masses`, multiples of their nominal masses. At least one mass must be fixed, because accelerations identify
+    only the ratios of stiffness to mass.
 
     Parameters
     ----------
     floors : dict of str to int, or sequence of pairs
-        Names of the channels, and the floors, from 1, that they are on.
+        Names of the channels, and the floors they are on, counted from 1.
     masses : sequence of float
-        Nominal, one a floor, in any unit (relative ones will do).
+        Nominal mass of each floor, in any unit; relative masses are sufficient.
     stiffnesses : sequence of float
-        Nominal, one a storey, in that unit times 1/s² (N/m where the masses are in kg).
+        Nominal stiffness of each storey, in the unit of the masses times 1/s² (N/m if the masses are in kg).
     free_masses : sequence of int
-        Floors, from 1, whose masses are unknown.
+        Floors, counted from 1, whose masses are parameters.
 
     Raises
     ------
     ValueError
-        If a floor does not exist, values are not positive, not one a floor, or no mass is fixed.
+        If a floor does not exist, values are not positive, their numbers differ, or no mass is fixed.
     """
 
     floors: tuple[tuple[str, int], ...]
@@ -136,9 +142,9 @@ class ShearFrame:
     n_supports = 1
 
     def __init__(self, floors, masses: Sequence[float], stiffnesses: Sequence[float], free_masses=()) -> None:
-        floors = tuple(floors.items() if hasattr(floors, "items") else floors)
+        floors = tuple(floors.items() if isinstance(floors, Mapping) else floors)
         for value in (*masses, *stiffnesses):
-            number("mass or stiffness of a ShearFrame", value)
+            check_positive("mass or stiffness of a ShearFrame", value)
         n = len(masses)
         if n < 1 or len(stiffnesses) != n:
             raise ValueError(f"ShearFrame: expected a stiffness for each of {n} masses; got {len(stiffnesses)}")
@@ -156,7 +162,7 @@ class ShearFrame:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``stiffness_1`` ... , ``damping_1`` ..., and ``mass_i`` of the free ones."""
+        """``stiffness_1``, ..., ``damping_1``, ..., and ``mass_i`` of the floors in `free_masses`."""
         numbers = range(1, len(self.masses) + 1)
         names = [f"{what}_{i}" for what in ("stiffness", "damping") for i in numbers]
         return (*names, *(f"mass_{i}" for i in self.free_masses))
@@ -167,10 +173,16 @@ class ShearFrame:
         return tuple(name for name, _ in self.floors)
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Matrices at the parameters; `SimulationFailed` for stiffness, mass or damping that is not positive."""
+        """Compute the matrices at the parameters (n_parameters,).
+
+        Raises
+        ------
+        SimulationFailed
+            If a stiffness, mass or damping is not positive.
+        """
         if not (theta > 0.0).all():
             bad = [name for name, value in zip(self.parameter_names, theta, strict=True) if not value > 0.0]
-            raise SimulationFailed(f"stiffnesses, dampings and masses must be positive; {', '.join(bad)} are not")
+            raise SimulationFailed(f"stiffnesses, dampings and masses must be positive; not positive: {', '.join(bad)}")
         n = len(self.masses)
         masses = np.array(self.masses)
         masses[[floor - 1 for floor in self.free_masses]] *= theta[2 * n :]

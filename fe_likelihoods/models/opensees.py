@@ -1,9 +1,11 @@
-"""A model built and run in OpenSees.
+"""Model that is built and run in OpenSees.
 
-OpenSees holds one model per process, may end that process, and prints a lot. So it lives in a process of its own, where
-it is wiped before each run, and is never imported here. Where a run crashes or takes too long, the next one starts in a
-new process.
+OpenSees holds one model per process, may end its process, and prints a lot. It therefore runs in a separate process,
+where it is wiped before each run, and is never imported into the process of the user. After a run that crashes or takes
+too long, the next run starts a new process.
 """
+
+from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Sequence
@@ -18,8 +20,8 @@ from .function import FunctionModel
 __all__ = ["OpenSeesModel"]
 
 
-class _Wiped:
-    """The user's function of OpenSees and of theta, as a function of theta in a clean OpenSees."""
+class _WithOpenSees:
+    """Function of theta that calls the user's function with a wiped OpenSees."""
 
     def __init__(self, build_and_run: Callable[[Any, np.ndarray], Any]) -> None:
         self.build_and_run = build_and_run
@@ -32,23 +34,33 @@ class _Wiped:
 
 
 class OpenSeesModel(FunctionModel):
-    """A function that builds an OpenSees model and runs it, as a model.
+    """Function that builds and runs an OpenSees model.
 
     Parameters
     ----------
-    build_and_run : callable (ops, theta) -> (n_channels, n_steps)
-        Given the module ``openseespy.opensees``, wiped, and the parameters (n_parameters,), returns the response in SI.
-        Defined at the top level of a module. It should raise where ``ops.analyze`` does not return 0: OpenSees itself
-        only prints.
-    parameter_names, channels, dt, n_steps : as in `CheckedModel`
+    build_and_run : callable
+        Function of the wiped module ``openseespy.opensees`` and of theta (n_parameters,) that returns the response
+        (n_channels, n_steps) in SI units. It must be defined at the top level of a module. It should raise an exception
+        if ``ops.analyze`` does not return 0, because OpenSees itself only prints a message.
+    parameter_names : sequence of str
+        Names of the structural parameters, in the order of theta.
+    channels : sequence of Channel
+        Channels of the response, in the order of its rows.
+    dt : float
+        Time step of the response [s].
+    n_steps : int
+        Number of samples of the response.
     time_limit : float, optional
-        A run that takes longer [s] is stopped and has failed.
-    memory_limit, version : as in `FunctionModel`
+        Longest duration of a run [s]. A longer run is stopped and counts as failed.
+    memory_limit : int, optional
+        Largest address space of the process [bytes]. Allocations beyond it fail.
+    version : str, optional
+        Text that replaces the code in the fingerprint; see `FunctionModel`.
 
     Raises
     ------
     ValueError
-        If openseespy is not installed, or what `FunctionModel` refuses.
+        If openseespy is not installed, or an argument is wrong (see `FunctionModel`).
 
     Examples
     --------
@@ -71,13 +83,15 @@ class OpenSeesModel(FunctionModel):
         version: str | None = None,
     ) -> None:
         if importlib.util.find_spec("openseespy") is None:
-            raise ValueError("OpenSeesModel needs OpenSees: pip install openseespy (and Debian's libblas3, liblapack3)")
+            raise ValueError(
+                "OpenSeesModel needs OpenSees: pip install openseespy (on Debian also libblas3 and liblapack3)"
+            )
         if not callable(build_and_run):
             raise ValueError(
                 f"OpenSeesModel: expected a function of OpenSees and the parameters; got {build_and_run!r}"
             )
         super().__init__(
-            _Wiped(build_and_run),
+            _WithOpenSees(build_and_run),
             parameter_names,
             channels,
             dt,

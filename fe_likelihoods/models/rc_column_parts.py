@@ -1,7 +1,7 @@
-"""What a reinforced-concrete column is made of: materials and reinforcement, each checked when it is made.
+"""Materials and reinforcement of a reinforced-concrete column. Arguments are checked when a part is made.
 
-Everything is in SI units. A value that cannot be (negative, not a number, text, a slip of units that contradicts its
-neighbours) is refused with what was expected, what came and what to do.
+All values are in SI units. A value that is negative, not a number, or inconsistent with the others (for example because
+of mixed units) raises ValueError.
 """
 
 from __future__ import annotations
@@ -10,28 +10,29 @@ import math
 from dataclasses import dataclass
 from numbers import Integral
 
-from .validation import number, refuse, whole_number
+from .validation import check_fields, check_integer, invalid
 
 __all__ = ["Bars", "Concrete", "Hoops", "Patches", "Steel"]
 
 
 @dataclass(frozen=True)
 class Concrete:
-    """Unconfined concrete (Popovics envelope, exponential softening in tension).
+    """Unconfined concrete: Popovics envelope in compression, exponential softening in tension.
 
     Attributes
     ----------
     fc, ec, ft : float
         Compressive strength (positive), initial modulus and tensile strength [Pa].
     peak_strain : float or None
-        Strain at fc (positive). None: 2 fc/Ec, which follows an updated Ec. A fixed strain below fc/Ec makes the
-        envelope ignore Ec.
+        Strain at fc (positive). None: 2 fc/Ec, which follows an updated Ec. With a fixed strain below fc/Ec the
+        envelope does not depend on Ec.
     ultimate_strain : float
-        Strain beyond which the cover carries nothing (positive); at least 1.5 times the peak strain is taken.
+        Strain beyond which the cover carries no stress (positive). The model uses at least 1.5 times the peak strain.
     softening_strain : float
-        Strain from cracking, ft/Ec, to where tension has decayed to `softening_ratio` ft and is dropped.
+        Length of the softening branch in tension: strain from cracking (ft/Ec) to the point where the stress has
+        decreased to `softening_ratio` ft and drops to zero.
     softening_ratio : float
-        Share of ft left there.
+        Ratio of the stress at the end of the softening branch to ft.
     """
 
     fc: float
@@ -43,28 +44,28 @@ class Concrete:
     softening_ratio: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("fc", "ec", "ultimate_strain", "softening_strain"):
-            number(name, getattr(self, name))
-        number("ft", self.ft, any_sign=True)
-        if self.peak_strain is not None:
-            number("peak_strain", self.peak_strain)
+        check_fields(
+            self,
+            positive=("fc", "ec", "ultimate_strain", "softening_strain", "peak_strain", "softening_ratio"),
+            finite=("ft",),
+            optional=("peak_strain",),
+        )
         if not 0.0 <= self.ft < self.fc:
-            refuse("a tensile strength between 0 and fc", self.ft, "give both positive, in Pa")
+            raise invalid("a tensile strength between 0 and fc", self.ft, "give both as positive values in Pa")
         if self.ec <= self.fc:
-            refuse("a modulus ec above the strength fc", self.ec, "give both in Pa")
-        number("softening_ratio", self.softening_ratio)
+            raise invalid("a modulus ec above the strength fc", self.ec, "give both in Pa")
         if self.softening_ratio >= 1.0:
-            refuse("a softening_ratio below 1", self.softening_ratio, "0.1 is the default")
+            raise invalid("a softening_ratio below 1", self.softening_ratio, "the default is 0.1")
 
 
 @dataclass(frozen=True)
 class Steel:
-    """Longitudinal steel.
+    """Longitudinal reinforcing steel.
 
     Attributes
     ----------
     fy, fu, es, esh : float
-        Yield strength, ultimate strength, modulus and modulus at the onset of hardening [Pa].
+        Yield strength, ultimate strength, elastic modulus and modulus at the onset of hardening [Pa].
     hardening_strain, ultimate_strain : float
         Strains at the onset of hardening and at fu.
     """
@@ -77,17 +78,27 @@ class Steel:
     ultimate_strain: float
 
     def __post_init__(self) -> None:
-        for name in ("fy", "fu", "es", "esh", "hardening_strain", "ultimate_strain"):
-            number(name, getattr(self, name))
+        check_fields(self, positive=("fy", "fu", "es", "esh", "hardening_strain", "ultimate_strain"))
         if not self.fy / self.es < self.hardening_strain < self.ultimate_strain or self.fu <= self.fy:
-            refuse("fy/es < hardening_strain < ultimate_strain and fy < fu", self, "check the units of the steel")
+            raise invalid(
+                "fy/es < hardening_strain < ultimate_strain and fy < fu", self, "check the units of the steel"
+            )
 
 
 @dataclass(frozen=True)
 class Bars:
-    """`number` longitudinal bars of `diameter` [m] and `area` [m2; None: of the circle], evenly on a circle.
+    """Longitudinal bars, evenly spaced on a circle.
 
-    first_angle [rad] : of the first bar from the direction of loading.
+    Attributes
+    ----------
+    number : int
+        Number of bars, at least 3.
+    diameter : float
+        Diameter of one bar [m].
+    area : float or None
+        Area of one bar [m²]. None: that of a circle of `diameter`.
+    first_angle : float
+        Angle between the direction of loading and the first bar [rad].
     """
 
     number: int
@@ -97,23 +108,33 @@ class Bars:
 
     def __post_init__(self) -> None:
         if not isinstance(self.number, Integral) or isinstance(self.number, bool) or self.number < 3:
-            refuse("a whole number of at least three bars", self.number, "a circular column needs them all around")
-        number("diameter of bars", self.diameter)
-        number("first_angle", self.first_angle, any_sign=True)
-        if self.area is not None:
-            number("area of bars", self.area)
+            raise invalid("an integer number of at least three bars", self.number, "bars stand on a whole circle")
+        check_fields(self, positive=("diameter", "area"), finite=("first_angle",), optional=("area",), of="of bars")
 
     @property
     def area_each(self) -> float:
-        """Area of one bar [m2]."""
+        """Area of one bar [m²]."""
         return self.area if self.area is not None else 0.25 * math.pi * self.diameter**2
 
 
 @dataclass(frozen=True)
 class Hoops:
-    """Transverse steel: hoops or a spiral of bar `diameter` [m], `area` [m2] of one set, at `spacing` [m].
+    """Transverse reinforcement: hoops or a spiral.
 
-    fy : yield strength [Pa]. ultimate_strain : at fracture. area None: that of one bar (bundled hoops have more).
+    Attributes
+    ----------
+    diameter : float
+        Diameter of the hoop bar [m].
+    spacing : float
+        Distance between the centres of adjacent sets [m].
+    fy : float
+        Yield strength [Pa].
+    area : float or None
+        Area of one set [m²]; bundled hoops have more than one bar. None: that of a circle of `diameter`.
+    ultimate_strain : float
+        Strain at fracture.
+    spiral : bool
+        Whether the reinforcement is a spiral.
     """
 
     diameter: float
@@ -124,30 +145,36 @@ class Hoops:
     spiral: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("diameter", "spacing"):
-            number(f"{name} of hoops", getattr(self, name))
-        number("fy of hoops", self.fy)
-        number("ultimate_strain of hoops", self.ultimate_strain)
-        if self.area is not None:
-            number("area of hoops", self.area)
+        positive = ("diameter", "spacing", "fy", "ultimate_strain", "area")
+        check_fields(self, positive=positive, optional=("area",), of="of hoops")
         if self.spacing <= self.diameter:
-            refuse("hoops further apart than their diameter", self.spacing, "spacing is centre to centre, in m")
+            raise invalid(
+                "a spacing of hoops larger than their diameter", self.spacing, "give it between centres, in m"
+            )
 
     @property
     def area_each(self) -> float:
-        """Area of one set [m2]."""
+        """Area of one set [m²]."""
         return self.area if self.area is not None else 0.25 * math.pi * self.diameter**2
 
 
 @dataclass(frozen=True)
 class Patches:
-    """Mesh of rings and wedges, as many codes have it (the strips of the default are the better quadrature)."""
+    """Fiber mesh of rings and wedges, as in other finite-element codes; the default strips integrate more accurately.
+
+    Attributes
+    ----------
+    wedges : int
+        Number of wedges.
+    core_rings, cover_rings : int
+        Number of rings in the core and in the cover.
+    """
 
     wedges: int = 20
     core_rings: int = 10
     cover_rings: int = 2
 
     def __post_init__(self) -> None:
-        whole_number("wedges of Patches", self.wedges, 4, 1000)
-        whole_number("core_rings of Patches", self.core_rings, 1, 1000)
-        whole_number("cover_rings of Patches", self.cover_rings, 1, 1000)
+        check_integer("wedges of Patches", self.wedges, 4, 1000)
+        check_integer("core_rings of Patches", self.core_rings, 1, 1000)
+        check_integer("cover_rings of Patches", self.cover_rings, 1, 1000)

@@ -1,16 +1,15 @@
-"""A bar of reinforcing steel in a testing machine: strain in, stress out.
+"""Bar of reinforcing steel in a testing machine: strain history in, stress history out.
 
-The law is that of the bars of `rc_column` (`kernels.reinforcing_steel`), alone: what a cyclic coupon test says about it
-is a prior, or a judge, for the bars of a column. The shape of the curves between reversals and the loss of stiffness at
-a reversal are fixed in that law (OpenSees' defaults); a steel that differs there is fitted by other parameters.
+The law is that of the bars of `RCColumn` (``docs/theory/reinforcing_steel.rst``). A cyclic test of a coupon of the same
+steel can therefore give a prior for the bars of a column, or check the posterior found from a column. The law fixes the
+shape of the curves between reversals and the loss of stiffness at a reversal; for a steel that behaves differently, the
+other parameters compensate for the difference.
 """
 
 from __future__ import annotations
 
-import hashlib
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,41 +17,43 @@ from ..kernels import reinforcing_steel
 from ..kernels.jit import KERNEL_HASH
 from ..signals.channels import Channel
 from ..simulation.model import SimulationFailed
+from .base import BuiltInModel
 from .rc_column_parts import Steel
-from .validation import refuse, theta_row
+from .validation import check_names, check_values, invalid
 
-__all__ = ["SteelCoupon"]
+__all__ = ["PARAMETERS", "SteelCoupon"]
 
 PARAMETERS = {
-    "fy": ("fy", "yield strength [Pa]"),
-    "fu": ("fu", "ultimate strength [Pa]"),
-    "Es": ("es", "modulus [Pa]"),
-    "Esh": ("esh", "modulus at the onset of hardening [Pa]"),
-    "eps_sh": ("hardening_strain", "strain at the onset of hardening [-]"),
-    "eps_u": ("ultimate_strain", "strain at the ultimate strength [-]"),
+    "fy": "yield strength [Pa]",
+    "fu": "ultimate strength [Pa]",
+    "Es": "modulus [Pa]",
+    "Esh": "modulus at the onset of hardening [Pa]",
+    "eps_sh": "strain at the onset of hardening [-]",
+    "eps_u": "strain at the ultimate strength [-]",
 }
 
 
 @dataclass(frozen=True, eq=False)
-class SteelCoupon:
-    """Stress of a bar under a strain history; `simulate` takes multiples of the nominal parameters.
+class SteelCoupon(BuiltInModel):
+    """Stress of a bar under a strain history; theta holds multiples of the nominal parameters.
 
     Parameters
     ----------
-    strain : (n_steps,) array_like
-        Engineering strain, tension positive, from the virgin bar on [-]; kept as a read-only copy.
+    strain : array_like, shape (n_steps,)
+        Engineering strain, positive in tension, starting from the unloaded bar [-]. A read-only copy is stored.
     steel : Steel
         Nominal values.
     parameters : tuple of str
-        Which of fy, fu, Es, Esh, eps_sh (onset of hardening) and eps_u (at fu) make up theta, in this order.
+        Names that make up theta, in this order, out of fy, fu, Es, Esh, eps_sh (strain at the onset of hardening) and
+        eps_u (strain at fu).
     unit : str
         Display unit of the channel "stress".
 
     Raises
     ------
     ValueError
-        If the strains are not one-dimensional, at least two, finite and above -.95, or a parameter is unknown or named
-        twice.
+        If the strains are not one-dimensional, at least two, finite and above -0.95, or a parameter is unknown or
+        repeated.
     """
 
     strain: np.ndarray
@@ -60,44 +61,40 @@ class SteelCoupon:
     parameters: tuple[str, ...] = tuple(PARAMETERS)
     unit: str = "MPa"
 
+    _code_version: ClassVar[str] = KERNEL_HASH
+    _time_label: ClassVar[str] = "step"
+
     def __post_init__(self) -> None:
         strain = np.array(self.strain, dtype=float)
         if strain.ndim != 1 or strain.size < 2 or not np.isfinite(strain).all() or strain.min() <= -0.95:
-            refuse(
-                "strains (n_steps,), two or more, finite and above -.95",
-                f"an array of shape {strain.shape}" + (f" from {strain.min():g}" if strain.size else ""),
+            raise invalid(
+                "strains (n_steps,), two or more, finite and above -0.95",
+                f"an array of shape {strain.shape}" + (f" with a minimum of {strain.min():g}" if strain.size else ""),
                 "give engineering strains, not per cent",
             )
         strain.flags.writeable = False
         object.__setattr__(self, "strain", strain)
         if not isinstance(self.steel, Steel):
-            refuse("Steel(...) as steel", self.steel, "import it from fe_likelihoods.models.rc_column")
-        names = self.parameters
-        if isinstance(names, str) or not isinstance(names, Sequence) or not names or set(names) - set(PARAMETERS):
-            refuse(f"parameters out of {tuple(PARAMETERS)}", names, "see SteelCoupon.nominal for their values")
-        if len(set(names)) != len(names):
-            refuse("each of the parameters once", names, "leave the repeated one out")
-        object.__setattr__(self, "parameters", tuple(names))
-        Channel("stress", "stress", self.unit)
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of theta, each a multiple of the value in `nominal`."""
-        return self.parameters
+            raise invalid("Steel(...) as steel", self.steel, "import it from fe_likelihoods")
+        check_names("parameters", self.parameters, PARAMETERS, "see SteelCoupon.nominal for their values")
+        object.__setattr__(self, "parameters", tuple(self.parameters))
+        Channel("stress", "stress", self.unit)  # checks the unit
 
     @property
     def nominal(self) -> dict[str, float]:
         """Nominal values of all parameters [SI]."""
-        return {name: getattr(self.steel, field) for name, (field, _) in PARAMETERS.items()}
+        s = self.steel
+        values = (s.fy, s.fu, s.es, s.esh, s.hardening_strain, s.ultimate_strain)
+        return dict(zip(PARAMETERS, values, strict=True))
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """One, the engineering stress."""
+        """One channel, the engineering stress."""
         return (Channel("stress", "stress", self.unit),)
 
     @property
     def dt(self) -> float:
-        """1: a step of the test."""
+        """1: the response is given per step of the test."""
         return 1.0
 
     @property
@@ -105,33 +102,15 @@ class SteelCoupon:
         """Number of strains."""
         return self.strain.size
 
-    @property
-    def fingerprint(self) -> str:
-        """Changes with the strains, the nominal values, the parameters and the law."""
-        text = f"{type(self).__name__}|{self.steel!r}|{self.parameters}|{KERNEL_HASH}"
-        return hashlib.blake2b(text.encode() + self.strain.tobytes(), digest_size=16).hexdigest()
-
     def with_record(self, strain: np.ndarray) -> SteelCoupon:
-        """The same steel under other strains (n_steps,), again from the virgin bar on."""
+        """Return the same steel under other strains (n_steps,), starting again from the unloaded bar."""
         return replace(self, strain=strain)
 
-    def simulate(self, theta: np.ndarray) -> np.ndarray:
-        """Stress (1, n_steps) [Pa] at multiples `theta` (n_parameters,) of the nominal parameters.
-
-        Raises
-        ------
-        SimulationFailed
-            When the parameters make no steel, or the law finds no stress.
-        """
-        theta = theta_row(theta, self.parameters)
-        v = self.nominal
-        for name, factor in zip(self.parameters, theta.tolist(), strict=True):
-            v[name] *= factor
-        for name, value in v.items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise SimulationFailed(f"{name} = {value:.4g}, {PARAMETERS[name][1]}, must be positive")
+    def _respond(self, theta: np.ndarray) -> np.ndarray:
+        v = self.physical_values(theta)
+        check_values(v)
         if not v["fy"] / v["Es"] < v["eps_sh"] < v["eps_u"]:
-            raise SimulationFailed("no plateau before hardening, or none of hardening: fy/Es < eps_sh < eps_u is asked")
+            raise SimulationFailed("no yield plateau or no hardening branch: fy/Es < eps_sh < eps_u is required")
         if v["fu"] <= v["fy"]:
             raise SimulationFailed(f"no hardening: fu = {v['fu']:.4g} Pa is not above fy = {v['fy']:.4g} Pa")
         constants = np.zeros(reinforcing_steel.N_CONSTANTS)

@@ -1,47 +1,151 @@
-"""How the inputs of models are checked: what was expected, what came, what to do."""
+"""Checks of the arguments and parameters of models.
+
+Every message states what was expected, what was given and what to do. A wrong argument raises `ValueError` when a model
+is built. Parameters that describe no structure raise `SimulationFailed` when they are simulated, because a sampler may
+propose them.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 
 from ..signals.channels import Channel
+from ..simulation.model import SimulationFailed
 
-__all__ = ["channel_rows", "number", "refuse", "theta_row", "theta_rows", "whole_number"]
+__all__ = [
+    "check_fields",
+    "check_finite",
+    "check_integer",
+    "check_measured",
+    "check_names",
+    "check_nominal",
+    "check_non_negative",
+    "check_positive",
+    "check_theta",
+    "check_thetas",
+    "check_values",
+    "invalid",
+    "positive_float",
+]
+
+_ADVICE = "give one number in SI units (fe_likelihoods.units.to_si converts)"
 
 
-def refuse(expected: str, got: object, advice: str) -> None:
-    """ValueError in the words of all inputs of models."""
-    raise ValueError(f"expected {expected}; got {got!r}; {advice}")
+def invalid(expected: str, got: object, advice: str) -> ValueError:
+    """Error with the message ``expected ...; got ...; advice``, to be raised by the caller."""
+    return ValueError(f"expected {expected}; got {got!r}; {advice}")
 
 
-def number(name: str, value: object, *, zero: bool = False, any_sign: bool = False) -> None:
-    """Refuse a `value` that is not a finite number, or not positive (`zero`: or zero; `any_sign`: either sign)."""
-    kind = "finite" if any_sign else "zero or positive" if zero else "positive"
-    is_number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    if not is_number or not (any_sign or value > 0.0 or (zero and value == 0.0)):
-        refuse(f"a {kind} {name}", value, "give one number in SI units (fe_likelihoods.units.to_si converts)")
+def _is_finite(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def whole_number(name: str, value: object, low: int, high: int) -> None:
-    """Refuse a `value` that is not a whole number from `low` to `high`."""
+def check_finite(name: str, value: object) -> None:
+    """Raise ValueError if `value` is not a finite number."""
+    if not _is_finite(value):
+        raise invalid(f"a finite {name}", value, _ADVICE)
+
+
+def check_positive(name: str, value: object) -> None:
+    """Raise ValueError if `value` is not a finite number above zero."""
+    if not (_is_finite(value) and value > 0.0):
+        raise invalid(f"a positive {name}", value, _ADVICE)
+
+
+def check_non_negative(name: str, value: object) -> None:
+    """Raise ValueError if `value` is not a finite number, zero or positive."""
+    if not (_is_finite(value) and value >= 0.0):
+        raise invalid(f"a zero or positive {name}", value, _ADVICE)
+
+
+def check_integer(name: str, value: object, low: int, high: int) -> None:
+    """Raise ValueError if `value` is not an integer from `low` to `high`, both included."""
     if not isinstance(value, Integral) or isinstance(value, bool) or not low <= value <= high:
-        refuse(f"{name} between {low} and {high}, a whole number", value, "see the documentation of the model")
+        raise invalid(f"{name} between {low} and {high}, an integer", value, "see the documentation of the model")
 
 
-def theta_row(theta: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Parameters of one run as floats (n_parameters,); ValueError for another shape."""
+def check_fields(
+    instance: Any,
+    *,
+    positive: Sequence[str] = (),
+    non_negative: Sequence[str] = (),
+    finite: Sequence[str] = (),
+    optional: Sequence[str] = (),
+    of: str = "",
+) -> None:
+    """Check numeric fields of a dataclass instance.
+
+    Parameters
+    ----------
+    instance : object
+        The instance.
+    positive, non_negative, finite : sequence of str
+        Names of the fields to check with the function of the same name.
+    optional : sequence of str
+        Those of them that may be None.
+    of : str
+        Appended to the names in messages, such as ``"of a pier"``.
+
+    Raises
+    ------
+    ValueError
+        If a field does not pass its check.
+    """
+    for check, names in ((check_positive, positive), (check_non_negative, non_negative), (check_finite, finite)):
+        for name in names:
+            value = getattr(instance, name)
+            if value is not None or name not in optional:
+                check(f"{name} {of}".rstrip(), value)
+
+
+def positive_float(value: Any, name: str, unit: str) -> float:
+    """Convert `value` to a float; raise ValueError if it is not a positive finite number of `unit`."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, bool) or not (math.isfinite(number) and number > 0.0):
+        raise ValueError(f"{name} must be a positive number of {unit}; got {value!r}")
+    return number
+
+
+def check_names(what: str, names: object, known: Collection[str], advice: str) -> None:
+    """Raise ValueError if `names` is not a non-empty sequence of different names out of `known`."""
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names or set(names) - set(known):
+        raise invalid(f"{what} out of {tuple(known)}", names, advice)
+    if len(set(names)) != len(names):
+        raise invalid(f"each of the {what} once", names, "remove the repeated name")
+
+
+def check_nominal(names: Sequence[str], nominal: Mapping[str, float]) -> None:
+    """Raise ValueError if one of the parameters `names` has a nominal value of zero, which has no multiples."""
+    zero = [name for name in names if nominal[name] == 0.0]
+    if zero:
+        raise invalid("non-zero nominal values", zero, "set these values, or remove the names from parameters")
+
+
+def check_values(values: Mapping[str, float], may_be_zero: Collection[str] = ()) -> None:
+    """Raise SimulationFailed if a physical value is not finite and positive; those in `may_be_zero` may be zero."""
+    for name, value in values.items():
+        if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name not in may_be_zero):
+            raise SimulationFailed(f"{name} = {value:.4g} is outside the range of the model: it must be positive")
+
+
+def check_theta(theta: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Convert the parameters of one simulation to floats (n_parameters,); raise ValueError for another shape."""
     theta = np.asarray(theta, dtype=float)
     if theta.shape != (len(names),):
         raise ValueError(f"expected one value for each of {tuple(names)}, shape ({len(names)},); got {theta.shape}")
     return theta
 
 
-def theta_rows(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Parameters of a batch as floats (n, n_parameters); ValueError for another shape."""
+def check_thetas(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Convert the parameters of a batch to floats (n, n_parameters); raise ValueError for another shape."""
     thetas = np.asarray(thetas, dtype=float)
     if thetas.ndim != 2 or thetas.shape[1] != len(names):
         raise ValueError(
@@ -50,12 +154,13 @@ def theta_rows(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:
     return thetas
 
 
-def channel_rows(measured: np.ndarray, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
-    """Measured responses as floats (n_channels, n_steps); ValueError for another shape."""
+def check_measured(measured: np.ndarray, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
+    """Convert measured responses to floats (n_channels, n_steps); raise ValueError for another shape."""
     measured = np.asarray(measured, dtype=float)
     if measured.shape != (len(channels), n_steps):
         raise ValueError(
-            f"expected measured responses of shape {(len(channels), n_steps)}, a row for each of "
-            f"{[c.name for c in channels]}; got {measured.shape}; bring record and measurements to one step and length"
+            f"expected measured responses of shape {(len(channels), n_steps)}, one row for each of "
+            f"{[c.name for c in channels]}; got {measured.shape}; resample and trim the record and the measurements to "
+            "the same step and length"
         )
     return measured

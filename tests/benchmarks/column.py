@@ -41,7 +41,7 @@ def simulation(repeats: int) -> list[Row]:
         record = bridge_column_data().record.scale(scale)
         usual = RCColumn.lhpost(record)
         model = RCColumn.lhpost(record, tolerance=TOLERANCE * INCH, element_tolerance=1e-12 * KIP * INCH)
-        fibers = sum(map(len, model.section()))
+        fibers = sum(map(len, model.section.fibers()))
         peer = peer_of(model, theta)
         response = model.simulate(theta)  # compile before the measurement
         ours, defaults, theirs = [], [], []

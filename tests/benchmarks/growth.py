@@ -60,7 +60,7 @@ def _simulations() -> dict[str, dict[float, Callable]]:
     ground = isolated_bridge_data().record
     models = {
         "column: fibers in a section": {
-            sum(map(len, model.section())): model
+            sum(map(len, model.section.fibers())): model
             for model in (RCColumn.lhpost(record, mesh=strips) for strips in (20, 40, 80, 160))
         },
         "column: time steps": {

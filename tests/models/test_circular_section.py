@@ -115,7 +115,7 @@ def test_reference_fibers(golden, lhpost, name, mesh):
     """The fibers of the reference results, from the dimensions of the column alone."""
     model = RCColumn.lhpost(lhpost.loading, mesh=mesh)
     y, area, material = golden[f"fibers/{name}"]
-    for fibers, tag in zip(model.section(), (CORE, COVER, STEEL), strict=True):
+    for fibers, tag in zip(model.section.fibers(), (CORE, COVER, STEEL), strict=True):
         expected = as_sorted(y[material == tag], area[material == tag])
         got = as_sorted(fibers[:, 0] / INCH, fibers[:, 1] / INCH**2)
         assert got.shape == expected.shape

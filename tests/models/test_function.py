@@ -179,13 +179,13 @@ def test_failures_are_in_the_report_with_their_seconds():
         ({"memory_limit": 0}, "memory_limit must be a positive number of bytes"),
         ({"function": 3}, "expected a function"),
         ({"function": lambda theta: line(theta), "isolated": True}, "cannot be sent to another process"),
-        ({"parameter_names": ()}, "parameter_names must be one or more str"),
+        ({"parameter_names": ()}, "parameter_names must be a tuple of one or more str"),
         ({"parameter_names": "ab"}, "parameter_names"),
         ({"parameter_names": ("a", "a")}, "must differ"),
-        ({"channels": ("a",)}, "channels must be one or more Channel"),
+        ({"channels": ("a",)}, "channels must be a tuple of one or more Channel"),
         ({"channels": CHANNELS * 2}, "must differ"),
         ({"dt": 0.0}, "dt must be a positive number of seconds"),
-        ({"n_steps": 0}, "n_steps must be a positive whole number"),
+        ({"n_steps": 0}, "n_steps must be a positive integer"),
         ({"n_steps": 20.0}, "n_steps"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",  # a lambda's address differs from process to process
@@ -197,7 +197,7 @@ def test_bad_settings_are_refused(options, advice):
 
 
 def test_theta_of_wrong_length_is_refused():
-    with pytest.raises(ValueError, match="expected values of offset, slope"):
+    with pytest.raises(ValueError, match="expected one value for each of .*offset"):
         model_of().simulate([1.0])
 
 
@@ -270,7 +270,7 @@ def test_methods_and_callable_objects():
 
 
 def test_what_has_no_stable_digest_needs_a_version():
-    with pytest.raises(ValueError, match="needs version= here.*no digest can be made of"):
+    with pytest.raises(ValueError, match="give version=, a text"):
         model_of(Counting().respond)
     first, second = (model_of(Counting().respond, version=version) for version in ("1", "2"))
     assert first.fingerprint == model_of(Counting().respond, version="1").fingerprint

@@ -639,7 +639,7 @@ REFUSED = [
     (dict(bars=dict(first_angle=math.nan)), "first_angle"),
     (dict(hoops=dict(diameter=-0.016)), "diameter of hoops"),
     (dict(hoops=dict(spacing=0.0)), "spacing of hoops"),
-    (dict(hoops=dict(spacing=0.01)), "further apart"),
+    (dict(hoops=dict(spacing=0.01)), "larger than their diameter"),
     (dict(hoops=dict(spacing=5.0)), "spacing"),  # arches between hoops would leave no confined core
     (dict(hoops=dict(ultimate_strain=-0.1)), "ultimate_strain"),
     (dict(hoops=dict(ultimate_strain=math.nan)), "ultimate_strain"),

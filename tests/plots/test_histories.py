@@ -154,7 +154,7 @@ def test_section(record, mesh):
     cover, core = axes.patches
     assert 2 * cover.radius == pytest.approx(48.0) and 2 * core.radius == pytest.approx(48.0 - 4.0 - 0.625)
     lines, bars = axes.collections
-    concrete, _, steel = column.section()
+    concrete, _, steel = column.section.fibers()
     centers = np.array([path.get_extents().get_points().mean(axis=0) for path in bars.get_paths()])
     assert len(centers) == 18
     np.testing.assert_allclose(np.unique(np.round(centers[:, 0], 9)), np.unique(np.round(steel[:, 0] / 0.0254, 9)))

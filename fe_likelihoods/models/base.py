@@ -1,0 +1,133 @@
+"""Base classes of the models of this package.
+
+`StructuralModel` checks the shape of the parameters and plots the response. `BuiltInModel` adds what the built-in
+structures share: parameters that are multiples of nominal values, and a fingerprint computed from the arguments. Models
+of your own need neither: any object with the attributes of `fe_likelihoods.simulation.model.Model` is a model.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from ..signals.channels import Channel, Measurements, plot_response
+from ..signals.records import DisplacementHistory, Record
+from .validation import check_theta
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["BuiltInModel", "History", "StructuralModel", "digest"]
+
+
+def digest(*parts: str) -> str:
+    """Hexadecimal digest of texts, in order."""
+    return hashlib.blake2b("|".join(parts).encode(), digest_size=16).hexdigest()
+
+
+@dataclass(frozen=True)
+class History:
+    """Named time histories of one simulation, for plots and checks.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the rows; ``history[name]`` returns one row.
+    values : ndarray[n_rows, n_steps]
+        The histories [SI].
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.values[self.names.index(name)]
+
+
+class StructuralModel:
+    """Base class of all models of this package; a subclass defines `_respond`."""
+
+    parameter_names: tuple[str, ...]
+    channels: tuple[Channel, ...]
+    dt: float
+    n_steps: int
+    _time_label = "time [s]"
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        """Simulate the structure for one set of parameters.
+
+        Parameters
+        ----------
+        theta : ndarray[n_parameters]
+            Values of `parameter_names`, in this order.
+
+        Returns
+        -------
+        ndarray[n_channels, n_steps]
+            Response [SI].
+
+        Raises
+        ------
+        SimulationFailed
+            If the parameters describe no structure, or the solution does not converge.
+        ValueError
+            If `theta` has another shape.
+        """
+        return self._respond(check_theta(theta, self.parameter_names))
+
+    def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
+        """Plot the response at `theta`, together with `measurements` of its channels if they are given."""
+        response = Measurements(self.channels, self.dt, self.simulate(theta))
+        return plot_response(response, measurements, time_label=self._time_label)
+
+    def _respond(self, theta: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+
+class BuiltInModel(StructuralModel):
+    """Base class of frozen dataclasses that describe a structure with nominal values.
+
+    A subclass has the field `parameters` and the property `nominal`.
+    """
+
+    parameters: tuple[str, ...]
+    _display_fields: ClassVar[tuple[str, ...]] = ("outputs", "unit", "units")
+    _code_version: ClassVar[str] = ""
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the elements of theta, which are multiples of the values in `nominal`."""
+        return self.parameters
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """Nominal values of all parameters [SI]."""
+        raise NotImplementedError
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest that changes with everything that changes a response: arguments, excitation, kernels."""
+        parts = [type(self).__name__, self._code_version, repr([channel.name for channel in self.channels])]
+        for field in fields(self):
+            if field.name not in self._display_fields:
+                parts.append(f"{field.name}={_text(getattr(self, field.name))}")
+        return digest(*parts)
+
+    def physical_values(self, theta: np.ndarray) -> dict[str, float]:
+        """Physical values [SI] of all parameters at the multiples `theta` (n_parameters,) of the nominal values."""
+        values = self.nominal
+        for name, multiple in zip(self.parameters, theta.tolist(), strict=True):
+            values[name] *= multiple
+        return values
+
+
+def _text(value: object) -> str:
+    """Text that is equal for equal arguments: names and sources of records do not enter it."""
+    if isinstance(value, Record | DisplacementHistory):
+        return value.fingerprint
+    if isinstance(value, np.ndarray):
+        return hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()
+    return repr(value)

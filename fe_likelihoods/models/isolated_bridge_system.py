@@ -1,0 +1,166 @@
+"""Linear part of the isolated bridge: matrices of deck and piers, and the matrices of one exact integration step.
+
+Degrees of freedom, relative to the table: q = [deck, pier 1 and its rotation, pier 2 and its rotation]. The linear part
+holds the structure, its damping, the dampers (Maxwell elements) and the linear term of the rubber ::
+
+    x' = A x + b a_g + B_F F,    x = [q, q', damper forces]
+
+with the acceleration a_g of the table and the remaining forces F of the two isolators (friction and the higher terms of
+the rubber). Between two instants a_g and F are linear in time, so that a step is exact for this part
+(``docs/theory/time_integration.rst``). The equations of motion are in ``docs/theory/isolated_bridge.rst``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels.exponential import matrix_exponential
+from ..kernels.isolated_bridge import N_STATES
+from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
+
+__all__ = ["BridgeMatrices", "BridgeStateSpace", "StepMatrices"]
+
+
+class BridgeMatrices(NamedTuple):
+    """Matrices of deck and piers, which do not depend on theta.
+
+    Attributes
+    ----------
+    mass, damping, stiffness : ndarray[5, 5]
+        Matrices of the degrees of freedom q [kg, N s/m, N/m and products with m].
+    kinematics : ndarray[2, 5]
+        B: bearing displacements from q, deck minus top of the block.
+    rubber_stiffness : float
+        Linear stiffness of the rubber at each pier [N/m].
+    """
+
+    mass: np.ndarray
+    damping: np.ndarray
+    stiffness: np.ndarray
+    kinematics: np.ndarray
+    rubber_stiffness: float
+
+    @classmethod
+    def assemble(
+        cls,
+        deck_mass: float,
+        piers: Sequence[Pier],
+        bearings: Sequence[Bearing],
+        rubber: Rubber,
+        gravity: float,
+        p_delta: bool,
+    ) -> BridgeMatrices:
+        """Assemble the matrices; with `p_delta` the piers have their geometric stiffness."""
+        mass, damping, stiffness = np.zeros((3, 5, 5))
+        mass[0, 0] = deck_mass
+        for i, (pier, bearing) in enumerate(zip(piers, bearings, strict=True)):
+            own = slice(1 + 2 * i, 3 + 2 * i)
+            mass[own, own], damping[own, own], stiffness[own, own] = pier.mass_matrix, pier.damping, pier.stiffness
+            if p_delta:
+                stiffness[own, own] += pier.geometric_stiffness(bearing.load, gravity)
+        h1, h2 = (pier.height for pier in piers)
+        kinematics = np.array([[1.0, -1.0, -h1, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0, -h2]])
+        return cls(mass, damping, stiffness, kinematics, rubber.linear_stiffness)
+
+
+class StepMatrices(NamedTuple):
+    """Matrices of one step, as `fe_likelihoods.kernels.isolated_bridge.step_isolated` takes them.
+
+    Attributes
+    ----------
+    step : ndarray[16, 16]
+        T, transposed.
+    end : ndarray[12, 2]
+        H1: states from the forces F at the end of the step.
+    compliance : ndarray[4, 2]
+        Q H1: bearing displacements and velocities from the forces F at the end of the step.
+    """
+
+    step: np.ndarray
+    end: np.ndarray
+    compliance: np.ndarray
+
+
+class BridgeStateSpace(NamedTuple):
+    """State-space form x' = A x + [b, B_F] [a_g, F], with A still without the dampers.
+
+    Attributes
+    ----------
+    system : ndarray[12, 12]
+        A; the rows of the damper forces are zero.
+    inputs : ndarray[12, 3]
+        b and B_F.
+    kinematics : ndarray[2, 5]
+        Bearing displacements from q.
+    """
+
+    system: np.ndarray
+    inputs: np.ndarray
+    kinematics: np.ndarray
+
+    @classmethod
+    def of(cls, matrices: BridgeMatrices) -> BridgeStateSpace:
+        """State-space form of the matrices of deck and piers."""
+        b = matrices.kinematics
+        inverse = np.linalg.inv(matrices.mass)
+        a, inputs = np.zeros((N_STATES, N_STATES)), np.zeros((N_STATES, 3))
+        a[:5, 5:10] = np.eye(5)
+        a[5:10, :5] = -inverse @ (matrices.stiffness + matrices.rubber_stiffness * b.T @ b)
+        a[5:10, 5:10] = -inverse @ matrices.damping
+        a[5:10, 10:] = -inverse @ b.T
+        inputs[5:10, 0] = [-1.0, -1.0, 0.0, -1.0, 0.0]
+        inputs[5:10, 1:] = -inverse @ b.T
+        return cls(a, inputs, b)
+
+    def step_matrices(self, dampers: Sequence[Damper], step: float, *, constant_forces: bool) -> StepMatrices:
+        """Matrices of one step with these dampers.
+
+        Parameters
+        ----------
+        dampers : sequence of Damper
+            The dampers of each pier.
+        step : float
+            Integration step [s].
+        constant_forces : bool
+            Whether F is constant over a step instead of linear in time. Coulomb friction needs this: a set-valued force
+            that is linear in time would oscillate about rest.
+
+        Returns
+        -------
+        StepMatrices
+        """
+        a, inputs = self._with_dampers(dampers), self.inputs
+        n, m = inputs.shape
+        augmented = np.zeros((n + 2 * m, n + 2 * m))
+        augmented[:n, :n], augmented[:n, n : n + m] = a * step, inputs * step
+        augmented[n : n + m, n + m :] = np.eye(m)
+        # Velocities are scaled by the step and forces by a stiffness, because large entries lose digits in the
+        # exponential. The factors are powers of two, so the scaling is exact.
+        units = np.ones(n + 2 * m)
+        units[5:n] = [1.0 / step] * 5 + [damper.count * damper.stiffness for damper in dampers]
+        units = 2.0 ** np.round(np.log2(units))
+        exponential = np.empty_like(augmented)
+        matrix_exponential(augmented / units[:, None] * units, exponential, np.empty((2, *augmented.shape)))
+        exponential *= units[:, None] / units
+        phi, whole, second = exponential[:n, :n], exponential[:n, n : n + m], exponential[:n, n + m :]
+        first = whole - second
+        if constant_forces:
+            first[:, 1:], second[:, 1:] = 0.0, whole[:, 1:]
+        ends = second[:, 1:]
+        advance = np.column_stack([phi, first[:, 0], second[:, 0], phi @ ends + first[:, 1:]])
+        q = np.zeros((4, n))
+        q[:2, :5] = q[2:, 5:10] = self.kinematics
+        return StepMatrices(
+            np.ascontiguousarray(np.vstack([advance, q @ advance]).T), np.ascontiguousarray(ends), q @ ends
+        )
+
+    def _with_dampers(self, dampers: Sequence[Damper]) -> np.ndarray:
+        """A (12, 12) with the dampers."""
+        a = self.system.copy()
+        for i, damper in enumerate(dampers):
+            a[10 + i, 5:10] = damper.count * damper.stiffness * self.kinematics[i]
+            a[10 + i, 10 + i] = -damper.stiffness / damper.viscosity
+        return a

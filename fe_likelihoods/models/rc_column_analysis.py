@@ -1,0 +1,181 @@
+"""Analysis of the reinforced-concrete column: material constants of the kernels, and the two kinds of excitation.
+
+A base acceleration is integrated by Newmark's method (`fe_likelihoods.kernels.newmark`), an imposed displacement of the
+top is solved as a sequence of static steps (`fe_likelihoods.kernels.static`). Both start from the gravity load.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels import concrete04, reinforcing_steel
+from ..kernels.frame import Column
+from ..kernels.newmark import HISTORY_ROWS, newmark
+from ..kernels.static import impose_displacement
+from ..signals.records import DisplacementHistory, Record
+from ..simulation.model import SimulationFailed
+from .base import History
+from .circular_section import Confinement
+from .rc_column_parts import Concrete, Steel
+
+__all__ = ["BaseMotion", "ColumnHistory", "ImposedMotion", "Solver", "set_materials"]
+
+_IMPOSED_ROWS = (
+    "displacement",
+    "vertical displacement",
+    "rotation",
+    "force",
+    "base axial strain",
+    "base curvature",
+    "base axial force",
+    "base moment",
+)
+
+
+@dataclass(frozen=True)
+class ColumnHistory(History):
+    """Time histories of one simulation of the column [SI].
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the rows; ``history[name]`` returns one row.
+    values : ndarray[n_rows, n_steps]
+        The histories.
+    retries : int
+        Number of steps that were repeated with half their size.
+    """
+
+    retries: int
+
+
+class Solver(NamedTuple):
+    """Settings of the Newton iterations.
+
+    Attributes
+    ----------
+    tolerance : float
+        Largest norm of the last correction [m and rad].
+    max_iterations : int
+        Most iterations per attempt.
+    halvings : int
+        How often a step may be halved before the simulation counts as failed.
+    """
+
+    tolerance: float
+    max_iterations: int
+    halvings: int
+
+
+class BaseMotion(NamedTuple):
+    """Base acceleration, interpolated to the integration steps.
+
+    Attributes
+    ----------
+    acceleration : ndarray[n_substeps + 1]
+        Base acceleration at the integration steps [m/s²].
+    dt : float
+        Integration step [s].
+    substeps : int
+        Integration steps per sample of the response.
+    n_steps : int
+        Number of samples of the response.
+    """
+
+    acceleration: np.ndarray
+    dt: float
+    substeps: int
+    n_steps: int
+
+    @classmethod
+    def of(cls, record: Record, substeps: int) -> BaseMotion:
+        """Motion of a record, linear between its samples."""
+        instants = np.arange((record.n_steps - 1) * substeps + 1) / substeps
+        acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
+        return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
+
+    def run(
+        self, column: Column, gravity: np.ndarray, mass: np.ndarray, a0: float, a1: float, solver: Solver
+    ) -> ColumnHistory:
+        """Integrate the equations of motion; SimulationFailed if a step does not converge."""
+        history = np.zeros((len(HISTORY_ROWS), self.n_steps))
+        status, retries, _ = newmark(
+            column,
+            gravity,
+            mass,
+            a0,
+            a1,
+            self.acceleration,
+            self.dt,
+            solver.tolerance,
+            solver.max_iterations,
+            solver.halvings,
+            self.substeps,
+            0.0,
+            history,
+        )
+        if status:
+            at = f" (t = {status * self.dt:.4g} s)"
+            raise SimulationFailed(_reason(status, len(self.acceleration), at, solver.halvings))
+        return ColumnHistory(HISTORY_ROWS, history, retries)
+
+
+class ImposedMotion(NamedTuple):
+    """Lateral displacement imposed on the top.
+
+    Attributes
+    ----------
+    targets : ndarray[n_increments]
+        Displacements to be reached one after the other [m].
+    kept : ndarray[n_steps]
+        Indices of the targets that are samples of the response.
+    """
+
+    targets: np.ndarray
+    kept: np.ndarray
+
+    @classmethod
+    def of(cls, history: DisplacementHistory, max_increment: float) -> ImposedMotion:
+        """Motion of a displacement history in increments of at most `max_increment` [m]."""
+        finer = history.subdivide(max_increment)
+        return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices))
+
+    def run(self, column: Column, gravity: np.ndarray, solver: Solver) -> ColumnHistory:
+        """Solve the static equilibrium at each target; SimulationFailed if a step does not converge."""
+        history = np.zeros((len(_IMPOSED_ROWS), len(self.targets)))
+        status, retries = impose_displacement(column, gravity, self.targets, *solver, history)
+        if status:
+            raise SimulationFailed(_reason(status, len(self.targets), "", solver.halvings))
+        return ColumnHistory(_IMPOSED_ROWS, history[:, self.kept], retries)
+
+
+def set_materials(
+    column: Column, values: dict[str, float], concrete: Concrete, steel: Steel, confinement: Confinement
+) -> None:
+    """Write the constants of core, cover and bars at the physical parameter `values` [SI] into `column`."""
+    fc, ec, ft = values["fc"], values["Ec"], values["ft"]
+    peak = concrete.peak_strain if concrete.peak_strain is not None else 2.0 * fc / ec
+    core_peak = peak * confinement.strain_ratio
+    core_ultimate = max(confinement.ultimate_strain, 1.05 * core_peak)
+    cover_ultimate = max(concrete.ultimate_strain, 1.5 * peak)
+    tension = (ec, ft, ft / ec + concrete.softening_strain, concrete.softening_ratio)
+    concrete04.constants(-fc * confinement.strength_ratio, -core_peak, -core_ultimate, *tension, column.concrete[0])
+    concrete04.constants(-fc, -peak, -cover_ultimate, *tension, column.concrete[1])
+    reinforcing_steel.constants(
+        values["fy"],
+        values["fu"],
+        values["Es"],
+        values["Esh"],
+        steel.hardening_strain,
+        steel.ultimate_strain,
+        column.steel,
+    )
+
+
+def _reason(status: int, n_steps: int, at: str, halvings: int) -> str:
+    if status < 0:
+        return "the gravity load did not converge: the section cannot carry it at these parameters"
+    return f"step {status} of {n_steps}{at} did not converge, halved {halvings} times"

@@ -1,0 +1,78 @@
+"""Base class of the built-in models whose simulations are compiled kernels: batches are run on threads."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..kernels.jit import KERNEL_HASH
+from ..simulation.model import MisfitBatch, SimulationBatch
+from ..simulation.threads import map_threads
+from .base import BuiltInModel
+from .validation import check_measured, check_thetas
+
+__all__ = ["ThreadedModel"]
+
+
+class ThreadedModel(BuiltInModel):
+    """Built-in model with compiled kernels, which release the lock of the interpreter.
+
+    A subclass defines `_prepare`, the work that is the same for every theta, and `_respond`, which uses its result,
+    `_prepared`.
+    """
+
+    _code_version: ClassVar[str] = KERNEL_HASH
+
+    def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
+        """Simulate many sets of parameters on as many threads as numba uses.
+
+        Parameters
+        ----------
+        thetas : ndarray[n, n_parameters]
+            One set of parameters per row.
+
+        Returns
+        -------
+        SimulationBatch
+            Responses, NaN in rows that failed, and the reasons of the failures.
+        """
+        thetas = check_thetas(thetas, self.parameter_names)
+        self._prepared  # noqa: B018  computed once here, not once per thread
+        return SimulationBatch(*map_threads(self._respond, thetas, (len(self.channels), self.n_steps)))
+
+    def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
+        """Compute sums of squared residuals at many sets of parameters; responses are not stored.
+
+        Parameters
+        ----------
+        thetas : ndarray[n, n_parameters]
+            One set of parameters per row.
+        measured : ndarray[n_channels, n_steps]
+            Measured response [SI].
+
+        Returns
+        -------
+        MisfitBatch
+            Sums (n, n_channels), NaN in rows that failed, and the reasons of the failures.
+        """
+        thetas = check_thetas(thetas, self.parameter_names)
+        measured = check_measured(measured, self.channels, self.n_steps)
+        self._prepared  # noqa: B018  computed once here, not once per thread
+
+        def misfit(theta: np.ndarray) -> np.ndarray:
+            return np.square(self._respond(theta) - measured).sum(axis=1)
+
+        return MisfitBatch(*map_threads(misfit, thetas, (len(self.channels),)))
+
+    def _prepare(self) -> Any:
+        raise NotImplementedError
+
+    @cached_property
+    def _prepared(self) -> Any:
+        return self._prepare()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without the prepared inputs: each process prepares its own."""
+        return {name: value for name, value in vars(self).items() if name != "_prepared"}
