@@ -1,46 +1,61 @@
-"""Settings of Sphinx: the pages of this folder, and the API from the docstrings. `make docs` builds them."""
+"""Settings of Sphinx. `make docs` builds the pages of this folder, the API reference and the tutorials.
+
+The API reference has one page per folder of the two packages, generated from the docstrings (``building.py``).
+Tutorials 01 to 05 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must fetch, and are
+shown without output. Both are written into folders that git ignores: ``docs/api`` and ``docs/tutorials``.
+"""
 
 import os
-import re
+import sys
 from importlib import metadata
+from pathlib import Path
 
-os.environ["NUMBA_DISABLE_JIT"] = "1"  # kernels as the plain functions that they are written as
+os.environ["FAST"] = "1"  # quick settings of the tutorials
+
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS), str(DOCS.parent / "tutorials")]  # `building`, and the modules that tutorials share
 
 project = "fe-likelihoods"
 author = "fe-likelihoods maintainers"
 release = metadata.version("fe-likelihoods")
 
-extensions = ["sphinx.ext.autodoc", "numpydoc", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build"]
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "numpydoc",
+    "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "tutorials/*.ipynb", "tutorials/*.json", "tutorials/*.py"]
 html_theme = "furo"
 html_title = f"fe-likelihoods {release}"
 html_show_sphinx = False
 default_role = "code"
 
-numpydoc_show_class_members = False  # autodoc shows them, with their docstrings
+numpydoc_show_class_members = False  # autodoc shows the members with their docstrings
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # shapes and units stand in the docstrings; hints would say "ndarray" again
+autodoc_typehints = "none"  # the docstrings state types with shapes and units
 autodoc_default_options = {"members": True, "show-inheritance": True}
 
-_ONE_LINE = re.compile(r"^( *)(\S[^—]* : [^—]*\S) — (.*)$")
-_STAR = re.compile(r"(?<=[(, ])\*(?=\w)")
 
-
-def read_as_numpydoc(app, what, name, obj, options, lines):
-    """Parameters that fit on a line, ``name : type — meaning``, as numpydoc's two; ``*shape`` is Python's star."""
-    rewritten = []
-    for line in lines:
-        line = _STAR.sub(r"\\*", line)
-        match = _ONE_LINE.match(line)
-        rewritten += [f"{match[1]}{match[2]}", f"{match[1]}    {match[3]}"] if match else [line]
-    lines[:] = rewritten
-
-
-def leave_out(app, what, name, obj, skip, options):
-    """Fields of NamedTuples, which stand in the docstring of the class and have none of their own."""
-    return True if type(obj).__name__ == "_tuplegetter" else None
+sphinx_gallery_conf = {
+    "examples_dirs": "../tutorials",
+    "gallery_dirs": "tutorials",
+    "filename_pattern": r"/0[1-5]_",  # executed
+    "ignore_pattern": r"/[a-z_]+\.py$",  # modules that tutorials share
+    "within_subsection_order": "FileNameSortKey",
+    "reset_argv": "building.tutorial_arguments",
+    "capture_repr": (),
+    "remove_config_comments": True,
+    "download_all_examples": False,
+    "write_computation_times": False,
+    "show_signature": False,
+}
 
 
 def setup(app):
-    app.connect("autodoc-process-docstring", read_as_numpydoc, priority=100)  # before numpydoc
-    app.connect("autodoc-skip-member", leave_out)
+    import building
+
+    app.connect("builder-inited", building.write_api_pages)
+    app.connect("env-before-read-docs", building.show_kernels_as_functions)
+    app.connect("autodoc-skip-member", building.skip_fields)
