@@ -69,8 +69,16 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         AveragedPrediction,
         average_predictions,
     )
-    from .prediction.propagation import (
+    from .prediction.fragility import (
+        Fragility,
+        fit_fragility,
+        fragility,
+        peak_ground_acceleration,
+    )
+    from .prediction.prediction import (
         Prediction,
+    )
+    from .prediction.propagation import (
         fit_measures,
         propagate,
     )
@@ -79,11 +87,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     )
     from .prediction.reliability import (
         Exceedance,
-        Fragility,
         exceedance,
-        fit_fragility,
-        fragility,
-        peak_ground_acceleration,
     )
     from .probability.likelihood import (
         FELikelihood,
@@ -281,19 +285,21 @@ _EXPORTS = {
         "AveragedPrediction",
         "average_predictions",
     ),
+    "prediction.fragility": (
+        "Fragility",
+        "fit_fragility",
+        "fragility",
+        "peak_ground_acceleration",
+    ),
+    "prediction.prediction": ("Prediction",),
     "prediction.propagation": (
-        "Prediction",
         "fit_measures",
         "propagate",
     ),
     "prediction.quantities": ("peak",),
     "prediction.reliability": (
         "Exceedance",
-        "Fragility",
         "exceedance",
-        "fit_fragility",
-        "fragility",
-        "peak_ground_acceleration",
     ),
     "probability.likelihood": (
         "FELikelihood",

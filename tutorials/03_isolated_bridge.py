@@ -37,9 +37,10 @@ from scipy.stats import gaussian_kde
 from fe_likelihoods import problems
 from fe_likelihoods.models.isolated_bridge import Bearing
 from fe_likelihoods.plots.predictions import plot_bands, plot_fragility
+from fe_likelihoods.prediction.fragility import fragility
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.quantities import peak
-from fe_likelihoods.prediction.reliability import exceedance, fragility
+from fe_likelihoods.prediction.reliability import exceedance
 from samplers import CHING_CHEN_2007, SMCSampler, TMCMCSampler
 from samplers.reporting.figures import ladder_plot
 from samplers.reporting.model_comparison import compare_models

@@ -37,7 +37,8 @@ from real_data import COLOURS, FAST, NOISES
 from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import BridgeDeck
 from fe_likelihoods.plots.predictions import plot_bands
-from fe_likelihoods.prediction.propagation import Prediction, propagate
+from fe_likelihoods.prediction.prediction import Prediction
+from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.probability.priors import HalfNormal, Uniform

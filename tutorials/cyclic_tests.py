@@ -21,7 +21,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from real_data import find
 
-from fe_likelihoods.prediction.propagation import Prediction, propagate
+from fe_likelihoods.prediction.prediction import Prediction
+from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.probability.posterior import Posterior

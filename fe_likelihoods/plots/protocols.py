@@ -105,7 +105,7 @@ class PredictionLike(Protocol):
 
 
 class CurveLike(Protocol):
-    """A lognormal fragility curve, such as `fe_likelihoods.prediction.reliability.FragilityCurve`."""
+    """A lognormal fragility curve, such as `fe_likelihoods.prediction.fragility.FragilityCurve`."""
 
     median: float
     dispersion: float

@@ -1,1 +1,1 @@
-"""Predictions from posterior samples: propagation, reliability and model averaging."""
+"""Predictions from samples of the parameters: histories, peaks, probabilities of exceedance and fragility."""

@@ -1,12 +1,13 @@
 """Bayesian model averaging of predictions.
 
-Where several models explain the data, each with its posterior probability, the prediction is their mixture. Its
-variance has two parts, by the law of total variance: what each model does not know of itself, and that the models
-differ.
+If several models explain the data, each with its posterior probability, the prediction is the mixture of their
+predictions. By the law of total variance its variance is the sum of two parts: the mean variance within the models, and
+the variance between the means of the models. See ``docs/theory/prediction.rst``.
 
 References
 ----------
-Hoeting, Madigan, Raftery & Volinsky (1999), Stat. Sci. 14(4), 382-417, doi:10.1214/ss/1009212519
+J. A. Hoeting, D. Madigan, A. E. Raftery, C. T. Volinsky (1999), Bayesian model averaging: a tutorial, Statistical
+Science 14(4), 382-417, doi:10.1214/ss/1009212519.
 """
 
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..signals.channels import Channel
-from .propagation import Prediction
+from .prediction import Prediction
 
 __all__ = ["AveragedPrediction", "average_predictions"]
 
@@ -25,13 +26,22 @@ class AveragedPrediction(NamedTuple):
 
     Attributes
     ----------
-    mean, variance : (*shape) float — of the mixture: ``variance = within + between``.
-    within : (*shape) float — mean of the models' variances.
-    between : (*shape) float — variance of the models' means.
-    standard_error : (*shape) float — Monte-Carlo error of `mean`, the probabilities taken as given.
+    mean : ndarray, shape (*shape)
+        Mean of the mixture.
+    variance : ndarray, shape (*shape)
+        Variance of the mixture, ``within + between``.
+    within : ndarray, shape (*shape)
+        Mean of the variances of the models.
+    between : ndarray, shape (*shape)
+        Variance of the means of the models.
+    standard_error : ndarray, shape (*shape)
+        Monte Carlo error of `mean` for the given probabilities.
     probabilities : dict of str to float
+        Probabilities of the models.
     channels : tuple of Channel
+        Channels of the predictions.
     dt : float or None
+        Time step of histories [s], None for other quantities.
     """
 
     mean: np.ndarray
@@ -45,28 +55,36 @@ class AveragedPrediction(NamedTuple):
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation, (*shape)."""
+        """Standard deviation, shape (*shape)."""
         return np.sqrt(self.variance)
 
 
 def average_predictions(
     predictions: Mapping[str, Prediction], probabilities: Mapping[str, float]
 ) -> AveragedPrediction:
-    """Average the predictions of several models, weighted by the models' probabilities.
+    """Average the predictions of several models with their probabilities as weights.
 
     Parameters
     ----------
-    predictions : by the model's name, of one and the same quantity.
-    probabilities : by the same names, summing to one.
+    predictions : mapping of str to Prediction
+        Predictions of the same quantity, by the name of the model.
+    probabilities : mapping of str to float
+        Posterior probabilities of the models, by the same names. They sum to one.
+
+    Returns
+    -------
+    AveragedPrediction
+        Mean and variance of the mixture.
 
     Raises
     ------
     ValueError
-        If the names differ, the probabilities are none, or the predictions differ in channels, step, shape or noise.
+        If the names differ, the probabilities are negative or do not sum to one, or the predictions differ in channels,
+        step, shape or noise.
     """
     if not predictions or set(predictions) != set(probabilities):
         raise ValueError(
-            f"one probability for each prediction is needed; predictions: {', '.join(predictions)}; probabilities: "
+            f"expected one probability for each prediction; got predictions {', '.join(predictions)}; probabilities "
             f"{', '.join(probabilities)}"
         )
     names, parts = list(predictions), list(predictions.values())
@@ -80,8 +98,8 @@ def average_predictions(
     for name, part in zip(names, parts, strict=True):
         if kind(part) != kind(parts[0]):
             raise ValueError(
-                f"predictions must be of one quantity (channels, step, shape, noise): {names[0]!r} is of "
-                f"{kind(parts[0])}, {name!r} of {kind(part)}"
+                f"predictions must be of one quantity (channels, step, shape, noise); {names[0]!r} has "
+                f"{kind(parts[0])}, {name!r} has {kind(part)}"
             )
     mean = np.tensordot(weights, [part.mean for part in parts], axes=1)
     within = np.tensordot(weights, [part.variance for part in parts], axes=1)

@@ -1,6 +1,7 @@
-"""What is asked of a response: histories of channels, numbers from the history of one channel, or any function of it.
+"""Quantities of a response: histories of channels, numbers from the history of one channel, or any function of it.
 
-A `ChannelQuantity` knows its channel, hence what it measures, and a threshold in a wrong unit can be refused.
+A `ChannelQuantity` has a channel and therefore a dimension, so that a threshold in a unit of another dimension is
+refused.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,12 +17,14 @@ __all__ = ["ChannelQuantity", "Evaluator", "Quantity", "evaluator", "peak"]
 
 @dataclass(frozen=True)
 class ChannelQuantity:
-    """A number from the history of one channel, of the channel's dimension.
+    """A number computed from the history of one channel, with the dimension of the channel.
 
     Parameters
     ----------
-    channel : str — its name.
-    function : callable — from the history (n_steps,) [SI] to a number [SI unit of the channel].
+    channel : str
+        Name of the channel.
+    function : callable
+        Function of the history (n_steps,) [SI] that returns a number [SI unit of the channel].
     """
 
     channel: str
@@ -29,12 +32,21 @@ class ChannelQuantity:
 
 
 Quantity = None | str | ChannelQuantity | Sequence[str] | Sequence[ChannelQuantity] | Callable[[np.ndarray], Any]
-"""What `fe_likelihoods.prediction.propagation.propagate` takes as a quantity."""
+"""Quantities that `fe_likelihoods.prediction.propagation.propagate` accepts."""
 
 
 class Evaluator(NamedTuple):
-    """A quantity of one model's response: `rows` of the histories wanted (None: not histories), the `function` of the
-    response (n_channels, n_steps) otherwise, and the `channels` that the result speaks of."""
+    """How a quantity is computed from the response of a model.
+
+    Attributes
+    ----------
+    rows : list of int or None
+        Rows of the response whose histories are the quantity, None for another quantity.
+    function : callable or None
+        Function of the response (n_channels, n_steps) [SI], None for histories.
+    channels : tuple of Channel
+        Channels of the quantity, empty for a function of the whole response.
+    """
 
     rows: list[int] | None
     function: Callable[[np.ndarray], Any] | None
@@ -42,7 +54,7 @@ class Evaluator(NamedTuple):
 
 
 def peak(channel: str) -> ChannelQuantity:
-    """Largest absolute value of a channel."""
+    """Return the quantity "largest absolute value of the channel"."""
     return ChannelQuantity(channel, _largest)
 
 
@@ -51,7 +63,25 @@ def _largest(history: np.ndarray) -> float:
 
 
 def evaluator(quantity: Quantity, channels: Sequence[Channel]) -> Evaluator:
-    """How a quantity is computed from responses with these channels; ValueError if it is none or names unknown ones."""
+    """Return how a quantity is computed from responses.
+
+    Parameters
+    ----------
+    quantity : Quantity
+        The quantity, as in `fe_likelihoods.prediction.propagation.propagate`.
+    channels : sequence of Channel
+        Channels of the model.
+
+    Returns
+    -------
+    Evaluator
+        Rows of histories, or a function of the response.
+
+    Raises
+    ------
+    ValueError
+        If this is not a quantity, or it names an unknown channel.
+    """
     channels = tuple(channels)
     names = [channel.name for channel in channels]
 

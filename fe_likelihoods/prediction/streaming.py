@@ -1,32 +1,37 @@
-"""Mean, variance and quantiles of results that come in batches and are too many to keep.
+"""Mean, variance and quantiles of results that arrive in batches.
 
-Mean and variance need one pass: each batch has its own, and two of them are joined by the update of Chan, Golub &
-LeVeque (1983), which never subtracts large numbers from each other as the mean of squares less the square of the mean
-does. Quantiles need the results themselves: as many are kept as a bound of memory allows. A result may stand for
-several samples (resampling makes copies), so everything here counts.
+Mean and variance need one pass. Each batch has its own, and two of them are combined by the update of Chan, Golub &
+LeVeque (1983), which avoids the cancellation of the mean of squares minus the square of the mean. Quantiles need the
+results themselves, of which as many are retained as fit into a limit of memory. A result may stand for several samples,
+because resampling makes copies, so that every result has a count.
+
+See ``docs/theory/prediction.rst``.
 
 References
 ----------
-Chan, Golub & LeVeque (1983), Am. Stat. 37(3), 242-247, doi:10.1080/00031305.1983.10483115
+T. F. Chan, G. H. Golub, R. J. LeVeque (1983), Algorithms for computing the sample variance: analysis and
+recommendations, The American Statistician 37(3), 242-247, doi:10.1080/00031305.1983.10483115.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["Kept", "Moments", "quantiles_with_errors"]
+__all__ = ["RetainedResults", "RunningMoments", "quantiles_with_errors"]
 
-FEWEST_KEPT = 20  # less than one sample beyond a 5 % quantile
-_CHUNK = 2**18  # values sorted at once
+FEWEST_RETAINED = 20  # with fewer samples a 5 % quantile has less than one sample below it
+_CHUNK = 2**18  # values that are sorted at once
 
 
-class Moments:
+class RunningMoments:
     """Running mean and variance of arrays of one shape.
 
     Attributes
     ----------
-    count : float — samples so far.
-    mean : (*shape) float
+    count : float
+        Number of samples so far.
+    mean : ndarray, shape (*shape)
+        Their mean, None before the first sample.
     """
 
     def __init__(self) -> None:
@@ -35,13 +40,13 @@ class Moments:
         self._squares: np.ndarray | None = None
 
     def add(self, values: np.ndarray, counts: np.ndarray) -> None:
-        """Enter `values` (m, *shape), each standing for `counts` (m,) samples."""
+        """Add results `values` (m, *shape) that stand for `counts` (m,) samples each."""
         total = float(counts.sum())
         if total == 0.0:
             return
         mean = np.tensordot(counts / total, values, axes=1)
         deviations = values - mean
-        with np.errstate(over="ignore"):  # the variance of responses that have blown up is infinite
+        with np.errstate(over="ignore"):  # unstable responses may have an infinite variance
             squares = np.tensordot(counts, np.square(deviations, out=deviations), axes=1)
         if self.mean is None:
             self.count, self.mean, self._squares = total, mean, squares
@@ -55,24 +60,32 @@ class Moments:
 
     @property
     def variance(self) -> np.ndarray:
-        """Mean squared deviation from the mean, (*shape)."""
+        """Mean squared deviation from the mean, shape (*shape)."""
         return self._squares / self.count
 
 
-class Kept:
-    """Results kept for quantiles: all of them if they fit into `memory`, else those of a random part of the samples.
+class RetainedResults:
+    """Results retained for quantiles: all of them if they fit into the limit, else those of a random subsample.
 
     Parameters
     ----------
-    result_of_sample : (n,) int — which result a sample has; copies share one.
-    shape : shape of a result.
-    dtype : type in which results are kept.
-    memory : int or None — bound of the kept results [bytes]; None for no bound.
-    rng : numpy.random.Generator — chooses the part.
+    result_of_sample : ndarray of int, shape (n,)
+        Index of the result of each sample. Copies of a sample share one result.
+    shape : tuple of int
+        Shape of a result.
+    dtype : type
+        Floating-point type of the retained results.
+    memory_bytes : int or None
+        Largest size of the retained results [bytes], None for no limit.
+    rng : numpy.random.Generator
+        Chooses the subsample.
 
     Attributes
     ----------
-    complete : bool — whether all results are kept.
+    complete : bool
+        Whether all results are retained.
+    shape : tuple of int
+        Shape of a result.
 
     Raises
     ------
@@ -85,54 +98,55 @@ class Kept:
         result_of_sample: np.ndarray,
         shape: tuple[int, ...],
         dtype: type,
-        memory: int | None,
+        memory_bytes: int | None,
         rng: np.random.Generator,
     ) -> None:
         n, n_results, size = len(result_of_sample), int(result_of_sample.max()) + 1, int(np.prod(shape))
         row = max(size * np.dtype(dtype).itemsize, 1)
-        fit = n_results if memory is None else int(memory) // row
+        fit = n_results if memory_bytes is None else int(memory_bytes) // row
         self.complete = fit >= n_results
-        if not self.complete and fit < FEWEST_KEPT:
+        if not self.complete and fit < FEWEST_RETAINED:
             raise ValueError(
-                f"quantiles need at least {FEWEST_KEPT} results of {row} bytes each, that is {FEWEST_KEPT * row} bytes "
-                f"of memory; got memory={memory}: give more, fewer channels, or quantiles=() for mean and variance only"
+                f"quantiles need at least {FEWEST_RETAINED} results of {row} bytes each, {FEWEST_RETAINED * row} bytes "
+                f"in all; got memory_bytes={memory_bytes}: give more, take fewer channels, or use quantiles=() for "
+                "mean and variance only"
             )
         chosen = result_of_sample if self.complete else result_of_sample[rng.choice(n, size=fit, replace=False)]
         counts = np.bincount(chosen, minlength=n_results)
-        kept = np.flatnonzero(counts)
+        retained = np.flatnonzero(counts)
         self.shape = shape
         self._position = np.full(n_results, -1)
-        self._position[kept] = np.arange(len(kept))
-        self._counts = counts[kept]
-        self._rows = np.empty((len(kept), size), dtype=dtype)
-        self._filled = np.zeros(len(kept), dtype=bool)
+        self._position[retained] = np.arange(len(retained))
+        self._counts = counts[retained]
+        self._rows = np.empty((len(retained), size), dtype=dtype)
+        self._filled = np.zeros(len(retained), dtype=bool)
         self._largest = float(np.finfo(dtype).max)
 
     def __contains__(self, result: int) -> bool:
         return self._position[result] >= 0
 
     def add(self, results: np.ndarray, values: np.ndarray) -> None:
-        """Enter `values` (m, *shape) of the `results` (m,); those that are not of the part are passed over."""
+        """Add the values (m, *shape) of the results with indices `results` (m,). Results not chosen are skipped."""
         positions = self._position[results]
         wanted = positions >= 0
         if not wanted.any():
             return
         rows = values.reshape(len(values), -1)[wanted]
-        # a response that has blown up must stay a number in single precision
+        # Unstable responses are clipped, so that they stay finite in single precision.
         self._rows[positions[wanted]] = np.clip(rows, -self._largest, self._largest)
         self._filled[positions[wanted]] = True
 
     @property
     def n_samples(self) -> int:
-        """Samples that the kept results stand for."""
+        """Number of samples that the retained results stand for."""
         return int(self._counts[self._filled].sum())
 
     def values_of(self, results: np.ndarray) -> np.ndarray:
-        """Kept results (m, *shape) of the `results` (m,), which must all have been entered."""
+        """Return the values (m, *shape) of the results with indices `results` (m,), all of them added before."""
         return self._rows[self._position[results]].reshape(len(results), *self.shape)
 
     def quantiles(self, probabilities: Sequence[float], effective: float) -> tuple[np.ndarray, np.ndarray]:
-        """Quantiles and their standard errors, (n_probabilities, *shape) each (see `quantiles_with_errors`)."""
+        """Return quantiles and their standard errors, each (n_probabilities, *shape); see `quantiles_with_errors`."""
         counts = self._counts[self._filled]
         size = self._rows.shape[1]
         out = np.empty((2, len(probabilities), size))
@@ -147,22 +161,31 @@ class Kept:
 def quantiles_with_errors(
     values: np.ndarray, counts: np.ndarray, probabilities: Sequence[float], effective: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Quantiles of the columns of an array, and their standard errors.
-
-    The quantile is that of `numpy.quantile` with every row repeated. Of n samples, the number below the p-quantile is
-    binomial: its rank is known to n sqrt(p (1 - p) / effective). The error is what so many ranks are worth: a quarter
-    of the way between the sorted samples twice as many ranks below and above, the 95 % interval.
+    r"""Compute quantiles of the columns of an array, and their standard errors.
 
     Parameters
     ----------
-    values : (m, k) float
-    counts : (m,) int — how many samples each row stands for.
-    probabilities : sequence of float in (0, 1)
-    effective : float — independent samples that all of them are worth.
+    values : ndarray, shape (m, k)
+        The results.
+    counts : ndarray of int, shape (m,)
+        Number of samples that each row stands for.
+    probabilities : sequence of float
+        Probabilities of the quantiles, between 0 and 1.
+    effective : float
+        Effective number of independent samples.
 
     Returns
     -------
-    tuple of (n_probabilities, k) float : quantiles and errors; an error is inf for a single sample.
+    quantiles : ndarray, shape (n_probabilities, k)
+        Quantiles as of `numpy.quantile` with every row repeated `counts` times.
+    errors : ndarray, shape (n_probabilities, k)
+        Their standard errors, inf for a single sample.
+
+    Notes
+    -----
+    The number of samples below the p-quantile is binomial, so that its rank among n samples has the standard error
+    :math:`s = n \sqrt{p (1 - p) / n_\mathrm{eff}}`. The error of the quantile is a quarter of the distance between the
+    sorted samples at the ranks 2 s below and 2 s above it, the 95 % interval. See ``docs/theory/prediction.rst``.
     """
     n = int(counts.sum())
     if n == len(values):

@@ -14,7 +14,7 @@ from fe_likelihoods.plots.predictions import plot_bands
 from fe_likelihoods.prediction.averaging import average_predictions
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
-from fe_likelihoods.prediction.streaming import Moments
+from fe_likelihoods.prediction.streaming import RunningMoments
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import HalfNormal, Prior, TruncatedNormal
@@ -101,7 +101,7 @@ def test_streaming_is_all_at_once_and_copies_count(rng):
         assert np.allclose(p.mean, responses.mean(axis=0), rtol=1e-13)
         assert np.allclose(p.variance, responses.var(axis=0), rtol=1e-11)
         assert np.allclose(p.quantiles, np.quantile(responses, p.probabilities, axis=0), rtol=1e-12)
-    single = quiet(model, samples, memory=model.runs * 50 * 4)  # in single precision all fit, in double they do not
+    single = quiet(model, samples, memory_bytes=model.runs * 50 * 4)  # fits in single precision only
     assert single.n_quantile == 500 and not np.array_equal(single.quantiles, p.quantiles)
     assert np.allclose(single.quantiles, p.quantiles, rtol=1e-6)
     with ThreadPool(2) as pool:
@@ -112,7 +112,7 @@ def test_streaming_is_all_at_once_and_copies_count(rng):
 def test_a_small_spread_about_a_large_value(rng):
     """The mean of squares less the squared mean would give nonsense here."""
     numbers = 1e9 + 1e-2 * rng.normal(size=5000)
-    moments = Moments()
+    moments = RunningMoments()
     for part in np.split(numbers, 50):
         moments.add(part, np.ones(len(part)))
     assert np.isclose(moments.variance, np.var(numbers - 1e9), rtol=1e-4)
@@ -125,7 +125,7 @@ def test_responses_that_have_blown_up_stay_numbers(rng, huge):
         def simulate(self, theta):
             return super().simulate(theta) * (huge if theta[0] > 1.3 else 1.0)
 
-    p = quiet(Unstable(), draws(rng, 200), batch=10, memory=200 * 50 * 4)
+    p = quiet(Unstable(), draws(rng, 200), batch=10, memory_bytes=200 * 50 * 4)
     for values in (p.mean, p.variance, p.standard_error, p.quantiles, p.quantile_error):
         assert not np.isnan(values).any()
     assert np.all(np.abs(p.quantile(0.5)) < 20.0)
@@ -155,7 +155,7 @@ def test_memory_is_bounded(rng, caplog):
     memory = 8 * 2**20
     tracemalloc.start()
     try:
-        p = quiet(Big(), samples, memory=memory, batch=16, seed=1)
+        p = quiet(Big(), samples, memory_bytes=memory, batch=16, seed=1)
         peak_memory = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -172,7 +172,7 @@ def test_memory_is_bounded(rng, caplog):
 
 def test_numbers_are_kept_all_in_the_order_of_the_samples(rng):
     samples = draws(rng, 60)[rng.integers(0, 60, size=100)]
-    p = quiet(Line(), samples, quantity=peak("b"), memory=0)
+    p = quiet(Line(), samples, quantity=peak("b"), memory_bytes=0)
     expected = [np.abs(Line().simulate(theta)[1]).max() for theta in samples]
     assert np.allclose(p.values, expected, rtol=1e-13) and p.dt is None
     assert np.allclose(p.quantiles, np.quantile(expected, p.probabilities))
@@ -354,7 +354,7 @@ def test_average_of_two_models_is_their_mixture(rng):
     assert np.allclose(average.standard_error, np.hypot(0.4 * errors[0], 0.6 * errors[1]))
     with pytest.raises(ValueError, match="sum to one"):
         average_predictions(predictions, {"one": 0.4, "two": 0.4})
-    with pytest.raises(ValueError, match="one probability for each"):
+    with pytest.raises(ValueError, match="expected one probability for each"):
         average_predictions(predictions, {"one": 0.4, "three": 0.6})
     with pytest.raises(ValueError, match="one quantity"):
         average_predictions(predictions | {"two": quiet(Line(), second, quantity="a")}, {"one": 0.4, "two": 0.6})
@@ -370,7 +370,7 @@ def test_average_of_two_models_is_their_mixture(rng):
         (np.array([[1.0, 1.0], [1.0, np.nan]]), {}, "first is sample 1"),
         (np.ones((5, 2)), {"noise": True}, "sigma_a, sigma_b"),
         (np.array([[1.0, 1.0, 1.0, 0.0]]), {"noise": True}, "positive standard deviation"),
-        (np.ones((5, 4)), {"record": Record("r", 0.1, [0.0, 1.0])}, "Line knows no other record.*with_record"),
+        (np.ones((5, 4)), {"record": Record("r", 0.1, [0.0, 1.0])}, "Line has one excitation only.*with_record"),
         (np.ones((5, 4)), {"quantity": "c"}, "no channel 'c'; the channels of the model are a, b"),
         (np.ones((5, 4)), {"quantity": ["a", "a"]}, "quantity must be"),
         (np.ones((5, 4)), {"quantity": peak("c")}, "no channel 'c'"),
@@ -379,9 +379,9 @@ def test_average_of_two_models_is_their_mixture(rng):
         (np.ones((5, 4)), {"quantiles": 0.5}, "sequence"),
         (np.ones((5, 4)), {"effective_sample_size": 0.0}, "effective_sample_size"),
         (np.ones((5, 4)), {"batch": 0}, "batch"),
-        (np.ones((5, 4)), {"memory": -1}, "memory must be"),
+        (np.ones((5, 4)), {"memory_bytes": -1}, "memory_bytes must be"),
         (np.ones((5, 4)), {"seed": -1}, "seed must be"),
-        (np.arange(200.0).reshape(50, 4), {"memory": 1000}, "at least 20 results of 200 bytes"),
+        (np.arange(200.0).reshape(50, 4), {"memory_bytes": 1000}, "at least 20 results of 200 bytes"),
     ],
 )
 def test_refused_before_any_simulation(samples, settings, message):
@@ -392,7 +392,7 @@ def test_refused_before_any_simulation(samples, settings, message):
 
 
 def test_refused_otherwise(oscillator, rng):
-    with pytest.raises(ValueError, match="noise=True needs the posterior"):
+    with pytest.raises(ValueError, match="noise=True needs a posterior"):
         quiet(Line(), np.ones((5, 2)), noise=True)
     with pytest.raises(ValueError, match="expected a Record as excitation; got ndarray"):
         quiet(oscillator, np.ones((5, 2)), record=np.ones(10))

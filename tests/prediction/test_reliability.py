@@ -6,9 +6,10 @@ from scipy import stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.plots.predictions import plot_fragility
+from fe_likelihoods.prediction.fragility import fit_fragility, fragility
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak
-from fe_likelihoods.prediction.reliability import exceedance, fit_fragility, fragility
+from fe_likelihoods.prediction.reliability import exceedance
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import SimulationFailed
@@ -93,7 +94,7 @@ def test_units_and_shapes_of_thresholds(record, rng):
         exceedance(p, np.nan)
     with pytest.raises(ValueError, match="must be numbers"):
         exceedance(p, "10 cm")
-    with pytest.raises(ValueError, match=r"shape \(3,\), is needed; got shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"shape \(3,\); got shape \(2,\)"):
         exceedance(np.zeros((50, 3)), [1.0, 2.0])
     assert exceedance(np.zeros((50, 3)), [1.0, -1.0, 2.0]).probability.tolist() == [0.0, 1.0, 0.0]
     with pytest.raises(ValueError, match="quantity, such as peak"):
@@ -179,10 +180,10 @@ def test_fit_is_the_maximum_of_the_likelihood(rng):
 @pytest.mark.parametrize(
     ("k", "message"),
     [
-        ([0, 0, 0], "none exceed"),
-        ([9, 9, 9], "all exceed"),
-        ([0, 0, 9], "slope open"),
-        ([0, 4, 9], "slope open"),
+        ([0, 0, 0], "none of the trials exceed"),
+        ([9, 9, 9], "all of the trials exceed"),
+        ([0, 0, 9], "do not determine the slope"),
+        ([0, 4, 9], "do not determine the slope"),
         ([8, 4, 1], "does not rise"),
         ([9, 9, 0], "does not rise"),
         ([1, 12, 2], "0 <= exceedances <= trials"),
@@ -207,7 +208,7 @@ def test_refused_before_any_simulation(record, monkeypatch):
     refused("one number as quantity", quantity="displacement")
     refused("one number as quantity", quantity=[peak("displacement"), peak("acceleration")])
     refused("no channel 'force'", quantity=peak("force"))
-    refused("needs records", records=[])
+    refused("needs one record or more", records=[])
     refused("expected a Record as excitation", records=[record, 3.0])
     refused("must be positive and finite", records=[record, record.scale(0.0)])
     refused("2 parameters", samples=np.ones((5, 3)))

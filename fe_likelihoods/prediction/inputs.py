@@ -1,0 +1,209 @@
+"""Inputs of a prediction: the model and the noise to predict with, and the parameters in the samples.
+
+This is the only module of predictions that asks foreign objects (posteriors, likelihoods, models, noises) for their
+optional members.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..probability.likelihood import FELikelihood, as_points
+from ..signals.records import Record
+from ..simulation.executors import as_executor
+from ..simulation.memory_cache import distinct_keys
+from ..simulation.model import Model
+
+__all__ = [
+    "PredictionSource",
+    "SampleNoise",
+    "distinct_rows",
+    "read_source",
+    "samples_of_rows",
+    "simulates_in_batches",
+    "split_samples",
+    "under_record",
+]
+
+
+class PredictionSource(NamedTuple):
+    """What a prediction is made with.
+
+    Attributes
+    ----------
+    model : Model
+        The model.
+    noise : Noise or None
+        The noise, None for a bare model. For a noise that was integrated out, the noise with its parameters.
+    likelihood : FELikelihood or None
+        The likelihood, None for a bare model.
+    executor : Executor or None
+        Where simulations run, None for this process.
+    """
+
+    model: Model
+    noise: Any
+    likelihood: FELikelihood | None
+    executor: Any
+
+
+class SampleNoise(NamedTuple):
+    """Noise of every sample.
+
+    Attributes
+    ----------
+    deviations : ndarray, shape (n, n_channels)
+        Standard deviations [SI].
+    lag_one : ndarray, shape (n, n_channels), or None
+        Correlation of successive errors [-], None for white noise.
+    """
+
+    deviations: np.ndarray
+    lag_one: np.ndarray | None
+
+    def draw(self, sample: int, n_steps: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw the errors of one sample, shape (n_channels, n_steps) [SI]."""
+        errors = rng.standard_normal((self.deviations.shape[1], n_steps))
+        if self.lag_one is not None:
+            from scipy.signal import lfilter  # imported here because it is slow to import and rarely needed
+
+            for row, rho in zip(errors, self.lag_one[sample], strict=True):
+                # e_t = rho e_{t-1} + sqrt(1 - rho^2) z_t is stationary: e_0 has the same variance as the others.
+                row[1:] *= np.sqrt((1.0 - rho) * (1.0 + rho))
+                row[:] = lfilter([1.0], [1.0, -rho], row)
+        return self.deviations[sample][:, None] * errors
+
+
+def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
+    """Return the model, the noise, the likelihood and the executor of an object.
+
+    Parameters
+    ----------
+    posterior_or_model : Posterior, FELikelihood or Model
+        The object to predict with.
+    pool : optional
+        Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
+
+    Returns
+    -------
+    PredictionSource
+        The parts.
+
+    Raises
+    ------
+    ValueError
+        If the object is none of the three.
+    """
+    likelihood = getattr(posterior_or_model, "likelihood", posterior_or_model)
+    if hasattr(likelihood, "measurements") and hasattr(likelihood, "model"):
+        executor = getattr(likelihood, "pool", None) if pool is None else as_executor(pool, likelihood.model)
+        noise = getattr(likelihood.noise, "noise", likelihood.noise)
+        return PredictionSource(likelihood.model, noise, likelihood, executor)
+    if not (hasattr(posterior_or_model, "simulate") and hasattr(posterior_or_model, "parameter_names")):
+        raise ValueError(
+            f"expected a Posterior, an FELikelihood or a model with simulate(theta); got {posterior_or_model!r}"
+        )
+    return PredictionSource(posterior_or_model, None, None, as_executor(pool, posterior_or_model))
+
+
+def under_record(model: Model, record: Record) -> Model:
+    """Return the model under another excitation; raise ValueError if it has no method ``with_record``."""
+    if not hasattr(model, "with_record"):
+        raise ValueError(
+            f"{type(model).__name__} has one excitation only: give it a method with_record(record) that returns the "
+            "same model under another excitation"
+        )
+    return model.with_record(record)
+
+
+def simulates_in_batches(model: Model) -> bool:
+    """Return whether the model simulates several sets of parameters at once."""
+    return hasattr(model, "simulate_batch")
+
+
+def split_samples(source: PredictionSource, samples: Any, noise: bool) -> tuple[np.ndarray, SampleNoise | None]:
+    """Split samples into structural parameters and, if wanted, the noise of each sample.
+
+    Parameters
+    ----------
+    source : PredictionSource
+        The model and the noise.
+    samples : (n, ndim) array_like, or named values of shape (n,)
+        All parameters, or without `noise` the structural parameters alone.
+    noise : bool
+        Whether the noise is wanted.
+
+    Returns
+    -------
+    thetas : ndarray, shape (n, n_structural)
+        Structural parameters.
+    sample_noise : SampleNoise or None
+        Noise of each sample, None if it is not wanted.
+
+    Raises
+    ------
+    ValueError
+        If the samples have another shape, are not finite, or give an impossible noise; or if noise is wanted of a
+        model, or of a noise without ``standard_deviations``.
+    """
+    model, noise_model = source.model, source.noise
+    structural = tuple(model.parameter_names)
+    names = structural + (() if noise_model is None else tuple(noise_model.parameter_names))
+    if noise and noise_model is None:
+        raise ValueError("noise=True needs a posterior, whose samples have the parameters of the noise; got a model")
+    width = len(samples) if isinstance(samples, Mapping) else np.shape(samples)[-1:]
+    structural_only = not noise and width in (len(structural), (len(structural),))
+    try:
+        points = as_points(samples, structural if structural_only else names)
+    except TypeError as error:
+        raise ValueError(f"samples must be numbers, (n, {len(names)}): {error}") from error
+    if points.ndim != 2 or len(points) == 0:
+        raise ValueError(
+            f"expected samples of shape (n, {len(names)}), as sampler.get_chain(flat=True) returns; got {points.shape}"
+        )
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"samples must be finite: {bad.size} of {len(points)} are not, the first is sample {bad[0]}: "
+            f"{points[bad[0]]}; leave them out"
+        )
+    thetas = points[:, : len(structural)]
+    if not noise:
+        return thetas, None
+    return thetas, _sample_noise(noise_model, points[:, len(structural) :], len(model.channels))
+
+
+def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct rows in the order of their first appearance, and the index among them of each row."""
+    keys, row_of_sample = distinct_keys(thetas)
+    return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), -1).copy(), np.array(row_of_sample)
+
+
+def samples_of_rows(row_of_sample: np.ndarray, n_rows: int) -> list[np.ndarray]:
+    """Return the indices of the samples that each distinct row stands for, the inverse of `distinct_rows`."""
+    order = np.argsort(row_of_sample, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(row_of_sample, minlength=n_rows))[:-1])
+
+
+def _sample_noise(noise_model: Any, parameters: np.ndarray, n_channels: int) -> SampleNoise:
+    if not hasattr(noise_model, "standard_deviations"):
+        raise ValueError(
+            f"{type(noise_model).__name__} cannot be drawn from: give it a method standard_deviations(parameters (n, "
+            "n_parameters)) that returns (n, n_channels) in SI units"
+        )
+    deviations = np.asarray(noise_model.standard_deviations(parameters), dtype=float)
+    if deviations.shape != (len(parameters), n_channels) or not np.all((deviations > 0) & (deviations < np.inf)):
+        raise ValueError(
+            f"the noise needs a positive standard deviation for each of {len(parameters)} samples and {n_channels} "
+            f"channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
+        )
+    if not hasattr(noise_model, "lag_one_correlations"):
+        return SampleNoise(deviations, None)
+    lag_one = np.asarray(noise_model.lag_one_correlations(parameters), dtype=float)
+    if lag_one.shape != deviations.shape or not np.all(np.abs(lag_one) < 1.0):
+        raise ValueError(
+            f"the noise needs a correlation between -1 and 1 for each of {len(parameters)} samples and {n_channels} "
+            f"channels; got shape {lag_one.shape}, largest {np.abs(lag_one).max(initial=0.0)}"
+        )
+    return SampleNoise(deviations, lag_one)

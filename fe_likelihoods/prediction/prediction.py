@@ -1,0 +1,189 @@
+"""The result of uncertainty propagation: mean, variance and quantiles of a quantity."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..signals.channels import Channel, Measurements
+from ..signals.error_measures import rrmse
+from ..signals.sampling import same_sampling
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.figure import Figure
+
+__all__ = ["Prediction"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Moments and quantiles of a quantity over samples of the parameters.
+
+    `shape` is the shape of the quantity: (n_channels, n_steps) for histories, () for a peak. Values are in SI units.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (*shape)
+        Mean.
+    variance : ndarray, shape (*shape)
+        Variance.
+    standard_error : ndarray, shape (*shape)
+        Monte Carlo error of `mean`: standard deviation / sqrt(effective sample size).
+    probabilities : tuple of float
+        Probabilities of the quantiles.
+    quantiles : ndarray, shape (n_probabilities, *shape)
+        Quantiles.
+    quantile_error : ndarray, shape (n_probabilities, *shape)
+        Monte Carlo errors of the quantiles.
+    values : ndarray, shape (n_samples, *shape), or None
+        The quantity of every sample that did not fail, in their order. None for histories, and for arrays that exceed
+        the limit of memory.
+    n_samples : int
+        Number of samples used for mean and variance.
+    n_quantile : int
+        Number of samples used for the quantiles, smaller if not all of them fitted into the limit of memory.
+    effective_sample_size : float
+        Effective number of independent samples, for the Monte Carlo errors.
+    failed : ndarray of int, shape (n_failed,)
+        Indices of the samples that are left out, because the simulation failed or the quantity is not finite.
+    failure_reasons : dict of str to int
+        Number of samples left out for each reason.
+    channels : tuple of Channel
+        Channels of the histories, or the channels whose quantities the values are. Empty for a function of the whole
+        response.
+    dt : float or None
+        Time step of the histories [s], None for other quantities.
+    noise : bool
+        Whether the measurement noise is included.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    standard_error: np.ndarray
+    probabilities: tuple[float, ...]
+    quantiles: np.ndarray
+    quantile_error: np.ndarray
+    values: np.ndarray | None
+    n_samples: int
+    n_quantile: int
+    effective_sample_size: float
+    failed: np.ndarray
+    failure_reasons: dict[str, int]
+    channels: tuple[Channel, ...] = ()
+    dt: float | None = None
+    noise: bool = False
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Standard deviation, shape (*shape)."""
+        return np.sqrt(self.variance)
+
+    @property
+    def n_failed(self) -> int:
+        """Number of samples that are left out."""
+        return len(self.failed)
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of the histories, from zero, shape (n_steps,) [s]; ValueError for other quantities."""
+        self._need_histories()
+        return np.arange(self.mean.shape[1]) * self.dt
+
+    def quantile(self, probability: float) -> np.ndarray:
+        """Return the quantile, shape (*shape), of one of the `probabilities`; raise ValueError for another one."""
+        if probability not in self.probabilities:
+            raise ValueError(
+                f"no quantile {probability!r} in this prediction, it has {self.probabilities}: propagate with "
+                f"quantiles=(..., {probability!r})"
+            )
+        return self.quantiles[self.probabilities.index(probability)]
+
+    def rrmse(self, measurements: Measurements, part: slice = slice(None)) -> np.ndarray:
+        """Compute the relative root mean square error of the mean.
+
+        Parameters
+        ----------
+        measurements : Measurements
+            Measurements of all channels, with the step and the length of the histories.
+        part : slice
+            The samples of the history to compare. Default: all.
+
+        Returns
+        -------
+        ndarray, shape (n_channels,)
+            The errors [-] in the order of `channels`, see `fe_likelihoods.signals.error_measures.rrmse`.
+
+        Raises
+        ------
+        ValueError
+            If the prediction has no histories, the measurements lack a channel or have another step or length, or a
+            measured channel is zero at all samples.
+        """
+        measured = self._measured(measurements)[:, part]
+        return rrmse(self.mean[:, part], measured, [channel.name for channel in self.channels])
+
+    def coverage(
+        self, measurements: Measurements, lower: float = 0.05, upper: float = 0.95, part: slice = slice(None)
+    ) -> np.ndarray:
+        """Compute the fraction of the measured samples between two quantiles.
+
+        Parameters
+        ----------
+        measurements : Measurements
+            Measurements of all channels, with the step and the length of the histories.
+        lower, upper : float
+            Probabilities of the two quantiles.
+        part : slice
+            The samples of the history to compare. Default: all.
+
+        Returns
+        -------
+        ndarray, shape (n_channels,)
+            The fractions [-] in the order of `channels`. A prediction with noise should have about ``upper - lower``.
+            A prediction without noise is a band of the response, not of the measurements, and covers fewer of them.
+
+        Raises
+        ------
+        ValueError
+            As `rrmse`, and if the prediction lacks one of the quantiles or `lower` is not below `upper`.
+        """
+        if not lower < upper:
+            raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
+        measured = self._measured(measurements)
+        inside = (self.quantile(lower) <= measured) & (measured <= self.quantile(upper))
+        return inside[:, part].mean(axis=1)
+
+    def check_sampling(self, measurements: Measurements) -> None:
+        """Raise ValueError if measurements have another time step or number of samples than the histories."""
+        self._need_histories()
+        n_steps = self.mean.shape[1]
+        if not same_sampling(self.dt, n_steps, measurements.dt, measurements.n_steps):
+            raise ValueError(
+                f"the prediction has {n_steps} samples at {self.dt} s, the measurements have {measurements.n_steps} at "
+                f"{measurements.dt} s; make them equal with Measurements.trim and Measurements.decimate"
+            )
+
+    def plot(self, measurements: Measurements | None = None, channels: "Sequence[str] | None" = None) -> "Figure":
+        """Plot mean, band and measurements, see `fe_likelihoods.plots.predictions.plot_bands`."""
+        from ..plots.predictions import plot_bands
+
+        return plot_bands(self, measurements, channels)
+
+    def _need_histories(self) -> None:
+        if self.dt is None:
+            raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
+
+    def _measured(self, measurements: Measurements) -> np.ndarray:
+        """Return the measured values, shape (n_channels, n_steps), in the order of `channels`."""
+        self._need_histories()
+        chosen = measurements.select([channel.name for channel in self.channels])
+        for predicted, measured in zip(self.channels, chosen.channels, strict=True):
+            if predicted.dimension != measured.dimension:
+                raise ValueError(
+                    f"channel {predicted.name!r} is {predicted.quantity!r} in the prediction, {measured.quantity!r} in "
+                    "the measurements"
+                )
+        self.check_sampling(measurements)
+        return chosen.values
