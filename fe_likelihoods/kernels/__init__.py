@@ -1,1 +1,1 @@
-"""Compiled mechanics on bare arrays: one law per file. See `jit.py` for how they are compiled and cached."""
+"""Compiled mechanics on bare arrays, one law per file; `jit.py` says how they are compiled and cached."""

@@ -1,35 +1,43 @@
-"""Force-based beam-column element: equilibrium exact along the element, compatibility by iteration.
+"""Force-based beam-column element: exact equilibrium along the element, compatibility by iteration.
 
-Basic forces Q = (N, Mi, Mj) give the section forces everywhere without approximation, b(xi) Q with N = Q1 and
-M = (xi - 1) Q2 + xi Q3; the section deformations integrate to the basic deformations,
+The basic forces Q = (N, Mi, Mj) determine the section forces without approximation, b(xi) Q with N = Q1 and
+M = (xi - 1) Q2 + xi Q3. The section deformations e, with section flexibilities f, integrate to the basic deformations::
 
-    v = integral b' e dx,    F = integral b' f b dx,    K = F^-1,
+    v = integral b' e dx,    F = integral b' f b dx,    K = F^-1
 
-with Gauss-Lobatto points (both ends included). For new deformations v, the element corrects Q by K times the
-compatibility residual until its work is below a tolerance (Neuenhofer & Filippou 1997). Q, K and the section
-states survive from one global iteration to the next.
+The integrals use Gauss-Lobatto points, which include both ends. For new deformations v, the element adds K times the
+compatibility residual to Q until the work of this correction is below a tolerance (Neuenhofer & Filippou 1997). Q, K
+and the section states are kept from one global iteration to the next.
 
-Softening concrete makes sections locally unstable, and the plain iteration sometimes fails. Then, in this order: the
-initial section flexibilities in every pass; in the first pass only; and a tenth of the increment at a time, up to four
-times over. A failure of all of them is reported, never hidden.
+Softening concrete makes sections locally unstable, and this iteration sometimes fails. The element then tries, in this
+order: the initial section flexibilities in every pass; the initial ones in the first pass only; a tenth of the
+increment at a time, up to four times in succession. If all of them fail, the element reports failure.
+``docs/theory/beam_column.rst`` has the equations.
 
 References
 ----------
-Spacone, Filippou & Taucer (1996), Earthq. Eng. Struct. Dyn. 25(7); Neuenhofer & Filippou (1997), J. Struct. Eng.
-123(7); specs/bridge_column.md, section 5.
+E. Spacone, F. C. Filippou, F. F. Taucer, Fibre beam-column model for non-linear analysis of R/C frames: part I,
+Earthquake Engineering and Structural Dynamics 25(7), 1996,
+doi:10.1002/(SICI)1096-9845(199607)25:7<711::AID-EQE576>3.0.CO;2-9.
+
+A. Neuenhofer, F. C. Filippou, Evaluation of nonlinear frame finite-element models, Journal of Structural Engineering
+123(7), 1997, doi:10.1061/(ASCE)0733-9445(1997)123:7(958).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from .fiber_section import forces
 from .jit import kernel
 
-__all__ = ["HEAD", "PER_SECTION", "initialise", "advance"]
+__all__ = ["HEAD", "PER_SECTION", "Elements", "initialise", "advance"]
 
-# State of one element: Q (3), K = K11 K12 K13 K22 K23 K33 (6), v (3), then for each section
-# e0, kappa, flexibility f11 f12 f22, N, M.
+# State of one element: Q (3), K = K11 K12 K13 K22 K23 K33 (6), v (3), then e0, kappa, flexibility f11 f12 f22, N and M
+# of each section.
 HEAD = 12
 PER_SECTION = 7
 
@@ -39,9 +47,35 @@ MAX_SUBDIVISIONS = 4
 MAX_ATTEMPTS = 3000
 
 
+class Elements(NamedTuple):
+    """Constants and state of all elements of a column.
+
+    Attributes
+    ----------
+    points : ndarray (n_points,)
+        Gauss-Lobatto points on [0, 1].
+    tributary : ndarray (n_elements, n_points)
+        Length that each section stands for, its weight times the length of the element [m].
+    initial_flexibility : ndarray (3,)
+        f11, f12, f22 of the virgin section.
+    tolerance : float
+        Largest work of the last compatibility correction [J].
+    state : ndarray (n_elements, HEAD + PER_SECTION n_points)
+    work : ndarray (2, HEAD + PER_SECTION n_points)
+        Scratch.
+    """
+
+    points: np.ndarray
+    tributary: np.ndarray
+    initial_flexibility: np.ndarray
+    tolerance: float
+    state: np.ndarray
+    work: np.ndarray
+
+
 @kernel
 def _invert(f11, f12, f13, f22, f23, f33):
-    """Inverse of a symmetric 3 x 3 matrix, upper half in, upper half out."""
+    """Return the upper half of the inverse of a symmetric 3 x 3 matrix, given by its upper half."""
     c11 = f22 * f33 - f23 * f23
     c12 = f13 * f23 - f12 * f33
     c13 = f12 * f23 - f13 * f22
@@ -57,14 +91,11 @@ def _invert(f11, f12, f13, f22, f23, f33):
 
 
 @kernel
-def initialise(state, points, tributary, initial_flexibility):
-    """Unloaded elastic state of one element into `state` (HEAD + PER_SECTION n_points,).
-
-    points : (n_points,) of the Gauss-Lobatto rule on [0, 1]. tributary : (n_points,) length that each stands for, its
-    weight times that of the element. initial_flexibility : (3,) f11, f12, f22.
-    """
+def initialise(element, elements):
+    """Write the unloaded elastic state of row `element` of the state, in place."""
+    state, points, tributary = elements.state[element], elements.points, elements.tributary[element]
     state[:] = 0.0
-    a, b, c = initial_flexibility
+    a, b, c = elements.initial_flexibility
     f11 = f12 = f13 = f22 = f23 = f33 = 0.0
     for m in range(points.shape[0]):
         xi, w = points[m], tributary[m]
@@ -80,34 +111,25 @@ def initialise(state, points, tributary, initial_flexibility):
 
 
 @kernel(inline=True)
-def advance(
-    v1,
-    v2,
-    v3,
-    element,
-    state,
-    work,
-    points,
-    tributary,
-    initial_flexibility,
-    tolerance,
-    core_count,
-    y,
-    area,
-    concrete,
-    concrete_memory,
-    bar_y,
-    bar_area,
-    steel,
-    steel_memory,
-    virgin,
-    trial,
-):
-    """Bring row `element` of `state` to the basic deformations (v1, v2, v3), in place; True when it converged.
+def advance(v1, v2, v3, element, elements, sections):
+    """Bring one element to the basic deformations (v1, v2, v3), in place.
 
-    tolerance bounds the work of the last correction [force x length]. work : scratch of the size of one row. The
-    other arguments are those of `fiber_section.forces`. On failure the row is left as it was.
+    Parameters
+    ----------
+    v1, v2, v3 : float
+        Elongation [m] and rotations of the two ends against the chord [rad].
+    element : int
+        Row of the state.
+    elements : Elements
+    sections : fiber_section.Sections
+
+    Returns
+    -------
+    bool
+        True if it converged. On failure the row is left as it was.
     """
+    points, tributary, state, work = elements.points, elements.tributary, elements.state, elements.work
+    initial_flexibility = elements.initial_flexibility
     n_points = points.shape[0]
     n_state = HEAD + PER_SECTION * n_points
     rest1 = v1 - state[element, 9]
@@ -117,19 +139,19 @@ def advance(
         return True
     i11, i12, i22 = initial_flexibility[0], initial_flexibility[1], initial_flexibility[2]
     for k in range(n_state):
-        work[0, k] = state[element, k]  # the last state reached
+        work[0, k] = state[element, k]  # the last state that was reached
     part1, part2, part3 = rest1, rest2, rest3
     scheme = 0
     subdivision = 0
     passes = 0
-    # One turn of this loop is one pass over the sections; schemes and subdivisions share it so that the
-    # section is merged into the machine code once.
     for k in range(n_state):
         work[1, k] = work[0, k]
     target1, target2, target3 = v1, v2, v3
     work[1, 0] += work[1, 3] * part1 + work[1, 4] * part2 + work[1, 5] * part3
     work[1, 1] += work[1, 4] * part1 + work[1, 6] * part2 + work[1, 7] * part3
     work[1, 2] += work[1, 5] * part1 + work[1, 7] * part2 + work[1, 8] * part3
+    # Each turn of this loop is one pass over the sections. Schemes and subdivisions share the loop, so that the inlined
+    # code of the section appears once.
     for _ in range(MAX_ATTEMPTS):
         use_initial = scheme == 1 or (scheme == 2 and passes == 0)
         q1, q2, q3 = work[1, 0], work[1, 1], work[1, 2]
@@ -147,22 +169,7 @@ def advance(
             dm = section_m - work[1, k + 6]
             e0 = work[1, k] + a * dn + b * dm
             kappa = work[1, k + 1] + b * dn + c * dm
-            n, moment, k_axial, k_coupling, k_bending = forces(
-                e0,
-                kappa,
-                element * n_points + m,
-                core_count,
-                y,
-                area,
-                concrete,
-                concrete_memory,
-                bar_y,
-                bar_area,
-                steel,
-                steel_memory,
-                virgin,
-                trial,
-            )
+            n, moment, k_axial, k_coupling, k_bending = forces(e0, kappa, element * n_points + m, sections)
             if use_initial:
                 a, b, c = i11, i12, i22
             else:
@@ -197,14 +204,14 @@ def advance(
         work[1, 2] = q3 + d3
         error = abs(r1 * d1 + r2 * d2 + r3 * d3)
         passes += 1
-        if error < tolerance:
+        if error < elements.tolerance:
             work[1, 3], work[1, 4], work[1, 5] = k11, k12, k13
             work[1, 6], work[1, 7], work[1, 8] = k22, k23, k33
             work[1, 9], work[1, 10], work[1, 11] = target1, target2, target3
             rest1 -= part1
             rest2 -= part2
             rest3 -= part3
-            if subdivision == 0:  # the part was the whole rest
+            if subdivision == 0:  # this part was all that remained
                 for k in range(n_state):
                     state[element, k] = work[1, k]
                 return True
@@ -225,7 +232,7 @@ def advance(
                 subdivision += 1
                 scheme = 0
                 part1, part2, part3 = 0.1 * part1, 0.1 * part2, 0.1 * part3
-        # The next attempt starts from the last state reached.
+        # The next attempt starts from the last state that was reached.
         for k in range(n_state):
             work[1, k] = work[0, k]
         if subdivision == 0:

@@ -1,26 +1,40 @@
-"""Laws of the devices between a deck and its piers: sliding bearing, rubber device.
+"""Force laws of the devices between a deck and its piers: sliding bearing and rubber restoring-force device.
 
-Friction.  The slider carries mu(v) W Z against the motion, with the coefficient of friction of velocity v, ::
+Friction. The slider resists the motion with mu(v) W Z, where the coefficient of friction depends on the velocity v::
 
     mu(v) = f_min + df (1 - exp(-a |v|))
 
-and Z in [-1, 1] in place of the sign of v. Regularised (Bouc-Wen, exponent 2, A = beta + gamma = 1), Z follows the
-displacement U over the yield displacement Y, ::
+and Z in [-1, 1] replaces the sign of v. There are three laws for Z.
 
-    Y Z' = v [1 - Z^2 (gamma sgn(v Z) + beta)]
+* Regularised (Bouc-Wen with exponent 2 and A = beta + gamma = 1): Z follows the displacement U over the yield
+  displacement Y, ``Y Z' = v [1 - Z^2 (gamma sgn(v Z) + beta)]``. This equation is independent of rates, so that a
+  monotone increment of U integrates exactly: tanh while Z grows, tan while it returns.
+* Exact (Coulomb): Z is the sign of v, or any value in [-1, 1] at rest.
+* Elastic-plastic: the slider is a spring of stiffness f_min W / Y that slides at mu(v) W.
 
-which does not know of rates, so that a monotone increment of U integrates exactly, tanh when Z grows and tan when it
-returns. Exact (Coulomb), Z is the sign of v, or any value in [-1, 1] at rest. Elastic-plastic, the slider is a spring
-of stiffness f_min W / Y that slides at mu(v) W.
+Rubber. With s = U / s_u, an odd polynomial F(s) is the skeleton, and an even polynomial D(s) is half the distance
+between the branches of loading and unloading::
 
-Rubber.  An odd polynomial F(s) of s = U / s_u is the skeleton, an even one D(s) half the distance between the branches
-of loading and unloading; the force is F(s) + D(s) Z. Beyond ``|s|`` = s_max the skeleton goes on along its tangent and
-D keeps its value.
+    F_r = F(s) + D(s) Z,    F = sum A_n s^n (n = 1, 3 ... 11),    D = sum B_m s^m (m = 0, 2, 4)
 
-Source: specs/isolated_bridge.md, section 3; equations (14) and (16) to (18) of the paper on TMCMC.
+Beyond ``|s|`` = s_max the skeleton continues along its tangent and D keeps its value.
+``docs/theory/isolated_bridge.rst`` has all equations.
+
+References
+----------
+M. C. Constantinou, A. Mokha, A. Reinhorn, Teflon bearings in base isolation II: modeling, Journal of Structural
+Engineering 116(2), 1990, doi:10.1061/(ASCE)0733-9445(1990)116:2(455).
+
+Y.-K. Wen, Method for random vibration of hysteretic systems, Journal of the Engineering Mechanics Division 102(2),
+1976, doi:10.1061/JMCEA3.0002106.
+
+P. Tsopelas, S. Okamoto, M. C. Constantinou, D. Ozaki, S. Fujii, NCEER-Taisei Corporation research program on sliding
+seismic isolation systems for bridges: experimental and analytical study of systems consisting of sliding bearings,
+rubber restoring force devices and fluid dampers, report NCEER-94-0002, 1994.
 """
 
 import math
+from typing import NamedTuple
 
 from .jit import kernel
 
@@ -28,6 +42,8 @@ __all__ = [
     "BOUC_WEN",
     "COULOMB",
     "ELASTIC_PLASTIC",
+    "RubberLaw",
+    "Slider",
     "bouc_wen",
     "coulomb",
     "elastic_plastic",
@@ -41,19 +57,69 @@ ELASTIC_PLASTIC = 1
 COULOMB = 2
 
 
+class Slider(NamedTuple):
+    """Constants of one sliding bearing.
+
+    Attributes
+    ----------
+    f_min, df : float
+        Coefficient of friction at rest, and its increase at high velocity.
+    a : float
+        Rate of this increase [s/m].
+    yield_displacement : float
+        Y [m].
+    stiffness : float
+        Of the elastic-plastic law, f_min W / Y [N/m].
+    """
+
+    f_min: float
+    df: float
+    a: float
+    yield_displacement: float
+    stiffness: float
+
+
+class RubberLaw(NamedTuple):
+    """Constants of a rubber device, without the linear term of its skeleton.
+
+    Attributes
+    ----------
+    a3, a5, a7, a9, a11 : float
+        Coefficients of the skeleton [N].
+    b0, b2, b4 : float
+        Coefficients of half the distance between the branches [N].
+    scale : float
+        s_u [m].
+    limit : float
+        s_max.
+    """
+
+    a3: float
+    a5: float
+    a7: float
+    a9: float
+    a11: float
+    b0: float
+    b2: float
+    b4: float
+    scale: float
+    limit: float
+
+
 @kernel(inline=True)
-def friction(velocity, f_min, df, a):
-    """``mu(v) = f_min + df (1 - exp(-a |v|))``: the coefficient and its derivative to v [s/m]."""
-    rest = df * math.exp(-a * abs(velocity))
-    slope = a * rest
-    return f_min + df - rest, slope if velocity >= 0.0 else -slope
+def friction(velocity, slider):
+    """Return the coefficient of friction at `velocity` [m/s] and its derivative to the velocity [s/m]."""
+    rest = slider.df * math.exp(-slider.a * abs(velocity))
+    slope = slider.a * rest
+    return slider.f_min + slider.df - rest, slope if velocity >= 0.0 else -slope
 
 
 @kernel(inline=True)
 def bouc_wen(increment, z, yield_displacement, c):
-    """Z after a monotone `increment` of displacement, and dZ/dU; c = sqrt(gamma - beta).
+    """Return Z after a monotone `increment` of the displacement [m], and dZ/dU [1/m].
 
-    In the direction of motion Z obeys dZ/dx = 1 + c^2 Z^2 below zero and 1 - Z^2 above, with x = ``|U|``/Y.
+    With Z counted in the direction of motion and x = ``|U|``/Y, dZ/dx is 1 + c^2 Z^2 below zero and 1 - Z^2 above,
+    where c = sqrt(gamma - beta).
     """
     sign = 1.0 if increment >= 0.0 else -1.0
     x = abs(increment) / yield_displacement
@@ -74,17 +140,17 @@ def bouc_wen(increment, z, yield_displacement, c):
 
 @kernel(inline=True)
 def rubber(displacement, law):
-    """F(U) without its linear term, dF/dU, D(U), dD/dU; law = [A3, A5, A7, A9, A11, B0, B2, B4, s_u, s_max]."""
-    scale, limit = law[8], law[9]
+    """Return F [N] without its linear term, dF/dU [N/m], D [N] and dD/dU [N/m] at the `displacement` U [m]."""
+    scale, limit = law.scale, law.limit
     s = displacement / scale
     inside = min(max(s, -limit), limit)
     q = inside * inside
-    force = inside * q * (law[0] + q * (law[1] + q * (law[2] + q * (law[3] + q * law[4]))))
+    force = inside * q * (law.a3 + q * (law.a5 + q * (law.a7 + q * (law.a9 + q * law.a11))))
     stiffness = (
-        q * (3.0 * law[0] + q * (5.0 * law[1] + q * (7.0 * law[2] + q * (9.0 * law[3] + q * 11.0 * law[4])))) / scale
+        q * (3.0 * law.a3 + q * (5.0 * law.a5 + q * (7.0 * law.a7 + q * (9.0 * law.a9 + q * 11.0 * law.a11)))) / scale
     )
-    half_loop = law[5] + q * (law[6] + q * law[7])
-    slope = inside * (2.0 * law[6] + 4.0 * law[7] * q) / scale
+    half_loop = law.b0 + q * (law.b2 + q * law.b4)
+    slope = inside * (2.0 * law.b2 + 4.0 * law.b4 * q) / scale
     if s != inside:
         force += stiffness * (displacement - inside * scale)
         slope = 0.0
@@ -92,46 +158,85 @@ def rubber(displacement, law):
 
 
 @kernel(inline=True)
-def regularised(increment, displacement, velocity, z, weight, bearing, c, law):
-    """Bouc-Wen slider and rubber: force, dF/dU, dF/dv, Z; bearing = [f_min, df, a, Y, k0]."""
-    z, dz = bouc_wen(increment, z, bearing[3], c)
-    mu, dmu = friction(velocity, bearing[0], bearing[1], bearing[2])
+def regularised(increment, displacement, velocity, z, weight, slider, c, law):
+    """Return force [N], dF/dU [N/m], dF/dv [N s/m] and Z of a Bouc-Wen slider and a rubber device.
+
+    Parameters
+    ----------
+    increment : float
+        Of the displacement, since `z` [m].
+    displacement, velocity : float
+        Of the bearing, at the end of the increment [m], [m/s].
+    z : float
+        Z before the increment.
+    weight : float
+        Normal load [N].
+    slider : Slider
+    c : float
+        sqrt(gamma - beta).
+    law : RubberLaw
+    """
+    z, dz = bouc_wen(increment, z, slider.yield_displacement, c)
+    mu, dmu = friction(velocity, slider)
     force, stiffness, half_loop, slope = rubber(displacement, law)
     bound = mu * weight + half_loop
     return bound * z + force, bound * dz + stiffness + slope * z, dmu * weight * z, z
 
 
 @kernel(inline=True)
-def elastic_plastic(increment, displacement, velocity, z, weight, bearing, c, law):
-    """Slider that is a spring of stiffness k0 up to mu(v) W, and rubber; z is the slider's force [N]."""
-    mu, dmu = friction(velocity, bearing[0], bearing[1], bearing[2])
+def elastic_plastic(increment, displacement, velocity, z, weight, slider, c, law):
+    """Return force [N], dF/dU [N/m], dF/dv [N s/m] and the force of the slider [N], for an elastic-plastic slider.
+
+    Arguments are those of `regularised`, but `z` is the force of the slider before the increment [N].
+    """
+    mu, dmu = friction(velocity, slider)
     force, stiffness, half_loop, slope = rubber(displacement, law)
     capacity, dcapacity = mu * weight, dmu * weight
-    slider, dslider, dv = z + bearing[4] * increment, bearing[4], 0.0
+    own, own_du, own_dv = z + slider.stiffness * increment, slider.stiffness, 0.0  # force of the slider, derivatives
     share, dshare, share_dv = 0.0, 0.0, 0.0  # of the capacity, and its derivatives to U and v
-    if abs(slider) >= capacity:  # also where nothing presses on the bearing
-        share = 1.0 if slider > 0.0 else -1.0
-        slider, dslider, dv = share * capacity, 0.0, share * dcapacity
+    if abs(own) >= capacity:  # also without a normal load
+        share = 1.0 if own > 0.0 else -1.0
+        own, own_du, own_dv = share * capacity, 0.0, share * dcapacity
     else:
-        share, dshare, share_dv = slider / capacity, dslider / capacity, -slider / capacity**2 * dcapacity
+        share, dshare, share_dv = own / capacity, own_du / capacity, -own / capacity**2 * dcapacity
     return (
-        slider + half_loop * share + force,
-        dslider + half_loop * dshare + slope * share + stiffness,
-        dv + half_loop * share_dv,
-        slider,
+        own + half_loop * share + force,
+        own_du + half_loop * dshare + slope * share + stiffness,
+        own_dv + half_loop * share_dv,
+        own,
     )
 
 
 @kernel(inline=True)
-def coulomb(total, displacement, velocity, pull, weight, bearing, law):
-    """Set-valued slider and rubber, at a trial force `total` without the rubber's linear part.
+def coulomb(total, displacement, velocity, pull, weight, slider, law):
+    """Evaluate a set-valued slider and a rubber device at a trial force.
 
-    The force on the set-valued part, tried with `pull` times the velocity, decides: within the bound the bearing
-    sticks, beyond it slides. Returns (sticks, force, dF/dU, dF/dv, Z); force and derivatives hold where it slides.
+    The trial force of the set-valued part, plus `pull` times the velocity, decides: the bearing sticks while it is
+    within the bound at rest, and slides beyond.
+
+    Parameters
+    ----------
+    total : float
+        Trial force, without the linear part of the rubber [N].
+    displacement, velocity : float
+        Of the bearing [m], [m/s].
+    pull : float
+        Positive factor that turns a velocity into a force [N s/m].
+    weight : float
+        Normal load [N].
+    slider : Slider
+    law : RubberLaw
+
+    Returns
+    -------
+    sticks : bool
+    force, stiffness, viscosity : float
+        F [N], dF/dU [N/m] and dF/dv [N s/m], valid where the bearing slides.
+    z : float
     """
-    mu, dmu = friction(velocity, bearing[0], bearing[1], bearing[2])
+    mu, dmu = friction(velocity, slider)
     force, stiffness, half_loop, slope = rubber(displacement, law)
-    at_rest = bearing[0] * weight + half_loop
+    at_rest = slider.f_min * weight + half_loop
     trial = total - force + pull * velocity
     if abs(trial) <= at_rest:
         return True, force, 0.0, 0.0, (total - force) / at_rest if at_rest > 0.0 else 0.0

@@ -1,9 +1,11 @@
-"""Responses of a linear system of first order as sums over its complex modes.
+"""Response of a linear first-order system as a sum over its complex modes.
 
-Each mode k obeys q_k' = lam_k q_k + f_k(t), with a forcing that is a straight line between its samples. Its step is
-then exact with three constants (Nigam & Jennings 1969, in complex form) ::
+Each mode k satisfies q_k' = lam_k q_k + f_k(t), where the forcing f_k is linear between its samples. A step is then
+exact with three constants (Nigam & Jennings 1969, in complex form)::
 
     q(t + dt) = decay q(t) + before f(t) + after f(t + dt)
+
+``docs/theory/time_integration.rst`` derives the constants.
 
 References
 ----------
@@ -18,18 +20,20 @@ __all__ = ["superpose_modes"]
 
 @kernel
 def superpose_modes(decay, before, after, participation, shapes, excitation, out):
-    """Add to `out` the real parts of the modes' responses, which start from zero.
+    """Add the real parts of the responses of all modes, which start from zero, to `out`.
 
     Parameters
     ----------
     decay, before, after : ndarray (n_modes,) complex
-        Constants of the step, see above.
+        Constants of the step.
     participation : ndarray (n_modes, n_inputs) complex
         Forcing of a mode under unit inputs.
     shapes : ndarray (n_modes, n_rows) complex
-        Share of a mode in each row of the response.
+        Contribution of a unit modal coordinate to each row of the response.
     excitation : ndarray (n_inputs, n_steps)
+        Samples of the inputs.
     out : ndarray (n_rows, n_steps)
+        Changed in place.
     """
     n_inputs, n_steps = excitation.shape
     for k in range(decay.shape[0]):

@@ -1,23 +1,27 @@
-"""Popovics concrete with Karsan-Jirsa unloading and exponential tension softening (OpenSees ``Concrete04``).
+"""Concrete: Popovics' envelope, Karsan and Jirsa's unloading, exponential tension softening.
 
-The law, compression negative, with memory (eps_min, eps_max), the extreme strains committed so far::
+Compression is negative. The memory of a fiber is (eps_min, eps_max), the extreme strains committed so far::
 
     eps < eps_min            sigma = fc eta r / (r - 1 + eta^r)   down to eps_cu, then 0
                              eta = eps/eps_0,  r = Ec/(Ec - fc/eps_0)
     eps_min <= eps < eps_end sigma = slope (eps - eps_end)        unloading towards the plastic strain
-    eps_end <= eps < 0       sigma = 0                            crack closing
+    eps_end <= eps < 0       sigma = 0                            open crack that has not closed yet
     0 <= eps <= eps_max      sigma = (sigma_env(eps_max)/eps_max) eps
     eps > eps_max            sigma = Ec eps                                    up to eps_ct = ft/Ec
                              sigma = ft beta^((eps-eps_ct)/(eps_tu-eps_ct))    up to eps_tu, then 0
 
-The stress is a single-valued function of the strain and of the two numbers of memory: it does not depend on the
-direction of loading, and a trial evaluation leaves no trace. That is what lets a section evaluate its fibers
-side by side.
+The stress is a single-valued function of the strain and of the memory. It does not depend on the direction of loading,
+and a trial evaluation changes nothing. A section can therefore evaluate its fibers side by side (SIMD).
+
+The law is that of the material Concrete04 of OpenSees. ``docs/theory/concrete.rst`` derives it.
 
 References
 ----------
-Popovics (1973), Cem. Concr. Res. 3(5); Karsan & Jirsa (1969), J. Struct. Div. ASCE 95(12).
-The rules as reproduced here: specs/bridge_column.md, section 2.
+S. Popovics, A numerical approach to the complete stress-strain curve of concrete, Cement and Concrete Research 3(5),
+1973, doi:10.1016/0008-8846(73)90096-3.
+
+I. D. Karsan, J. O. Jirsa, Behavior of concrete under compressive loadings, Journal of the Structural Division 95(12),
+1969.
 """
 
 from __future__ import annotations
@@ -35,7 +39,23 @@ N_CONSTANTS = 11
 
 @kernel
 def constants(fc, e0, ecu, ec, ft, etu, beta, out):
-    """Fill `out` (N_CONSTANTS,) from the seven material constants (fc, e0, ecu < 0; any consistent units)."""
+    """Fill `out` with the constants of one concrete.
+
+    Parameters
+    ----------
+    fc, e0, ecu : float
+        Compressive strength [Pa], strain at the strength and crushing strain, all negative.
+    ec : float
+        Initial modulus [Pa].
+    ft : float
+        Tensile strength [Pa].
+    etu : float
+        Strain at which tension ends.
+    beta : float
+        Share of `ft` that is left at `etu`.
+    out : ndarray (N_CONSTANTS,)
+        Overwritten. Any other consistent unit of stress serves as well.
+    """
     e_secant = fc / e0
     out[FC] = fc
     out[E0] = e0
@@ -52,14 +72,14 @@ def constants(fc, e0, ecu, ec, ft, etu, beta, out):
 
 @kernel
 def envelope(eps, c):
-    """Stress and tangent of the virgin material at strain `eps`, compression or tension."""
+    """Return stress and tangent of the envelope at strain `eps`, in compression or tension."""
     if eps <= 0.0:
         if eps < c[ECU]:
             return 0.0, 0.0
         r = c[R]
         eta = eps / c[E0]
         power = eta * eta if r == 2.0 else eta**r
-        if power > 1e150:  # far down the r = 400 branch: its square would overflow to nan
+        if power > 1e150:  # occurs for r = 400 only, where the square of `power` would overflow to NaN
             return 0.0, 0.0
         d = r - 1.0 + power
         return c[FC] * eta * r / d, c[ESEC] * r * (r - 1.0) * (1.0 - power) / (d * d)
@@ -73,10 +93,10 @@ def envelope(eps, c):
 
 @kernel
 def unloading(eps_min, eps_max, c):
-    """What follows from the memory: eps_end and slope of compressive unloading, secant slope of tensile unloading.
+    """Return eps_end and slope of unloading from compression, and the secant slope of unloading from tension.
 
-    Karsan & Jirsa's plastic strain ratio = .145 eta^2 + .13 eta (eta < 2), .707 (eta - 2) + .834 beyond; the slope is
-    never steeper than Ec.
+    The plastic strain over eps_0 is 0.145 eta^2 + 0.13 eta for eta < 2, and 0.707 (eta - 2) + 0.834 beyond (Karsan &
+    Jirsa 1969). The slope never exceeds Ec.
     """
     ec = c[EC]
     eps_end, slope, tension_slope = 0.0, ec, ec
@@ -101,10 +121,13 @@ def unloading(eps_min, eps_max, c):
 
 @kernel
 def stress_tangent(eps, eps_min, eps_max, eps_end, slope, tension_slope, c):
-    """Stress and tangent at a trial strain, memory and what `unloading` made of it given."""
+    """Return stress and tangent at the trial strain `eps`.
+
+    The arguments after it are the memory and the values that `unloading` derives from it.
+    """
     if eps < eps_min or eps > eps_max:
         return envelope(eps, c)
-    if eps >= 0.0:  # also where eps_end > 0 (Ec below the secant fc/eps_0): tension starts from zero strain
+    if eps >= 0.0:  # tested before eps_end, which is positive where Ec < fc/eps_0: tension starts from zero strain
         return tension_slope * eps, tension_slope
     if eps < eps_end:
         return slope * (eps - eps_end), slope
@@ -113,5 +136,5 @@ def stress_tangent(eps, eps_min, eps_max, eps_end, slope, tension_slope, c):
 
 @kernel
 def commit(eps, eps_min, eps_max):
-    """Memory after the strain `eps` has been committed."""
+    """Return the memory after the strain `eps` has been committed."""
     return min(eps_min, eps), max(eps_max, eps)

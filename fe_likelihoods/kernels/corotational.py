@@ -1,52 +1,124 @@
-"""From the displacements of an upright beam's ends to its basic deformations and back (corotational or linear).
+"""Transformation between the displacements of the ends of an upright beam and its basic deformations.
 
-Basic deformations v = (elongation, theta_i, theta_j) are what remains after the rigid motion of the chord is taken
-away; p = T' Q are the end forces, T = dv/du, and the stiffness is T'KT + Kg with the geometric part Kg = dT'/du Q.
-In a column the undeformed chord points along global +Y, so that local x = +Y and local y = -X. Both rows of T that
-belong to rotations share their translational part, and the translations of the two ends enter with opposite signs:
-one 2-vector each for the chord (`axial`) and for its normal (`normal`) holds all of T.
+The basic deformations v = (elongation, theta_i, theta_j) are what remains of the displacements u of both ends after the
+rigid motion of the chord is removed. The end forces are p = T' Q with T = dv/du, and the stiffness is T'KT + Kg with
+the geometric part Kg = dT'/du Q::
 
-The linear variant is the same with the direction and length of the undeformed chord and no Kg.
+    lx = L + d_uy,   ly = -d_ux,   Ln = sqrt(lx^2 + ly^2),   c = lx/Ln,   s = ly/Ln,   alpha = atan2(ly, lx)
+    v = (Ln - L, theta_i - alpha, theta_j - alpha)
 
-References: specs/bridge_column.md, section 6.
+The undeformed chord of a column points along global +Y, so that local x = +Y and local y = -X. The two rows of T that
+belong to rotations have the same translational part, and the translations of the two ends enter with opposite signs.
+Two vectors therefore hold all of T: one along the chord (ax, ay) and one along its normal (nx, ny).
+
+The linear variant uses the direction and the length of the undeformed chord and no Kg.
+``docs/theory/beam_column.rst`` derives the matrices.
+
+References
+----------
+M. A. Crisfield, Non-linear finite element analysis of solids and structures, volume 1, Wiley, 1991, chapter 7.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from .jit import kernel
 
-__all__ = ["deformations", "add_to_stiffness"]
+__all__ = ["BasicForces", "Chord", "deformations", "add_to_stiffness"]
+
+
+class Chord(NamedTuple):
+    """Deformations and chord of one element.
+
+    Attributes
+    ----------
+    elongation : float
+        [m]
+    theta_i, theta_j : float
+        Rotations of the ends against the chord [rad].
+    c, s : float
+        Direction cosines of the chord against +Y.
+    length : float
+        Of the deformed chord, or of the undeformed one in the linear variant [m].
+    """
+
+    elongation: float
+    theta_i: float
+    theta_j: float
+    c: float
+    s: float
+    length: float
+
+
+class BasicForces(NamedTuple):
+    """Basic forces of one element and the upper half of its basic stiffness.
+
+    Attributes
+    ----------
+    q1, q2, q3 : float
+        Axial force [N] and moments of the ends [N m].
+    k11, k12, k13, k22, k23, k33 : float
+        Derivatives of q to the elongation [m] and the rotations [rad].
+    """
+
+    q1: float
+    q2: float
+    q3: float
+    k11: float
+    k12: float
+    k13: float
+    k22: float
+    k23: float
+    k33: float
 
 
 @kernel
 def deformations(dux, duy, theta_i, theta_j, length, corotational):
-    """Basic deformations, direction cosines (c, s) of the chord against +Y and its length.
+    """Return the `Chord` of an element.
 
-    dux, duy : displacements of end J minus those of end I.
+    Parameters
+    ----------
+    dux, duy : float
+        Displacements of end J minus those of end I [m].
+    theta_i, theta_j : float
+        Rotations of the ends [rad].
+    length : float
+        Of the undeformed element [m].
+    corotational : bool
+        False for the linear variant.
     """
     if not corotational:
         alpha = -dux / length
-        return duy, theta_i - alpha, theta_j - alpha, 1.0, 0.0, length
+        return Chord(duy, theta_i - alpha, theta_j - alpha, 1.0, 0.0, length)
     lx = length + duy
     ly = -dux
     chord = math.sqrt(lx * lx + ly * ly)
     alpha = math.atan2(ly, lx)
-    # chord - length without cancellation
+    # chord - length, written without cancellation
     elongation = (2.0 * length * duy + duy * duy + ly * ly) / (chord + length)
-    return elongation, theta_i - alpha, theta_j - alpha, lx / chord, ly / chord, chord
+    return Chord(elongation, theta_i - alpha, theta_j - alpha, lx / chord, ly / chord, chord)
 
 
 @kernel(inline=True)
-def add_to_stiffness(
-    first, q1, q2, q3, k11, k12, k13, k22, k23, k33, c, s, chord, corotational, force, stiffness
-):  # fmt: skip
-    """Add the end forces and the tangent of one element to the structure, in place.
+def add_to_stiffness(first, basic, direction, corotational, force, stiffness):
+    """Add the end forces and the tangent of one element to those of the structure, in place.
 
-    `first` is the degree of freedom of end I's ux (-3 at the fixed base: only end J is free). (q1, q2, q3) and k are
-    the basic forces and stiffness.
+    Parameters
+    ----------
+    first : int
+        Degree of freedom of ux at end I; -3 at the fixed base, where only end J is free.
+    basic : BasicForces
+    direction : Chord
+    corotational : bool
+        Whether to add the geometric stiffness.
+    force : ndarray (n,)
+    stiffness : ndarray (n, n)
     """
+    q1, q2, q3 = basic.q1, basic.q2, basic.q3
+    k11, k12, k13, k22, k23, k33 = basic.k11, basic.k12, basic.k13, basic.k22, basic.k23, basic.k33
+    c, s, chord = direction.c, direction.s, direction.length
     ax, ay = -s, c
     nx, ny = c / chord, s / chord
     axial_i = k12

@@ -1,7 +1,16 @@
-"""Exponential of a small matrix by one thread in one order, so that it has the same bits on every engine.
+"""Exponential of a small matrix, computed by one thread in a fixed order, so that its bits are always the same.
 
-LAPACK's, on which :func:`scipy.linalg.expm` stands, divides a solve among its threads, and the last bit follows their
-number: a worker that has one thread would simulate another response than the process that has two.
+`scipy.linalg.expm` uses LAPACK, which may divide a solve among threads, and the last bit then depends on their number:
+a worker process with one thread would compute another response than a process with two.
+
+The method is scaling and squaring with a Taylor series (Moler & Van Loan 2003, methods 1 and 3)::
+
+    exp(a) = (sum_k (a / 2^s)^k / k!)^(2^s)
+
+References
+----------
+C. Moler, C. Van Loan, Nineteen dubious ways to compute the exponential of a matrix, twenty-five years later, SIAM
+Review 45(1), 2003, doi:10.1137/S00361445024180.
 """
 
 import numpy as np
@@ -11,22 +20,23 @@ from .jit import kernel
 __all__ = ["matrix_exponential"]
 
 _TERMS = 16
-_LARGEST = 1e15  # of a row sum: far beyond, yet few squarings
+_LARGEST = 1e15  # largest row sum; it needs some fifty squarings
 
 
 @kernel
 def matrix_exponential(a, out, work):
-    """exp(a) = (sum_k (a / 2^s)^k / k!)^(2^s), with s so that the largest row sum of a / 2^s is at most 1/2.
+    """Write exp(a) to `out`.
 
-    The terms after the last, k = 16, are together below 1e-19 of the sum.
+    The number of squarings s makes the largest row sum of a / 2^s at most 1/2. The series ends after k = 16; the terms
+    left out are together below 1e-19 of the sum.
 
     Parameters
     ----------
     a : ndarray (n, n)
     out : ndarray (n, n)
-        exp(a) is put here; NaN where `a` is not finite, or so large that the exponential could not be.
+        Written: exp(a), or NaN where `a` is not finite or a row sum is 1e15 or more.
     work : ndarray (2, n, n)
-        Overwritten.
+        Scratch.
     """
     n = a.shape[0]
     scaled, product = work[0], work[1]
@@ -45,7 +55,7 @@ def matrix_exponential(a, out, work):
     while norm * scale > 0.5:
         squarings += 1
         scale *= 0.5
-    # Horner: I + a (I + a/2 (I + a/3 (...)))
+    # Horner's scheme: I + a (I + a/2 (I + a/3 (...)))
     for i in range(n):
         for j in range(n):
             scaled[i, j] = scale * a[i, j]
@@ -66,7 +76,7 @@ def matrix_exponential(a, out, work):
 
 @kernel
 def _multiply(a, b, out):
-    """out = a b; zeros of a, of which a system of first order has many, cost nothing."""
+    """Write a b to `out`; zeros of `a`, of which a first-order system has many, are skipped."""
     n = a.shape[0]
     for i in range(n):
         for j in range(n):

@@ -1,29 +1,31 @@
 """Axial force and bending moment of a fiber section: core concrete, cover concrete and bars.
 
-Plane sections, eps = e0 - y kappa::
+Plane sections stay plane, eps = e0 - y kappa::
 
     N = sum(sigma A),   M = -sum(sigma A y)
     k = [[sum(E A), -sum(E A y)], [-sum(E A y), sum(E A y^2)]]
 
-A trial evaluation only reads the memory of the fibers; `commit` advances it. Most fibers of most trials lie within
-their memory, where Concrete04 is a choice between three straight lines: these are summed side by side (SIMD), the few
-beyond it one after the other. Bars that have never been committed beyond yield leave no trace: their stress is the
-backbone's, and well below yield that is a series (`reinforcing_steel.virgin_stress_tangent`), again side by side.
+A trial evaluation only reads the memory of the fibers; `commit` advances it. In most trials most fibers stay within
+the strains that they have reached before, where the stress of concrete is one of three straight lines. These fibers are
+summed side by side (SIMD); the few beyond are evaluated one after the other on the envelope. Bars that have never been
+committed beyond yield have no memory: their stress is that of the backbone, and well below yield that is a series
+(`reinforcing_steel.virgin_stress_tangent`), which is again evaluated side by side.
 
-The memory of all sections of a column is held in three arrays:
+Empty fibers (no area, at y = 0) may be appended to fill whole SIMD registers. Without them the remainder of a few
+fibers would take as long as all others. ``docs/theory/fiber_section.rst`` has the equations and the mesh.
 
-* ``concrete_memory`` (n_sections, 5, n_concrete): eps_min, eps_max, eps_end, slope, tension slope;
-* ``steel_memory`` (n_sections, n_bars, reinforcing_steel.N_STATE);
-* ``virgin`` (n_sections,): 1 while no bar of the section has been committed beyond yield, else 0; the memory of the
-  bars of a virgin section is not kept up.
-
-Fibers may be filled up with empty ones (no area, on the axis) to whole SIMD registers: a remainder of a few fibers
-would cost as much as all others.
-
-References: specs/bridge_column.md, section 4.
+References
+----------
+E. Spacone, F. C. Filippou, F. F. Taucer, Fibre beam-column model for non-linear analysis of R/C frames: part I,
+Earthquake Engineering and Structural Dynamics 25(7), 1996,
+doi:10.1002/(SICI)1096-9845(199607)25:7<711::AID-EQE576>3.0.CO;2-9.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
 
 from . import concrete04
 from .concrete04 import envelope, unloading
@@ -41,22 +43,62 @@ from .reinforcing_steel import (
     virgin_stress_tangent,
 )
 
-__all__ = ["reset", "forces", "commit", "release"]
+__all__ = ["Sections", "reset", "forces", "commit", "cross_jumps"]
 
-VERGE = 0.995
+NEAR_JUMP = 0.995
+"""Share of the strain of a stress jump of concrete from which on `cross_jumps` takes a fiber across it."""
 
 _EC = concrete04.EC
 
 
+class Sections(NamedTuple):
+    """Fibers of a section, and the memory of all sections that have these fibers.
+
+    Attributes
+    ----------
+    core_count : int
+        The first `core_count` concrete fibers are of the core, the others of the cover.
+    y, area : ndarray (n_concrete,)
+        Position [m] and area [m²] of the concrete fibers, with empty ones appended.
+    bar_y, bar_area : ndarray (n_bars or more,)
+        Position [m] and area [m²] of the bars, with empty ones appended.
+    concrete : ndarray (2, concrete04.N_CONSTANTS)
+        Constants of core and cover.
+    steel : ndarray (reinforcing_steel.N_CONSTANTS,)
+        Constants of the bars.
+    concrete_memory : ndarray (n_sections, 5, n_concrete)
+        eps_min, eps_max, eps_end, slope and tension slope of each fiber.
+    steel_memory : ndarray (n_sections, n_bars, reinforcing_steel.N_STATE)
+    virgin : ndarray (n_sections,)
+        1 while no bar of the section has been committed beyond yield, else 0. The memory of the bars of a virgin
+        section is not kept up to date.
+    trial : ndarray (reinforcing_steel.N_STATE,)
+        Scratch.
+    """
+
+    core_count: int
+    y: np.ndarray
+    area: np.ndarray
+    bar_y: np.ndarray
+    bar_area: np.ndarray
+    concrete: np.ndarray
+    steel: np.ndarray
+    concrete_memory: np.ndarray
+    steel_memory: np.ndarray
+    virgin: np.ndarray
+    trial: np.ndarray
+
+
 @kernel
-def reset(core_count, concrete, concrete_memory, steel_memory, virgin):
-    """Bring the memory of all sections into the virgin state, in place."""
-    steel_memory[:] = 0.0
-    virgin[:] = 1.0
+def reset(sections):
+    """Make the memory of all sections virgin, in place."""
+    concrete_memory = sections.concrete_memory
+    sections.steel_memory[:] = 0.0
+    sections.virgin[:] = 1.0
     n_sections, _, n = concrete_memory.shape
     for j in range(n_sections):
         for i in range(n):
-            ec = concrete[0 if i < core_count else 1, _EC]
+            ec = sections.concrete[0 if i < sections.core_count else 1, _EC]
             concrete_memory[j, 0, i] = 0.0
             concrete_memory[j, 1, i] = 0.0
             concrete_memory[j, 2, i] = 0.0
@@ -65,8 +107,8 @@ def reset(core_count, concrete, concrete_memory, steel_memory, virgin):
 
 
 @kernel(fastmath=SUM_REORDERING)
-def _concrete_beyond(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
-    """Sums over the concrete fibers beyond their memory only, on the envelope."""
+def _sum_envelope(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
+    """Sum over the concrete fibers beyond their extreme strains, which are on the envelope."""
     n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(y.shape[0]):
         yi = y[i]
@@ -84,8 +126,8 @@ def _concrete_beyond(e0, kappa, j, core_count, y, area, concrete, concrete_memor
 
 
 @kernel
-def _bars_one_by_one(e0, kappa, j, bar_y, bar_area, steel, steel_memory, virgin, trial):
-    """Sums over the bars where some are near or beyond yield."""
+def _sum_bars(e0, kappa, j, bar_y, bar_area, steel, steel_memory, virgin, trial):
+    """Sum over the bars, one after the other, where some are near or beyond yield."""
     n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(steel_memory.shape[1]):
         yi = bar_y[i]
@@ -104,35 +146,33 @@ def _bars_one_by_one(e0, kappa, j, bar_y, bar_area, steel, steel_memory, virgin,
 
 
 @kernel(inline=True, fastmath=SUM_REORDERING)
-def forces(
-    e0,
-    kappa,
-    j,
-    core_count,
-    y,
-    area,
-    concrete,
-    concrete_memory,
-    bar_y,
-    bar_area,
-    steel,
-    steel_memory,
-    virgin,
-    trial,
-):
-    """Axial force, moment and the three tangents (axial, coupling, bending) of section `j` at a trial strain.
+def forces(e0, kappa, j, sections):
+    """Return the forces and the tangent of section `j` at a trial strain.
 
-    y, area : (n_concrete,) fibers, the first `core_count` of the core. concrete : (2, concrete04.N_CONSTANTS) core and
-    cover. bar_y, bar_area : (n_bars or more,), filled up with empty bars. steel : (reinforcing_steel.N_CONSTANTS,).
-    trial : scratch (reinforcing_steel.N_STATE,).
+    Parameters
+    ----------
+    e0, kappa : float
+        Axial strain at y = 0, and curvature [1/m].
+    j : int
+        Number of the section.
+    sections : Sections
+
+    Returns
+    -------
+    n_force, moment : float
+        [N], [N m].
+    k_axial, k_coupling, k_bending : float
+        Tangent: dN/de0 [N], dN/dkappa = dM/de0 [N m], dM/dkappa [N m²].
     """
+    y, area, concrete_memory = sections.y, sections.area, sections.concrete_memory
+    bar_y, bar_area, steel = sections.bar_y, sections.bar_area, sections.steel
     n_force = 0.0
     moment = 0.0
     k_axial = 0.0
     k_coupling = 0.0
     k_bending = 0.0
     beyond = 0.0
-    # Every load stands before the choices, so that they become masks and not branches: half the time.
+    # All loads precede the choices, so that the compiler makes masks of them and no branches: this halves the time.
     for i in range(y.shape[0]):
         yi = y[i]
         eps = e0 - yi * kappa
@@ -156,14 +196,14 @@ def forces(
         k_coupling -= ea * yi
         k_bending += ea * yi * yi
     if beyond > 0.0:
-        a, b, c, d, e = _concrete_beyond(e0, kappa, j, core_count, y, area, concrete, concrete_memory)
+        a, b, c, d, e = _sum_envelope(e0, kappa, j, sections.core_count, y, area, sections.concrete, concrete_memory)
         n_force += a
         moment += b
         k_axial += c
         k_coupling += d
         k_bending += e
 
-    if virgin[j] == 1.0:
+    if sections.virgin[j] == 1.0:
         bars_n = 0.0
         bars_m = 0.0
         bars_axial = 0.0
@@ -193,13 +233,15 @@ def forces(
                 k_coupling + bars_coupling,
                 k_bending + bars_bending,
             )
-    a, b, c, d, e = _bars_one_by_one(e0, kappa, j, bar_y, bar_area, steel, steel_memory, virgin, trial)
+    a, b, c, d, e = _sum_bars(
+        e0, kappa, j, bar_y, bar_area, steel, sections.steel_memory, sections.virgin, sections.trial
+    )
     return n_force + a, moment + b, k_axial + c, k_coupling + d, k_bending + e
 
 
 @kernel
 def _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory):
-    """Advance the memory of the concrete fibers beyond it."""
+    """Advance the memory of the concrete fibers beyond their extreme strains."""
     for i in range(y.shape[0]):
         eps = e0 - y[i] * kappa
         if eps < concrete_memory[j, 0, i] or eps > concrete_memory[j, 1, i]:
@@ -214,7 +256,7 @@ def _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory):
 
 @kernel
 def _commit_bars(e0, kappa, j, bar_y, steel, steel_memory, virgin):
-    """Advance the memory of the bars of a section that is committed beyond yield, or has been before."""
+    """Advance the memory of the bars of a section that is, or has been, committed beyond yield."""
     if virgin[j] == 1.0:
         virgin[j] = 0.0
         steel_memory[j] = 0.0
@@ -223,8 +265,10 @@ def _commit_bars(e0, kappa, j, bar_y, steel, steel_memory, virgin):
 
 
 @kernel(inline=True, fastmath=SUM_REORDERING)
-def commit(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel, steel_memory, virgin):
+def commit(e0, kappa, j, sections):
     """Advance the memory of section `j` to the strains of (e0, kappa), in place."""
+    y, bar_y, steel, virgin = sections.y, sections.bar_y, sections.steel, sections.virgin
+    concrete_memory = sections.concrete_memory
     beyond = 0.0
     for i in range(y.shape[0]):
         eps = e0 - y[i] * kappa
@@ -233,7 +277,7 @@ def commit(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel,
         is_beyond = 1.0 if eps < eps_min else 0.0
         beyond += 1.0 if eps > eps_max else is_beyond
     if beyond > 0.0:
-        _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory)
+        _commit_concrete(e0, kappa, j, sections.core_count, y, sections.concrete, concrete_memory)
     beyond = 1.0
     if virgin[j] == 1.0:
         beyond = 0.0
@@ -241,27 +285,32 @@ def commit(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel,
         for i in range(bar_y.shape[0]):
             beyond += 1.0 if abs(e0 - bar_y[i] * kappa) >= limit else 0.0
     if beyond > 0.0:
-        _commit_bars(e0, kappa, j, bar_y, steel, steel_memory, virgin)
+        _commit_bars(e0, kappa, j, bar_y, steel, sections.steel_memory, virgin)
 
 
 @kernel
-def release(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel, steel_memory, virgin):
-    """Take the fibers of section `j` that stand on the verge of a jump of their stress across it; how many.
+def cross_jumps(e0, kappa, j, sections):
+    """Take the fibers of section `j` that are next to a jump of their stress across it, in place.
 
-    The laws have jumps: concrete loses its stress at once at eps_cu and at eps_tu, and a bar whose two backbones have
+    The laws have jumps. Concrete loses its stress at once at eps_cu and at eps_tu, and a bar whose two backbones have
     different origins changes from one to the other at zero stress (`reinforcing_steel.switch_backbone`). Where the
-    jump itself takes the fiber back, there is equilibrium neither before nor after it, however small the step. All
-    three jumps are for good, so a fiber that stands there is taken across. `VERGE` is the share of the strain from
-    which on concrete counts as there.
+    jump itself drives the fiber back, there is equilibrium neither before nor after it, however small the step is. None
+    of the three jumps can be undone, so a fiber next to one is taken across it.
+
+    Returns
+    -------
+    int
+        Number of fibers that were moved.
     """
+    y, concrete, concrete_memory = sections.y, sections.concrete, sections.concrete_memory
     count = 0
     for i in range(y.shape[0]):
-        c = concrete[0 if i < core_count else 1]
+        c = concrete[0 if i < sections.core_count else 1]
         eps = e0 - y[i] * kappa
         eps_min, eps_max = concrete_memory[j, 0, i], concrete_memory[j, 1, i]
-        if eps_min >= c[concrete04.ECU] and eps <= VERGE * c[concrete04.ECU]:
+        if eps_min >= c[concrete04.ECU] and eps <= NEAR_JUMP * c[concrete04.ECU]:
             eps_min = (1.0 + 1e-9) * c[concrete04.ECU]
-        elif eps_max <= c[concrete04.ETU] and eps >= VERGE * c[concrete04.ETU] and c[concrete04.FT] > 0.0:
+        elif eps_max <= c[concrete04.ETU] and eps >= NEAR_JUMP * c[concrete04.ETU] and c[concrete04.FT] > 0.0:
             eps_max = (1.0 + 1e-9) * c[concrete04.ETU]
         else:
             continue
@@ -272,7 +321,7 @@ def release(e0, kappa, j, core_count, y, concrete, concrete_memory, bar_y, steel
         concrete_memory[j, 3, i] = slope
         concrete_memory[j, 4, i] = tension_slope
         count += 1
-    if virgin[j] == 0.0:
-        for i in range(steel_memory.shape[1]):
-            count += switch_backbone(steel_memory[j, i], steel)
+    if sections.virgin[j] == 0.0:
+        for i in range(sections.steel_memory.shape[1]):
+            count += switch_backbone(sections.steel_memory[j, i], sections.steel)
     return count

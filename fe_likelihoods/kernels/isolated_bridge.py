@@ -1,74 +1,111 @@
-"""Two isolators on a linear structure, stepped by exponentials.
+"""Two isolators on a linear structure, integrated by an exponential method.
 
-Everything linear (structure, damping, Maxwell dampers, the rubber's linear term) goes into x' = A x + b a_g + B F,
-with F the remaining forces of the two isolators. Between two instants a_g and F are straight lines, so that ::
+All linear parts (structure, damping, Maxwell dampers, linear term of the rubber) form x' = A x + b a_g + B F, where F
+are the remaining forces of the two isolators. With a_g and F linear within a step, the step is exact::
 
     x_{n+1} = Phi x_n + G0 a_n + G1 a_{n+1} + H0 F_n + H1 F_{n+1}
 
-exactly (exponential integrator of first-order hold: no step is too long for the linear part). F_{n+1} is what the laws
-of `bearings` give at the bearing displacements and velocities y = Q x_{n+1}, two equations in two unknowns for Newton.
+This is an exponential integrator with a first-order hold. No step is too long for the stability of the linear part.
+F_{n+1} has to satisfy the laws of `bearings` at the bearing displacements and velocities y = Q x_{n+1}; Newton's method
+solves these two equations.
 
-The state is kept without its last term, r_n = x_n - H1 F_n: then one step is one product ::
+The recursion is written for r_n = x_n - H1 F_n, so that one step is one product::
 
-    [r_{n+1}, Q r_{n+1}] = T [r_n, a_n, a_{n+1}, F_n],     T's columns of F: Phi H1 + H0
+    [r_{n+1}, Q r_{n+1}] = T [r_n, a_n, a_{n+1}, F_n],     the columns of T for F_n are those of Phi H1 + H0
 
-Source: specs/isolated_bridge.md, section 7; Hochbruck & Ostermann, Exponential integrators, Acta Numerica 19 (2010).
+``docs/theory/time_integration.rst`` derives the scheme, ``docs/theory/isolated_bridge.rst`` the equations of motion.
+
+References
+----------
+M. Hochbruck, A. Ostermann, Exponential integrators, Acta Numerica 19, 2010, doi:10.1017/S0962492910000048.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
-from .bearings import BOUC_WEN, ELASTIC_PLASTIC, coulomb, elastic_plastic, regularised
+from .bearings import BOUC_WEN, ELASTIC_PLASTIC, RubberLaw, Slider, coulomb, elastic_plastic, regularised
 from .jit import kernel
 
-__all__ = ["N_OUT", "N_STATES", "step_isolated"]
+__all__ = ["N_OUT", "N_STATES", "Isolators", "StepMatrices", "step_isolated"]
 
 N_STATES = 12
 """Displacements (5), velocities (5), damper forces (2)."""
 N_OUT = 16
-"""Rows of the output: the state, the isolators' forces F (2), Z (2)."""
+"""Columns of the output: the state, the forces F of the isolators (2), Z (2)."""
+
+
+class StepMatrices(NamedTuple):
+    """Matrices of one step of the linear part.
+
+    Attributes
+    ----------
+    transposed : ndarray (16, 16)
+        T transposed: row j holds the contribution of input j of (r, a_n, a_{n+1}, F) to r and Q r.
+    end : ndarray (12, 2)
+        H1.
+    compliance : ndarray (4, 2)
+        Q H1, bearing displacements and velocities under F_{n+1}.
+    """
+
+    transposed: np.ndarray
+    end: np.ndarray
+    compliance: np.ndarray
+
+
+class Isolators(NamedTuple):
+    """Nonlinear laws of the isolators at the two piers.
+
+    Attributes
+    ----------
+    sliders : pair of bearings.Slider
+    rubber : bearings.RubberLaw
+        The same at both piers.
+    c : float
+        sqrt(gamma - beta) of the Bouc-Wen law.
+    form : int
+        `BOUC_WEN`, `ELASTIC_PLASTIC` or `COULOMB`.
+    """
+
+    sliders: tuple[Slider, Slider]
+    rubber: RubberLaw
+    c: float
+    form: int
 
 
 @kernel
-def step_isolated(
-    step_matrix, end, compliance, ground, weights, n_sub, bearing, c, law, form, tolerance, max_iterations, work, out
-):
+def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_iterations, work, out):
     """Integrate from rest.
 
     Parameters
     ----------
-    step_matrix : (16, 16) float
-        T, transposed: row j holds what input j (r, a_n, a_{n+1}, F) gives to r and Q r.
-    end : (12, 2) float
-        H1.
-    compliance : (4, 2) float
-        Q H1: bearing displacements and velocities under F_{n+1}.
-    ground : (n_steps,) float
-        Base acceleration at the samples of the record [m/s2]; straight lines between.
-    weights : (n_steps, 2) float
+    matrices : StepMatrices
+    isolators : Isolators
+    ground : ndarray (n_steps,)
+        Base acceleration at the samples of the record, linear between them [m/s²].
+    weights : ndarray (n_steps, 2)
         Normal load on the bearings at the samples [N].
     n_sub : int
-        Steps in one step of the record.
-    bearing : (2, 5) float
-        f_min [-], df [-], a [s/m], Y [m] and k0 [N/m] of each slider.
-    c : float
-        sqrt(gamma - beta) of the Bouc-Wen law.
-    law : (10,) float
-        Rubber, as in `bearings.rubber`.
-    form : int
-        BOUC_WEN, ELASTIC_PLASTIC, else COULOMB.
+        Integration steps per step of the record.
     tolerance : float
-        Of the last correction of F [N].
+        Largest last correction of F [N].
     max_iterations : int
-        Of Newton.
-    work : (2, 16) float
-        Memory.
-    out : (n_steps, 16) float
-        Filled: state, F, Z at the samples of the record.
+        Newton iterations per step.
+    work : ndarray (2, 16)
+        Scratch.
+    out : ndarray (n_steps, 16)
+        Written: state, F and Z at the samples of the record.
 
     Returns
     -------
-    (int, int) : 0, or the number of the step (from 1) that did not converge or is not finite; Newton iterations in all.
+    status : int
+        0, or the number (from 1) of the step that did not converge or is not finite.
+    iterations : int
+        Newton iterations of all steps.
     """
+    step_matrix, end, compliance = matrices.transposed, matrices.end, matrices.compliance
+    first, second = isolators.sliders
+    c, law, form = isolators.c, isolators.rubber, isolators.form
     u, r = work[0], work[1]
     for i in range(16):
         u[i] = 0.0
@@ -78,7 +115,7 @@ def step_isolated(
     d0 = d1 = 0.0  # bearing displacements
     c00, c01, c10, c11 = compliance[0, 0], compliance[0, 1], compliance[1, 0], compliance[1, 1]
     s00, s01, s10, s11 = compliance[2, 0], compliance[2, 1], compliance[3, 0], compliance[3, 1]
-    # a pull that makes force and velocity alike: the force that the step's compliance takes to change v
+    # factor that turns a velocity into a force: the change of F that changes v by one within the step
     pull0, pull1 = 1.0 / abs(s00), 1.0 / abs(s11)
     iterations = 0
     for k in range(ground.size - 1):
@@ -98,7 +135,7 @@ def step_isolated(
                         step_matrix[j + 2, i] * u2 + step_matrix[j + 3, i] * u3
                     )
             b0, b1, b2, b3 = r[12], r[13], r[14], r[15]
-            n0, n1 = 2.0 * f0 - before0, 2.0 * f1 - before1  # where a straight line leads
+            n0, n1 = 2.0 * f0 - before0, 2.0 * f1 - before1  # linear extrapolation as the first guess
             change = np.inf
             iteration = 0
             y0 = y1 = g0 = g1 = 0.0
@@ -110,15 +147,15 @@ def step_isolated(
                 v0, v1 = b2 + s00 * n0 + s01 * n1, b3 + s10 * n0 + s11 * n1
                 stick0 = stick1 = False
                 if form == BOUC_WEN:
-                    p0, k0, m0, g0 = regularised(y0 - d0, y0, v0, z0, w0, bearing[0], c, law)
-                    p1, k1, m1, g1 = regularised(y1 - d1, y1, v1, z1, w1, bearing[1], c, law)
+                    p0, k0, m0, g0 = regularised(y0 - d0, y0, v0, z0, w0, first, c, law)
+                    p1, k1, m1, g1 = regularised(y1 - d1, y1, v1, z1, w1, second, c, law)
                 elif form == ELASTIC_PLASTIC:
-                    p0, k0, m0, g0 = elastic_plastic(y0 - d0, y0, v0, z0, w0, bearing[0], c, law)
-                    p1, k1, m1, g1 = elastic_plastic(y1 - d1, y1, v1, z1, w1, bearing[1], c, law)
+                    p0, k0, m0, g0 = elastic_plastic(y0 - d0, y0, v0, z0, w0, first, c, law)
+                    p1, k1, m1, g1 = elastic_plastic(y1 - d1, y1, v1, z1, w1, second, c, law)
                 else:
-                    stick0, p0, k0, m0, g0 = coulomb(n0, y0, v0, pull0, w0, bearing[0], law)
-                    stick1, p1, k1, m1, g1 = coulomb(n1, y1, v1, pull1, w1, bearing[1], law)
-                # residual and its derivative: F - law(y(F)), or v(F) where a bearing sticks
+                    stick0, p0, k0, m0, g0 = coulomb(n0, y0, v0, pull0, w0, first, law)
+                    stick1, p1, k1, m1, g1 = coulomb(n1, y1, v1, pull1, w1, second, law)
+                # residual F - law(y(F)), or v(F) where a bearing sticks, and its derivatives
                 if stick0:
                     e0, j00, j01 = v0 * pull0, s00 * pull0, s01 * pull0
                 else:
@@ -134,7 +171,7 @@ def step_isolated(
                 n1 -= x1
                 change = max(abs(x0), abs(x1)) if x0 == x0 and x1 == x1 else np.nan
             iterations += iteration
-            # Z and the displacement that it belongs to, both before the last correction: they must not drift apart
+            # Z and its displacement are both kept from before the last correction, so that they stay consistent
             d0, d1, z0, z1 = y0, y1, g0, g1
             before0, before1 = f0, f1
             f0, f1 = n0, n1

@@ -1,9 +1,10 @@
-"""How the kernels are compiled: one decorator, and a disk cache that is never stale.
+"""The decorator that compiles kernels, and a disk cache that is never stale.
 
-numba keys its disk cache by the file that holds a function, so an edit in a *called* kernel of another file
-would leave an old machine code in use. Here the cache lies in a folder named by a hash of the sources of all
-kernels: any edit opens a new folder, an unchanged library starts without compiling. The same hash enters the
-fingerprint of every model, so that a result computed by other kernels is never taken for a current one.
+numba identifies cached machine code by the file that defines a function. It does not notice an edit of a kernel that
+this function calls in another file, and would keep using the old machine code. Here the cache folder is named after a
+hash of the sources of all kernels: any edit opens a new folder, and an unchanged library starts without compiling. The
+same hash is part of the fingerprint of every model, so that results of other kernels are never mistaken for current
+ones.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import numba
 __all__ = ["kernel", "KERNEL_HASH", "SUM_REORDERING"]
 
 SUM_REORDERING = {"reassoc", "contract", "nsz"}
-"""LLVM licence to reorder sums (SIMD reductions). Not `fastmath`: NaN and infinity keep their meaning."""
+"""LLVM flags that allow sums to be reordered, which SIMD reductions need. NaN and infinity keep their meaning, which
+full `fastmath` does not guarantee."""
 
 
 def _hash_sources() -> str:
@@ -35,7 +37,7 @@ KERNEL_HASH: str = _hash_sources()
 
 
 def _cache_folder() -> str:
-    """First writable of $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME, ~/.cache and the temporary folder."""
+    """Return the first writable folder below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME, ~/.cache, the temporary folder."""
     user = f"fe_likelihoods-{os.getuid()}" if hasattr(os, "getuid") else "fe_likelihoods"
     roots = [
         os.environ.get("FE_LIKELIHOODS_CACHE"),
@@ -51,7 +53,8 @@ def _cache_folder() -> str:
         except OSError:
             continue
     raise OSError(
-        f"no writable folder for compiled kernels among {roots}: set FE_LIKELIHOODS_CACHE to one that can be written"
+        f"expected a writable folder for compiled kernels; none of {[r for r in roots if r]} can be written: set the "
+        "environment variable FE_LIKELIHOODS_CACHE to a writable folder"
     )
 
 
@@ -63,25 +66,30 @@ def kernel(
 ) -> Callable:
     """Compile a kernel: no Python objects, no GIL, IEEE division, no allocation, cached on disk.
 
-    Kernels are compiled without numba's reference counting: every array comes from the caller, and an allocation is a
-    compile error. Counting the references of the arrays of a section cost more than its fibers (110 of 180 ns).
+    Kernels are compiled without numba's reference counting: the caller provides every array, and an allocation is a
+    compile error. Reference counting took 110 of the 180 ns of one evaluation of a section.
 
     Parameters
     ----------
     function : callable
-        The kernel in plain Python; it stays reachable as ``.py_func``.
+        The kernel in plain Python; it stays available as ``.py_func``.
     inline : bool
-        Merge the body into every caller: for functions of the hot loop that take arrays, because a call passes
-        about eight scalars for each array.
+        Merge the body into every caller. This is for functions of the inner loop that take arrays, because a call
+        passes about eight scalars per array.
     fastmath : set of str
-        LLVM flags; only `SUM_REORDERING` is used in this library.
+        LLVM flags; this library uses `SUM_REORDERING` only.
     cache : bool
-        Keep the machine code on disk. Functions that are only ever merged into others need none.
+        Keep the machine code on disk. Inlined functions are never cached on their own.
+
+    Returns
+    -------
+    callable
+        The compiled function, or a decorator where `function` is omitted.
     """
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _CACHE_FOLDER  # read by numba at decoration; other users' setting is put back
+    numba.config.CACHE_DIR = _CACHE_FOLDER  # numba reads it at decoration; it is restored below
     try:
         return numba.njit(
             nogil=True,

@@ -1,7 +1,12 @@
-"""Solution of the small banded symmetric systems of a column: A x = b by L D L', no pivoting.
+"""Solution of A x = b for the small banded symmetric matrices of a column, by A = L D L' without pivoting.
 
-A column of n elements has 3 n degrees of freedom numbered from the base up, so that the half bandwidth is 5. The
-tangent may be indefinite beyond a peak of the response; L D L' needs only non-zero pivots.
+A column of n elements has 3 n degrees of freedom, numbered from the base up, so that the half bandwidth is 5. The
+tangent may be indefinite after the peak of the force; L D L' needs non-zero pivots only (Golub & Van Loan 2013, section
+4.1.2). A zero pivot gives infinities or NaN, which the caller recognises as a failed iteration.
+
+References
+----------
+G. H. Golub, C. F. Van Loan, Matrix computations, 4th edition, Johns Hopkins University Press, 2013.
 """
 
 from __future__ import annotations
@@ -15,14 +20,14 @@ HALF_BANDWIDTH = 5
 
 @kernel(inline=True)
 def copy_vector(a, b):
-    """b <- a, element by element."""
+    """Copy the vector `a` to `b`."""
     for i in range(a.shape[0]):
         b[i] = a[i]
 
 
 @kernel(inline=True)
 def copy_matrix(a, b):
-    """b <- a, element by element."""
+    """Copy the matrix `a` to `b`."""
     for i in range(a.shape[0]):
         for k in range(a.shape[1]):
             b[i, k] = a[i, k]
@@ -30,7 +35,7 @@ def copy_matrix(a, b):
 
 @kernel
 def solve_banded(a, b):
-    """Overwrite `b` (n,) with the solution of a x = b; `a` (n, n) symmetric, its lower half is overwritten."""
+    """Overwrite `b` (n,) with the solution x of a x = b, and the lower half of the symmetric `a` (n, n)."""
     n = b.shape[0]
     for j in range(n):
         low = max(0, j - HALF_BANDWIDTH)

@@ -1,35 +1,43 @@
 """Response of a column to base acceleration: Newmark's average acceleration with Newton iterations.
 
-Equation of motion relative to the base, C = a0 M + a1 Kc with the tangent Kc (geometric part included) of the last
-committed step::
+The equation of motion relative to the base, with C = a0 M + a1 Kc and the tangent Kc (geometric part included) of the
+last committed step, is::
 
     M A + C V + p(U) = P - M r ag(t),       gamma = 1/2, beta = 1/4
 
-From the committed (U, V, A) a step of size h starts with U unchanged, V <- -V, A <- -A - 4 V/h, and each iteration
-solves (K + 2/h C + 4/h^2 M) dU = residual, then U += dU, V += 2 dU/h, A += 4 dU/h^2, until ``|dU|`` < tolerance.
+A step of size h starts from the committed (U, V, A) with U unchanged, V <- -V and A <- -A - 4 V/h. Each iteration
+solves (K + 2/h C + 4/h^2 M) dU = residual and sets U += dU, V += 2 dU/h, A += 4 dU/h^2, until ``|dU|`` < tolerance.
 
-A step that fails is retried with a tolerance a hundred times looser, then halved (ground acceleration linear within the
-step), again and again down to h / 2^halvings. Where that fails too, fibers on the verge of a jump of their stress are
-taken across it (`fiber_section.release`), as there may be no equilibrium before they are. The retries are counted, and
-a step that still fails ends the run with its number. Nothing is ever carried on unconverged.
+A step that fails is repeated with a tolerance that is a hundred times larger, then halved (ground acceleration linear
+within the step), repeatedly, down to h / 2^halvings. Where that fails too, there may be no equilibrium before some
+fibers have crossed a jump of their stress, and these are taken across it (`fiber_section.cross_jumps`). The retries are
+counted. A step that still fails ends the run, which returns the number of the step. No step is accepted unconverged.
 
-Energy is summed by the trapezoidal rule, with which average acceleration balances exactly up to the tolerance:
+Energies are summed by the trapezoidal rule. Average acceleration then balances them exactly up to the tolerance:
 kinetic + damped + absorbed = input.
 
-References: Newmark (1959), J. Eng. Mech. Div. ASCE 85(EM3); specs/bridge_column.md, sections 7 and 9.
+``docs/theory/time_integration.rst`` derives the scheme.
+
+References
+----------
+N. M. Newmark, A method of computation for structural dynamics, Journal of the Engineering Mechanics Division 85(3),
+1959, doi:10.1061/JMCEA3.0000098.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from .beam_column import HEAD
-from .frame import assemble, commit_sections, release_sections
+from .frame import assemble, commit_sections, cross_jumps
 from .jit import kernel
 from .linear_solve import copy_matrix, solve_banded
-from .static import LOOSER, MAX_RELEASES, apply_gravity
+from .static import LOOSENING, MAX_CROSSINGS, Position, apply_gravity
 
-__all__ = ["HISTORY_ROWS", "newmark"]
+__all__ = ["HISTORY_ROWS", "Dynamics", "newmark"]
 
 HISTORY_ROWS = (
     "relative displacement",
@@ -47,33 +55,73 @@ HISTORY_ROWS = (
 )
 
 
+class Dynamics(NamedTuple):
+    """Loads, inertia and damping of a column.
+
+    Attributes
+    ----------
+    gravity : ndarray (n_dof,)
+        Static load [N and N m].
+    mass : ndarray (n_dof,)
+        Diagonal of the mass matrix [kg and kg m²].
+    a0, a1 : float
+        Rayleigh damping: factors of the mass [1/s] and of the committed tangent stiffness [s].
+    velocity : float
+        Initial velocity of the top along x [m/s].
+    """
+
+    gravity: np.ndarray
+    mass: np.ndarray
+    a0: float
+    a1: float
+    velocity: float
+
+
 @kernel(inline=True)
 def _record_forces(column, force, out):
-    """Restoring force of the top, and e0, kappa, N, M of the base section, into `out` (5,)."""
+    """Write the restoring force of the top, and e0, kappa, N and M of the base section, to `out` (5,)."""
+    state = column.elements.state
     out[0] = force
-    out[1] = column.element_state[0, HEAD]
-    out[2] = column.element_state[0, HEAD + 1]
-    out[3] = column.element_state[0, HEAD + 5]
-    out[4] = column.element_state[0, HEAD + 6]
+    out[1] = state[0, HEAD]
+    out[2] = state[0, HEAD + 1]
+    out[3] = state[0, HEAD + 5]
+    out[4] = state[0, HEAD + 6]
 
 
 @kernel
-def newmark(
-    column, gravity, mass, a0, a1, ground, dt, tolerance, max_iterations, halvings, every, initial_velocity, history
-):
-    """Gravity, then base acceleration `ground` (n,) at steps of `dt` along x.
+def newmark(column, dynamics, ground, dt, every, iteration, history):
+    """Apply gravity, then the base acceleration `ground` along x.
 
-    gravity, mass : (n_dof,) static load and diagonal mass. every : one sample in `every` steps is kept.
-    initial_velocity : of the top, along x. history : (12, n_kept) out, rows as HISTORY_ROWS.
-    Returns (status, retries, iterations): status 0 when all went well, -1 when gravity failed, k when step k failed.
+    Parameters
+    ----------
+    column : Column
+    dynamics : Dynamics
+    ground : ndarray (n_steps,)
+        Base acceleration [m/s²].
+    dt : float
+        Step [s].
+    every : int
+        One sample in `every` steps is recorded.
+    iteration : static.Iteration
+    history : ndarray (12, n_recorded)
+        Written; rows as in `HISTORY_ROWS`.
+
+    Returns
+    -------
+    status : int
+        0 on success, -1 when gravity failed, k when step k failed.
+    retries, iterations : int
     """
+    gravity, mass, a0, a1 = dynamics.gravity, dynamics.mass, dynamics.a0, dynamics.a1
+    initial_velocity = dynamics.velocity
+    tolerance, max_iterations, halvings = iteration.tolerance, iteration.max_iterations, iteration.halvings
     n = gravity.shape[0]
     rows = column.vectors
     u, v, a, force, damping, du = rows[4], rows[5], rows[6], rows[7], rows[8], rows[9]
     u_old, v_old, a_old, force_old, damping_old = rows[10], rows[11], rows[12], rows[13], rows[14]
-    # matrices[1] and vectors[:4] are scratch of the static steps of gravity
+    # the static steps of gravity use matrices[1] and vectors[:4]
     matrix, stiffness, committed, base = column.matrices[0], column.matrices[2], column.matrices[3], column.matrices[4]
-    retries = apply_gravity(column, u, gravity, force, stiffness, tolerance, max_iterations, halvings)
+    retries = apply_gravity(column, Position(u, force, stiffness), gravity, iteration)
     if retries < 0:
         return -1, 0, 0
     top = n - 3
@@ -82,7 +130,7 @@ def newmark(
         a[i] = 0.0
     v[top] = initial_velocity
     copy_matrix(stiffness, committed)  # Kc
-    for i in range(n):  # C V at the last committed instant
+    for i in range(n):  # C V of the last committed instant
         damping[i] = a0 * mass[i] * v[i]
         for k in range(n):
             damping[i] += a1 * committed[i, k] * v[k]
@@ -103,12 +151,12 @@ def newmark(
     _record_forces(column, force[top], history[7:, 0])
 
     for step in range(1, ground.shape[0]):
-        done, part, loose, releases = 0.0, 1.0, False, 0
+        done, part, loose, crossings = 0.0, 1.0, False, 0
         while done < 1.0:
             h = part * dt
             at_start = ground[step - 1] + done * (ground[step] - ground[step - 1])
             at_end = ground[step - 1] + (done + part) * (ground[step] - ground[step - 1])
-            limit = LOOSER * tolerance if loose else tolerance
+            limit = LOOSENING * tolerance if loose else tolerance
             for i in range(n):
                 u_old[i] = u[i]
                 v_old[i] = v[i]
@@ -120,7 +168,7 @@ def newmark(
                 for k in range(n):
                     base[i, k] = 2.0 / h * a1 * committed[i, k]
                 base[i, i] += (2.0 / h * a0 + 4.0 / (h * h)) * mass[i]
-            copy_matrix(column.element_state, column.element_state_before)
+            copy_matrix(column.elements.state, column.state_before)
 
             converged = False
             for _ in range(max_iterations):
@@ -156,15 +204,15 @@ def newmark(
                     a[i] = a_old[i]
                     force[i] = force_old[i]
                 copy_matrix(committed, stiffness)
-                copy_matrix(column.element_state_before, column.element_state)
+                copy_matrix(column.state_before, column.elements.state)
                 if not loose:
                     loose = True
                     continue
                 loose = False
                 part *= 0.5
                 if part < smallest:
-                    releases += 1
-                    if releases > MAX_RELEASES or release_sections(column) == 0:
+                    crossings += 1
+                    if crossings > MAX_CROSSINGS or cross_jumps(column) == 0:
                         return step, retries, total_iterations
                     part = 1.0 - done
                 continue

@@ -1,28 +1,41 @@
-"""Reinforcing steel: yield plateau, hardening, Menegotto-Pinto reversals (OpenSees ``ReinforcingSteel``).
+"""Reinforcing steel: yield plateau, strain hardening, and reversals along curves of Menegotto and Pinto.
 
-The law works in natural coordinates, x = ln(1 + eps), and is returned in engineering ones::
+The law works with the natural strain x = ln(1 + eps) and the natural stress s. Arguments and results are engineering
+quantities::
 
     sigma = s/(1 + eps),   d sigma/d eps = (E - s)/(1 + eps)^2
 
-Backbone s_b(x), odd in x (specs/bridge_column.md, 3.2): a smooth knee s = z [(E0-Ep)/(1+q^10)^.1 + Ep],
-q = (E0-Ep) z/f0, up to the plateau; a parabola over the transition; strain hardening
-s = fsh + (z-shp) Eu + (fsu-fsh)(1-w^p), w = (up-z)/(up-shp), up to the ultimate strain.
+The backbone s_b(x) is odd in x. With z = |x|::
 
-Between reversals the path is a curve of Menegotto and Pinto from (xa, sa, Ea) to (xb, sb, Eb) (3.3)::
+    up to a        s = z [(E0-Ep)/(1+q^10)^0.1 + Ep],   q = (E0-Ep) z/f0       elastic range, knee and plateau
+    up to shp+d    s = (EhT-Ep)(z-a)^2/(2 (shp+d-a)) + Ep z + f0               transition
+    up to up       s = fsh + (z-shp) Eu + (fsu-fsh)(1-w^p),   w = (up-z)/(up-shp)    strain hardening
+    beyond         s = fsu + (z-shp) Eu
+
+Between reversals the path is a curve of Menegotto and Pinto from (xa, sa, Ea) to (xb, sb, Eb)::
 
     s = sa + Ea (x-xa) [Q - (Q-1)/(1+t^R)^(1/R)],   t = |Ea (x-xa)/(s_ch-sa)|
 
-Which curve is followed is told by a branch number: 1 and 2 are the backbones in tension and compression, 3, 5, 7 ...
-the curves of ever deeper nested reversals that start downwards from tension, 4, 6, 8 ... their mirror images (3.4).
-A branch b > 2 keeps its curve in the slot of level (b+1)//2. Only the rules of the odd branches are written; an even
-branch is run through them with all strains and stresses mirrored.
+A branch number selects the curve. Branches 1 and 2 are the backbones in tension and compression. Branches 3, 5, 7 ...
+are the curves of successively nested reversals of which the first goes down from tension; 4, 6, 8 ... are their mirror
+images. A branch b > 2 keeps its curve in the slot of level (b+1)//2. Only the rules of the odd branches are written
+out. An even branch is processed by the same rules with the signs of all strains and stresses changed.
 
-Buckling, fatigue and isotropic hardening are off, as by default in OpenSees.
+The law is that of the material ReinforcingSteel of OpenSees with its default options: no buckling, no fatigue, no
+isotropic hardening. ``docs/theory/reinforcing_steel.rst`` lists all rules.
 
 References
 ----------
-Chang & Mander (1994), NCEER-94-0006; Dodd & Restrepo-Posada (1995), J. Struct. Eng. 121(3);
-Menegotto & Pinto (1973), IABSE; Kunnath, Heo & Mohle (2009), J. Struct. Eng. 135(4).
+G. A. Chang, J. B. Mander, Seismic energy based fatigue damage analysis of bridge columns, part I, report
+NCEER-94-0006, 1994.
+
+M. Menegotto, P. E. Pinto, Method of analysis for cyclically loaded R.C. plane frames, IABSE Symposium, Lisbon, 1973.
+
+L. L. Dodd, J. I. Restrepo-Posada, Model for predicting cyclic behavior of reinforcing steel, Journal of Structural
+Engineering 121(3), 1995, doi:10.1061/(ASCE)0733-9445(1995)121:3(433).
+
+S. K. Kunnath, Y. Heo, J. F. Mohle, Nonlinear uniaxial material model for reinforcing steel bars, Journal of Structural
+Engineering 135(4), 2009, doi:10.1061/(ASCE)0733-9445(2009)135:4(335).
 """
 
 from __future__ import annotations
@@ -48,20 +61,32 @@ __all__ = [
 E0, FYP, YP, SHP, FSH, UP, EU, FSU, EH, EP, F0, P, FT, EHT, A_SHIFT, VIRGIN_LIMIT, YIELD_STRAIN = range(17)
 N_CONSTANTS = 17
 
-# Layout of the memory of one fiber: scalars, then nine numbers for the curve of each level 2..10.
+# Layout of the memory of one bar: ten scalars, then nine numbers for the curve of each level from 2 to 10.
 BRANCH, OP, ON, XMAX, XMIN, XXMAX, XXMIN, RE, XC, SC, CURVES = range(11)
 XA, SA, EA, XB, SB, EB, RR, QQ, SCH = range(9)
 N_STATE = 10 + 9 * 9
 
 TRANSITION = 0.0002  # strain over which the plateau turns into hardening
-TIE = 1e-14  # strains closer than this are equal
-NEAR_ZERO = 1e-6  # strain from the origin of a backbone within which a bar counts as being there
-VIRGIN_Q = 0.6  # the series of virgin_stress_tangent are exact to round-off up to here
+TIE = 1e-14  # strains closer than this count as equal
+NEAR_ZERO = 1e-6  # a bar this close to the origin of its backbone counts as being at the origin [strain]
+VIRGIN_Q = 0.6  # largest q for which the series of virgin_stress_tangent are exact to round-off
 
 
 @kernel
 def constants(fy, fu, es, esh, eps_sh, eps_u, out):
-    """Fill `out` (N_CONSTANTS,) from the six material constants in engineering coordinates (any consistent units)."""
+    """Fill `out` with the constants of one steel.
+
+    Parameters
+    ----------
+    fy, fu : float
+        Yield strength and ultimate strength [Pa].
+    es, esh : float
+        Modulus and modulus at the onset of hardening [Pa].
+    eps_sh, eps_u : float
+        Engineering strains at the onset of hardening and at `fu`.
+    out : ndarray (N_CONSTANTS,)
+        Overwritten. Any other consistent unit of stress serves as well.
+    """
     out[YP] = math.log(1.0 + fy / es)
     out[FYP] = fy * (1.0 + fy / es)
     out[E0] = out[FYP] / out[YP]
@@ -78,15 +103,15 @@ def constants(fy, fu, es, esh, eps_sh, eps_u, out):
     out[FT] = out[FSH] + TRANSITION * out[EU] + (out[FSU] - out[FSH]) * (1.0 - w ** out[P])
     out[EHT] = out[EH] * ((out[FSU] - out[FT]) / (out[FSU] - out[FSH])) ** (1.0 - 1.0 / out[P])
     out[A_SHIFT] = out[SHP] + TRANSITION - 2.0 * (out[FT] - out[FSH]) / out[EHT]
-    # Smallest strain of either sign beyond which a reversal leaves a trace, |ln(1+eps)| < yp.
+    # A reversal changes the memory where |ln(1+eps)| >= yp; this is the smaller of the two strains.
     out[YIELD_STRAIN] = 1.0 - math.exp(-out[YP])
-    # Strain up to which the series below hold: q < .6 and eps < .01.
+    # The series below hold up to this strain: q < 0.6 and eps < 0.01.
     out[VIRGIN_LIMIT] = min(VIRGIN_Q * out[F0] / (out[E0] - out[EP]), 0.01)
 
 
 @kernel
 def backbone(x, c):
-    """Natural stress and modulus of the monotonic curve at natural strain `x`."""
+    """Return natural stress and modulus of the monotonic curve at the natural strain `x`."""
     z = abs(x)
     if z <= c[A_SHIFT]:
         q = (c[E0] - c[EP]) * z / c[F0]
@@ -112,10 +137,10 @@ def backbone(x, c):
 
 @kernel(inline=True, fastmath=SUM_REORDERING)
 def virgin_stress_tangent(eps, e0, ep, f0):
-    """Engineering stress and tangent well below yield, where no reversal has left a trace: the backbone as series.
+    """Return engineering stress and tangent of the backbone well below yield, from series.
 
-    For ``|eps| < VIRGIN_LIMIT`` the truncated series of ln(1+eps) and (1+q^10)^-.1 are exact to round-off; they need
-    neither a logarithm nor a power, so that a section evaluates its bars side by side.
+    For ``|eps| < VIRGIN_LIMIT`` the truncated series of ln(1+eps) and (1+q^10)^-0.1 are exact to round-off. They need
+    neither a logarithm nor a power, so that a section can evaluate its bars side by side (SIMD).
     """
     x = -0.125
     x = eps * x + 1.0 / 7.0
@@ -144,15 +169,16 @@ def virgin_stress_tangent(eps, e0, ep, f0):
 
 @kernel
 def _fit_residual(a, r, ea, eb, es):
-    """g(A) of the Menegotto-Pinto fit: zero where the curve ends at (xb, sb) with slope Eb."""
+    """Return g(A) of the Menegotto-Pinto fit, which is zero where the curve ends at (xb, sb) with slope Eb."""
     return eb - es * (1.0 - a ** (r + 1.0)) / (1.0 - a) + ea * a * (1.0 - a**r) / (1.0 - a)
 
 
 @kernel
 def _fit_root(r, ea, eb, es, r_min):
-    """Root A in (0, 1) of `_fit_residual`, by the search whose stopping rule the reference results carry.
+    """Return the root A in (0, 1) of `_fit_residual`.
 
-    A stops within 1e-4, so the search itself, not only the equation, fixes the last digits of the stress.
+    The search stops when A changes by less than 1e-4, so its steps affect the last digits of the stress. They follow
+    OpenSees, to which the stress histories of the tests belong.
     """
     alpha = 0.01
     for _ in range(60):
@@ -186,7 +212,10 @@ def _fit_root(r, ea, eb, es, r_min):
 
 @kernel
 def _fit(xa, sa, ea, xb, sb, eb, clip, c, curve):
-    """Curve from (xa, sa, ea) to (xb, sb, eb) into `curve` (9,); `clip` keeps the slopes astride the chord's."""
+    """Fit the curve from (xa, sa, ea) to (xb, sb, eb) and write it to `curve` (9,).
+
+    `clip` moves an end slope that is on the wrong side of the slope of the chord to the other side of it.
+    """
     es = (sb - sa) / (xb - xa) if xb != xa else ea
     if clip:
         if es < eb:
@@ -202,7 +231,7 @@ def _fit(xa, sa, ea, xb, sb, eb, clip, c, curve):
             r_min = max(0.0, (eb - es) / (es - ea))
             if r <= r_min:
                 r = r_min + 0.01
-            # The chord not between the end slopes: no curve, A = 0 makes it the straight line to the target.
+            # Where the slope of the chord is not between the end slopes there is no curve: A = 0 gives a straight line.
             a = _fit_root(r, ea, eb, es, r_min) if r_min > 0.0 else 0.0
         q = (es / ea - a) / (1.0 - a)
         sch = sa + ea * (xb - xa) * a / (1.0 - a**r) ** (1.0 / r)
@@ -213,13 +242,14 @@ def _fit(xa, sa, ea, xb, sb, eb, clip, c, curve):
 
 @kernel
 def _on_curve(x, curve):
-    """Natural stress and modulus of a Menegotto-Pinto curve at `x`."""
+    """Return natural stress and modulus of a Menegotto-Pinto curve at the natural strain `x`."""
     ea, q, r = curve[EA], curve[QQ], curve[RR]
     dx = x - curve[XA]
     if dx == 0.0:
         return curve[SA], ea
     t = abs(ea * dx / (curve[SCH] - curve[SA]))
-    # (1 + t^R)^(1/R) and t^R/(1 + t^R). R up to 1e13 occurs where the clip makes Ea = Es = Eb: no overflow to nan.
+    # (1 + t^R)^(1/R) and t^R/(1 + t^R). Where the clip makes Ea, Es and Eb nearly equal, R reaches 1e13 and t^R would
+    # overflow to NaN.
     power = t**r
     if power < 1e100:
         root = (1.0 + power) ** (1.0 / r)
@@ -235,13 +265,13 @@ def _on_curve(x, curve):
 
 @kernel
 def _mirror_branch(b):
-    """1 <-> 2, 3 <-> 4, ..."""
+    """Return the branch of the other sign: 1 <-> 2, 3 <-> 4, ..."""
     return b + 1 if b % 2 == 1 else b - 1
 
 
 @kernel
 def _mirror(state):
-    """Change the sign of every strain and stress of the memory, in place: tension becomes compression."""
+    """Change the sign of every strain and stress of the memory in place, so that tension becomes compression."""
     state[BRANCH] = _mirror_branch(int(state[BRANCH]))
     state[OP], state[ON] = -state[ON], -state[OP]
     state[XMAX], state[XMIN] = -state[XMIN], -state[XMAX]
@@ -260,13 +290,13 @@ def _mirror(state):
 
 @kernel
 def _slot(branch):
-    """Where the memory keeps the curve of a branch > 2."""
+    """Return the position in the memory of the curve of a branch > 2."""
     return CURVES + 9 * ((branch + 1) // 2 - 2)
 
 
 @kernel
 def _returning_curve(xc, state, c, curve):
-    """Auxiliary curve of branches 5 and 7: where a path that reversed at `xc` on branch 5 would rejoin branch 3."""
+    """Write to `curve` the auxiliary curve on which a path that reversed at `xc` on branch 5 returns to branch 3."""
     two, three = state[_slot(3) :], state[_slot(5) :]
     xa2, xb2, ea2 = two[XA], two[XB], two[EA]
     xa3, xb3 = three[XA], three[XB]
@@ -278,9 +308,24 @@ def _returning_curve(xc, state, c, curve):
 
 @kernel
 def _step(x, tension, state, c):
-    """One transition of an odd branch at trial strain `x`; True, stress, modulus when no further one is due.
+    """Make one transition of an odd branch at the natural strain `x`.
 
-    `tension` tells a branch from the mirror image of its even twin: one rule holds on the tension side only.
+    Parameters
+    ----------
+    x : float
+        Trial strain.
+    tension : bool
+        False for an even branch, which is processed as the mirror image of an odd one. One rule holds in tension only.
+    state : ndarray (N_STATE,)
+        Memory, changed in place.
+    c : ndarray (N_CONSTANTS,)
+
+    Returns
+    -------
+    done : bool
+        False where another transition has to follow.
+    stress, modulus : float
+        Natural stress and modulus, valid where `done`.
     """
     b = int(state[BRANCH])
     xc, sc = state[XC], state[SC]
@@ -379,9 +424,9 @@ def _step(x, tension, state, c):
 
 @kernel
 def update(eps, state, c):
-    """Advance the memory of one fiber to the strain `eps`, in place; returns engineering stress and tangent.
+    """Advance the memory of one bar to the strain `eps` in place, and return engineering stress and tangent.
 
-    A trial works on a copy of the committed memory; to commit is to work on the memory itself.
+    A trial works on a copy of the committed memory, a commit on the memory itself.
     """
     x = math.log(1.0 + eps) if eps > -0.95 else math.nan
     if state[BRANCH] == 0.0:
@@ -407,16 +452,16 @@ def update(eps, state, c):
 
 @kernel
 def monotonic_stress_tangent(eps, c):
-    """Engineering stress and tangent on the backbone: all there is as long as no strain beyond yield was committed."""
+    """Return engineering stress and tangent of the backbone; a bar stays on it until it is committed beyond yield."""
     s, modulus = backbone(math.log(1.0 + eps) if eps > -0.95 else math.nan, c)
     return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
 
 
 @kernel
 def stress_tangent(eps, state, c, trial):
-    """Stress and tangent at a trial strain, `state` untouched; `trial` (N_STATE,) is scratch.
+    """Return engineering stress and tangent at the trial strain `eps` without changing `state`.
 
-    A trial that goes on along its branch needs no copy of the memory.
+    `trial` (N_STATE,) is scratch. A trial that continues on its branch needs no copy of the memory.
     """
     x = math.log(1.0 + eps) if eps > -0.95 else math.nan
     b = int(state[BRANCH])
@@ -427,7 +472,8 @@ def stress_tangent(eps, state, c, trial):
             s, modulus = _on_curve(x, curve)
             return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
     elif b > 0:
-        # On the backbone: going on, or where a reversal leaves no trace, or beyond zero on the other one.
+        # The stress follows from a backbone alone where the strain goes on, where it reverses below yield (which leaves
+        # the memory as it is), and where it passes zero, on the other backbone.
         sign = 1.0 if b == 1 else -1.0
         origin, other = (state[OP], state[ON]) if b == 1 else (state[ON], state[OP])
         onwards = sign * (x - state[XC]) >= 0.0
@@ -446,10 +492,15 @@ def stress_tangent(eps, state, c, trial):
 
 @kernel
 def switch_backbone(state, c):
-    """Change a bar at zero stress from one backbone to the other, in place; 1 if it stands there, else 0.
+    """Move a bar that is at the origin of its backbone to the other backbone, in place.
 
-    After small yielding the backbones in tension and compression have different origins, and the law jumps from one to
-    the other where the stress of the present one passes zero.
+    After small yielding the backbones in tension and compression have different origins. The law jumps from one to the
+    other where the stress on the present one passes zero.
+
+    Returns
+    -------
+    int
+        1 if the bar was at the origin and has been moved, else 0.
     """
     b = int(state[BRANCH])
     if b != 1 and b != 2 or state[OP] == state[ON]:
@@ -465,6 +516,6 @@ def switch_backbone(state, c):
 
 @kernel
 def stress_history(strain, state, c, stress):
-    """Engineering `stress` (n,) out of one bar taken through `strain` (n,), its memory carried on in place."""
+    """Take one bar through `strain` (n,), write its engineering `stress` (n,), and advance its memory in place."""
     for i in range(strain.shape[0]):
         stress[i], _ = update(strain[i], state, c)

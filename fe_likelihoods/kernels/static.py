@@ -1,43 +1,110 @@
-"""Static analysis of a column: gravity, and reversed lateral displacement imposed at the top.
+"""Static analysis of a column: gravity, and a lateral displacement imposed at the top.
 
-Newton on equilibrium with the tangent; where a lateral displacement is imposed, the row of that degree of freedom is
-replaced by its increment, and the force it takes is the restoring force there. A step that does not converge is
-retried with a tolerance a hundred times looser, then halved, and what was committed before stays; at the smallest part,
-fibers on the verge of a jump of their stress are taken across it (`fiber_section.release`).
+Newton's method on the equilibrium of forces, K du = load - force(u), with the tangent K. Where a displacement is
+imposed, its increment replaces the row of that degree of freedom, and the force that it takes is the restoring force
+there. A step that does not converge is repeated with a tolerance that is a hundred times larger, then halved. At the
+smallest part of a step, fibers next to a jump of their stress are taken across it (`fiber_section.cross_jumps`).
 
-References: specs/bridge_column.md, sections 1, 8 and 9.
+``docs/theory/time_integration.rst`` describes the steps and the retries.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from .beam_column import HEAD
-from .frame import assemble, commit_sections, initialise_column, release_sections
+from .frame import assemble, commit_sections, cross_jumps, initialise_column
 from .jit import kernel
 from .linear_solve import copy_matrix, copy_vector, solve_banded
 
-__all__ = ["GRAVITY_STEPS", "LOOSER", "MAX_RELEASES", "equilibrate", "apply_gravity", "impose_displacement"]
+__all__ = [
+    "GRAVITY_STEPS",
+    "LOOSENING",
+    "MAX_CROSSINGS",
+    "Iteration",
+    "Position",
+    "equilibrate",
+    "apply_gravity",
+    "impose_displacement",
+]
 
 GRAVITY_STEPS = 10
-LOOSER = 100.0
-MAX_RELEASES = 20
+LOOSENING = 100.0
+"""Factor on the tolerance when a step is repeated."""
+MAX_CROSSINGS = 20
+"""How often stress jumps may be crossed in one step."""
+
+
+class Iteration(NamedTuple):
+    """Settings of Newton's method.
+
+    Attributes
+    ----------
+    tolerance : float
+        Norm of the last correction [m and rad].
+    max_iterations : int
+        Iterations of one attempt.
+    halvings : int
+        How often a step may be halved.
+    """
+
+    tolerance: float
+    max_iterations: int
+    halvings: int
+
+
+class Position(NamedTuple):
+    """Displacements of the structure with the forces and the tangent that belong to them.
+
+    Attributes
+    ----------
+    u : ndarray (n,)
+        Displacements [m and rad].
+    force : ndarray (n,)
+        Restoring forces [N and N m].
+    stiffness : ndarray (n, n)
+    """
+
+    u: np.ndarray
+    force: np.ndarray
+    stiffness: np.ndarray
 
 
 @kernel
-def equilibrate(column, u, load, imposed, increment, force, stiffness, tolerance, max_iterations):
-    """Newton iterations to equilibrium with `load` (n,), in place; False when they fail, everything put back.
+def equilibrate(column, position, load, imposed, increment, tolerance, max_iterations):
+    """Iterate to equilibrium with a load, in place.
 
-    imposed : degree of freedom that moves by `increment` whatever force it takes, or -1. On entry `force` and
-    `stiffness` belong to `u`; on success they belong to the new `u` and the fibers are committed.
+    Parameters
+    ----------
+    column : Column
+    position : Position
+        Consistent on entry, and on return in either case.
+    load : ndarray (n,)
+        [N and N m]
+    imposed : int
+        Degree of freedom that moves by `increment`, whatever force it takes; -1 for none.
+    increment : float
+        [m or rad]
+    tolerance : float
+        Norm of the last correction [m and rad].
+    max_iterations : int
+
+    Returns
+    -------
+    bool
+        True on success, and the fibers are committed. False on failure, and everything is as it was.
     """
+    u, force, stiffness = position.u, position.force, position.stiffness
     n = u.shape[0]
     du, u_before, force_before = column.vectors[0], column.vectors[1], column.vectors[2]
     matrix, stiffness_before = column.matrices[0], column.matrices[1]
     copy_vector(u, u_before)
     copy_vector(force, force_before)
     copy_matrix(stiffness, stiffness_before)
-    copy_matrix(column.element_state, column.element_state_before)
+    copy_matrix(column.elements.state, column.state_before)
     step = increment
     for _ in range(max_iterations):
         for i in range(n):
@@ -65,69 +132,70 @@ def equilibrate(column, u, load, imposed, increment, force, stiffness, tolerance
     copy_vector(u_before, u)
     copy_vector(force_before, force)
     copy_matrix(stiffness_before, stiffness)
-    copy_matrix(column.element_state_before, column.element_state)
+    copy_matrix(column.state_before, column.elements.state)
     return False
 
 
 @kernel
-def _advance_to(
-    column, u, load, total, share, imposed, increment, force, stiffness, tolerance, max_iterations, halvings
-):
-    """Add `share` of the load `total` and an imposed displacement, halved where it does not converge.
+def _advance_to(column, position, load, total, share, imposed, increment, iteration):
+    """Add `share` of the load `total` and an imposed displacement, in halved steps where it does not converge.
 
-    Returns the number of retries, or -1 when it failed.
+    Returns
+    -------
+    int
+        Number of retries, or -1 on failure.
     """
-    done, part, retries, releases = 0.0, 1.0, 0, 0
-    smallest = 0.5**halvings
+    done, part, retries, crossings = 0.0, 1.0, 0, 0
+    smallest = 0.5**iteration.halvings
+    tolerance, max_iterations = iteration.tolerance, iteration.max_iterations
     while done < 1.0:
-        for i in range(u.shape[0]):
+        for i in range(load.shape[0]):
             load[i] += part * share * total[i]
         move = part * increment
-        converged = equilibrate(column, u, load, imposed, move, force, stiffness, tolerance, max_iterations)
+        converged = equilibrate(column, position, load, imposed, move, tolerance, max_iterations)
         if not converged:
             retries += 1
-            converged = equilibrate(
-                column, u, load, imposed, move, force, stiffness, LOOSER * tolerance, max_iterations
-            )
+            converged = equilibrate(column, position, load, imposed, move, LOOSENING * tolerance, max_iterations)
         if converged:
             done += part
             continue
-        for i in range(u.shape[0]):
+        for i in range(load.shape[0]):
             load[i] -= part * share * total[i]
         part *= 0.5
         if part < smallest:
-            releases += 1
-            if releases > MAX_RELEASES or release_sections(column) == 0:
+            crossings += 1
+            if crossings > MAX_CROSSINGS or cross_jumps(column) == 0:
                 return -1
             part = 1.0 - done
     return retries
 
 
 @kernel
-def apply_gravity(column, u, gravity, force, stiffness, tolerance, max_iterations, halvings):
-    """Virgin column under `gravity` (n,) in ten equal steps; number of retries, or -1 when it failed."""
+def apply_gravity(column, position, gravity, iteration):
+    """Make the column virgin and apply the load `gravity` (n,) [N and N m] in ten equal steps.
+
+    Parameters
+    ----------
+    column : Column
+    position : Position
+        Overwritten.
+    gravity : ndarray (n,)
+    iteration : Iteration
+
+    Returns
+    -------
+    int
+        Number of retries, or -1 on failure.
+    """
     initialise_column(column)
     load = column.vectors[3]
-    for i in range(u.shape[0]):
-        u[i] = 0.0
+    for i in range(load.shape[0]):
+        position.u[i] = 0.0
         load[i] = 0.0
-    assemble(u, column, force, stiffness)
+    assemble(position.u, column, position.force, position.stiffness)
     total = 0
     for _ in range(GRAVITY_STEPS):
-        retries = _advance_to(
-            column,
-            u,
-            load,
-            gravity,
-            1.0 / GRAVITY_STEPS,
-            -1,
-            0.0,
-            force,
-            stiffness,
-            tolerance,
-            max_iterations,
-            halvings,
-        )
+        retries = _advance_to(column, position, load, gravity, 1.0 / GRAVITY_STEPS, -1, 0.0, iteration)
         if retries < 0:
             return -1
         total += retries
@@ -135,35 +203,37 @@ def apply_gravity(column, u, gravity, force, stiffness, tolerance, max_iteration
 
 
 @kernel
-def impose_displacement(column, gravity, targets, tolerance, max_iterations, halvings, history):
-    """Gravity, then the lateral displacement of the top through `targets` (n_steps,); 0 or (-1 gravity, k step failed).
+def impose_displacement(column, gravity, targets, iteration, history):
+    """Apply gravity, then move the top laterally through `targets`.
 
-    history : (8, n_steps) out: ux, uy, theta of the top, lateral force, and e0, kappa, N, M of the base section.
-    Returns (status, retries): status 0 when all went well, -1 when gravity failed, k > 0 when step k failed.
+    Parameters
+    ----------
+    column : Column
+    gravity : ndarray (n,)
+        Load [N and N m].
+    targets : ndarray (n_steps,)
+        Lateral displacement of the top [m].
+    iteration : Iteration
+    history : ndarray (8, n_steps)
+        Written: ux, uy and theta of the top, lateral force, and e0, kappa, N and M of the base section.
+
+    Returns
+    -------
+    status : int
+        0 on success, -1 when gravity failed, k > 0 when step k failed.
+    retries : int
     """
     u, force, load = column.vectors[4], column.vectors[5], column.vectors[3]
-    stiffness = column.matrices[2]
-    retries = apply_gravity(column, u, gravity, force, stiffness, tolerance, max_iterations, halvings)
+    position = Position(u, force, column.matrices[2])
+    state = column.elements.state
+    retries = apply_gravity(column, position, gravity, iteration)
     if retries < 0:
         return -1, 0
     top = gravity.shape[0] - 3
     for step in range(targets.shape[0]):
         increment = targets[step] - u[top]
         if increment != 0.0:
-            more = _advance_to(
-                column,
-                u,
-                load,
-                gravity,
-                0.0,
-                top,
-                increment,
-                force,
-                stiffness,
-                tolerance,
-                max_iterations,
-                halvings,
-            )
+            more = _advance_to(column, position, load, gravity, 0.0, top, increment, iteration)
             if more < 0:
                 return step + 1, retries
             retries += more
@@ -171,8 +241,8 @@ def impose_displacement(column, gravity, targets, tolerance, max_iterations, hal
         history[1, step] = u[top + 1]
         history[2, step] = u[top + 2]
         history[3, step] = force[top]
-        history[4, step] = column.element_state[0, HEAD]
-        history[5, step] = column.element_state[0, HEAD + 1]
-        history[6, step] = column.element_state[0, HEAD + 5]
-        history[7, step] = column.element_state[0, HEAD + 6]
+        history[4, step] = state[0, HEAD]
+        history[5, step] = state[0, HEAD + 1]
+        history[6, step] = state[0, HEAD + 5]
+        history[7, step] = state[0, HEAD + 6]
     return 0, retries

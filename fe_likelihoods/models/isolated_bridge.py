@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC
-from ..kernels.isolated_bridge import N_OUT, N_STATES, step_isolated
+from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Slider
+from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, step_isolated
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
@@ -72,7 +72,7 @@ class _Prepared(NamedTuple):
     linear: BridgeStateSpace
     to_channels: csr_array
     weights: np.ndarray  # (n_steps, 2) load on the bearings at the samples of the record [N]
-    law: np.ndarray  # (10,) constants of the rubber
+    law: RubberLaw
     tolerance: float  # of a correction of the isolator forces [N]
     rubber_range: float  # bearing displacement up to which the law of the rubber holds [m]
 
@@ -270,7 +270,7 @@ class IsolatedBridge(ThreadedModel):
             # Sparse, because a dense product is left to BLAS, whose last bit depends on its number of threads.
             to_channels=csr_array(channel_matrix(matrices, self.piers, self.outputs)),
             weights=np.maximum(0.0, 1.0 + lift)[:, None] * load,
-            law=np.array([*rubber.skeleton[1:], *rubber.half_loop, rubber.scale, rubber.limit]),
+            law=RubberLaw(*map(float, (*rubber.skeleton[1:], *rubber.half_loop, rubber.scale, rubber.limit))),
             tolerance=self.tolerance * load.min(),
             rubber_range=rubber.limit * rubber.scale,
         )
@@ -282,26 +282,25 @@ class IsolatedBridge(ThreadedModel):
         prepared = self._prepared
         dampers = [Damper(v[f"Kd_{i}"], v[f"C0_{i}"], damper.count) for i, damper in enumerate(self.dampers, 1)]
         matrices = prepared.linear.step_matrices(dampers, self.step, constant_forces=self.friction == "coulomb")
-        bearing = np.array(
-            [
-                [v[f"fmin_{i}"], v[f"df_{i}"], v[f"a_{i}"], b.yield_displacement]
-                + [v[f"fmin_{i}"] * b.load / b.yield_displacement]
-                for i, b in enumerate(self.bearings, 1)
-            ]
+        first, second = (
+            Slider(
+                f_min=float(v[f"fmin_{i}"]),
+                df=float(v[f"df_{i}"]),
+                a=float(v[f"a_{i}"]),
+                yield_displacement=float(bearing.yield_displacement),
+                stiffness=float(v[f"fmin_{i}"] * bearing.load / bearing.yield_displacement),
+            )
+            for i, bearing in enumerate(self.bearings, 1)
         )
+        c = math.sqrt(2.0 * self.bearings[0].gamma - 1.0)
         out = np.zeros((self.record.n_steps, N_OUT))
         n_sub = round(self.record.dt / self.step)
         status, iterations = step_isolated(
-            matrices.step,
-            matrices.end,
-            matrices.compliance,
+            matrices,
+            Isolators((first, second), prepared.law, c, _FORMS[self.friction]),
             self.record.acceleration,
             prepared.weights,
             n_sub,
-            bearing,
-            math.sqrt(2.0 * self.bearings[0].gamma - 1.0),
-            prepared.law,
-            _FORMS[self.friction],
             prepared.tolerance,
             self.max_iterations,
             np.zeros((2, 16)),

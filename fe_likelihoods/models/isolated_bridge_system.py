@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels.exponential import matrix_exponential
-from ..kernels.isolated_bridge import N_STATES
+from ..kernels.isolated_bridge import N_STATES, StepMatrices
 from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
 
-__all__ = ["BridgeMatrices", "BridgeStateSpace", "StepMatrices"]
+__all__ = ["BridgeMatrices", "BridgeStateSpace"]
 
 
 class BridgeMatrices(NamedTuple):
@@ -64,24 +64,6 @@ class BridgeMatrices(NamedTuple):
         h1, h2 = (pier.height for pier in piers)
         kinematics = np.array([[1.0, -1.0, -h1, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0, -h2]])
         return cls(mass, damping, stiffness, kinematics, rubber.linear_stiffness)
-
-
-class StepMatrices(NamedTuple):
-    """Matrices of one step, as `fe_likelihoods.kernels.isolated_bridge.step_isolated` takes them.
-
-    Attributes
-    ----------
-    step : ndarray[16, 16]
-        T, transposed.
-    end : ndarray[12, 2]
-        H1: states from the forces F at the end of the step.
-    compliance : ndarray[4, 2]
-        Q H1: bearing displacements and velocities from the forces F at the end of the step.
-    """
-
-    step: np.ndarray
-    end: np.ndarray
-    compliance: np.ndarray
 
 
 class BridgeStateSpace(NamedTuple):

@@ -31,12 +31,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..kernels.frame import allocate
+from ..kernels.newmark import Dynamics
+from ..kernels.static import Iteration
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from ..units import G0, find_unit, to_si
 from .circular_section import Confinement, gauss_lobatto
-from .rc_column_analysis import BaseMotion, ColumnHistory, ImposedMotion, Solver, set_materials
+from .rc_column_analysis import BaseMotion, ColumnHistory, ImposedMotion, set_materials
 from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
 from .rc_column_section import ReinforcedSection
 from .threaded import ThreadedModel
@@ -338,14 +340,15 @@ class RCColumn(ThreadedModel):
             penetration=values["penetration"],
         )
         set_materials(column, values, self.concrete, self.steel, prepared.section.confinement(values["fc"]))
-        solver = Solver(self.tolerance, self.max_iterations, self.halvings)
+        iteration = Iteration(float(self.tolerance), int(self.max_iterations), int(self.halvings))
         gravity = np.zeros(3 * self.n_elements)
         gravity[-2] = -(self.axial_load if self.axial_load is not None else values["mass"] * G0)
         if isinstance(prepared.motion, ImposedMotion):
-            return prepared.motion.run(column, gravity, solver)
+            return prepared.motion.run(column, gravity, iteration)
         mass = np.zeros(3 * self.n_elements)
         mass[-3:] = values["mass"], values["mass"] * self.vertical_mass, self.rotational_inertia
-        return prepared.motion.run(column, gravity, mass, values["a0"], values["a1"], solver)
+        dynamics = Dynamics(gravity, mass, float(values["a0"]), float(values["a1"]), 0.0)
+        return prepared.motion.run(column, dynamics, iteration)
 
     @property
     def _time_label(self) -> str:

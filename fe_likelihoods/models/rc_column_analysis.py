@@ -13,15 +13,15 @@ import numpy as np
 
 from ..kernels import concrete04, reinforcing_steel
 from ..kernels.frame import Column
-from ..kernels.newmark import HISTORY_ROWS, newmark
-from ..kernels.static import impose_displacement
+from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
+from ..kernels.static import Iteration, impose_displacement
 from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from .base import History
 from .circular_section import Confinement
 from .rc_column_parts import Concrete, Steel
 
-__all__ = ["BaseMotion", "ColumnHistory", "ImposedMotion", "Solver", "set_materials"]
+__all__ = ["BaseMotion", "ColumnHistory", "ImposedMotion", "set_materials"]
 
 _IMPOSED_ROWS = (
     "displacement",
@@ -52,24 +52,6 @@ class ColumnHistory(History):
     retries: int
 
 
-class Solver(NamedTuple):
-    """Settings of the Newton iterations.
-
-    Attributes
-    ----------
-    tolerance : float
-        Largest norm of the last correction [m and rad].
-    max_iterations : int
-        Most iterations per attempt.
-    halvings : int
-        How often a step may be halved before the simulation counts as failed.
-    """
-
-    tolerance: float
-    max_iterations: int
-    halvings: int
-
-
 class BaseMotion(NamedTuple):
     """Base acceleration, interpolated to the integration steps.
 
@@ -97,29 +79,13 @@ class BaseMotion(NamedTuple):
         acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
         return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
 
-    def run(
-        self, column: Column, gravity: np.ndarray, mass: np.ndarray, a0: float, a1: float, solver: Solver
-    ) -> ColumnHistory:
+    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration) -> ColumnHistory:
         """Integrate the equations of motion; SimulationFailed if a step does not converge."""
         history = np.zeros((len(HISTORY_ROWS), self.n_steps))
-        status, retries, _ = newmark(
-            column,
-            gravity,
-            mass,
-            a0,
-            a1,
-            self.acceleration,
-            self.dt,
-            solver.tolerance,
-            solver.max_iterations,
-            solver.halvings,
-            self.substeps,
-            0.0,
-            history,
-        )
+        status, retries, _ = newmark(column, dynamics, self.acceleration, self.dt, self.substeps, iteration, history)
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
-            raise SimulationFailed(_reason(status, len(self.acceleration), at, solver.halvings))
+            raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings))
         return ColumnHistory(HISTORY_ROWS, history, retries)
 
 
@@ -143,12 +109,12 @@ class ImposedMotion(NamedTuple):
         finer = history.subdivide(max_increment)
         return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices))
 
-    def run(self, column: Column, gravity: np.ndarray, solver: Solver) -> ColumnHistory:
+    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration) -> ColumnHistory:
         """Solve the static equilibrium at each target; SimulationFailed if a step does not converge."""
         history = np.zeros((len(_IMPOSED_ROWS), len(self.targets)))
-        status, retries = impose_displacement(column, gravity, self.targets, *solver, history)
+        status, retries = impose_displacement(column, gravity, self.targets, iteration, history)
         if status:
-            raise SimulationFailed(_reason(status, len(self.targets), "", solver.halvings))
+            raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings))
         return ColumnHistory(_IMPOSED_ROWS, history[:, self.kept], retries)
 
 
@@ -162,8 +128,9 @@ def set_materials(
     core_ultimate = max(confinement.ultimate_strain, 1.05 * core_peak)
     cover_ultimate = max(concrete.ultimate_strain, 1.5 * peak)
     tension = (ec, ft, ft / ec + concrete.softening_strain, concrete.softening_ratio)
-    concrete04.constants(-fc * confinement.strength_ratio, -core_peak, -core_ultimate, *tension, column.concrete[0])
-    concrete04.constants(-fc, -peak, -cover_ultimate, *tension, column.concrete[1])
+    core, cover = column.sections.concrete
+    concrete04.constants(-fc * confinement.strength_ratio, -core_peak, -core_ultimate, *tension, core)
+    concrete04.constants(-fc, -peak, -cover_ultimate, *tension, cover)
     reinforcing_steel.constants(
         values["fy"],
         values["fu"],
@@ -171,7 +138,7 @@ def set_materials(
         values["Esh"],
         steel.hardening_strain,
         steel.ultimate_strain,
-        column.steel,
+        column.sections.steel,
     )
 
 

@@ -114,9 +114,9 @@ def column(
         cover=fibers.cover,
         bars=fibers.bars,
     )
-    concrete04.constants(*map(float, core), out.concrete[0])
-    concrete04.constants(*map(float, cover), out.concrete[1])
-    reinforcing_steel.constants(*map(float, steel), out.steel)
+    concrete04.constants(*map(float, core), out.sections.concrete[0])
+    concrete04.constants(*map(float, cover), out.sections.concrete[1])
+    reinforcing_steel.constants(*map(float, steel), out.sections.steel)
     frame.initialise_column(out)
     return out
 
@@ -182,40 +182,13 @@ def _steel_history(strain, c, state, out):
 @kernel
 def section_forces(e0, kappa, column, section=0):
     """N, M and the three tangents of one section of a column, at its committed memory."""
-    return fiber_section.forces(
-        e0,
-        kappa,
-        section,
-        column.core_count,
-        column.y,
-        column.area,
-        column.concrete,
-        column.concrete_memory,
-        column.bar_y,
-        column.bar_area,
-        column.steel,
-        column.steel_memory,
-        column.virgin,
-        column.trial,
-    )
+    return fiber_section.forces(e0, kappa, section, column.sections)
 
 
 @kernel
 def section_commit(e0, kappa, column):
     """Commit the first section of a column."""
-    fiber_section.commit(
-        e0,
-        kappa,
-        0,
-        column.core_count,
-        column.y,
-        column.concrete,
-        column.concrete_memory,
-        column.bar_y,
-        column.steel,
-        column.steel_memory,
-        column.virgin,
-    )
+    fiber_section.commit(e0, kappa, 0, column.sections)
 
 
 @kernel

@@ -9,7 +9,7 @@ import pytest
 
 from fe_likelihoods.kernels import concrete04, frame, reinforcing_steel
 from fe_likelihoods.kernels.beam_column import HEAD, PER_SECTION
-from fe_likelihoods.kernels.static import equilibrate
+from fe_likelihoods.kernels.static import Position, equilibrate
 
 from . import golden
 
@@ -30,7 +30,7 @@ def advance(column, v):
     """Bring the element to basic deformations `v`; whether it converged, Q, and K as a matrix."""
     u = np.array([v[1] * column.length, v[0], v[2] - v[1]])
     converged = golden.restore(u, column, np.zeros(3), np.zeros((3, 3)))
-    row = column.element_state[0]
+    row = column.elements.state[0]
     return converged, row[:3].copy(), symmetric(row[3:9])
 
 
@@ -47,10 +47,11 @@ def section_matrix(xi):
 
 def stiffness_of_section(column):
     """EA and EI of the virgin section."""
-    modulus = np.where(np.arange(column.y.size) < column.core_count, *column.concrete[:, concrete04.EC])
-    steel = column.steel[reinforcing_steel.E0]
-    ea = modulus @ column.area + steel * column.bar_area.sum()
-    return ea, (modulus * column.area) @ column.y**2 + steel * column.bar_area @ column.bar_y**2
+    s = column.sections
+    modulus = np.where(np.arange(s.y.size) < s.core_count, *s.concrete[:, concrete04.EC])
+    steel = s.steel[reinforcing_steel.E0]
+    ea = modulus @ s.area + steel * s.bar_area.sum()
+    return ea, (modulus * s.area) @ s.y**2 + steel * s.bar_area @ s.bar_y**2
 
 
 def basic_forces_by_hand(column, v, scheme):
@@ -58,9 +59,9 @@ def basic_forces_by_hand(column, v, scheme):
 
     scheme: 0 current flexibilities, 1 the initial ones in every pass, 2 the initial ones in the first pass.
     """
-    row = column.element_state[0]
+    row = column.elements.state[0]
     sections = row[HEAD:].reshape(-1, PER_SECTION)
-    a, b, c = column.initial_flexibility
+    a, b, c = column.elements.initial_flexibility
     initial = np.array([[a, b], [b, c]])
     deformation = sections[:, :2].copy()
     flexibility = [np.array([[s[2], s[3]], [s[3], s[4]]]) for s in sections]
@@ -69,7 +70,7 @@ def basic_forces_by_hand(column, v, scheme):
     for number in range(100 if scheme == 1 else 10):
         from_start = scheme == 1 or (scheme == 2 and number == 0)
         residual, compliance = v.copy(), np.zeros((3, 3))
-        for m, (xi, weight) in enumerate(zip(column.points, column.tributary[0], strict=True)):
+        for m, (xi, weight) in enumerate(zip(column.elements.points, column.elements.tributary[0], strict=True)):
             along = section_matrix(xi)
             used = initial if from_start else flexibility[m]
             deformation[m] += used @ (along @ q - resisting[m])
@@ -84,7 +85,7 @@ def basic_forces_by_hand(column, v, scheme):
             return None
         correction = np.linalg.solve(compliance, residual)
         q = q + correction
-        if abs(residual @ correction) < column.element_tolerance:
+        if abs(residual @ correction) < column.elements.tolerance:
             return q
     return None
 
@@ -107,9 +108,10 @@ def test_elastic_cantilever_is_closed_form(n_elements, n_points):
     p, axial = 1e-11 * ei / (24.0 * h), -1e-12 * ea
     load = np.zeros(n)
     load[-3:-1] = p, axial
-    u, force, stiffness = np.zeros(n), np.zeros(n), np.zeros((n, n))
-    assert golden.restore(u, column, force, stiffness)
-    assert equilibrate(column, u, load, -1, 0.0, force, stiffness, 1e-18, 20)
+    position = Position(np.zeros(n), np.zeros(n), np.zeros((n, n)))
+    u = position.u
+    assert golden.restore(u, column, position.force, position.stiffness)
+    assert equilibrate(column, position, load, -1, 0.0, 1e-18, 20)
     trapezoidal = 1.0 + 1.0 / (2.0 * n_elements**2) if n_points == 2 else 1.0
     assert u[-3] == pytest.approx(p * h**3 / (3 * ei) * trapezoidal, rel=1e-8)
     assert u[-1] == pytest.approx(-p * h**2 / (2 * ei), rel=1e-8)
@@ -125,7 +127,7 @@ def test_initial_stiffness_is_that_of_a_beam(n_points):
     expected = [[ea / length, 0, 0], [0, 4 * ei / length, 2 * ei / length], [0, 2 * ei / length, 4 * ei / length]]
     if n_points == 2:
         expected = [[ea / length, 0, 0], [0, 2 * ei / length, 0], [0, 0, 2 * ei / length]]
-    stiffness = symmetric(column.element_state[0, 3:9])
+    stiffness = symmetric(column.elements.state[0, 3:9])
     np.testing.assert_allclose(stiffness, expected, rtol=1e-13, atol=1e-12 * ei / length)
 
 
@@ -144,10 +146,10 @@ MILD = np.array([0.02, 2e-3, 2e-3])
 def test_tangent_is_the_derivative(rng):
     """Consistent where no fiber changes its branch between the two neighbours."""
     column = single(element_tolerance=1e-22)
-    scale = np.diag(1.0 / np.sqrt(np.diag(symmetric(column.element_state[0, 3:9]))))
+    scale = np.diag(1.0 / np.sqrt(np.diag(symmetric(column.elements.state[0, 3:9]))))
     errors = []
     for _ in states(rng, column, 40, MILD):
-        v = column.element_state[0, 9:12] + rng.normal(size=3) * 0.1 * MILD
+        v = column.elements.state[0, 9:12] + rng.normal(size=3) * 0.1 * MILD
         converged, _, tangent = advance(column, v)
         if not converged:
             continue
@@ -178,15 +180,15 @@ def test_sections_are_in_equilibrium_and_compatible_when_converged(rng):
     column = single(element_tolerance=1e-16)
     seen = 0
     for v in states(rng, column, 60, MILD):
-        row = column.element_state[0]
+        row = column.elements.state[0]
         integral = np.zeros(3)
         for m, section in enumerate(row[HEAD:].reshape(-1, PER_SECTION)):
-            along = section_matrix(column.points[m])
+            along = section_matrix(column.elements.points[m])
             unbalanced = along @ row[:3] - section[5:]
             assert abs(unbalanced[0]) < 1e-3  # kip, of thousands
             assert abs(unbalanced[1]) < 1e-2  # kip in, of tens of thousands
             flexibility = np.array([[section[2], section[3]], [section[3], section[4]]])
-            weight = column.tributary[0, m]
+            weight = column.elements.tributary[0, m]
             integral += weight * along.T @ (section[:2] + flexibility @ unbalanced)
         np.testing.assert_allclose(integral, v, rtol=0, atol=1e-8 * MILD.max())
         seen += 1
@@ -205,9 +207,9 @@ def test_every_rung_of_the_ladder_is_reached(rng):
     for _ in range(20):
         column = single()
         for _ in states(rng, column, 3, MILD):
-            before = column.element_state.copy()
+            before = column.elements.state.copy()
             for v in rng.normal(size=(6, 3)) * 8.0 * MILD:
-                column.element_state[:] = before
+                column.elements.state[:] = before
                 attempts = (basic_forces_by_hand(column, v, scheme) for scheme in (0, 1, 2))
                 rung, expected = next(((i, q) for i, q in enumerate(attempts) if q is not None), (None, None))
                 converged, q, _ = advance(column, v)
@@ -217,12 +219,12 @@ def test_every_rung_of_the_ladder_is_reached(rng):
                     np.testing.assert_allclose(q, expected, rtol=1e-7, atol=1e-5)
                 elif converged:
                     counts["subdivision"] += 1
-                    np.testing.assert_allclose(column.element_state[0, 9:12], v, rtol=0, atol=1e-15)
-                    column.element_state[:] = before
+                    np.testing.assert_allclose(column.elements.state[0, 9:12], v, rtol=0, atol=1e-15)
+                    column.elements.state[:] = before
                     start = before[0, 9:12]
                     if all(advance(column, start + part * (v - start))[0] for part in np.linspace(0.002, 1.0, 500)):
-                        gaps.append(np.abs(q - column.element_state[0, :3]).max() / np.abs(q).max())
-            column.element_state[:] = before
+                        gaps.append(np.abs(q - column.elements.state[0, :3]).max() / np.abs(q).max())
+            column.elements.state[:] = before
     assert min(counts.values()) > 3
     assert len(gaps) > 3
     assert np.median(gaps) < 1e-6
@@ -232,24 +234,24 @@ def test_every_rung_of_the_ladder_is_reached(rng):
 def test_hopeless_deformation_is_reported_and_leaves_no_trace(v, rng):
     column = single()
     list(states(rng, column, 3, MILD))
-    before = column.element_state.copy()
+    before = column.elements.state.copy()
     converged, _, _ = advance(column, np.array(v))
     assert not converged
-    np.testing.assert_array_equal(column.element_state, before)
+    np.testing.assert_array_equal(column.elements.state, before)
 
 
 def test_unchanged_deformation_evaluates_nothing(rng):
     column = single()
     v = list(states(rng, column, 3, MILD))[-1]
-    before = column.element_state.copy()
+    before = column.elements.state.copy()
     assert advance(column, v)[0]
-    np.testing.assert_array_equal(column.element_state, before)
+    np.testing.assert_array_equal(column.elements.state, before)
 
 
 def test_initial_flexibility_is_that_of_the_section():
     column = single()
     ea, ei = stiffness_of_section(column)
-    np.testing.assert_allclose(column.initial_flexibility, [1 / ea, 0.0, 1 / ei], rtol=1e-13, atol=1e-20)
+    np.testing.assert_allclose(column.elements.initial_flexibility, [1 / ea, 0.0, 1 / ei], rtol=1e-13, atol=1e-20)
 
 
 def test_initialise_column_forgets_everything(rng):
@@ -257,5 +259,7 @@ def test_initialise_column_forgets_everything(rng):
     column, new = single(), single()
     list(states(rng, column, 5, MILD))
     frame.initialise_column(column)
-    for name in ("element_state", "concrete_memory", "steel_memory", "virgin", "initial_flexibility"):
-        np.testing.assert_array_equal(getattr(column, name), getattr(new, name))
+    for name in ("concrete_memory", "steel_memory", "virgin"):
+        np.testing.assert_array_equal(getattr(column.sections, name), getattr(new.sections, name))
+    for name in ("state", "initial_flexibility"):
+        np.testing.assert_array_equal(getattr(column.elements, name), getattr(new.elements, name))

@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from fe_likelihoods.kernels import bearings
 from fe_likelihoods.kernels.jit import kernel
 
-BEARING = np.array([0.055, 0.065, 24.0, 0.13e-3, 0.055 * 70e3 / 0.13e-3])
-LAW = np.array([250.0, 100.0, 150.0, 1500.0, 7500.0, 450.0, 100.0, 250.0, 0.05, 1.2])
+BEARING = bearings.Slider(0.055, 0.065, 24.0, 0.13e-3, 0.055 * 70e3 / 0.13e-3)
+LAW = bearings.RubberLaw(250.0, 100.0, 150.0, 1500.0, 7500.0, 450.0, 100.0, 250.0, 0.05, 1.2)
 C = math.sqrt(0.8)
 
 
@@ -20,18 +20,18 @@ def bouc_wen(increment, z, y, c):
 
 
 @kernel
-def regularised(increment, displacement, velocity, z, weight, bearing, c, law):
-    return bearings.regularised(increment, displacement, velocity, z, weight, bearing, c, law)
+def regularised(increment, displacement, velocity, z, weight, slider, c, law):
+    return bearings.regularised(increment, displacement, velocity, z, weight, slider, c, law)
 
 
 @kernel
-def elastic_plastic(increment, displacement, velocity, z, weight, bearing, c, law):
-    return bearings.elastic_plastic(increment, displacement, velocity, z, weight, bearing, c, law)
+def elastic_plastic(increment, displacement, velocity, z, weight, slider, c, law):
+    return bearings.elastic_plastic(increment, displacement, velocity, z, weight, slider, c, law)
 
 
 @kernel
-def coulomb(total, displacement, velocity, pull, weight, bearing, law):
-    return bearings.coulomb(total, displacement, velocity, pull, weight, bearing, law)
+def coulomb(total, displacement, velocity, pull, weight, slider, law):
+    return bearings.coulomb(total, displacement, velocity, pull, weight, slider, law)
 
 
 @kernel
@@ -94,11 +94,11 @@ def test_rubber_is_the_polynomial_and_its_tangent_beyond():
 
 def test_an_elastic_plastic_slider_slides_at_the_friction_of_its_speed():
     capacity = (0.055 + 0.065 * (1.0 - math.exp(-24.0 * 0.1))) * 70e3
-    no_rubber = np.array([0.0] * 8 + [0.05, 1.2])
+    no_rubber = bearings.RubberLaw(*[0.0] * 8, 0.05, 1.2)
     force, *_, slider = elastic_plastic(0.01, 0.01, 0.1, 0.0, 70e3, BEARING, C, no_rubber)
     assert force == slider == pytest.approx(capacity, rel=1e-14)
     force, *_, slider = elastic_plastic(-1e-6, 0.01, -0.1, slider, 70e3, BEARING, C, no_rubber)
-    assert slider == pytest.approx(capacity - BEARING[4] * 1e-6, rel=1e-14)
+    assert slider == pytest.approx(capacity - BEARING.stiffness * 1e-6, rel=1e-14)
 
 
 def test_coulomb_sticks_within_the_bound_and_slides_beyond():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels.corotational import add_to_stiffness, deformations
+from fe_likelihoods.kernels.corotational import BasicForces, add_to_stiffness, deformations
 from fe_likelihoods.kernels.jit import kernel
-from fe_likelihoods.kernels.static import apply_gravity, equilibrate
+from fe_likelihoods.kernels.static import Iteration, Position, apply_gravity, equilibrate
 
 from . import golden
 from .test_beam_column import stiffness_of_section, symmetric
@@ -18,11 +18,11 @@ STIFFNESS = np.array([7.0, 0.4, -0.3, 3.0, 1.1, 2.5])
 @kernel
 def end_forces(u, q0, k, length, corotational, force, stiffness):
     """End forces and tangent of an element with basic forces q0 + k v at the displacements of both ends (6,)."""
-    v1, v2, v3, c, s, chord = deformations(u[3] - u[0], u[4] - u[1], u[2], u[5], length, corotational)
+    chord = deformations(u[3] - u[0], u[4] - u[1], u[2], u[5], length, corotational)
+    v1, v2, v3 = chord.elongation, chord.theta_i, chord.theta_j
     force[:] = 0.0
     stiffness[:] = 0.0
-    add_to_stiffness(
-        0,
+    basic = BasicForces(
         q0[0] + k[0] * v1 + k[1] * v2 + k[2] * v3,
         q0[1] + k[1] * v1 + k[3] * v2 + k[4] * v3,
         q0[2] + k[2] * v1 + k[4] * v2 + k[5] * v3,
@@ -32,13 +32,8 @@ def end_forces(u, q0, k, length, corotational, force, stiffness):
         k[3],
         k[4],
         k[5],
-        c,
-        s,
-        chord,
-        corotational,
-        force,
-        stiffness,
     )
+    add_to_stiffness(0, basic, chord, corotational, force, stiffness)
 
 
 def element(u, q0=(0.0, 0.0, 0.0), k=STIFFNESS, corotational=True):
@@ -141,9 +136,9 @@ def test_fixed_base_takes_the_rows_of_the_free_end(rng):
     q0 = np.array([1.0, 2.0, -0.5])
     force, stiffness = element(u, q0)
     basic_forces = q0 + symmetric(STIFFNESS) @ basic(u)
-    _, _, _, c, s, chord = deformations(u[3], u[4], 0.0, u[5], LENGTH, True)
+    chord = deformations(u[3], u[4], 0.0, u[5], LENGTH, True)
     out, matrix = np.zeros(3), np.zeros((3, 3))
-    add_to_stiffness(-3, *basic_forces, *STIFFNESS, c, s, chord, True, out, matrix)
+    add_to_stiffness(-3, BasicForces(*basic_forces, *STIFFNESS), chord, True, out, matrix)
     np.testing.assert_allclose(out, force[3:], rtol=1e-13)
     np.testing.assert_allclose(matrix, stiffness[3:, 3:], rtol=1e-13)
 
@@ -164,12 +159,12 @@ def amplified_deflection(n_elements, corotational=True):
     h = 100 * golden.HEIGHT
     n = 3 * n_elements
     weight, lateral = ei / h**2, 1e-5 * ei / h**2
-    u, force, stiffness = np.zeros(n), np.zeros(n), np.zeros((n, n))
+    position = Position(np.zeros(n), np.zeros(n), np.zeros((n, n)))
     load = golden.gravity(n_elements, weight)
-    assert apply_gravity(column, u, load, force, stiffness, 1e-9, 20, 0) == 0
+    assert apply_gravity(column, position, load, Iteration(1e-9, 20, 0)) == 0
     load[-3] = lateral
-    assert equilibrate(column, u, load, -1, 0.0, force, stiffness, 1e-9, 20)
-    return u[-3] / (lateral * h**3 / (3 * ei)), 3 * (np.tan(1.0) - 1.0)
+    assert equilibrate(column, position, load, -1, 0.0, 1e-9, 20)
+    return position.u[-3] / (lateral * h**3 / (3 * ei)), 3 * (np.tan(1.0) - 1.0)
 
 
 def test_p_delta_amplification_converges_to_the_closed_form():

@@ -35,7 +35,7 @@ def test_reference_histories(reference):
 
 def test_the_comparison_sees_a_tension_strength_one_percent_off():
     for _, column, history in histories(golden.load(golden.BUNDLED, "section")):
-        column.concrete[0, concrete04.FT] *= 1.01
+        column.sections.concrete[0, concrete04.FT] *= 1.01
         assert deviation(column, history)[1] > 1e-5
 
 
@@ -46,14 +46,15 @@ def column():
 
 def properties(column):
     """EA, coupling and EI of the virgin section."""
-    modulus = np.where(np.arange(column.y.size) < column.core_count, *column.concrete[:, concrete04.EC])
-    ea, y = modulus * column.area, column.y
-    bars, z = column.steel[reinforcing_steel.E0] * column.bar_area, column.bar_y
+    s = column.sections
+    modulus = np.where(np.arange(s.y.size) < s.core_count, *s.concrete[:, concrete04.EC])
+    ea, y = modulus * s.area, s.y
+    bars, z = s.steel[reinforcing_steel.E0] * s.bar_area, s.bar_y
     return ea.sum() + bars.sum(), -(ea @ y + bars @ z), ea @ y**2 + bars @ z**2
 
 
 def test_round_section_has_its_area_and_second_moment(column):
-    area, y = column.area, column.y
+    area, y = column.sections.area, column.sections.y
     assert area.sum() == pytest.approx(np.pi * 24.0**2, rel=1e-12)
     assert area @ y**2 == pytest.approx(np.pi / 4 * 24.0**4, rel=1e-12)
 
@@ -76,7 +77,7 @@ def test_symmetric_section_does_not_couple(column):
         assert abs(moment) < 1e-13 * (abs(n) + 1.0) * 24.0
         assert abs(coupling) < 1e-13 * ea * 24.0
     # control: one bar moved
-    column.bar_y[0] += 1.0
+    column.sections.bar_y[0] += 1.0
     assert abs(golden.section_forces(-1e-3, 0.0, column)[1]) > 1.0
 
 
@@ -119,47 +120,50 @@ def test_tangent_is_the_derivative(column, rng, yielded):
             errors.append(np.abs((tangent - sides[1]) / scale).max())
     assert len(errors) > 300
     assert np.mean(np.array(errors) < 1e-5) > (0.95 if yielded else 0.999)
-    assert column.virgin[0] == (0.0 if yielded else 1.0)
+    assert column.sections.virgin[0] == (0.0 if yielded else 1.0)
 
 
 def test_order_of_the_fibers_does_not_matter(column, rng):
     """Sums may be reordered by the compiler: equal to round-off, memory included."""
-    n = column.core_count
-    order = np.concatenate([rng.permutation(n), n + rng.permutation(column.y.size - n)])
-    n_bars = column.steel_memory.shape[1]  # the rest is empty
+    one, two = column.sections, golden.column(golden.circle())
+    other = two.sections
+    n = one.core_count
+    order = np.concatenate([rng.permutation(n), n + rng.permutation(one.y.size - n)])
+    n_bars = one.steel_memory.shape[1]  # the remaining bars are empty
     bars = rng.permutation(n_bars)
-    other = golden.column(golden.circle())
-    other.y[:], other.area[:] = column.y[order], column.area[order]
-    other.bar_y[:n_bars], other.bar_area[:n_bars] = column.bar_y[bars], column.bar_area[bars]
+    other.y[:], other.area[:] = one.y[order], one.area[order]
+    other.bar_y[:n_bars], other.bar_area[:n_bars] = one.bar_y[bars], one.bar_area[bars]
     e0, kappa = rng.normal(size=(2, 300)) * [[1e-3], [1e-4]]
     out = np.zeros((2, 5, 300))
     golden.section_history(e0, kappa, column, out[0])
-    golden.section_history(e0, kappa, other, out[1])
+    golden.section_history(e0, kappa, two, out[1])
     scale = np.abs(out[0]).max(axis=1, keepdims=True)
     np.testing.assert_allclose(out[1] / scale, out[0] / scale, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(other.concrete_memory[0], column.concrete_memory[0][:, order])
-    np.testing.assert_array_equal(other.steel_memory[0], column.steel_memory[0][bars])
+    np.testing.assert_array_equal(other.concrete_memory[0], one.concrete_memory[0][:, order])
+    np.testing.assert_array_equal(other.steel_memory[0], one.steel_memory[0][bars])
 
 
 def test_a_trial_leaves_no_trace(column, rng):
+    sections = column.sections
+    memory = (sections.concrete_memory, sections.steel_memory, sections.virgin)
     for e0, kappa in rng.normal(size=(20, 2)) * (1e-3, 1e-4):
         golden.section_commit(e0, kappa, column)
-        before = column.concrete_memory.copy(), column.steel_memory.copy(), column.virgin.copy()
+        before = [array.copy() for array in memory]
         for trial in rng.normal(size=(20, 2)) * (2e-3, 2e-4):
             golden.section_forces(*trial, column)
-        for array, kept in zip((column.concrete_memory, column.steel_memory, column.virgin), before, strict=True):
+        for array, kept in zip(memory, before, strict=True):
             np.testing.assert_array_equal(array, kept)
 
 
 def test_virgin_bars_equal_bars_with_memory(column, rng):
     """The series below yield and the full law agree: the flag is a matter of speed only."""
-    limit = column.steel[reinforcing_steel.YIELD_STRAIN]
+    limit = column.sections.steel[reinforcing_steel.YIELD_STRAIN]
     other = golden.column(golden.circle())
-    other.virgin[0] = 0.0
+    other.sections.virgin[0] = 0.0
     e0, kappa = rng.uniform(-1, 1, size=(2, 200)) * [[0.5 * limit], [0.45 * limit / 21.0]]
     out = np.zeros((2, 5, 200))
     golden.section_history(e0, kappa, column, out[0])
     golden.section_history(e0, kappa, other, out[1])
-    assert column.virgin[0] == 1.0
+    assert column.sections.virgin[0] == 1.0
     scale = np.abs(out[0]).max(axis=1, keepdims=True)
     np.testing.assert_allclose(out[1] / scale, out[0] / scale, rtol=0, atol=1e-12)

@@ -12,8 +12,8 @@ import pytest
 
 from fe_likelihoods import kernels
 from fe_likelihoods.kernels import concrete04, corotational, fiber_section, jit, linear_solve, reinforcing_steel
-from fe_likelihoods.kernels.newmark import HISTORY_ROWS, newmark
-from fe_likelihoods.kernels.static import impose_displacement
+from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
+from fe_likelihoods.kernels.static import Iteration, impose_displacement
 
 from . import golden
 
@@ -172,24 +172,12 @@ def short_subset() -> dict[str, np.ndarray]:
     e0, kappa = rng.normal(size=(2, 60)) * [[5e-4], [1e-4]]
     golden.section_history(e0, kappa, column(), out["section"])
     out["pushover"] = np.zeros((8, 12))
-    impose_displacement(column(), golden.gravity(), np.linspace(0.0, 4.0, 12), 1e-10, 50, 4, out["pushover"])
+    iteration = Iteration(1e-10, 50, 4)
+    impose_displacement(column(), golden.gravity(), np.linspace(0.0, 4.0, 12), iteration, out["pushover"])
     out["run"] = np.zeros((len(HISTORY_ROWS), 40))
     ground = 300.0 * np.sin(np.linspace(0.0, 6.0, 40))
-    status = newmark(
-        column(),
-        golden.gravity(),
-        golden.mass(),
-        golden.A0,
-        golden.A1,
-        ground,
-        0.02,
-        1e-10,
-        50,
-        4,
-        1,
-        0.0,
-        out["run"],
-    )
+    dynamics = Dynamics(golden.gravity(), golden.mass(), golden.A0, golden.A1, 0.0)
+    status = newmark(column(), dynamics, ground, 0.02, 1, iteration, out["run"])
     out["status"] = np.array(status)
     return out
 
@@ -257,20 +245,7 @@ def test_section_forces_equal_their_own_python(rng):
     """The sums are reordered by the compiler."""
     column = golden.column(golden.circle())
     for e0, kappa in rng.normal(size=(30, 2)) * (5e-4, 5e-5):
-        arguments = (
-            column.core_count,
-            column.y,
-            column.area,
-            column.concrete,
-            column.concrete_memory,
-            column.bar_y,
-            column.bar_area,
-            column.steel,
-            column.steel_memory,
-            column.virgin,
-            column.trial,
-        )
-        pure = fiber_section.forces.py_func(e0, kappa, 0, *arguments)
+        pure = fiber_section.forces.py_func(e0, kappa, 0, column.sections)
         compiled = golden.section_forces(e0, kappa, column)
         for one, other, scale in zip(pure, compiled, (1e3, 1e4, 1e6, 1e7, 1e9), strict=True):
             assert one == pytest.approx(other, rel=1e-12, abs=ROUND_OFF * scale)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.kernels import concrete04
-from fe_likelihoods.kernels.newmark import HISTORY_ROWS, newmark
+from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
+from fe_likelihoods.kernels.static import Iteration
 
 from . import golden
 from .test_beam_column import stiffness_of_section
@@ -34,23 +35,11 @@ def run(
 ):
     """(status, retries, iterations) and the history; what the run does not reach stays nan."""
     ground = np.asarray(ground, dtype=float)
-    n_elements = column.element_state.shape[0]
+    n_elements = column.elements.state.shape[0]
     history = np.full((len(HISTORY_ROWS), (len(ground) - 1) // every + 1), np.nan)
-    result = newmark(
-        column,
-        golden.gravity(n_elements, weight),
-        golden.mass(n_elements),
-        a0,
-        a1,
-        ground,
-        dt,
-        tolerance,
-        max_iterations,
-        halvings,
-        every,
-        velocity,
-        history,
-    )
+    dynamics = Dynamics(golden.gravity(n_elements, weight), golden.mass(n_elements), a0, a1, velocity)
+    iteration = Iteration(tolerance, max_iterations, halvings)
+    result = newmark(column, dynamics, ground, dt, every, iteration, history)
     return result, history
 
 
@@ -100,7 +89,7 @@ def test_the_comparison_sees_parameters_one_percent_off():
         assert rrmse(run(column, ground, **damping)[1][:3], expected).max() > (1e-4 if case == "prior8" else 1e-3)
     for case, column, damping, ground, expected in cases(arrays):
         if case == "nominal_x4_sub1":  # the one that cracks
-            column.concrete[:, concrete04.FT] *= 1.01
+            column.sections.concrete[:, concrete04.FT] *= 1.01
             assert rrmse(run(column, ground, **damping)[1][:3], expected).max() > 1e-3
 
 
@@ -242,9 +231,9 @@ def test_energy_balances(motion, scale, cracked, yielded, corotational):
     largest = np.abs(history[INPUT]).max()
     balance = history[KINETIC] + history[DAMPED] + history[ABSORBED] - history[INPUT]
     assert np.abs(balance).max() < 1e-6 * largest
-    assert bool((column.virgin == 0.0).any()) == yielded
-    tension = column.concrete_memory[:, 1].max()
-    assert (tension > column.concrete[0, concrete04.ECT]) == cracked
+    assert bool((column.sections.virgin == 0.0).any()) == yielded
+    tension = column.sections.concrete_memory[:, 1].max()
+    assert (tension > column.sections.concrete[0, concrete04.ECT]) == cracked
     assert (history[KINETIC] >= 0.0).all()
     assert history[DAMPED, -1] > 0.0
     # control: the balance sees a term left out

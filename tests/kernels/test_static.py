@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.kernels import concrete04
-from fe_likelihoods.kernels.static import GRAVITY_STEPS, apply_gravity, impose_displacement
+from fe_likelihoods.kernels.static import GRAVITY_STEPS, Iteration, Position, apply_gravity, impose_displacement
 
 from . import golden
 
@@ -26,8 +26,9 @@ TOLERANCE = 1e-10
 
 def push(column, targets, tolerance=TOLERANCE, max_iterations=100, halvings=6, gravity=None):
     history = np.full((8, len(targets)), np.nan)
-    load = golden.gravity(column.element_state.shape[0]) if gravity is None else gravity
-    return impose_displacement(column, load, np.asarray(targets), tolerance, max_iterations, halvings, history), history
+    load = golden.gravity(column.elements.state.shape[0]) if gravity is None else gravity
+    iteration = Iteration(tolerance, max_iterations, halvings)
+    return impose_displacement(column, load, np.asarray(targets), iteration, history), history
 
 
 def cases(arrays):
@@ -61,7 +62,7 @@ def test_reference_pushovers(reference):
 def test_the_comparison_sees_a_tension_strength_one_percent_off():
     arrays = golden.load(golden.BUNDLED, "pushover")
     for _, _, column, targets, expected in cases(arrays):
-        column.concrete[:, concrete04.FT] *= 1.01
+        column.sections.concrete[:, concrete04.FT] *= 1.01
         _, history = push(column, targets)
         assert deviation(history, expected, arrays["_meta"]["rows"]).max() > 1e-4
 
@@ -72,14 +73,14 @@ def column():
 
 
 def test_gravity_is_the_weight_on_every_section(column):
-    u, force, stiffness = np.zeros(6), np.zeros(6), np.zeros((6, 6))
-    assert apply_gravity(column, u, golden.gravity(), force, stiffness, TOLERANCE, 20, 4) == 0
-    np.testing.assert_allclose(force, golden.gravity(), atol=1e-9 * golden.WEIGHT)
-    sections = column.element_state[:, 12:].reshape(-1, 7)
+    position = Position(np.zeros(6), np.zeros(6), np.zeros((6, 6)))
+    assert apply_gravity(column, position, golden.gravity(), Iteration(TOLERANCE, 20, 4)) == 0
+    np.testing.assert_allclose(position.force, golden.gravity(), atol=1e-9 * golden.WEIGHT)
+    sections = column.elements.state[:, 12:].reshape(-1, 7)
     np.testing.assert_allclose(sections[:, 5], -golden.WEIGHT, rtol=1e-7)
     np.testing.assert_allclose(sections[:, 6], 0.0, atol=1e-6)
-    assert u[4] < 0.0
-    assert abs(u[3]) < 1e-12
+    assert position.u[4] < 0.0
+    assert abs(position.u[3]) < 1e-12
     assert GRAVITY_STEPS == 10
 
 

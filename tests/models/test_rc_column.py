@@ -13,7 +13,8 @@ from scipy import optimize, stats
 
 from fe_likelihoods.kernels import concrete04, reinforcing_steel
 from fe_likelihoods.kernels.frame import allocate
-from fe_likelihoods.kernels.newmark import HISTORY_ROWS, newmark
+from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
+from fe_likelihoods.kernels.static import Iteration
 from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column import PARAMETERS, Bars, Concrete, Hoops, Patches, RCColumn, Steel
 from fe_likelihoods.probability.likelihood import FELikelihood
@@ -173,14 +174,15 @@ def test_units_do_not_matter(strong, theta):
         cover=cover,
         bars=bars,
     )
-    concrete04.constants(*peer.core, kernels.concrete[0])
-    concrete04.constants(*peer.cover, kernels.concrete[1])
-    reinforcing_steel.constants(*peer.steel, kernels.steel)
+    concrete04.constants(*peer.core, kernels.sections.concrete[0])
+    concrete04.constants(*peer.cover, kernels.sections.concrete[1])
+    reinforcing_steel.constants(*peer.steel, kernels.sections.steel)
     gravity = np.array([0.0, 0.0, 0.0, 0.0, -peer.axial_load, 0.0])
     mass = np.array([0.0, 0.0, 0.0, *peer.mass])
     history = np.zeros((len(HISTORY_ROWS), strong.n_steps))
     ground = strong.acceleration / INCH
-    newmark(kernels, gravity, mass, peer.a0, peer.a1, ground, strong.dt, 1e-10, 20, 10, 1, 0.0, history)
+    dynamics = Dynamics(gravity, mass, peer.a0, peer.a1, 0.0)
+    newmark(kernels, dynamics, ground, strong.dt, 1, Iteration(1e-10, 20, 10), history)
     assert rrmse(history[1::-1] * INCH, model.simulate(theta)).max() < 1e-8
 
 
