@@ -1,6 +1,6 @@
-"""A small solver for the tests of `ExecutableModel`: ``python program.py INPUT``, standard library only.
+"""Small solver for the tests of `ExecutableModel`: ``python program.py INPUT``. Uses the standard library only.
 
-INPUT has a line each for offset, slope, n, dt and what to do; the answer goes to ``out.txt``.
+INPUT contains offset, slope, n, dt and the behaviour, one per line. The response is written to ``out.txt``.
 """
 
 import os
@@ -18,7 +18,7 @@ if what == "family":
     with open(os.environ["FAMILY"], "w") as file:
         file.write(" ".join(str(pid) for pid in (os.getpid(), *(child.pid for child in children))))
     time.sleep(3600)
-if what == "leftover":  # ends well and leaves a child in its group
+if what == "leftover":  # succeeds and leaves a child process in its group
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(3600)"])
     with open(os.environ["FAMILY"], "w") as file:
         file.write(str(child.pid))

@@ -1,4 +1,4 @@
-"""The circular section: exact areas, known meshes, Gauss-Lobatto rules, and the confinement of published columns."""
+"""Circular section: exact areas, reference meshes, Gauss-Lobatto rules, and the confinement of published columns."""
 
 import math
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fe_likelihoods import Patches, RCColumn, Record, to_si
 from fe_likelihoods.models.circular_section import (
     bar_circle,
     circular_patches,
@@ -13,12 +14,9 @@ from fe_likelihoods.models.circular_section import (
     gauss_lobatto,
     mander_confinement,
 )
-from fe_likelihoods.models.rc_column import Patches, RCColumn
-from fe_likelihoods.signals.records import Record
-from fe_likelihoods.units import to_si
 
 INCH, KSI = to_si(1.0, "in").item(), to_si(1.0, "ksi").item()
-RADIUS, CORE_RADIUS = 24.0, 43.375 / 2  # in, of the tested column
+RADIUS, CORE_RADIUS = 24.0, 43.375 / 2  # of the tested column [in]
 CORE, COVER, STEEL = 1, 2, 3  # materials of the reference fibers
 
 
@@ -52,15 +50,15 @@ def test_strips_have_the_area_and_inertia_of_the_circle(n, core):
         assert np.abs(fibers[:, 0]).max() < RADIUS
 
 
-def test_strips_lie_in_their_strips():
+def test_every_fiber_is_inside_its_strip():
     _, cover = circular_strips(RADIUS, CORE_RADIUS, 40)
     edges = np.linspace(-RADIUS, RADIUS, 41)
     assert len(cover) == 40
     assert ((cover[:, 0] > edges[:-1]) & (cover[:, 0] < edges[1:])).all()
 
 
-def test_strips_at_centroids_would_lose_inertia():
-    """Control: the usual place of a fiber, its centroid, does not do."""
+def test_fibers_at_centroids_lose_inertia():
+    """Control: fibers at the centroids of the strips, as usual, have too small a second moment of area."""
     edges = np.linspace(-RADIUS, RADIUS, 21)
     y = np.linspace(-RADIUS, RADIUS, 200_001)
     chord = 2 * np.sqrt(RADIUS**2 - y**2)
@@ -88,7 +86,7 @@ def test_patches_converge_to_the_inertia_of_the_circle_from_below():
 
 
 @pytest.mark.parametrize(("n", "positions"), [(18, 10), (3, 2), (4, 3), (7, 4)])
-def test_bars_of_equal_position_are_one(n, positions):
+def test_bars_with_the_same_position_are_merged(n, positions):
     bars = bar_circle(20.0, n, 1.56)
     assert len(bars) == positions
     assert bars[:, 1].sum() == pytest.approx(n * 1.56, rel=1e-14)
@@ -96,7 +94,7 @@ def test_bars_of_equal_position_are_one(n, positions):
     assert bars[:, 1] @ bars[:, 0] == pytest.approx(0.0, abs=1e-10)
 
 
-def test_first_angle_turns_the_bars():
+def test_first_angle_rotates_the_bars():
     straight, turned = bar_circle(20.0, 18, 1.56), bar_circle(20.0, 18, 1.56, math.pi / 18)
     assert (len(straight), len(turned)) == (10, 9)
     assert np.abs(turned[:, 0]).max() == pytest.approx(20.0 * math.cos(math.pi / 18))
@@ -112,7 +110,7 @@ def as_sorted(y, area):
 
 @pytest.mark.parametrize(("name", "mesh"), [("rms40", 40), ("circ20_10_2_merged", Patches(20, 10, 2))])
 def test_reference_fibers(golden, lhpost, name, mesh):
-    """The fibers of the reference results, from the dimensions of the column alone."""
+    """The dimensions of the column give the fibers of the reference results."""
     model = RCColumn.lhpost(lhpost.loading, mesh=mesh)
     y, area, material = golden[f"fibers/{name}"]
     for fibers, tag in zip(model.section.fibers(), (CORE, COVER, STEEL), strict=True):
@@ -129,7 +127,7 @@ def test_gauss_lobatto_is_exact_to_its_degree(n):
     np.testing.assert_array_equal(points + points[::-1], np.ones(n))
     for degree in range(2 * n - 2):
         assert weights @ points**degree == pytest.approx(1 / (degree + 1), rel=1e-13)
-    assert abs(weights @ points ** (2 * n - 2) - 1 / (2 * n - 1)) > 1e-7  # and no further
+    assert abs(weights @ points ** (2 * n - 2) - 1 / (2 * n - 1)) > 1e-7  # not exact for the next degree
 
 
 @pytest.mark.parametrize(
@@ -141,7 +139,7 @@ def test_gauss_lobatto_is_exact_to_its_degree(n):
         (5, [-1, -math.sqrt(3 / 7), 0, math.sqrt(3 / 7), 1], [1 / 10, 49 / 90, 32 / 45, 49 / 90, 1 / 10]),
     ],
 )
-def test_gauss_lobatto_of_the_tables(n, points, weights):
+def test_gauss_lobatto_equals_published_tables(n, points, weights):
     """Abramowitz & Stegun (1964), table 25.6, on [-1, 1]."""
     got_points, got_weights = gauss_lobatto(n)
     np.testing.assert_allclose(2 * got_points - 1, points, atol=1e-14)
@@ -159,7 +157,7 @@ def test_confinement_of_the_tested_column(lhpost):
 
 
 def test_confinement_of_the_reference_results(golden):
-    """Its inputs are assumed ones: fyh 60 ksi, fc 6 ksi, clear spacing 4.75 in."""
+    """The reference results assume fyh = 60 ksi, fc = 6 ksi and a clear spacing of 4.75 in."""
     fc, fyh, core = 6.0, 60.0, 43.375
     confinement = mander_confinement(
         fc,
@@ -180,8 +178,8 @@ def test_confinement_of_the_reference_results(golden):
     assert confinement.ultimate_strain == pytest.approx(ultimate, rel=1e-8)
 
 
-def test_gain_from_confinement():
-    """None without hoops, ever less for each more, and at a tenth of fc the number worked out by hand."""
+def test_strength_gain_by_confinement():
+    """Zero without hoops, concave in the hoop area, and equal to a hand calculation at a pressure of fc/10."""
     common = dict(core_diameter=1.0, steel_ratio=0.02, spacing=0.1, clear_spacing=0.08, fyh=400e6)
     common |= dict(ultimate_hoop_strain=0.12, spiral=False)
     none = mander_confinement(30e6, hoop_area=0.0, **common)

@@ -1,4 +1,4 @@
-"""A program as a model: parameters into files to the last digit, responses back, whatever the program does."""
+"""Models defined by a program: parameters and responses are exact, and failing programs are reported."""
 
 import os
 import pickle
@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods.models.executable import ExecutableModel
-from fe_likelihoods.simulation.executors import LocalPool
-from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch, split_seconds
+from fe_likelihoods import ExecutableModel, LocalPool, SimulationFailed
+from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
 
 PROGRAM = Path(__file__).with_name("program.py")
@@ -43,16 +42,16 @@ def family(path):
     return [int(pid) for pid in path.read_text().split()]
 
 
-# what it computes ---------------------------------------------------------------------------------------------------
+# responses ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("options", [{}, {"what": "commas"}, {"what": "one", "columns": None}], ids=str)
-def test_parameters_arrive_and_responses_return_to_the_last_digit(options):
+def test_parameters_and_responses_are_exact(options):
     theta = np.array([1.0 / 3.0, -(2.0**-40) / 7.0])
     np.testing.assert_array_equal(model_of(**options).simulate(theta), line(theta))
 
 
-def test_parameters_in_the_command_files_and_a_function_of_the_folder(tmp_path):
+def test_parameters_in_the_command_copied_files_and_an_output_function(tmp_path):
     data = tmp_path / "record.txt"
     data.write_text("17 $5\n")
     model = model_of(
@@ -85,14 +84,14 @@ def test_same_bits_on_two_processes():
     np.testing.assert_array_equal(batch.response, [line(theta) for theta in thetas])
 
 
-def test_runs_leave_no_folder(tmp_path, monkeypatch):
+def test_runs_leave_no_files(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     model_of().simulate(THETA)
     failure(model_of("fail"))
     assert list(tmp_path.iterdir()) == []
 
 
-# what goes wrong ----------------------------------------------------------------------------------------------------
+# failures ----------------------------------------------------------------------------------------------------
 
 CASES = {
     "fail": "the program ended with exit code 1: matrix is singular / at step 12",
@@ -110,14 +109,14 @@ CASES = {
 
 
 @pytest.mark.parametrize("what", CASES)
-def test_reason_and_duration(what):
+def test_reason_and_duration_of_a_failure(what):
     limits = {"time_limit": 0.5} if what == "hang" else {"max_output": 1_000_000}
     reason, seconds = failure(model_of(what, **limits))
     assert reason.startswith(CASES[what])
     assert (0.5 if what == "hang" else 0.0) < seconds < 60.0
 
 
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: programs in the background are not found")
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: background processes cannot be found")
 def test_hanging_program_is_killed_with_its_children(tmp_path, monkeypatch):
     monkeypatch.setenv("FAMILY", str(tmp_path / "pids"))
     reason, _ = failure(model_of("family", time_limit=2.0))
@@ -127,13 +126,13 @@ def test_hanging_program_is_killed_with_its_children(tmp_path, monkeypatch):
     assert gone(pids)
 
 
-def test_children_that_a_program_leaves_are_killed(tmp_path, monkeypatch):
+def test_children_left_by_a_program_are_killed(tmp_path, monkeypatch):
     monkeypatch.setenv("FAMILY", str(tmp_path / "pids"))
     np.testing.assert_array_equal(model_of("leftover").simulate(THETA), line(THETA))
     assert gone(family(tmp_path / "pids"))
 
 
-def test_folders_of_failures_are_kept_up_to_a_number(tmp_path):
+def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path):
     model = model_of("fail", keep_failures=tmp_path / "kept", max_kept=2)
     for _ in range(3):
         failure(model)
@@ -187,12 +186,12 @@ def test_failures_are_counted_by_the_posterior():
     ],
     ids=str,
 )
-def test_bad_settings_are_refused(options, advice):
+def test_wrong_arguments_are_rejected(options, advice):
     with pytest.raises(ValueError, match=advice):
         model_of(**options)
 
 
-def test_fingerprint_knows_all_that_is_run(tmp_path):
+def test_fingerprint_depends_on_everything_that_is_run(tmp_path):
     script, template, data = tmp_path / "solver", tmp_path / "template", tmp_path / "data"
     script.write_text("#!/bin/sh\necho 1\n")
     script.chmod(0o755)
@@ -221,7 +220,7 @@ def test_fingerprint_knows_all_that_is_run(tmp_path):
     assert fingerprint(hash_executable=False) == unhashed
 
 
-def test_pickle():
+def test_a_pickled_copy_gives_the_same_response():
     model = model_of()
     copy = pickle.loads(pickle.dumps(model))
     assert copy.fingerprint == model.fingerprint

@@ -1,4 +1,4 @@
-"""A Python function as a model: the same bits wherever it runs, a fingerprint of its code, and what goes wrong told."""
+"""Models defined by a Python function: same bits in every process, failures with reasons, fingerprint of the code."""
 
 import functools
 import json
@@ -15,12 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.signals.channels import Channel
-from fe_likelihoods.signals.records import Record
+from fe_likelihoods import Channel, FunctionModel, LinearOscillator, Record, SimulationFailed
 from fe_likelihoods.simulation.code_digest import code_digest
-from fe_likelihoods.simulation.model import SimulationFailed, split_seconds
+from fe_likelihoods.simulation.model import split_seconds
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line, posterior_of, treacherous
 
@@ -34,7 +31,7 @@ def model_of(function=treacherous, **options):
 
 
 def failure(model, what):
-    """Reason and seconds of a simulation that fails."""
+    """Reason and duration [s] of a failed simulation."""
     with pytest.raises(SimulationFailed) as caught:
         model.simulate([what + 0.5, 0.1])
     return split_seconds(caught.value.reason)
@@ -45,7 +42,7 @@ def guarded():
     return model_of(time_limit=1.0)
 
 
-# what it computes ---------------------------------------------------------------------------------------------------
+# responses ---------------------------------------------------------------------------------------------------
 
 
 def test_same_bits_in_process_and_isolated(guarded):
@@ -56,8 +53,8 @@ def test_same_bits_in_process_and_isolated(guarded):
         np.testing.assert_array_equal(model_of().simulate(theta), line(theta))
 
 
-def test_posterior_of_an_oscillator_as_a_function(rng):
-    """A wrapped model gives the posterior of the model itself."""
+def test_an_oscillator_as_a_function(rng):
+    """A wrapped model gives the response of the model itself."""
     oscillator = LinearOscillator(Record("noise", 0.02, rng.normal(size=200)), period=0.5)
     wrapped = FunctionModel(
         oscillator.simulate, oscillator.parameter_names, oscillator.channels, oscillator.dt, oscillator.n_steps
@@ -68,7 +65,7 @@ def test_posterior_of_an_oscillator_as_a_function(rng):
     assert wrapped.fingerprint != again.fingerprint
 
 
-def test_caller_keeps_its_theta():
+def test_theta_of_the_caller_is_not_changed():
     def scribbles(theta):
         theta[:] = 0.0
         return line(theta)
@@ -86,8 +83,8 @@ def _attempt(model, theta):
 
 
 @pytest.mark.parametrize("kind", ["threads", "forks"])
-def test_threads_and_forks_have_processes_of_their_own(kind, guarded):
-    """Also where the model had one before the fork: it belongs to the parent."""
+def test_threads_and_forks_have_separate_processes(kind, guarded):
+    """A fork starts a new process even if the model had one before, which belongs to the parent."""
     guarded.simulate(THETA)
     thetas = [np.array([0.1 * k, 0.2]) for k in range(6)]
     thetas[2][0] = bad.CRASHES + 0.5
@@ -100,13 +97,13 @@ def test_threads_and_forks_have_processes_of_their_own(kind, guarded):
     np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
 
 
-def test_travels_with_its_settings(guarded):
+def test_a_pickled_copy_keeps_its_settings(guarded):
     copy = pickle.loads(pickle.dumps(guarded))
     assert (copy.fingerprint, copy.time_limit, copy.isolated) == (guarded.fingerprint, 1.0, True)
     np.testing.assert_array_equal(copy.simulate(THETA), line(THETA))
 
 
-# what goes wrong ----------------------------------------------------------------------------------------------------
+# failures ----------------------------------------------------------------------------------------------------
 
 REASONS = {
     "RAISES": "ZeroDivisionError: float division by zero",
@@ -133,14 +130,14 @@ def test_reason_and_duration_in_process_and_isolated(name, guarded):
 
 
 @pytest.mark.parametrize("name", DEADLY)
-def test_deadly_runs_are_failures_and_the_next_is_fine(name, guarded):
+def test_a_killed_process_is_a_failure_and_the_next_run_succeeds(name, guarded):
     reason, seconds = failure(guarded, getattr(bad, name))
     assert reason.startswith(DEADLY[name])
     assert (seconds >= 1.0) == name.startswith("HANGS")
     np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
 
 
-def test_last_words_of_a_crash_are_told():
+def test_last_output_of_a_crash_is_in_the_reason():
     reason, _ = failure(model_of(bad.speaks, isolated=True), 0)
     assert reason == "the worker process ended with exit code 1; out of licences"
 
@@ -150,7 +147,7 @@ def test_memory_is_limited():
     assert reason.startswith("MemoryError")
 
 
-def test_failures_are_in_the_report_with_their_seconds():
+def test_failures_are_in_the_report_with_their_duration():
     posterior = posterior_of(model_of(time_limit=0.5), top=10.0)
     x = np.array([[what + 0.5, 0.1, 0.5] for what in (bad.FINE, bad.RAISES, bad.HANGS, bad.CRASHES, bad.RAISES)])
     x[4, 1] = 0.2
@@ -188,15 +185,15 @@ def test_failures_are_in_the_report_with_their_seconds():
         ({"n_steps": 0}, "n_steps must be a positive integer"),
         ({"n_steps": 20.0}, "n_steps"),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",  # a lambda's address differs from process to process
+    ids=lambda value: value if isinstance(value, str) else "",  # the address of a lambda differs between processes
 )
-def test_bad_settings_are_refused(options, advice):
+def test_wrong_arguments_are_rejected(options, advice):
     settings = {"function": line, "parameter_names": NAMES, "channels": CHANNELS, "dt": DT, "n_steps": N_STEPS}
     with pytest.raises(ValueError, match=advice):
         FunctionModel(**settings | options)
 
 
-def test_theta_of_wrong_length_is_refused():
+def test_theta_of_wrong_length_is_rejected():
     with pytest.raises(ValueError, match="expected one value for each of .*offset"):
         model_of().simulate([1.0])
 
@@ -209,7 +206,7 @@ def scaled(by):
 
 
 def defined(source):
-    """The function f of a piece of source, as a module would define it."""
+    """Function f defined by `source`, as in a module."""
     space = {"__name__": "someones_model", "np": np, "math": math}
     exec(source, space)
     return space["f"]
@@ -232,7 +229,7 @@ def test_every_change_changes_the_digest(old, new):
     assert code_digest(defined(CODE)) != code_digest(defined(CODE.replace(old, new)))
 
 
-def test_values_that_are_closed_over_count():
+def test_values_in_a_closure_enter_the_digest():
     record = Record("r", 0.1, np.arange(5.0))
     table = np.arange(6.0)
     values = [2.0, 3.0, "2.0", (1, 2), [1, 2], {"a": 1}, {"a": 2}, table, table[::2], record, record.scale(2.0), None]
@@ -269,7 +266,7 @@ def test_methods_and_callable_objects():
     assert code_digest(Spring(1.0)) != code_digest(Spring(1.0).respond)
 
 
-def test_what_has_no_stable_digest_needs_a_version():
+def test_an_object_without_stable_digest_needs_a_version():
     with pytest.raises(ValueError, match="give version=, a text"):
         model_of(Counting().respond)
     first, second = (model_of(Counting().respond, version=version) for version in ("1", "2"))
@@ -277,11 +274,11 @@ def test_what_has_no_stable_digest_needs_a_version():
     assert first.fingerprint != second.fingerprint
 
 
-def test_recursion_ends():
+def test_recursive_functions_have_a_digest():
     assert code_digest(defined("def f(n):\n    return f(n - 1) if n else h(n)\ndef h(n):\n    return f(n)\n"))
 
 
-def test_fingerprint_knows_names_channels_and_steps():
+def test_fingerprint_depends_on_names_channels_and_steps():
     models = [
         model_of(),
         FunctionModel(treacherous, ("a", "b"), CHANNELS, DT, N_STEPS),
@@ -290,7 +287,7 @@ def test_fingerprint_knows_names_channels_and_steps():
         FunctionModel(treacherous, NAMES, CHANNELS, DT, 21),
     ]
     assert len({model.fingerprint for model in models}) == len(models)
-    assert model_of(time_limit=1.0).fingerprint == models[0].fingerprint  # where it runs changes no response
+    assert model_of(time_limit=1.0).fingerprint == models[0].fingerprint  # the process does not change a response
 
 
 @pytest.mark.parametrize("hash_seed", ["0", "123"])
@@ -325,8 +322,8 @@ class Spring:
 """
 
 
-def test_a_change_in_a_file_beside_the_function_is_another_model(tmp_path):
-    """Files of the user's own that the function imports: an old simulation must not be served for their new state."""
+def test_a_change_in_an_imported_file_changes_the_fingerprint(tmp_path):
+    """A cached simulation must not be reused after a change in a file of the user that the function imports."""
     for name, call in CALLS.items():
         (tmp_path / f"own_{name.replace(' ', '_')}.py").write_text(call + "\n")
     (tmp_path / "between.py").write_text("import aside\ndef shift(x):\n    return aside.shift(x)\n")
@@ -352,13 +349,13 @@ def test_a_change_in_a_file_beside_the_function_is_another_model(tmp_path):
     assert [name for name in CALLS if found[0][name] == found[1][name]] == []
 
 
-def test_equal_values_need_not_be_the_same_objects():
-    """Whether two equal things are one object is an accident of the process, so it may not enter."""
+def test_equal_values_have_equal_digests():
+    """Whether two equal values are one object may differ between processes, so it must not enter the digest."""
     one = (1.5, [2.5])
     assert code_digest(scaled((one, one))) == code_digest(scaled(((1.5, [2.5]), (1.5, [2.5]))))
 
 
-def test_things_that_contain_themselves_end():
+def test_objects_that_contain_themselves_have_a_digest():
     circle = [1.0]
     circle.append(circle)
     other = [2.0]

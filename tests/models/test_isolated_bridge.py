@@ -1,4 +1,4 @@
-"""The isolated bridge: golden results, closed forms, orders of convergence, energy, invariances, bad input."""
+"""Isolated bridge: reference results, closed forms, orders of convergence, energy, invariances, wrong arguments."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,7 @@ from fe_likelihoods.models.isolated_bridge_channels import CHANNEL_SETS
 
 PART = Path(__file__).parents[1] / "kernels" / "data" / "isolated_bridge.npz"
 LIMIT = 1e-3
-"""Of the peak, per channel: what the default step must give."""
+"""Largest error of the default step, as a fraction of the peak of each channel."""
 NO_RUBBER = Rubber(skeleton=(0.0,) * 6, half_loop=(0.0,) * 3)
 FEEBLE = Damper(stiffness=1e-3, viscosity=1e-6)
 STIFF = Pier(inertia=3.02e-1)
@@ -21,14 +21,14 @@ G = 9.81
 
 
 def shaking(rng, duration=4.0, dt=0.005, peak=8.0) -> Record:
-    """Smooth noise that starts and ends at zero: a record of our own."""
+    """Record of smooth noise that starts and ends at zero."""
     n = round(duration / dt) + 1
     noise = np.convolve(rng.standard_normal(n), np.hanning(25), mode="same") * np.sin(np.linspace(0.0, np.pi, n))
     return Record("noise", dt, peak * noise / np.abs(noise).max())
 
 
 def worst(response, reference, peak) -> float:
-    """Largest error of any channel, in shares of its peak."""
+    """Largest error of any channel, as a fraction of its peak."""
     return float((np.abs(response - reference).max(axis=-1) / peak).max())
 
 
@@ -37,10 +37,10 @@ def part():
     return np.load(PART)
 
 
-# ------------------------------------------------------------------ golden results
+# ------------------------------------------------------------------ reference results
 
 
-def test_the_golden_part_in_the_project(part):
+def test_reference_results_in_the_repository(part):
     model = IsolatedBridge(Record("own", float(part["dt"]), part["ag"]), every=8, outputs=tuple(part["channels"]))
     for theta, reference, peak in zip(part["theta"], part["Y"], part["peak"], strict=True):
         assert worst(model.simulate(theta), reference, peak) < LIMIT
@@ -53,12 +53,16 @@ def test_p_delta_and_vertical_motion(part):
     reference = part["Y_opt"]
     peak = np.abs(reference).max(axis=1)
     assert worst(both.simulate(np.ones(10)), reference, peak) < LIMIT
-    for alone in (model, replace(both, p_delta=False), replace(both, vertical=None)):  # each of the two is needed
+    for alone in (
+        model,
+        replace(both, p_delta=False),
+        replace(both, vertical=None),
+    ):  # each of the two changes the response
         assert worst(alone.simulate(np.ones(10)), reference, peak) > 5 * LIMIT
 
 
 @pytest.mark.parametrize("file", ["setA", "own_records"])
-def test_every_golden_case(shared, file):
+def test_every_reference_case(shared, file):
     golden = np.load(shared / "golden" / "isolated_bridge" / f"{file}.npz")
     for k in (0, 1):
         record = Record("golden", float(golden[f"dt{k}"]), golden[f"ag{k}"])
@@ -74,7 +78,7 @@ def test_every_golden_case(shared, file):
 
 
 def test_frequencies_of_the_nominal_bridge(rng):
-    """Pier alone 9.6 and 123 Hz; sliding .75 Hz (specs/isolated_bridge.md, section 4)."""
+    """Pier alone 9.6 and 123 Hz; sliding 0.75 Hz (docs/theory/isolated_bridge.rst)."""
     pier = Pier()
     alone = np.sqrt(np.linalg.eigvals(np.linalg.solve(pier.mass_matrix, pier.stiffness)).real) / (2 * np.pi)
     np.testing.assert_allclose(sorted(alone), [9.6, 123.0], rtol=5e-3)
@@ -85,7 +89,7 @@ def test_frequencies_of_the_nominal_bridge(rng):
 
 
 def test_a_block_on_a_sliding_table():
-    """Rigid piers, friction alone: the deck slides at a - mu g; below mu g it moves with the table."""
+    """Rigid piers, friction only: the deck slides at the acceleration a - mu g; below mu g it moves with the table."""
     mu = 0.1
     bearing = Bearing(load=70e3, f_min=mu, df=0.0)
     model = IsolatedBridge(
@@ -101,18 +105,18 @@ def test_a_block_on_a_sliding_table():
     )
     displacement, acceleration, _ = model.simulate([1.0])
     time = model.record.time
-    late = model.step / time[-1]  # the force is constant over a step: the law of first order is a step late
+    late = model.step / time[-1]  # the force is constant over a step, so it is one step late
     np.testing.assert_allclose(displacement, -0.5 * (3.0 - mu * G) * time**2, atol=2.0 * late * abs(displacement[-1]))
     np.testing.assert_allclose(acceleration[1:], mu * G, rtol=1e-6)
     gentle = model.with_record(Record("gentle", 0.01, 0.9 * mu * G * np.sin(np.linspace(0.0, 12.0, 101))))
     _, acceleration, bearing_displacement = gentle.simulate([1.0])
-    assert np.abs(bearing_displacement).max() < 1e-7  # at rest at every step; in between the table turns under it
+    assert np.abs(bearing_displacement).max() < 1e-7  # at rest at every step; the table reverses in between
     steepest = np.abs(np.diff(gentle.record.acceleration)).max() / gentle.dt
     np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=3.0 * model.step * steepest)
 
 
 def test_without_hysteresis_the_bridge_is_linear(rng):
-    """Against scipy's simulation of a linear system, assembled here from the equations of section 2."""
+    """Against scipy's simulation of a linear system that is assembled here from the equations of motion."""
     record = shaking(rng, duration=3.0)
     rubber = Rubber(skeleton=(8500.0, 0, 0, 0, 0, 0), half_loop=(0.0,) * 3)
     slippery = Bearing(f_min=1e-12, df=0.0)
@@ -160,7 +164,7 @@ def test_the_deck_is_in_equilibrium(rng):
 
 @pytest.mark.parametrize(("friction", "order"), [("bouc-wen", 1.7), ("elastic-plastic", 0.8), ("coulomb", 0.9)])
 def test_order_of_convergence(rng, friction, order):
-    """Second order where the law is smooth; corners of the elastic-plastic law cost up to one, Coulomb's has one."""
+    """Second order for the smooth law; corners reduce it by up to one for elastic-plastic; first order for Coulomb."""
     record = shaking(rng, duration=2.0)
     model = IsolatedBridge(record, friction=friction, outputs=("Ub_1", "Ub_2", "Ud"), tolerance=1e-8)
     steps = 1e-3 / 2.0 ** np.arange(5)
@@ -171,7 +175,7 @@ def test_order_of_convergence(rng, friction, order):
     assert slope > order
 
 
-def test_a_thin_elastic_plastic_slider_is_coulombs(rng):
+def test_elastic_plastic_converges_to_coulomb_with_the_yield_displacement(rng):
     record = shaking(rng, duration=2.0)
     outputs = ("Ub_1", "Ub_2", "drift_1", "Ud")
     exact = IsolatedBridge(record, friction="coulomb", outputs=outputs, step=0.05e-3).simulate(np.ones(10))
@@ -181,13 +185,13 @@ def test_a_thin_elastic_plastic_slider_is_coulombs(rng):
         bearings = (Bearing(yield_displacement=y), Bearing(f_min=0.05, df=0.07, a=28.0, yield_displacement=y))
         model = IsolatedBridge(record, friction="elastic-plastic", bearings=bearings, outputs=outputs, step=0.05e-3)
         distance.append(worst(model.simulate(np.ones(10)), exact, peak))
-    print("largest distance to Coulomb's law, in shares of the peak:", distance)
+    print("largest distance to Coulomb's law, as fractions of the peak:", distance)
     assert distance[1] < 0.3 * distance[0] < 0.02
 
 
 @pytest.mark.parametrize("friction", ["bouc-wen", "elastic-plastic"])
 def test_energy_is_balanced(rng, friction):
-    """Work of the table = kinetic + elastic + damped + done on the isolators, with second order."""
+    """Work of the table = kinetic + elastic + damped energy + work on the isolators, with an error of second order."""
     theta = np.array([1.2, 0.8, 1.1, 0.9, 1.2, 0.9, 1.1, 0.8, 0.9, 1.3])
     coarse = shaking(rng, duration=2.0)
     defects = []
@@ -247,7 +251,7 @@ def test_means_of_the_piers(rng):
     )
 
 
-def test_a_batch_is_its_rows(rng):
+def test_a_batch_equals_its_rows(rng):
     model = IsolatedBridge(shaking(rng, duration=1.0), outputs=6)
     thetas = rng.uniform(0.5, 1.5, (5, 10))
     thetas[3, 6] = -1.0
@@ -292,10 +296,10 @@ def test_draws_of_the_prior_with_the_other_laws(rng, friction):
     assert not any(batch.reasons)
 
 
-# ------------------------------------------------------------------ beyond the range, bad input
+# ------------------------------------------------------------------ beyond the range, wrong arguments
 
 
-def test_beyond_the_rubbers_range_is_said(rng, caplog):
+def test_displacements_beyond_the_law_of_the_rubber_are_reported_once(rng, caplog):
     gentle = IsolatedBridge(shaking(rng))
     assert gentle.history(np.ones(10)).beyond_range.max() < 1.0
     gentle.simulate(np.ones(10))
@@ -307,11 +311,11 @@ def test_beyond_the_rubbers_range_is_said(rng, caplog):
     violent.simulate(np.ones(10))
     violent.simulate(np.ones(10))
     assert "exceeds the 60.0 mm" in caplog.text
-    assert len(caplog.records) == 1, "said once for a model, not for every one of thousands of runs"
+    assert len(caplog.records) == 1, "one warning per model, not one per simulation"
 
 
 @pytest.mark.parametrize("name", ["fmin_1", "df_2", "a_1", "Kd_2", "C0_1"])
-def test_negative_devices_are_not_simulated(rng, name):
+def test_negative_parameters_fail(rng, name):
     model = IsolatedBridge(shaking(rng, duration=1.0))
     theta = np.ones(10)
     theta[model.parameter_names.index(name)] = -0.1
@@ -339,12 +343,12 @@ def test_negative_devices_are_not_simulated(rng, name):
         ({"bearings": (Bearing(df=0.0), Bearing())}, "df_1"),
     ],
 )
-def test_bad_input_is_refused(rng, changes, message):
+def test_wrong_arguments_are_rejected(rng, changes, message):
     with pytest.raises(ValueError, match=message):
         replace(IsolatedBridge(shaking(rng, duration=1.0)), **changes)
 
 
-def test_vertical_motion_must_fit(rng):
+def test_vertical_motion_must_have_the_same_samples(rng):
     model = IsolatedBridge(shaking(rng, duration=1.0))
     with pytest.raises(ValueError, match="vertical"):
         replace(model, vertical=shaking(rng, duration=2.0))
@@ -363,7 +367,7 @@ def test_vertical_motion_must_fit(rng):
         lambda: Rubber(half_loop=(-1.0, 0.0, 0.0)),
     ],
 )
-def test_impossible_devices_are_refused(make):
+def test_impossible_parts_are_rejected(make):
     with pytest.raises(ValueError, match="expected"):
         make()
 

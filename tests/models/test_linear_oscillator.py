@@ -1,4 +1,4 @@
-"""The oscillator against closed forms, quadrature of Duhamel's integral, and scipy's state-space solver."""
+"""Linear oscillator against closed forms, quadrature of Duhamel's integral, and scipy's state-space solver."""
 
 import math
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.signals.records import Record
+from fe_likelihoods import LinearOscillator, Record, SimulationFailed
 from fe_likelihoods.signals.sdof import respond
-from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch
+from fe_likelihoods.simulation.model import simulate_batch
 
 DAMPING = (0.0, 0.02, 0.3, 0.95)
 
@@ -34,7 +33,7 @@ def test_free_vibration(zeta, period, dt):
     response = respond(np.zeros(2000), dt, omega, zeta, u0, v0)
     displacement = decay * (u0 * cosine + (v0 + zeta * omega * u0) / omega_d * sine)
     velocity = decay * (v0 * cosine - (omega**2 * u0 + zeta * omega * v0) / omega_d * sine)
-    # round-off: a few units a step, and of the phase at the end
+    # round-off of a few units per step, and of the phase at the end
     scale = 4 * np.finfo(float).eps * (2000 + omega * time[-1]) * (abs(u0) + abs(v0) / omega)
     np.testing.assert_allclose(response.displacement, displacement, rtol=0, atol=scale)
     np.testing.assert_allclose(response.velocity, velocity, rtol=0, atol=scale * omega)
@@ -83,7 +82,7 @@ def test_equals_quadrature_of_duhamel_integral(record, zeta):
 
 
 def test_harmonic_excitation_converges_at_second_order():
-    # a sampled sine is only nearly piecewise linear: the one error left is the input's, of order dt^2
+    # the only error is the linear interpolation of the sine between samples, of order dt^2
     omega, zeta, forcing = 6.0, 0.05, 9.0
     errors = []
     for n_steps in (801, 1601, 3201):
@@ -117,7 +116,7 @@ def test_stiff_oscillator_moves_with_its_base(record):
     assert np.abs(displacement).max() < 1e-7
 
 
-def test_batch_is_row_by_row_and_failures_stay_alone(record):
+def test_a_batch_equals_its_rows_and_failures_affect_only_their_rows(record):
     model = LinearOscillator(record)
     thetas = np.array([[1.0, 1.0], [-1.0, 1.0], [1.3, 0.5], [1.0, 21.0], [1.0, -0.1], [0.7, 0.0]])
     response, reasons = simulate_batch(model, thetas)
@@ -133,7 +132,7 @@ def test_batch_is_row_by_row_and_failures_stay_alone(record):
             np.testing.assert_array_equal(row, model.simulate(theta))
 
 
-def test_fingerprint_knows_record_and_nominal_values(record):
+def test_fingerprint_depends_on_record_and_nominal_values(record):
     model = LinearOscillator(record, 0.8, 0.05)
     assert model.fingerprint == LinearOscillator(record, 0.8, 0.05).fingerprint
     others = [
@@ -147,6 +146,6 @@ def test_fingerprint_knows_record_and_nominal_values(record):
 @pytest.mark.parametrize(
     "values", [{"period": 0.0}, {"period": math.nan}, {"damping_ratio": 0.0}, {"damping_ratio": 5}]
 )
-def test_nominal_values_out_of_range_are_refused(record, values):
+def test_nominal_values_out_of_range_are_rejected(record, values):
     with pytest.raises(ValueError, match="LinearOscillator"):
         LinearOscillator(record, **values)

@@ -1,4 +1,4 @@
-"""Structures on several supports against closed forms, scipy's state-space solver, and the oscillator."""
+"""Linear structures on several supports against closed forms, scipy's state-space solver, and the oscillator."""
 
 import math
 import pickle
@@ -8,12 +8,11 @@ import pytest
 from scipy import signal
 from scipy.linalg import eigh
 
+from fe_likelihoods import BridgeDeck, LinearStructure, Record, ShearFrame, SimulationFailed
 from fe_likelihoods.kernels.complex_modes import superpose_modes
-from fe_likelihoods.models.linear_structure import LinearStructure, LinearSystem, modal_damping, respond_structure
-from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
-from fe_likelihoods.signals.records import Record
+from fe_likelihoods.models.linear_structure import LinearSystem, modal_damping, respond_structure
 from fe_likelihoods.signals.sdof import respond
-from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch
+from fe_likelihoods.simulation.model import simulate_batch
 
 DT = 0.02
 
@@ -26,7 +25,7 @@ def system(mass, damping, stiffness, influence) -> LinearSystem:
 
 @pytest.fixture
 def three(rng) -> list[Record]:
-    """A column's base and two ends."""
+    """Records of the base of a column and of two ends."""
     return [Record(name, DT, rng.normal(size=400)) for name in ("base", "first", "second")]
 
 
@@ -40,8 +39,8 @@ def test_one_degree_of_freedom_is_the_oscillator(three, zeta):
 
 
 @pytest.mark.parametrize("strength", [0.2, 5.0], ids=["damped", "overdamped"])
-def test_equals_state_space_solution_where_damping_couples_the_modes(three, strength):
-    """One damper to the ground at one floor: no modal ratios give this matrix."""
+def test_equals_state_space_solution_if_damping_couples_the_modes(three, strength):
+    """With one damper between a floor and the ground, the damping matrix does not follow from modal ratios."""
     a = np.stack([record.acceleration for record in three])
     mass, stiffness = np.diag([2.0, 1.0]), np.array([[900.0, -400.0], [-400.0, 400.0]])
     damping = np.array([[0.4 + 40.0 * strength, -0.4], [-0.4, 0.4]])
@@ -102,12 +101,12 @@ def test_two_storeys_under_a_step_follow_their_modes():
     theta = np.array([k, k, *ratios])
     np.testing.assert_allclose(model.simulate(theta), expected, rtol=0, atol=1e-11 * np.abs(expected).max())
     heavy = LinearStructure(ShearFrame([("low", 1), ("top", 2)], [2, 4], [3, 2], free_masses=[2]), model.supports)
-    same = heavy.simulate(np.array([2 * k, 2 * k, *ratios, 0.5]))  # masses cannot be told from stiffnesses
+    same = heavy.simulate(np.array([2 * k, 2 * k, *ratios, 0.5]))  # only the ratios of stiffness to mass matter
     np.testing.assert_allclose(same, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
 def test_a_sampled_sine_converges_at_second_order():
-    """The one error is that of straight lines between samples."""
+    """The only error is the linear interpolation between samples."""
     parts, forcing = ShearFrame({"top": 3}, [1, 1, 1.3], [1, 1, 1]), 9.0
     theta = np.array([2000.0, 2500.0, 1800.0, 0.2, 0.1, 0.15])
     found = parts.assemble(theta)
@@ -133,7 +132,7 @@ def test_modal_damping_gives_the_ratios():
         modal_damping(mass, stiffness - 3.0 * mass, ratios)
 
 
-def test_deck_follows_its_shares(three):
+def test_deck_equals_the_weighted_oscillator(three):
     base, first, second = (record.acceleration for record in three)
     model = LinearStructure(BridgeDeck("m", "s1", "s2"), three)
     assert model.parameter_names == ("frequency", "damping", "share", "shape")
@@ -145,7 +144,7 @@ def test_deck_follows_its_shares(three):
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_one_support_is_a_limit_of_two(three, share):
+def test_a_single_kind_of_support_is_a_limit(three, share):
     fixed = LinearStructure(BridgeDeck("m", share=share), three)
     assert fixed.parameter_names == ("frequency", "damping")
     free = LinearStructure(BridgeDeck("m"), three).simulate([3.0, 0.1, share])
@@ -163,7 +162,7 @@ def test_stiff_structure_moves_with_its_supports():
     np.testing.assert_allclose(middle[2:], carried[2:], atol=2e-3)
 
 
-def test_a_lead_brings_the_structure_into_its_state(three):
+def test_a_lead_starts_the_channels_from_a_moving_state(three):
     theta = [3.0, 0.02, 0.7, 0.6]
     whole = LinearStructure(BridgeDeck("m", "s"), three).simulate(theta)
     late = LinearStructure(BridgeDeck("m", "s"), three, lead=1.0)
@@ -174,7 +173,7 @@ def test_a_lead_brings_the_structure_into_its_state(three):
     assert np.abs(from_rest - whole[:, 50:]).max() > 0.1 * np.abs(whole).max(), "control: the state matters"
 
 
-def test_impossible_parameters_fail_alone_and_say_why(three):
+def test_impossible_parameters_fail_with_reasons_in_their_rows_only(three):
     model = LinearStructure(BridgeDeck("m"), three)
     thetas = np.array([[3, 0.1, 0.5], [-3, 0.1, 0.5], [3, 0.1, 1.5], [3, 0.0, 0.5], [3, 1.0, 0.5], [3, 1.1, 0.5]])
     response, reasons = simulate_batch(model, thetas)
@@ -187,14 +186,14 @@ def test_impossible_parameters_fail_alone_and_say_why(three):
         frame.simulate([1.0, 1.0, 0.1, -0.1])
 
 
-def test_travels_to_other_processes(three):
+def test_a_pickled_copy_gives_the_same_response(three):
     model = LinearStructure(BridgeDeck("m", "s"), three, lead=0.5)
     twin = pickle.loads(pickle.dumps(model))
     assert twin.fingerprint == model.fingerprint
     np.testing.assert_array_equal(twin.simulate([3.0, 0.1, 0.5, 0.6]), model.simulate([3.0, 0.1, 0.5, 0.6]))
 
 
-def test_fingerprint_knows_parts_and_supports(three):
+def test_fingerprint_depends_on_parts_and_supports(three):
     model = LinearStructure(BridgeDeck("m"), three)
     assert model.fingerprint == LinearStructure(BridgeDeck("m"), three, unit="m/s2").fingerprint
     others = [
@@ -229,6 +228,6 @@ def test_fingerprint_knows_parts_and_supports(three):
         (lambda r: LinearStructure(ShearFrame((), [1, 1], [1, 1]), r[0]), "channels must be a tuple of one or more"),
     ],
 )
-def test_bad_input_is_refused(three, make, words):
+def test_wrong_arguments_are_rejected(three, make, words):
     with pytest.raises(ValueError, match=words):
         make(three)

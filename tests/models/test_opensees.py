@@ -1,4 +1,4 @@
-"""OpenSees as a model: right, repeatable, apart from this process, and replaced after a crash."""
+"""OpenSees models: accurate, repeatable, run in a separate process, restarted after a crash."""
 
 import importlib.util
 import sys
@@ -6,11 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.models.opensees import OpenSeesModel
-from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.executors import LocalPool
-from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch, split_seconds
+from fe_likelihoods import LinearOscillator, LocalPool, OpenSeesModel, Record, SimulationFailed
+from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.opensees_column import require_opensees
 from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD, Oscillator
 
@@ -36,7 +33,7 @@ def model(record):
     return model_of(record, 5, time_limit=2.0)
 
 
-def test_converges_to_the_exact_response_with_the_square_of_the_step(record):
+def test_converges_to_the_exact_response_with_second_order(record):
     theta = np.array([1.2, 0.8])
     exact = LinearOscillator(record, PERIOD, DAMPING).simulate(theta)
     scale = np.abs(exact).max(axis=1)
@@ -44,12 +41,12 @@ def test_converges_to_the_exact_response_with_the_square_of_the_step(record):
     for substeps in (5, 10, 20):
         response = model_of(record, substeps).simulate(theta)
         errors.append(np.abs(response - exact).max(axis=1) / scale)
-    # average acceleration elongates the period by (omega h)^2 / 12: 2e-5 of it with the smallest step
+    # average acceleration elongates the period by the fraction (omega h)^2 / 12: 2e-5 with the smallest step
     assert (errors[-1] < 1e-3).all()
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 2.0, atol=0.1)
 
 
-def test_runs_do_not_know_of_each_other(model, record):
+def test_runs_are_independent(model, record):
     theta, other = np.array([1.2, 0.8]), np.array([0.4, 2.0])
     first = model.simulate(theta)
     model.simulate(other)
@@ -58,7 +55,7 @@ def test_runs_do_not_know_of_each_other(model, record):
     assert not [name for name in sys.modules if name.startswith("openseespy.opensees")]
 
 
-def test_failures_leave_the_next_run_alone(model):
+def test_the_run_after_a_failure_is_not_affected(model):
     expected = model.simulate([1.0, 1.0])
     reasons = {
         9.0: "the worker process died (signal 6)",
@@ -69,8 +66,8 @@ def test_failures_leave_the_next_run_alone(model):
     for stiffness, reason in reasons.items():
         with pytest.raises(SimulationFailed) as caught:
             model.simulate([stiffness, 1.0])
-        told, seconds = split_seconds(caught.value.reason)
-        assert told.startswith(reason)
+        text, seconds = split_seconds(caught.value.reason)
+        assert text.startswith(reason)
         assert seconds is not None
         np.testing.assert_array_equal(model.simulate([1.0, 1.0]), expected)
 
@@ -84,13 +81,13 @@ def test_same_bits_in_two_workers(model, rng):
     np.testing.assert_array_equal(batch.response, expected)
 
 
-def test_fingerprint_knows_the_function_and_its_data(model, record):
+def test_fingerprint_depends_on_the_function_and_its_data(model, record):
     assert model.fingerprint == model_of(record, 5).fingerprint
     assert model.fingerprint != model_of(record, 6).fingerprint
     assert model.fingerprint != model_of(record.scale(2.0), 5).fingerprint
 
 
-def test_bad_settings_are_refused(record, monkeypatch):
+def test_wrong_arguments_are_rejected(record, monkeypatch):
     with pytest.raises(ValueError, match="expected a function of OpenSees"):
         OpenSeesModel(3, NAMES, CHANNELS, DT, N_STEPS)
     with pytest.raises(ValueError, match="time_limit must be a positive number"):

@@ -1,4 +1,4 @@
-"""The reinforced-concrete column as a model: reference results, arguments, batches, failures and bad input."""
+"""Reinforced-concrete column: reference results, arguments, batches, failures and wrong arguments."""
 
 import json
 import math
@@ -11,26 +11,37 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
+from fe_likelihoods import (
+    Bars,
+    Concrete,
+    DisplacementHistory,
+    FELikelihood,
+    HalfNormal,
+    Hoops,
+    Measurements,
+    Patches,
+    Posterior,
+    RCColumn,
+    Record,
+    SimulationFailed,
+    Steel,
+    TruncatedNormal,
+    read_csv,
+    to_si,
+)
 from fe_likelihoods.kernels import concrete04, reinforcing_steel
 from fe_likelihoods.kernels.frame import allocate
 from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from fe_likelihoods.kernels.static import Iteration
 from fe_likelihoods.models.circular_section import gauss_lobatto
-from fe_likelihoods.models.rc_column import PARAMETERS, Bars, Concrete, Hoops, Patches, RCColumn, Steel
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal
+from fe_likelihoods.models.rc_column import PARAMETERS
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
-from fe_likelihoods.signals.channels import Measurements
-from fe_likelihoods.signals.readers import read_csv
-from fe_likelihoods.signals.records import DisplacementHistory, Record
-from fe_likelihoods.simulation.model import SimulationFailed
-from fe_likelihoods.units import G0, to_si
+from fe_likelihoods.units import G0
 from tests.opensees_column import CORE, COVER, INCH, KIP, KSI, STEEL, peer_of
 
 NOMINAL = np.ones(5)
 PAPER = np.array(list(BRIDGE_COLUMN_MEANS.values()))
-PUSHED = ("Ec", "Es", "ft")  # what can be updated where nothing is damped
+PUSHED = ("Ec", "Es", "ft")  # parameters that act under imposed displacement
 REFERENCE_THETA = np.array([3320.0, 28400.0, 0.737, 0.0002016, 0.306])  # ksi, 1/s, s
 TIGHT = dict(tolerance=1e-11, element_tolerance=1e-12 * KIP * INCH)
 
@@ -52,7 +63,7 @@ def column(strong):
 
 
 def cycles(*amplitudes, points=20):
-    """Reversed cycles of the given amplitudes [m], starting and ending at rest."""
+    """Reversed cycles of the given amplitudes [m], starting and ending at zero."""
     corners = [0.0] + [sign * a for a in amplitudes for sign in (1.0, -1.0)] + [0.0]
     legs = [np.linspace(a, b, points, endpoint=False) for a, b in zip(corners[:-1], corners[1:], strict=True)]
     return DisplacementHistory("cycles", np.concatenate([*legs, [0.0]]))
@@ -67,10 +78,10 @@ def pushed():
 
 
 def reference_column(loading, **changes):
-    """The column of the reference results: other materials, and a clear hoop spacing of 4.75 in.
+    """Column of the reference results: other materials, and a clear hoop spacing of 4.75 in.
 
-    That spacing is no argument; the pressure it gives and the energy of the hoops are kept with another yield
-    strength and another ultimate strain of the hoops.
+    That spacing is not an argument. Another yield strength and another ultimate strain of the hoops give the same
+    lateral pressure and the same energy of the hoops.
     """
     base = RCColumn.lhpost(loading, **({"parameters": PUSHED} if isinstance(loading, DisplacementHistory) else {}))
     arch = [(1 - clear / (2 * 43.375)) ** 2 for clear in (4.75, 5.375)]
@@ -91,13 +102,15 @@ def golden(shared):
     return np.load(shared / "golden" / "column" / "golden_A_dynamic.npz")
 
 
-DIGITS = ["nominal"] + [f"prior{i}" for i in range(3, 10)]  # cases without bifurcations, where digits agree
+DIGITS = ["nominal"] + [
+    f"prior{i}" for i in range(3, 10)
+]  # cases without bifurcations, in which two codes agree to many digits
 ROUGH = ["posterior", "nominal_x4_sub1", "posterior_x4_sub1"] + [f"prior{i}" for i in range(3)]
 
 
 @pytest.mark.parametrize("case", DIGITS + ROUGH)
 def test_reference_responses(golden, case):
-    """OpenSees' response of the same column in kip and inch, from arguments in SI."""
+    """Arguments in SI give the response of the same column in OpenSees, which was computed in kip and inch."""
     expected, scale = golden[f"dyn/{case}/resp"], json.loads(str(golden["_meta"]))["cases"][case]["scale"]
     record = Record(case, float(golden["dt"]), golden["record50"][: expected.shape[1]] * scale * INCH)
     history = reference_column(record).history(golden[f"dyn/{case}/theta"] / REFERENCE_THETA)
@@ -122,13 +135,13 @@ def test_reference_pushover(shared, theta, geometry):
         assert rrmse(history[name] / units.get(name, KIP * INCH), expected[row]) < 1e-7, name
 
 
-SENSITIVITY = {  # specs/bridge_column.md, section 8: acceleration RRMSE of the nominal response
+SENSITIVITY = {  # changes, and the RRMSE that they cause in the nominal acceleration of OpenSees
     "linear geometry": (dict(geometry="linear"), 0.58),
     "rotational inertia": (dict(rotational_inertia=522 / 386.4 * 60**2 * KIP * INCH), 0.75),
     "length of softening": (dict(softening_strain=0.0005), 0.68),
     "end of softening": (dict(softening_ratio=0.3), 0.65),
-    "peak strain .0026": (dict(peak_strain=0.0026), 0.28),
-    "peak strain .0020": (dict(peak_strain=0.0020), 0.41),
+    "peak strain 0.0026": (dict(peak_strain=0.0026), 0.28),
+    "peak strain 0.0020": (dict(peak_strain=0.0020), 0.41),
     "strength 7 ksi": (dict(fc=7.0 * KSI), 0.15),
     "five points": (dict(n_points=5), 0.11),
     "one element": (dict(n_points=5, n_elements=1), 0.16),
@@ -145,8 +158,8 @@ def reference_response(golden):
 
 
 @pytest.mark.parametrize("choice", SENSITIVITY)
-def test_choices_move_the_response_as_published(reference_response, choice):
-    """Each choice that the paper leaves open is an argument, with the weight that was found in OpenSees."""
+def test_modelling_choices_change_the_response_as_in_opensees(reference_response, choice):
+    """Each choice that the paper leaves open is an argument, and changes the response as much as in OpenSees."""
     record, response = reference_response
     changes, expected = SENSITIVITY[choice]
     moved = reference_column(record, **changes).simulate(NOMINAL)
@@ -157,8 +170,8 @@ def test_choices_move_the_response_as_published(reference_response, choice):
 
 
 @pytest.mark.parametrize("theta", [NOMINAL, PAPER], ids=["nominal", "paper"])
-def test_units_do_not_matter(strong, theta):
-    """The kernels in kip and inch, with materials worked out apart from the model, against the model in SI."""
+def test_the_system_of_units_does_not_matter(strong, theta):
+    """The kernels in kip and inch, with separately computed materials, against the model in SI."""
     model = RCColumn.lhpost(strong, **TIGHT)
     peer = peer_of(model, theta)
     points, weights = gauss_lobatto(peer.n_points)
@@ -186,7 +199,7 @@ def test_units_do_not_matter(strong, theta):
     assert rrmse(history[1::-1] * INCH, model.simulate(theta)).max() < 1e-8
 
 
-def test_substeps_are_a_finer_record(strong, column):
+def test_substeps_equal_a_finer_record(strong, column):
     finer = replace(column, substeps=4, tolerance=1e-11).simulate(NOMINAL)
     resampled = replace(column, loading=strong.resample(strong.dt / 4), tolerance=1e-11).simulate(NOMINAL)
     assert rrmse(finer, resampled[:, ::4]).max() < 1e-8
@@ -202,11 +215,13 @@ def test_energy_is_balanced(strong, changes, scale):
     )
     largest = np.abs(supplied).max()
     assert np.abs(kinetic + damped + absorbed - supplied).max() < 1e-7 * largest
-    assert damped[-1] > 0.05 * largest and np.abs(absorbed).max() > 0.05 * largest  # else the balance would say little
+    assert (
+        damped[-1] > 0.05 * largest and np.abs(absorbed).max() > 0.05 * largest
+    )  # otherwise the balance would prove little
     assert kinetic.min() >= 0.0
 
 
-def test_history_holds_the_response(column):
+def test_history_contains_the_response(column):
     history = column.history(PAPER)
     response = column.simulate(PAPER)
     np.testing.assert_array_equal(response, [history["absolute acceleration"], history["relative displacement"]])
@@ -215,7 +230,7 @@ def test_history_holds_the_response(column):
 
 
 def test_forces_in_the_history_are_in_equilibrium(strong):
-    """Without damping or vertical inertia: F = -m a at the top, and F and the weight make the moment at the base."""
+    """Without damping and vertical inertia, F = -m a at the top, and F and the weight give the moment at the base."""
     tight = dict(TIGHT, a0=0.0, a1=0.0, vertical_mass=False, parameters=("Ec",))
     model = RCColumn.lhpost(strong.trim(0.0, 2.0), **tight)
     history = model.history([0.6])
@@ -223,13 +238,13 @@ def test_forces_in_the_history_are_in_equilibrium(strong):
     np.testing.assert_allclose(force, -model.mass * history["absolute acceleration"], rtol=0, atol=1e-6 * np.ptp(force))
     moment = force * (model.height + history["vertical displacement"]) + weight * history["relative displacement"]
     np.testing.assert_allclose(-history["base moment"], moment, rtol=0, atol=1e-6 * np.ptp(moment))
-    np.testing.assert_allclose(history["base axial force"], -weight, rtol=1e-3)  # it leans by a hundredth
+    np.testing.assert_allclose(history["base axial force"], -weight, rtol=1e-3)  # the column leans by one hundredth
     assert np.corrcoef(history["base curvature"], history["base moment"])[0, 1] > 0.9
 
 
 # --- arguments and parameters ----------------------------------------------------------------------------------------
 
-CHANGED = dict(  # for every argument another value; `loading`, `units` and `outputs` have tests of their own
+CHANGED = dict(  # another value of every argument; `loading`, `units` and `outputs` have separate tests
     diameter=1.3,
     height=7.0,
     cover=0.06,
@@ -280,7 +295,14 @@ CHANGED = dict(  # for every argument another value; `loading`, `units` and `out
     penetration=0.3,
 )
 NUMERICAL = {"max_increment", "tolerance", "element_tolerance", "max_iterations", "halvings"}
-ONE_LOADING = {"mass", "rotational_inertia", "vertical_mass", "a0", "a1", "substeps"}  # inertia and damping
+ONE_LOADING = {
+    "mass",
+    "rotational_inertia",
+    "vertical_mass",
+    "a0",
+    "a1",
+    "substeps",
+}  # act under base acceleration only
 
 
 VARIANTS = [
@@ -322,7 +344,7 @@ def test_fingerprint_of_loading_units_and_outputs(strong, column, pushed):
     assert replace(column, outputs=("displacement",)).fingerprint != column.fingerprint
     assert replace(column, mesh=Patches()).fingerprint != replace(column, mesh=Patches(24)).fingerprint
     assert pushed.fingerprint != replace(pushed, loading=cycles(0.02)).fingerprint
-    # what does not change a response does not ask for new simulations
+    # display units and names of records do not change a response, hence not the fingerprint
     assert replace(column, units=(("acceleration", "m/s2"),)).fingerprint == column.fingerprint
     renamed = Record("another name", strong.dt, strong.acceleration, "another source")
     assert replace(column, loading=renamed).fingerprint == column.fingerprint
@@ -331,7 +353,7 @@ def test_fingerprint_of_loading_units_and_outputs(strong, column, pushed):
 
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_parameters_are_multiples_of_nominal_values(strong, pushed, name):
-    """A factor in theta does the same as the factor on the argument."""
+    """A factor in theta has the same effect as the same factor on the argument."""
     factor = 1.1
     places = {"Ec": ("concrete", "ec"), "ft": ("concrete", "ft"), "fc": ("concrete", "fc"), "Es": ("steel", "es")}
     places |= {"fy": ("steel", "fy"), "fu": ("steel", "fu"), "Esh": ("steel", "esh")}
@@ -385,7 +407,7 @@ def threads():
     numba.set_num_threads(before)
 
 
-def test_a_batch_is_its_rows_on_any_number_of_threads(column, rng, threads):
+def test_a_batch_equals_its_rows_on_any_number_of_threads(column, rng, threads):
     thetas = rng.uniform(0.6, 1.6, size=(7, 5))
     thetas[3, 0] = -1.0
     singles = [None if i == 3 else column.simulate(theta) for i, theta in enumerate(thetas)]
@@ -405,13 +427,13 @@ def test_a_batch_is_its_rows_on_any_number_of_threads(column, rng, threads):
     assert column.misfit_batch(np.empty((0, 5)), measured).misfit.shape == (0, 2)
 
 
-def test_runs_leave_no_trace(column):
+def test_runs_are_independent(column):
     first = column.simulate(PAPER)
     column.simulate(2.0 * NOMINAL)
     np.testing.assert_array_equal(column.simulate(PAPER), first)
 
 
-def test_the_model_travels_to_other_processes(column, pushed):
+def test_copies_in_other_processes_give_the_same_response(column, pushed):
     for model, theta in ((column, PAPER), (pushed, PAPER[[0, 1, 4]])):
         copy = pickle.loads(pickle.dumps(model))
         assert copy.fingerprint == model.fingerprint
@@ -430,20 +452,20 @@ def test_imposed_displacement_is_followed(pushed):
     force = pushed.simulate(np.ones(3))
     assert force.shape == (1, pushed.n_steps) == (1, pushed.loading.n_steps) and pushed.dt == 1.0
     np.testing.assert_array_equal(force[0], history["force"])
-    assert abs(force[0, 0]) < 1.0  # N: gravity alone pushes sideways no more than its round-off
-    assert force[0, 1] > 1e4  # and the first push takes force
+    assert abs(force[0, 0]) < 1.0  # [N] gravity causes no lateral force beyond round-off
+    assert force[0, 1] > 1e4  # the first increment requires a force
     assert history["base axial force"][0] == pytest.approx(-pushed.mass * G0, rel=1e-6)
 
 
-def test_a_history_may_start_displaced(pushed):
+def test_a_history_may_start_with_a_displacement(pushed):
     late = replace(pushed, loading=DisplacementHistory("late", [0.01, 0.02]))
     early = replace(pushed, loading=DisplacementHistory("early", [0.0, 0.01, 0.02]))
     force = late.simulate(np.ones(3))[0]
     assert force[0] > 1e5
-    np.testing.assert_allclose(force, early.simulate(np.ones(3))[0, 1:], rtol=1e-3)  # other increments on the way
+    np.testing.assert_allclose(force, early.simulate(np.ones(3))[0, 1:], rtol=1e-3)  # the increments differ
 
 
-def test_the_column_has_no_preferred_side(pushed):
+def test_the_column_is_symmetric(pushed):
     mirrored = replace(pushed, loading=DisplacementHistory("mirrored", -pushed.loading.displacement))
     force, other = pushed.simulate(np.ones(3)), mirrored.simulate(np.ones(3))
     np.testing.assert_allclose(other, -force, rtol=0, atol=1e-6 * np.abs(force).max())
@@ -453,7 +475,7 @@ def test_reversals_dissipate_energy_and_repeat(pushed):
     model = replace(pushed, loading=cycles(0.1, 0.1, 0.1))
     x, force = model.loading.displacement, model.simulate(np.ones(3))[0]
     loops = [np.trapezoid(force[i : i + 41], x[i : i + 41]) for i in (20, 60)]  # from one positive peak to the next
-    assert loops[0] > loops[1] > 0.02 * np.ptp(force) * np.ptp(x)  # the second time the concrete is cracked
+    assert loops[0] > loops[1] > 0.02 * np.ptp(force) * np.ptp(x)  # the concrete is cracked in the second cycle
     assert force[20] > 0 > force[40]
 
 
@@ -464,8 +486,8 @@ def test_finer_increments_change_little(pushed):
 
 
 @pytest.mark.parametrize("n_elements", [1, 2, 5])
-def test_strain_that_penetrates_the_foundation_turns_the_base(pushed, n_elements):
-    """Uncracked, 1/k = H^3/(3 EI) + H (M/EI) l/M: the base turns by its curvature times the length l."""
+def test_strain_penetration_rotates_the_base(pushed, n_elements):
+    """Uncracked, 1/k = H^3/(3 EI) + H^2 l/EI: the base rotates by its curvature times the length l."""
     small = DisplacementHistory("small", [0.0, 1e-7 * pushed.height, -1e-7 * pushed.height])
     rigid = replace(pushed, loading=small, geometry="linear", axial_load=0.0, n_elements=n_elements)
     for share in (0.05, 0.4):
@@ -475,7 +497,7 @@ def test_strain_that_penetrates_the_foundation_turns_the_base(pushed, n_elements
 
 
 def test_penetration_changes_what_cycles_dissipate_but_not_the_strength(pushed):
-    """After yielding the same displacement asks for less curvature; what the base section can carry is the same."""
+    """After yielding, the same displacement requires less curvature; the strength of the base section is the same."""
     model = replace(pushed, loading=cycles(0.1, 0.3), geometry="linear")
     rigid, slipping = (
         replace(model, penetration=length).history(np.ones(3)) for length in (0.0, 0.022 * 518.0 * 0.0358)
@@ -487,7 +509,7 @@ def test_penetration_changes_what_cycles_dissipate_but_not_the_strength(pushed):
 
 
 def test_a_cyclic_test_is_updated_end_to_end(rng):
-    """Synthetic force, noise included: the most probable parameters lie where linear theory says."""
+    """For a synthetic force with noise, the most probable parameters are where linear theory predicts them."""
     model = RCColumn.lhpost(cycles(0.01, 0.03, 0.06), parameters=PUSHED, outputs=("force",))
     truth, sigma = np.array([0.8, 1.1, 1.5]), 5e3
     force = model.simulate(truth)
@@ -526,7 +548,7 @@ def test_a_cyclic_test_is_updated_end_to_end(rng):
         ([1, 0.2, 1, 1, 1], "plateau"),
     ],
 )
-def test_parameters_that_make_no_column(column, theta, words):
+def test_parameters_that_describe_no_column_fail(column, theta, words):
     with pytest.raises(SimulationFailed, match=words) as failure:
         column.simulate(theta)
     assert words in failure.value.reason
@@ -534,8 +556,7 @@ def test_parameters_that_make_no_column(column, theta, words):
     assert np.isnan(row).all() and reason == failure.value.reason
 
 
-def test_parameters_may_vanish_where_that_means_something(column):
-    """Undamped, or without tensile strength: a column still."""
+def test_damping_and_tensile_strength_may_be_zero(column):
     assert np.isfinite(column.simulate([1, 1, 0, 0, 0])).all()
 
 
@@ -546,12 +567,12 @@ def test_steel_without_hardening_fails(strong):
 
 @pytest.mark.parametrize("load", [7e7, 2e8, 5e8])
 def test_a_load_beyond_all_capacity_fails(column, load):
-    """The squash load is near 60 MN; what is told must not be the response of a column crushed to nothing."""
+    """The squash load is about 60 MN. A crushed column must be a failure, not a response."""
     with pytest.raises(SimulationFailed):
         replace(column, axial_load=load).simulate(NOMINAL)
 
 
-def test_a_step_that_does_not_converge_is_told(column):
+def test_a_step_that_does_not_converge_is_reported(column):
     hasty = replace(column, loading=column.loading.scale(20.0), max_iterations=2, halvings=0)
     with pytest.raises(SimulationFailed, match=r"step \d+ of \d+ \(t = .* s\) did not converge, halved 0 times"):
         hasty.simulate(NOMINAL)
@@ -567,10 +588,10 @@ def test_retries_are_counted(column):
     assert rrmse(history["relative displacement"], usual[1]) < 0.05
 
 
-# --- bad input -------------------------------------------------------------------------------------------------------
+# --- wrong arguments -------------------------------------------------------------------------------------------------
 
-REFUSED = [
-    # what is changed, words of the message
+WRONG = [
+    # change, part of the message
     (dict(diameter=-1.2), "positive diameter"),
     (dict(diameter=0.0), "positive diameter"),
     (dict(diameter="48 in"), "positive diameter"),
@@ -621,14 +642,14 @@ REFUSED = [
     (dict(units={"acc": "g"}), "unit"),
     (dict(loading=np.zeros(10)), "Record or a DisplacementHistory"),
     (dict(concrete=dict(fc=-42e6)), "fc"),
-    (dict(concrete=dict(fc=6.1)), "tensile strength between 0 and fc"),  # ksi for one of them
+    (dict(concrete=dict(fc=6.1)), "tensile strength between 0 and fc"),  # one of them in ksi
     (dict(concrete=dict(ec=0.0)), "ec"),
     (dict(concrete=dict(ft=-2e6)), "tensile strength"),
     (dict(concrete=dict(peak_strain=-0.002)), "peak_strain"),
     (dict(concrete=dict(softening_strain=0.0)), "softening_strain"),
     (dict(concrete=dict(softening_ratio=1.0)), "softening_ratio"),
     (dict(steel=dict(es=-2e11)), "es"),
-    (dict(steel=dict(es=29000.0)), "fy/es"),  # ksi for one of them
+    (dict(steel=dict(es=29000.0)), "fy/es"),  # one of them in ksi
     (dict(steel=dict(fu=5e8)), "fy < fu"),
     (dict(steel=dict(hardening_strain=0.001)), "hardening_strain"),
     (dict(bars=dict(number=2)), "three bars"),
@@ -637,19 +658,19 @@ REFUSED = [
     (dict(bars=dict(diameter=-0.036)), "diameter of bars"),
     (dict(bars=dict(diameter=1.4)), "bars that fit"),
     (dict(bars=dict(area=0.0)), "area of bars"),
-    (dict(bars=dict(area=1.0)), "area of bars"),  # more steel than section
+    (dict(bars=dict(area=1.0)), "area of bars"),  # larger than the section
     (dict(bars=dict(first_angle=math.nan)), "first_angle"),
     (dict(hoops=dict(diameter=-0.016)), "diameter of hoops"),
     (dict(hoops=dict(spacing=0.0)), "spacing of hoops"),
     (dict(hoops=dict(spacing=0.01)), "larger than their diameter"),
-    (dict(hoops=dict(spacing=5.0)), "spacing"),  # arches between hoops would leave no confined core
+    (dict(hoops=dict(spacing=5.0)), "spacing"),  # no confined core between hoops
     (dict(hoops=dict(ultimate_strain=-0.1)), "ultimate_strain"),
     (dict(hoops=dict(ultimate_strain=math.nan)), "ultimate_strain"),
 ]
 
 
-@pytest.mark.parametrize(("change", "words"), [pytest.param(*case, id=str(case[0])) for case in REFUSED])
-def test_columns_that_cannot_be(column, change, words):
+@pytest.mark.parametrize(("change", "words"), [pytest.param(*case, id=str(case[0])) for case in WRONG])
+def test_wrong_arguments_are_rejected(column, change, words):
     ((name, value),) = change.items()
     with pytest.raises(ValueError, match="expected .*; got .*; .*") as error:
         if name == "mesh" and isinstance(value, tuple):
@@ -659,12 +680,12 @@ def test_columns_that_cannot_be(column, change, words):
 
 
 @pytest.mark.parametrize("group", ["concrete", "steel", "bars", "hoops"])
-def test_groups_of_the_wrong_kind(column, group):
+def test_parts_of_the_wrong_type_are_rejected(column, group):
     with pytest.raises(ValueError, match=group.capitalize()):
         replace(column, **{group: None})
 
 
-def test_damping_cannot_be_updated_where_nothing_moves():
+def test_damping_is_no_parameter_under_imposed_displacement():
     with pytest.raises(ValueError, match="expected parameters that act .* got .*'a0', 'a1'.* leave damping out"):
         RCColumn.lhpost(cycles(0.01))
 
@@ -690,15 +711,15 @@ def test_measurements_of_the_wrong_shape(column, shape):
         column.misfit_batch(np.ones((1, 5)), np.zeros(shape))
 
 
-def test_nothing_is_refused_that_is_right(column):
-    """Control: the arguments that the tests above spoil are fine as they are."""
+def test_limits_of_the_arguments_are_accepted(column):
+    """Control: arguments at the limits of their ranges are accepted."""
     for changes in (dict(cover=0.0), dict(mesh=4), dict(mesh=Patches(4, 1, 1)), dict(n_points=2), dict(n_points=7)):
         assert np.isfinite(replace(column, **changes).simulate(NOMINAL)).all()
     assert to_si(24.0, "ft").item() == pytest.approx(column.height)
 
 
-def test_a_jump_of_the_law_is_crossed(shared):
-    """A bar changes backbone at zero stress, by 35 MPa: no equilibrium on either side, however small the step."""
+def test_a_jump_of_the_steel_law_is_crossed(shared):
+    """The stress of a bar jumps by 35 MPa at zero stress: there is no equilibrium on either side, for any step size."""
     path = shared / "records" / "loma_prieta_1989_apeel2_redwood_city_133.csv"
     record = read_csv(path).scale(0.85).trim(0.0, 12.0)
     theta = [0.5284587364146686, 1.0214677685625493, 0.32405312400652414, 0.9625611775286573, 1.432206729992988]

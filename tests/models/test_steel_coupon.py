@@ -1,16 +1,23 @@
-"""The steel coupon: the law of the column's bars alone, against its closed forms."""
+"""Steel coupon: the law of the bars of the column against its closed forms."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from fe_likelihoods import (
+    FELikelihood,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    SimulationFailed,
+    Steel,
+    SteelCoupon,
+    TruncatedNormal,
+    propagate,
+)
 from fe_likelihoods.kernels import reinforcing_steel
-from fe_likelihoods.models.rc_column import Steel
-from fe_likelihoods.models.steel_coupon import PARAMETERS, SteelCoupon
-from fe_likelihoods.prediction.propagation import propagate
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.simulation.model import SimulationFailed
+from fe_likelihoods.models.steel_coupon import PARAMETERS
 
 STEEL = Steel(fy=450e6, fu=650e6, es=200e9, esh=5e9, hardening_strain=0.01, ultimate_strain=0.12)
 FIELDS = dict(zip(PARAMETERS, ("fy", "fu", "es", "esh", "hardening_strain", "ultimate_strain"), strict=True))
@@ -22,8 +29,8 @@ def coupon():
     return SteelCoupon(CYCLES, STEEL)
 
 
-def test_monotonic_loading_has_the_values_that_define_the_steel(coupon):
-    """Elastic with Es, fy on the plateau, fu and no slope at the ultimate strain."""
+def test_monotonic_loading_reproduces_the_defining_values(coupon):
+    """Slope Es at the start, fy on the plateau, fu and zero slope at the ultimate strain."""
     strain = np.array([0.0, 5e-4, 0.005, 0.01, 0.1199, 0.12, 0.1201])
     stress = coupon.with_record(strain).simulate(np.ones(6))[0]
     assert stress[0] == 0.0
@@ -34,12 +41,14 @@ def test_monotonic_loading_has_the_values_that_define_the_steel(coupon):
     np.testing.assert_allclose(coupon.with_record(-strain[:4]).simulate(np.ones(6))[0], -stress[:4], rtol=0.03)
 
 
-def test_cycles_are_those_of_the_bars_of_a_column(coupon):
+def test_cycles_equal_those_of_a_bar_of_the_column(coupon):
     constants, state = np.zeros(reinforcing_steel.N_CONSTANTS), np.zeros(reinforcing_steel.N_STATE)
     reinforcing_steel.constants(450e6, 650e6, 200e9, 5e9, 0.01, 0.12, constants)
     stress = [reinforcing_steel.update(strain, state, constants)[0] for strain in CYCLES]
     np.testing.assert_array_equal(coupon.simulate(np.ones(6))[0], stress)
-    assert np.trapezoid(stress[15:], CYCLES[15:]) > 450e6 * 0.05  # energy: about 2 fy times the plastic strain
+    assert (
+        np.trapezoid(stress[15:], CYCLES[15:]) > 450e6 * 0.05
+    )  # dissipated energy, about 2 fy times the plastic strain
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
@@ -53,7 +62,7 @@ def test_parameters_are_multiples_of_nominal_values(coupon, name):
     assert one.nominal == coupon.nominal
 
 
-def test_fingerprint_follows_the_strains(coupon):
+def test_fingerprint_depends_on_the_strains(coupon):
     assert coupon.with_record(CYCLES).fingerprint == coupon.fingerprint
     assert coupon.with_record(1.0001 * CYCLES).fingerprint != coupon.fingerprint
     assert replace(coupon, unit="ksi").fingerprint == coupon.fingerprint
@@ -69,7 +78,7 @@ def test_fingerprint_follows_the_strains(coupon):
         ([1, 1, 1, 1, 20, 1], "plateau"),
     ],
 )
-def test_parameters_that_make_no_steel(coupon, theta, words):
+def test_parameters_that_describe_no_steel_fail(coupon, theta, words):
     with pytest.raises(SimulationFailed, match=words):
         coupon.simulate(theta)
 
@@ -88,17 +97,13 @@ def test_parameters_that_make_no_steel(coupon, theta, words):
         (dict(unit="kN"), "kN"),
     ],
 )
-def test_coupons_that_cannot_be(coupon, change, words):
+def test_wrong_arguments_are_rejected(coupon, change, words):
     with pytest.raises(ValueError, match=words):
         replace(coupon, **change)
 
 
-def test_a_coupon_is_a_model(coupon, rng):
-    """Through likelihood, posterior and prediction under other strains; the truth is the most probable of three."""
-    from fe_likelihoods.probability.likelihood import FELikelihood
-    from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal
-    from fe_likelihoods.signals.channels import Measurements
-
+def test_a_coupon_works_as_a_model(coupon, rng):
+    """Likelihood, posterior and prediction under other strains; the true parameters are the most probable of three."""
     model = replace(coupon, parameters=("fy", "Es"))
     truth = np.array([1.05, 0.98])
     stress = model.simulate(truth)
