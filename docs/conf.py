@@ -42,7 +42,7 @@ sphinx_gallery_conf = {
     "examples_dirs": "../tutorials",
     "gallery_dirs": "tutorials",
     "filename_pattern": r"/0[1-5]_",  # executed
-    "ignore_pattern": r"/[a-z_]+\.py$",  # modules that tutorials share
+    "ignore_pattern": r"^[a-z_]+\.py$",  # modules that tutorials share
     "within_subsection_order": "FileNameSortKey",
     "reset_argv": "building.tutorial_arguments",
     "capture_repr": (),
