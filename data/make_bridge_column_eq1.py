@@ -1,11 +1,11 @@
-"""Make data/bridge_column_eq1.h5: a synthetic EQ1 for the bridge column.
+"""Make data/bridge_column_eq1.h5: synthetic data of earthquake EQ1 for the bridge column.
 
-The record and the responses of the paper could not be had. This script makes a stochastic base motion
-(`ground_motion`) with **assumed** parameters, chosen to give the features of the paper's Fig. 3 (50 s, about .2 g, top
-displacement about +-2 in at the paper's posterior means). The responses are those of a finer model than the one that is
-updated, plus white noise.
+The record and the responses of Ramancha et al. (2022) are not public. This script makes a stochastic base motion
+(`ground_motion`) with **assumed** parameters. They give the features of Fig. 3 of the paper: 50 s, about 0.2 g, and a
+displacement of the top of about ±2 in at the posterior means of the paper. The responses are those of a refined model
+with white noise added.
 
-Run it with ``make data``; it writes the same file every time.
+Run the script with ``make data``. It writes the same file every time.
 """
 
 from pathlib import Path
@@ -17,18 +17,18 @@ from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, BRIDGE_COLUMN_NOISE, br
 from fe_likelihoods.units import G0
 
 SEED = 17
-"""One of the draws in which stiffness and strength can be told from the damping (see README.md)."""
+"""A draw in which the data distinguish stiffness and strength from damping (see README.md)."""
 DT = 1.0 / 256.0  # s
 DURATION = 50.0  # s
 PEAK = 0.20 * G0  # m/s2
-PEAK_TIME, SHAPE = 9.0, 3.0  # s, -; gamma modulation t^(SHAPE-1) exp(-(SHAPE-1) t/PEAK_TIME)
+PEAK_TIME, SHAPE = 9.0, 3.0  # s, -; modulation by t^(SHAPE-1) exp(-(SHAPE-1) t/PEAK_TIME)
 START_FREQUENCY, END_FREQUENCY = 4.0, 2.0  # Hz at 0 s and at 40 s
 FILTER_DAMPING = 0.30
 HIGH_PASS = 0.20  # Hz
 
 
 def base_motion(seed: int = SEED) -> Record:
-    """The stochastic base motion, scaled to PEAK."""
+    """Make the stochastic base motion, scaled to PEAK."""
     motion = stochastic_motion(
         seed,
         dt=DT,

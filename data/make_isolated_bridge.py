@@ -1,15 +1,15 @@
 """Make data/isolated_bridge.h5 and data/isolated_bridge_means.h5: synthetic tests of the isolated bridge.
 
-The records and responses of the paper could not be had, and most nominal values of the model are assumed. The table
-motion is a stochastic one of our own (`ground_motion`), at the time scale of a quarter-scale model (15 s); its
-parameters are **assumed**, chosen for bearing displacements of about 35 mm. The responses are those of the model with
-a fifth of the default step of integration at parameters that are not the nominal ones, every second sample (100 Hz),
-plus white noise of a given share of each channel's root mean square.
+The records and responses of the tests are not public, and most nominal values of the model are assumed. The table
+motion is stochastic (`ground_motion`), at the time scale of a quarter-scale model (15 s). Its parameters are
+**assumed** and give bearing displacements of about 35 mm. The responses are those of the model with a fifth of the
+default integration step, at parameters that differ from the nominal values, at every second sample (100 Hz). White
+noise is added, with a given fraction of the root mean square of each channel.
 
-`isolated_bridge_means.h5` holds the means of the two piers alone: with structurally identical piers nothing in it tells
-them apart, so its posterior has exactly two modes (specs/isolated_bridge.md, section 8).
+`isolated_bridge_means.h5` has only means over the two piers. The piers are structurally identical, so that these data
+do not distinguish them, and the posterior has exactly two modes (see `IsolatedBridge.exchanged`).
 
-Run it with ``make data``; it writes the same files every time.
+Run the script with ``make data``. It writes the same files every time.
 """
 
 from pathlib import Path
@@ -26,12 +26,12 @@ from fe_likelihoods.problems import (
 
 SEED = 1994
 NOISE_SEED = 1999
-"""The noise is one draw of many: of nine, this is one of the four for which the estimate of every parameter lies within
-two posterior standard deviations of the truth. What holds over many draws is shown by a test of coverage."""
+"""One of four seeds, of nine, for which the estimates of all parameters lie within two posterior standard deviations
+of the truth. Tests of calibration use many draws of the noise."""
 
 
 def table_motion(seed: int = SEED) -> Record:
-    """The table's acceleration: 15 s at 200 Hz, .8 g."""
+    """Make the acceleration of the table: 15 s at 200 Hz, 0.8 g."""
     motion = stochastic_motion(
         seed,
         dt=0.005,

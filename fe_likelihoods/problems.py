@@ -1,15 +1,23 @@
-"""Ready-made posteriors, with bundled data: the two systems of the papers.
+"""Ready-made posteriors with bundled data: a bridge column and a seismically isolated bridge.
 
-`bridge_column` is the full-scale bridge column of the LHPOST tests, updated as in the paper: five multiples of nominal
-values with normal priors truncated at zero, two noise levels with half-normal priors. The measured record and
-responses of the paper could not be had; the bundled data are **synthetic** (see ``data/README.md``), and
+`bridge_column` is the full-scale bridge column of the LHPOST tests, updated as in Ramancha et al. (2022): five multiples
+of nominal values with normal priors truncated at zero, and two noise levels with half-normal priors. The measured
+record and responses are not public. The bundled data are **synthetic** (see ``data/README.md``), and
 `bridge_column_measurements` makes such data for any other base motion.
 
-`isolated_bridge` is the isolated bridge of the paper on TMCMC: ten multiples of nominal values of friction and dampers.
-Its data are **synthetic** and most nominal values are **assumed**.
+`isolated_bridge` is a bridge on sliding bearings with fluid dampers, after the shake-table tests of Tsopelas et al.
+(1994): ten multiples of nominal values of friction and dampers. Its data are **synthetic** and most nominal values are
+**assumed** (``docs/theory/isolated_bridge.rst``).
 
-The models are imported by the functions that make them: numba takes longer to start than the rest together.
+References
+----------
+M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd (2022), Bayesian nonlinear finite element model
+updating of a full-scale bridge-column using sequential Monte Carlo.
+P. Tsopelas, S. Okamoto, M. C. Constantinou, D. Ozaki, S. Fujii (1994), NCEER-TAISEI Corporation Research Program on
+Sliding Seismic Isolation Systems for Bridges, Report NCEER 94-0002, State University of New York, Buffalo.
 """
+
+# The models are imported inside the functions that make them, because numba takes longer to import than all the rest.
 
 from __future__ import annotations
 
@@ -50,16 +58,17 @@ __all__ = [
 ]
 
 BRIDGE_COLUMN_MEANS = MappingProxyType({"Ec": 0.59, "Es": 0.96, "a0": 0.27, "a1": 4.78, "ft": 2.43})
-"""Posterior means of the paper (Table 2), multiples of the nominal values: the truth of the synthetic data."""
+"""Posterior means of Ramancha et al. (2022), Table 2, as multiples of the nominal values: the synthetic truth."""
 
 BRIDGE_COLUMN_NOISE = MappingProxyType(
     {"acceleration": to_si(7.7, "in/s2").item(), "displacement": to_si(0.09, "in").item()}
 )
-"""Noise levels of the paper (Table 2) [SI]: standard deviations of the white noise of the synthetic data."""
+"""Noise levels of Ramancha et al. (2022), Table 2 [SI]: standard deviations of the white noise in the data."""
 
-
-_COARSE_SHARE = 0.75
+_COARSE_SHARE = 0.75  # part of the Arias intensity that the coarse column sees
 _COARSE_TOLERANCES = {"tolerance": 1e-3, "element_tolerance": 1e-3}
+
+_NOISE_SCALE = 0.3  # half-normal prior of a sigma in root mean squares of the measured channels (assumed)
 
 
 def _bundled(name: str) -> Dataset:
@@ -68,27 +77,34 @@ def _bundled(name: str) -> Dataset:
 
 
 def bridge_column_data() -> Dataset:
-    """The bundled synthetic EQ1: base record, measured channels and how they were made (``data/README.md``)."""
+    """Read the bundled synthetic data of earthquake EQ1: base motion, measured channels and truth (``data/README.md``)."""
     return _bundled("bridge_column_eq1.h5")
 
 
 def bridge_column_measurements(
     record: Record, *, seed: int = 1, n_strips: int = 200, substeps: int = 4, noise: bool = True, **changes
 ) -> Measurements:
-    """Synthetic measurements of the column under `record`: a finer model than the one to be updated, plus white noise.
+    """Make synthetic measurements of the bridge column: the response of a refined model plus white noise.
 
     Parameters
     ----------
     record : Record
         Base acceleration.
     seed : int
-        Of the noise.
-    n_strips, substeps : int
-        Mesh and integration steps per record step of the finer model (the updated one has 40 and 1).
+        Seed of the noise.
+    n_strips : int
+        Number of strips of the section in the refined model (40 in the model that is updated).
+    substeps : int
+        Integration steps per sample of the record in the refined model (1 in the model that is updated).
     noise : bool
-        False: the response alone.
+        Whether to add the noise. False: the response alone.
     **changes
         Other arguments of `RCColumn.lhpost`.
+
+    Returns
+    -------
+    Measurements
+        The channels "acceleration" and "displacement".
     """
     from .models.rc_column import RCColumn
 
@@ -108,46 +124,57 @@ def bridge_column_measurements(
 def bridge_column_prior(
     noise_parameters: Sequence[str] = ("sigma_acceleration", "sigma_displacement"),
 ) -> Prior:
-    """The paper's prior: normal, truncated at zero, CV .30 .20 .60 .60 .40; half-normal of .1 g and 1.2 in.
+    """Make the prior of Ramancha et al. (2022).
+
+    The structural parameters are normal with mean 1, truncated at zero, with coefficients of variation of 0.30 (Ec),
+    0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal with scales of 0.1 g and 1.2 in.
 
     Parameters
     ----------
     noise_parameters : sequence of str
-        Those of another noise: a shared ``sigma`` in root mean squares of the measured channels is half-normal of .3,
-        correlations ``rho_...`` are uniform between -1 and 1; both assumed.
+        Parameters of the noise. For another noise than that of the paper: a shared ``sigma`` in root mean squares of
+        the measured channels is half-normal with scale 0.3, correlations ``rho_...`` are uniform between -1 and 1 (both
+        assumed).
+
+    Returns
+    -------
+    Prior
+        The prior of structural parameters and noise.
 
     Raises
     ------
     ValueError
-        For a parameter that is none of these.
+        If there is no default prior for a parameter of the noise.
     """
     structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
     scales = {
         "sigma_acceleration": to_si(0.1, "g").item(),
         "sigma_displacement": to_si(1.2, "in").item(),
-        "sigma": 0.3,
+        "sigma": _NOISE_SCALE,
     }
     noise = {name: HalfNormal(scales[name]) for name in noise_parameters if name in scales}
     return Prior(
-        {name: TruncatedNormal(1.0, cv) for name, cv in structural.items()} | noise | _rest(noise_parameters, scales)
+        {name: TruncatedNormal(1.0, cv) for name, cv in structural.items()}
+        | noise
+        | _correlation_priors(noise_parameters, scales)
     )
 
 
-def _rest(noise_parameters: Sequence[str], scales: Mapping[str, float]) -> dict[str, Uniform]:
-    """Priors of the parameters of a noise that are no standard deviations, hence not in `scales`."""
-    rest = [name for name in noise_parameters if name not in scales]
-    unknown = [name for name in rest if not name.startswith("rho_")]
+def _correlation_priors(noise_parameters: Sequence[str], scales: Mapping[str, float]) -> dict[str, Uniform]:
+    """Return priors of the noise parameters that are correlations, not standard deviations with a scale."""
+    others = [name for name in noise_parameters if name not in scales]
+    unknown = [name for name in others if not name.startswith("rho_")]
     if unknown:
         raise ValueError(
             f"no default prior for {', '.join(unknown)} of this noise: make Posterior(FELikelihood(...), prior) with "
-            "your own"
+            "your own prior"
         )
-    return {name: Uniform(-1.0, 1.0) for name in rest}
+    return {name: Uniform(-1.0, 1.0) for name in others}
 
 
-def _noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) -> Any:
-    """The noise of a name, or the one that was given; ValueError for another name."""
-    if hasattr(noise, "log_likelihood"):
+def _make_noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) -> Any:
+    """Return the noise with a name, or the noise that was given; raise ValueError for an unknown name."""
+    if not isinstance(noise, str):
         return noise
     if noise == "per channel":
         return GaussianNoise(channels)
@@ -156,7 +183,7 @@ def _noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) 
     if noise == "autoregressive":
         return AutoregressiveNoise(channels)
     raise ValueError(
-        'expected noise="per channel", "shared", "autoregressive" or "marginal", or a noise of fe_likelihoods.probability.noise; '
+        'expected noise="per channel", "shared", "autoregressive" or "marginal", or a noise such as GaussianNoise; '
         f"got {noise!r}"
     )
 
@@ -172,47 +199,57 @@ def bridge_column(
     cache: SimulationCache | str | os.PathLike | None = None,
     **changes,
 ) -> Posterior:
-    """Posterior of the bridge column: seven parameters, two measured channels, likelihood of the paper's equation (3).
+    """Make the posterior of the bridge column: seven parameters, two measured channels.
+
+    The likelihood is equation (3) of Ramancha et al. (2022).
 
     Parameters
     ----------
-    record, measurements : optional
-        Base motion and measured responses at its step. Default: the bundled synthetic EQ1. With a record alone,
-        synthetic measurements are made for it (`bridge_column_measurements`).
+    record : Record, optional
+        Base motion. Default: the bundled synthetic EQ1.
+    measurements : Measurements, optional
+        Responses at the step of the record. Default: the bundled ones, or, for another record, synthetic measurements
+        (`bridge_column_measurements`).
     every : int
-        Keep one sample in `every`: record resampled (anti-aliased), measurements decimated. 2 costs about half.
-    duration : float
-        Keep the first `duration` seconds.
-    noise : {"per channel", "shared", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.probability.noise`
-        White, one sigma for each channel as in the paper, or one for both; or an error that lasts, with a correlation
-        ``rho_...`` per channel too. Priors are in `bridge_column_prior`. "marginal" is "per channel" with the sigmas
-        integrated out (`Posterior.marginal`): five parameters.
+        Use every n-th sample only: the record is resampled with a filter, the measurements are decimated. 2 halves the
+        cost of a simulation.
+    duration : float, optional
+        Use the first `duration` seconds only.
+    noise : {"per channel", "shared", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
+        "per channel" is white noise with one sigma per channel, as in the paper. "shared" has one sigma for all
+        channels, in root mean squares of the measured channels. "autoregressive" has a correlation ``rho_...`` per
+        channel in addition. "marginal" is "per channel" with the sigmas integrated out (`Posterior.marginal`), which
+        leaves five parameters. The priors are in `bridge_column_prior`.
     seed : int
-        Of the noise, where measurements are made.
+        Seed of the noise of synthetic measurements.
     cache : SimulationCache or path, optional
-        Where simulations are kept on disk, for later runs too.
+        Cache of simulations on disk.
     **changes
         Other arguments of `RCColumn.lhpost`.
 
     Returns
     -------
     Posterior
-        Parameters Ec, Es, a0, a1, ft (multiples of nominal), sigma_acceleration [m/s2], sigma_displacement [m], or
-        those of another noise.
-        Its `coarse` sees the record up to three quarters of its Arias intensity only and solves the equations of motion
-        less tightly: a quarter of the cost, for a wider posterior about the same place. (A larger step or fewer strips
-        save less and move the posterior by many of its standard deviations.)
+        Parameters Ec, Es, a0, a1, ft (multiples of nominal values), sigma_acceleration [m/s²] and sigma_displacement
+        [m], or those of another noise.
 
     Raises
     ------
     ValueError
-        For measurements without a record, or that do not fit it; for an unknown noise.
+        If measurements are given without a record or do not match it, or the noise is unknown.
+
+    Notes
+    -----
+    The attribute `coarse` of the posterior is a cheaper posterior of the same parameters. It uses the first part of the
+    record, up to three quarters of its Arias intensity, and larger tolerances in the solution of the equations of
+    motion. It costs a quarter as much and is wider, but has nearly the same location. A larger time step or fewer
+    strips would save less and would shift the posterior by many of its standard deviations.
     """
     from .models.rc_column import RCColumn
 
     if record is None:
         if measurements is not None:
-            raise ValueError("measurements came without the record that caused them: give record= too")
+            raise ValueError("measurements need the record under which they were measured: give record= too")
         data = bridge_column_data()
         record, measurements = data.record, data.measurements
     elif measurements is None:
@@ -223,15 +260,14 @@ def bridge_column(
         measurements = measurements.decimate(every)
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
-    law = _noise("per channel" if noise == "marginal" else noise, model.channels, measurements)
+    law = _make_noise("per channel" if noise == "marginal" else noise, model.channels, measurements)
     likelihood, prior = FELikelihood(model, measurements, law, cache=cache), bridge_column_prior(law.parameter_names)
     coarse = None
     intensity = np.cumsum(record.acceleration**2)
-    most = int(np.searchsorted(intensity, _COARSE_SHARE * intensity[-1])) * record.dt
-    if most > record.dt:
-        few = measurements.trim(0.0, most)
-        cheap = replace(model, loading=record.trim(0.0, most), **_COARSE_TOLERANCES)
-        coarse = Posterior(FELikelihood(cheap, few, law, cache=likelihood.cache), prior)
+    end = int(np.searchsorted(intensity, _COARSE_SHARE * intensity[-1])) * record.dt
+    if end > record.dt:
+        cheap = replace(model, loading=record.trim(0.0, end), **_COARSE_TOLERANCES)
+        coarse = Posterior(FELikelihood(cheap, measurements.trim(0.0, end), law, cache=likelihood.cache), prior)
     posterior = Posterior(likelihood, prior, coarse)
     return posterior.marginal() if noise == "marginal" else posterior
 
@@ -247,7 +283,7 @@ ISOLATED_BRIDGE_TRUTH = MappingProxyType(
         "means": MappingProxyType(dict.fromkeys(_DEVICES, 1.0) | {"df_1": 0.8, "df_2": 1.2}),
     }
 )
-"""Multiples of the nominal values from which the two synthetic data sets were made (assumed)."""
+"""Multiples of the nominal values with which the two synthetic data sets were made (assumed)."""
 
 ISOLATED_BRIDGE_OUTPUTS = MappingProxyType(
     {"twin": CHANNEL_SETS[10], "means": ("mean_Ub", "mean_Fb", "mean_drift", "mean_shear", "mean_acc_p")}
@@ -255,24 +291,31 @@ ISOLATED_BRIDGE_OUTPUTS = MappingProxyType(
 """Channels of the two synthetic data sets."""
 
 ISOLATED_BRIDGE_NOISE = MappingProxyType({"twin": 0.05, "means": 0.10})
-"""White noise of the two synthetic data sets, in root mean squares of each channel (assumed)."""
+"""Standard deviation of the noise of the two synthetic data sets, in root mean squares of each channel (assumed)."""
 
 
 def isolated_bridge_data(data: str = "twin") -> Dataset:
-    """A bundled synthetic test of the isolated bridge, nominal values assumed (``data/README.md``).
+    """Read a bundled synthetic test of the isolated bridge, with assumed nominal values (``data/README.md``).
 
     Parameters
     ----------
     data : {"twin", "means"}
-        Ten channels of both piers; or five means of the two piers, whose posterior has two modes.
+        "twin" has ten channels of both piers. "means" has five means over the two piers, whose posterior has two modes.
+
+    Returns
+    -------
+    Dataset
+        Table motion, measured channels and truth.
 
     Raises
     ------
     ValueError
-        For another name.
+        If the name is unknown.
     """
     if data not in ISOLATED_BRIDGE_TRUTH:
-        raise ValueError(f'expected data="twin" or "means"; got {data!r}; for your own give record= and measurements=')
+        raise ValueError(
+            f'expected data="twin" or "means"; got {data!r}; for your own data give record= and measurements='
+        )
     return _bundled("isolated_bridge.h5" if data == "twin" else "isolated_bridge_means.h5")
 
 
@@ -287,26 +330,31 @@ def isolated_bridge_measurements(
     every: int = 2,
     **changes,
 ) -> Measurements:
-    """Synthetic measurements of the isolated bridge under `record`: a finer step of integration, plus white noise.
+    """Make synthetic measurements of the isolated bridge: the response with a finer time step plus white noise.
 
     Parameters
     ----------
     record : Record
-        Acceleration of the table.
+        Acceleration of the shake table.
     theta : mapping of str to float
         Multiples of the nominal values of all ten parameters.
     outputs : tuple of str, 5, 6 or 10
         Channels (see `IsolatedBridge`).
     noise : float
-        Standard deviation of the noise, in root mean squares of each channel; 0 for the response alone.
+        Standard deviation of the noise, in root mean squares of each channel. 0: the response alone.
     seed : int
-        Of the noise.
+        Seed of the noise.
     step : float
-        Of integration [s]; the updated model has .25 ms.
+        Integration step [s]. The model that is updated has 0.25 ms.
     every : int
-        One sample in so many of the record's.
+        Return every n-th sample of the record only.
     **changes
         Other arguments of `IsolatedBridge`.
+
+    Returns
+    -------
+    Measurements
+        The channels `outputs`.
     """
     from .models.isolated_bridge import IsolatedBridge
 
@@ -322,19 +370,26 @@ def isolated_bridge_measurements(
 
 
 def isolated_bridge_prior(parameter_names: Sequence[str], sigmas: Mapping[str, float]) -> Prior:
-    """Multiples of nominal N(1, .5) within [.2, 2.5]; half-normal noise of .3 scales, above a thousandth: all assumed.
+    """Make the prior of the isolated bridge (assumed).
 
-    The paper gives no prior (specs/isolated_bridge.md, section 5).
+    The multiples of nominal values are normal with mean 1 and standard deviation 0.5, truncated to [0.2, 2.5]. A noise
+    level with scale s is half-normal with scale 0.3 s, truncated below at 0.001 s.
 
     Parameters
     ----------
     parameter_names : sequence of str
         Structural parameters.
     sigmas : mapping of str to float
-        Noise parameters and the scale of each: 1 for a shared sigma, the measured root mean square of a channel [SI].
+        Scale of each noise parameter: 1 for a shared sigma, the measured root mean square of the channel [SI] for a
+        sigma per channel.
+
+    Returns
+    -------
+    Prior
+        The prior of structural parameters and noise.
     """
     structural = {name: TruncatedNormal(1.0, 0.5, 0.2, 2.5) for name in parameter_names}
-    return Prior(structural | {name: TruncatedNormal(0.0, 0.3 * s, 1e-3 * s) for name, s in sigmas.items()})
+    return Prior(structural | {name: TruncatedNormal(0.0, _NOISE_SCALE * s, 1e-3 * s) for name, s in sigmas.items()})
 
 
 def isolated_bridge(
@@ -348,45 +403,48 @@ def isolated_bridge(
     cache: str | os.PathLike | SimulationCache | None = None,
     **changes,
 ) -> Posterior:
-    """Posterior of the isolated bridge: ten parameters of friction and dampers, and the noise.
+    """Make the posterior of the isolated bridge: ten parameters of friction and dampers, and the noise.
 
     Parameters
     ----------
     data : {"twin", "means"}
-        Bundled synthetic test: "twin" has a known truth and one mode; "means" holds only means of the two piers, so
-        the devices of the piers can be exchanged: exactly two modes, whose masses are known
+        Bundled synthetic test. "twin" has a known truth and one mode. "means" has only means over the two piers, so
+        that the devices of the piers can be exchanged: its posterior has exactly two modes, whose masses are known
         (`IsolatedBridge.exchanged`).
     channels : tuple of str, 5, 6 or 10, optional
-        Measured channels that are used. Default: six of "twin", as in the paper's figure of the fit; all of any other.
-    noise : {"shared", "per channel", "autoregressive", "marginal"}, or a noise of `fe_likelihoods.probability.noise`
-        White, one sigma for all channels, in root mean squares of the measured channel, as in the paper's results, or
-        one for each channel [SI], its general formulation; or an error that lasts, with a correlation ``rho_...`` per
-        channel too (uniform between -1 and 1). "marginal" is "shared" with sigma integrated out
-        (`Posterior.marginal`): ten parameters.
-    record, measurements : optional
-        Table motion and responses of your own. With a record alone, synthetic measurements are made for it
-        (`isolated_bridge_measurements`). Measurements may have a step that is a multiple of the record's.
+        Measured channels to use. Default: six of "twin", all of any other data.
+    noise : {"shared", "per channel", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
+        "shared" is white noise with one sigma for all channels, in root mean squares of the measured channels. "per
+        channel" has one sigma per channel [SI]. "autoregressive" has a correlation ``rho_...`` per channel in addition
+        (uniform between -1 and 1). "marginal" is "shared" with sigma integrated out (`Posterior.marginal`), which
+        leaves ten parameters.
+    record : Record, optional
+        Table motion of your own. Default: that of `data`.
+    measurements : Measurements, optional
+        Responses of your own. Their step may be a multiple of that of the record. Default: for a record of your own,
+        synthetic measurements (`isolated_bridge_measurements`).
     seed : int
-        Of the noise, where measurements are made.
-    cache : path or SimulationCache, optional
-        Where simulations are kept from run to run (see `FELikelihood`).
+        Seed of the noise of synthetic measurements.
+    cache : SimulationCache or path, optional
+        Cache of simulations on disk.
     **changes
         Other arguments of `IsolatedBridge`: step, friction, bearings, parameters ...
 
     Returns
     -------
     Posterior
+        Ten multiples of nominal values, and the parameters of the noise.
 
     Raises
     ------
     ValueError
-        For unknown names, for measurements without a record, or that do not fit it.
+        If a name is unknown, or measurements are given without a record or do not match it.
     """
     from .models.isolated_bridge import IsolatedBridge
 
     if record is None:
         if measurements is not None:
-            raise ValueError("measurements came without the record that caused them: give record= too")
+            raise ValueError("measurements need the record under which they were measured: give record= too")
         bundled = isolated_bridge_data(data)
         record, measurements = bundled.record, bundled.measurements
         channels = 6 if channels is None and data == "twin" else channels
@@ -401,10 +459,12 @@ def isolated_bridge(
     model = IsolatedBridge(
         record, outputs=tuple(c.name for c in measurements.channels), **({"every": max(1, every)} | changes)
     )
-    law = _noise("shared" if noise == "marginal" else noise, model.channels, measurements)
+    law = _make_noise("shared" if noise == "marginal" else noise, model.channels, measurements)
     rms = SharedGaussianNoise.of(measurements).scales
     scales = {"sigma": 1.0} | {f"sigma_{c.name}": scale for c, scale in zip(measurements.channels, rms, strict=True)}
     sigmas = {name: scales[name] for name in law.parameter_names if name in scales}
-    prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | _rest(law.parameter_names, scales)
+    prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | _correlation_priors(
+        law.parameter_names, scales
+    )
     posterior = Posterior(FELikelihood(model, measurements, law, cache=cache), prior)
     return posterior.marginal() if noise == "marginal" else posterior

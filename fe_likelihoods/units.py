@@ -1,8 +1,8 @@
-"""Units: one table from the name of a unit to its SI factor and its dimension.
+"""Units: a table from the name of a unit to its SI factor and its dimension.
 
-Inside the library every number is SI. Conversion happens at two places only: where files are read (`to_si`) and where
-labels and plots are made (`from_si`). A unit that is not in the table, or that measures something else than what was
-asked for, is refused: a wrong unit is a wrong answer that looks like a right one.
+All numbers inside the library are in SI units. They are converted in two places only: where files are read (`to_si`),
+and where labels and figures are made (`from_si`). A unit that is unknown or has another dimension than the quantity
+raises ValueError, because a wrong unit gives results that look right.
 
 The factors are exact by definition: 1 in = 25.4 mm, 1 lb = 0.45359237 kg, standard gravity 9.80665 m/s².
 """
@@ -24,7 +24,17 @@ POUND_FORCE = 0.45359237 * G0
 
 
 class Unit(NamedTuple):
-    """A unit of measurement: its canonical `name`, the `factor` that brings it to SI, and its `dimension`."""
+    """A unit of measurement.
+
+    Attributes
+    ----------
+    name : str
+        Canonical name.
+    factor : float
+        Size of the unit in the SI unit of its dimension.
+    dimension : str
+        Dimension, a key of `DIMENSIONS`.
+    """
 
     name: str
     factor: float
@@ -60,7 +70,7 @@ _FACTORS = {
 UNITS: dict[str, Unit] = {
     name: Unit(name, factor, dimension) for dimension, table in _FACTORS.items() for name, factor in table.items()
 }
-"""Every unit that is known, by its canonical name."""
+"""All known units by their canonical name."""
 
 DIMENSIONS: dict[str, str] = {
     dimension: next(name for name, factor in table.items() if factor == 1.0) for dimension, table in _FACTORS.items()
@@ -71,23 +81,28 @@ _BY_LOWER_CASE = {name.lower(): unit for name, unit in UNITS.items()}
 
 
 def find_unit(name: str, dimension: str | None = None) -> Unit:
-    """Unit of the table with this name.
+    """Return the unit with a name.
 
-    The spellings of the usual file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2``, ``cm_s2`` are all
-    ``cm/s2``. Letter case is ignored (file headers are often in capitals), except for the prefix of ``MN`` and
-    ``MPa``, because ``mN`` means something a thousand million times smaller.
+    The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are all
+    ``cm/s2``. Letter case is ignored, because file headers are often in capitals, except for the prefix of ``MN`` and
+    ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
 
     Parameters
     ----------
     name : str
         Name of the unit.
     dimension : str, optional
-        What the unit must measure, one of `DIMENSIONS`.
+        Required dimension of the unit, a key of `DIMENSIONS`.
+
+    Returns
+    -------
+    Unit
+        The unit.
 
     Raises
     ------
     ValueError
-        If the unit is not in the table or measures another dimension; the message lists what is known.
+        If the unit is unknown or has another dimension. The message lists the known units.
     """
     if dimension is not None and dimension not in DIMENSIONS:
         raise ValueError(f"unknown dimension {dimension!r}; known dimensions: {', '.join(DIMENSIONS)}")
@@ -102,32 +117,54 @@ def find_unit(name: str, dimension: str | None = None) -> Unit:
 
 
 def to_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArray[np.float64]:
-    """Values in SI from values in `unit`.
+    """Convert values to SI units.
 
     Parameters
     ----------
     values : array_like
         Numbers in `unit`.
     unit : str
-        A unit of `UNITS` (see `find_unit` for the spellings).
+        Name of a unit in `UNITS` (see `find_unit` for the spellings).
     dimension : str, optional
-        What the unit must measure, one of `DIMENSIONS`.
+        Required dimension of the unit, a key of `DIMENSIONS`.
 
     Returns
     -------
     ndarray
-        The numbers in SI, same shape, float64 (a scalar for a scalar).
+        The numbers in SI units, float64, of the same shape (a scalar for a scalar).
 
     Raises
     ------
     ValueError
-        If the unit is unknown or of another dimension.
+        If the unit is unknown or has another dimension.
     """
     return np.asarray(values, dtype=np.float64) * find_unit(unit, dimension).factor
 
 
 def from_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArray[np.float64]:
-    """Values in `unit` from values in SI: the inverse of `to_si`, with the same arguments and errors."""
+    """Convert values from SI units to `unit`.
+
+    This is the inverse of `to_si`.
+
+    Parameters
+    ----------
+    values : array_like
+        Numbers in SI units.
+    unit : str
+        Name of a unit in `UNITS` (see `find_unit` for the spellings).
+    dimension : str, optional
+        Required dimension of the unit, a key of `DIMENSIONS`.
+
+    Returns
+    -------
+    ndarray
+        The numbers in `unit`, float64, of the same shape (a scalar for a scalar).
+
+    Raises
+    ------
+    ValueError
+        If the unit is unknown or has another dimension.
+    """
     return np.asarray(values, dtype=np.float64) / find_unit(unit, dimension).factor
 
 

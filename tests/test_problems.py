@@ -188,7 +188,7 @@ def test_other_records_and_models(strong):
 
 def test_measurements_must_fit(data, strong):
     record, measurements = data.record.trim(0.0, 2.0), data.measurements.trim(0.0, 2.0)
-    with pytest.raises(ValueError, match="without the record .* give record="):
+    with pytest.raises(ValueError, match="need the record .* give record="):
         bridge_column(measurements=measurements)
     with pytest.raises(ValueError, match="samples.*make them equal"):
         bridge_column(record=record, measurements=data.measurements.trim(0.0, 1.5))
