@@ -49,8 +49,12 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .tempering.evidence_check import (
         EvidenceCheck,
     )
-    from .tempering.weights import (
+    from .tempering.population import (
         Stage,
+    )
+    from .tempering.settings import (
+        RecyclingSettings,
+        Settings,
     )
     from .tmcmc import (
         TMCMCSampler,
@@ -64,8 +68,10 @@ __all__ = [
     "RAMANCHA_2022_CONSTANT",
     "RAMANCHA_2022_LITERAL",
     "RandomWalkMove",
+    "RecyclingSettings",
     "SMCSampler",
     "SamplingWarning",
+    "Settings",
     "Stage",
     "StudentTMove",
     "Summary",
@@ -113,7 +119,11 @@ _EXPORTS = {
     "tempered": ("TemperedSampler",),
     "tempering.diagnostics": ("SamplingWarning",),
     "tempering.evidence_check": ("EvidenceCheck",),
-    "tempering.weights": ("Stage",),
+    "tempering.population": ("Stage",),
+    "tempering.settings": (
+        "RecyclingSettings",
+        "Settings",
+    ),
     "tmcmc": ("TMCMCSampler",),
 }
 _MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names}

@@ -1,20 +1,21 @@
 """Settings of published runs, by name: ``SMCSampler(1000, ndim, log_prob_fn, **RAMANCHA_2022_LITERAL)``.
 
-Ramancha, Astroza, Conte, Restrepo & Todd (2022) update a bridge column with 1000 particles, multinomial resampling and
-10 Metropolis steps a stage, and choose beta so that "ESS_j = 0.95 ESS_{j-1}" (their Table 1). Two readings:
+`RAMANCHA_2022_CONSTANT` and `RAMANCHA_2022_LITERAL` are for `SMCSampler`. Ramancha, Astroza, Conte, Restrepo & Todd
+(2022) update a bridge column with 1000 particles, multinomial resampling and 10 Metropolis steps per stage, and choose
+beta so that "ESS_j = 0.95 ESS_{j-1}" (their Table 1). This can be read in two ways:
 
 constant
     After resampling all weights are equal, so ESS_{j-1} is the number of particles, and every stage keeps 95 % of it.
 literal
-    The target itself shrinks by 5 % a stage, 950, 902, 857, ..., with a floor of 50.
+    The target itself decreases by 5 % per stage, 950, 902, 857, ..., with a floor of 50.
 
-The scale of their random walk is not given; 2.38 / sqrt(ndim) is taken.
+The scale of their random walk is not given; 2.38 / sqrt(ndim) is used.
 
-Ching & Chen (2007), for ``TMCMCSampler(1000, ndim, log_prob_fn, **CHING_CHEN_2007)``: coefficient of variation 1,
-multinomial leaders, one Metropolis step a point, covariance 0.04 times the weighted one. It can collapse on sharp
-posteriors; the default of `TMCMCSampler` does not.
+`CHING_CHEN_2007` is for `TMCMCSampler`: coefficient of variation 1, multinomial leaders, one Metropolis step per point,
+covariance 0.04 times the weighted one (Ching & Chen 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)). It can collapse
+on sharp posteriors; the default of `TMCMCSampler` does not.
 
-None of them has sweeps over fast parameters, which are not in the papers.
+None of them makes sweeps over fast parameters, which are not in the papers.
 """
 
 from collections.abc import Mapping
@@ -27,6 +28,7 @@ __all__ = ["CHING_CHEN_2007", "RAMANCHA_2022_CONSTANT", "RAMANCHA_2022_LITERAL"]
 
 _COMMON = {
     "moves": RandomWalkMove(),  # a sampler copies its moves, so runs do not share it
+    "recycle": False,
     "ess_ratio": 0.95,
     "resampling": "multinomial",
     "min_moves": 10,
@@ -41,7 +43,6 @@ CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
         "coefficient_of_variation": 1.0,
         "resampling": "multinomial",
         "chains": "leaders",
-        "burn_in": 0,
         "fast_sweeps": 0,
     }
 )

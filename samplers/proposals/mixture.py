@@ -25,6 +25,7 @@ from scipy.special import gammaln
 
 from .shears import Shear, apply_shears, find_shears, invert_shears
 from .support_bounds import SupportBounds, from_unbounded, log_abs_det_jacobian, near_bounds, to_unbounded
+from .systematic import systematic
 
 __all__ = [
     "Mixture",
@@ -199,8 +200,7 @@ def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
     less than one.
     """
     ndim = mixture.means.shape[1]
-    cumulated = np.cumsum(mixture.weights)
-    component = np.searchsorted(cumulated / cumulated[-1], (np.arange(n) + random.uniform()) / n, side="right")
+    component = systematic(mixture.weights, random, n)
     z = random.standard_normal((n, ndim))
     z *= np.sqrt(mixture.dof / random.chisquare(mixture.dof, size=n))[:, None]
     coords = np.empty((n, ndim))

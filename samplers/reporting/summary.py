@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..tempering.weights import Stage
+from ..tempering.population import Stage
 from .inspection import is_tempered, parameter_names_of
 
 __all__ = ["SamplerComparison", "Summary", "comparison_table", "finished_ladder", "ladder_table", "summary", "to_arviz"]

@@ -1,12 +1,12 @@
-"""Where a run is kept: the chain in emcee's backend, the ladder beside it, and for an HDF5 file a journal beside that.
+"""Storage of a run: the chain in emcee's backend, the ladder with it, and a journal beside an HDF5 file.
 
-In an HDF5 file the ladder is the dataset ``ladder`` in the group of the chain, one row a stage, appended as soon as the
-stage is done, and the independent check of the evidence is its attribute ``evidence_check``. In memory both are
+In an HDF5 file the ladder is the dataset ``ladder`` in the group of the chain, one row per stage, appended when the
+stage is finished. The independent check of the evidence is its attribute ``evidence_check``. In memory both are
 attributes of the backend.
 
-An HDF5 file can be damaged by a process that dies while it writes. So the journal (see `samplers.storage.journal`) is written
-first, and a chain that does not agree with it is made again from it. It lies beside the file, as
-``<file>.<group>.journal``. The group names its run, so that a journal of another run is of no effect.
+A process that dies while it writes can damage an HDF5 file. Therefore the journal (`samplers.storage.journal`) is
+written first, and a chain that does not agree with it is rebuilt from it. The journal is ``<file>.<group>.journal``,
+beside the file. The group names its run, so that the journal of another run has no effect.
 """
 
 import logging
@@ -15,13 +15,13 @@ import secrets
 import time
 from pathlib import Path
 
-import h5py
 import numpy as np
 from emcee.backends import Backend, HDFBackend
 
 from ..tempering.evidence_check import EvidenceCheck
-from ..tempering.weights import Stage
-from .journal import Contents, Evaluated, Journal, Start, Step, read_journal
+from ..tempering.population import Stage
+from .emcee_internals import append_steps, holds_steps
+from .journal import Contents, EvaluatedBatch, Journal, RunStart, Step, read_journal
 
 __all__ = ["JournaledBackend", "read_check", "read_ladder", "write_check", "write_stage"]
 
@@ -39,22 +39,23 @@ STAGE_DTYPE = np.dtype(
 class JournaledBackend(HDFBackend):
     """emcee's HDF5 backend, with a journal beside it.
 
-    Steps go to the journal at once and to the HDF5 file a few times a second, and before anything is read through this
-    object. `TemperedSampler` makes one of any emcee `HDFBackend` that it is given.
+    Steps are written to the journal at once, and to the HDF5 file a few times per second and before anything is read
+    through this object. `TemperedSampler` makes one from any emcee `HDFBackend`.
 
     Attributes
     ----------
-    contents : Contents, or None — what the journal of a run that is to go on holds; used up by the sampler.
+    contents : Contents, or None
+        Journal of an interrupted run that can be continued; None after `continue_run`.
     """
 
     @classmethod
     def of(cls, backend: HDFBackend) -> "JournaledBackend":
-        """Of emcee's backend; what a killed process left is mended.
+        """From emcee's backend; a chain that a killed process left incomplete is repaired.
 
         Raises
         ------
         ValueError
-            If the file is damaged and cannot be made again, or the journal is damaged.
+            If the file is damaged and cannot be rebuilt, or the journal is damaged.
         """
         self = cls.__new__(cls)
         self.__dict__.update(backend.__dict__)
@@ -70,13 +71,13 @@ class JournaledBackend(HDFBackend):
 
     @property
     def journal_path(self) -> Path:
-        """Where the journal is."""
+        """Path of the journal."""
         return Path(f"{self.filename}.{self.name.replace('/', '.')}.journal")
 
     # ------------------------------------------------------------------ the chain, as emcee writes it
 
     def open(self, mode="r"):
-        """emcee's: the open HDF5 file; what was waiting is written first."""
+        """emcee's: the open HDF5 file, after pending steps have been written."""
         self.flush()
         return super().open(mode)
 
@@ -85,7 +86,7 @@ class JournaledBackend(HDFBackend):
         super().reset(nwalkers, ndim)
         if self._journal is not None:
             self._journal.wipe()
-            self._mark()
+            self._write_run()
 
     def save_step(self, state, accepted):
         """emcee's: store a step."""
@@ -105,22 +106,13 @@ class JournaledBackend(HDFBackend):
             self.flush()
 
     def flush(self) -> None:
-        """Write to the HDF5 file what waits for it."""
+        """Write pending steps to the HDF5 file."""
         if not self._pending:
             return
         steps, self._pending = self._pending, []
         try:
             with super().open("a") as file:
-                group = file[self.name]
-                start, stop = group.attrs["iteration"], group.attrs["iteration"] + len(steps)
-                group["chain"][start:stop] = np.stack([step.coords for step in steps])
-                group["log_prob"][start:stop] = np.stack([step.log_prob for step in steps])
-                if steps[0].blobs is not None:
-                    group["blobs"][start:stop] = np.stack([step.blobs for step in steps])
-                group["accepted"][:] += np.sum([step.accepted for step in steps], axis=0)
-                for i, value in enumerate(steps[-1].random_state):
-                    group.attrs[f"random_state_{i}"] = value
-                group.attrs["iteration"] = stop
+                append_steps(file[self.name], steps)
         except BaseException:
             self._pending = steps + self._pending
             raise
@@ -128,46 +120,46 @@ class JournaledBackend(HDFBackend):
 
     # ------------------------------------------------------------------ the journal
 
-    def begin(self, header: dict, start: Start) -> None:
-        """A climb begins: enter it in the journal, a new one if there is none and the chain is empty."""
+    def begin(self, header: dict, start: RunStart) -> None:
+        """Enter the start of the annealing in the journal; a new one if there is none and the chain is empty."""
         if self._journal is None:
             if self.iteration > 0:
-                logger.info("%s holds a chain without a journal: the new run cannot be resumed", self.filename)
+                logger.info("%s contains a chain without a journal: the new run cannot be resumed", self.filename)
                 return
             header = {**header, RUN: secrets.token_hex(8)}
             self._run = header[RUN]
             self._journal = Journal.create(self.journal_path, header)
-            self._mark()
+            self._write_run()
         self._journal.start(start)
 
-    def go_on(self, contents: Contents) -> None:
-        """Go on with the journal that was read; its contents are not kept."""
+    def continue_run(self, contents: Contents) -> None:
+        """Append to the journal that was read from now on."""
         self.contents = None
         self._run = contents.header[RUN]
         self._journal = Journal(self.journal_path, contents)
 
-    def evaluated(self, batch: Evaluated) -> None:
-        """A batch of points has been evaluated."""
+    def evaluated(self, batch: EvaluatedBatch) -> None:
+        """Enter a batch of evaluated points in the journal."""
         if self._journal is not None:
             self._journal.evaluated(batch)
 
     def call(self, nsteps: int) -> None:
-        """So many steps are wanted."""
+        """Enter the number of steps that a call asks for in the journal."""
         if self._journal is not None:
             self._journal.call(nsteps)
 
     def done(self) -> None:
-        """They have been made, or are not wanted any more."""
+        """Enter that the call is complete, or was ended by the user, in the journal."""
         if self._journal is not None:
             self._journal.done()
 
-    def _mark(self) -> None:
-        """Say in the group which run it holds."""
+    def _write_run(self) -> None:
+        """Name the run in the group."""
         with super().open("a") as file:
             file[self.name].attrs[RUN] = self._run
 
     def _recover(self) -> Contents | None:
-        """The journal of the run in the file, whose chain is mended where the two differ."""
+        """The journal of the run in the file; where the chain differs from it, the chain is rebuilt."""
         if not os.path.exists(self.filename):
             return None
         try:
@@ -177,29 +169,29 @@ class JournaledBackend(HDFBackend):
                     return None
                 contents = read_journal(self.journal_path)
                 if contents is None or contents.header[RUN] != run:
-                    logger.info("%s: the journal of the run is not there", self.filename)
+                    logger.info("%s: the journal of the run is missing", self.filename)
                     return None
                 self._run = run
-                if _agree(file[self.name], contents.steps):
+                if holds_steps(file[self.name], contents.steps):
                     return contents
         except (OSError, KeyError, RuntimeError) as error:
             contents = read_journal(self.journal_path)
             if contents is None:
                 raise ValueError(
-                    f"{self.filename} is damaged, or no HDF5 file ({error}), and there is no journal to make it again "
-                    f"from at {self.journal_path}: restore it from a copy, or give another file"
+                    f"{self.filename} is damaged or not an HDF5 file ({error}), and there is no journal at "
+                    f"{self.journal_path} to rebuild it from: restore it from a copy, or give another file"
                 ) from error
             aside = f"{self.filename}.damaged"
             os.replace(self.filename, aside)
-            logger.warning("%s is damaged: set aside as %s and made again from its journal", self.filename, aside)
-        self._make_again(contents)
+            logger.warning("%s is damaged: set aside as %s and rebuilt from its journal", self.filename, aside)
+        self._rebuild(contents)
         return contents
 
-    def _make_again(self, contents: Contents) -> None:
+    def _rebuild(self, contents: Contents) -> None:
         self._run = contents.header[RUN]
         ladder = read_ladder(self) if self.initialized else ()
         HDFBackend.reset(self, contents.header["nwalkers"], contents.header["ndim"])
-        self._mark()
+        self._write_run()
         for index, stage in enumerate(ladder):
             write_stage(self, index, stage)
         if contents.steps:
@@ -208,27 +200,17 @@ class JournaledBackend(HDFBackend):
             self.flush()
 
 
-def _agree(group: h5py.Group, steps: list[Step]) -> bool:
-    """Whether the chain in the file is the one of the journal."""
-    if group.attrs["iteration"] != len(steps):
-        return False
-    if not steps:
-        return True
-    stored = group["chain"][: len(steps)], group["log_prob"][: len(steps)], group["accepted"][...]
-    coords, log_prob = np.stack([step.coords for step in steps]), np.stack([step.log_prob for step in steps])
-    expected = coords.astype(stored[0].dtype), log_prob.astype(stored[1].dtype), sum(step.accepted for step in steps)
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(stored, expected, strict=True))
-
-
 def write_stage(backend: Backend, index: int, stage: Stage) -> None:
-    """Store a stage at its place in the ladder; what was there from `index` on is dropped,
-    and the check of the evidence with it.
+    """Store a stage at its place in the ladder; later stages and the check of the evidence are dropped.
 
     Parameters
     ----------
-    backend : an initialised emcee Backend or HDFBackend.
-    index : int — place in the ladder, 0 for the first stage.
+    backend : emcee Backend or HDFBackend
+        Initialised.
+    index : int
+        Place in the ladder, 0 for the first stage.
     stage : Stage
+        The stage.
     """
     row = np.array(tuple(stage), dtype=STAGE_DTYPE)
     if isinstance(backend, HDFBackend):
@@ -246,12 +228,18 @@ def write_stage(backend: Backend, index: int, stage: Stage) -> None:
 
 
 def read_ladder(backend: Backend) -> tuple[Stage, ...]:
-    """Stages stored in a backend; empty where there are none.
+    """The ladder stored in a backend.
 
     Parameters
     ----------
-    backend : emcee Backend or HDFBackend. HDF5 locks files: reading one while a run writes it can stop that run, as
-        with emcee's chains; set HDF5_USE_FILE_LOCKING=FALSE in both to watch a run.
+    backend : emcee Backend or HDFBackend
+        HDF5 locks files: reading a file while a run writes to it can stop that run, as with emcee's chains. To watch a
+        run, set HDF5_USE_FILE_LOCKING=FALSE in both processes.
+
+    Returns
+    -------
+    tuple of Stage
+        The sequence of stages; empty if there are none.
     """
     if isinstance(backend, HDFBackend):
         if not backend.initialized:
@@ -265,7 +253,7 @@ def read_ladder(backend: Backend) -> tuple[Stage, ...]:
 
 
 def write_check(backend: Backend, check: EvidenceCheck) -> None:
-    """Store the check of the evidence beside a ladder that is there."""
+    """Store the check of the evidence with a stored ladder."""
     if isinstance(backend, HDFBackend):
         with backend.open("a") as file:
             file[backend.name][DATASET].attrs[CHECK] = np.array(check, dtype=float)
@@ -274,7 +262,7 @@ def write_check(backend: Backend, check: EvidenceCheck) -> None:
 
 
 def read_check(backend: Backend) -> EvidenceCheck | None:
-    """The stored check of the evidence; None where there is none."""
+    """The stored check of the evidence; None if there is none."""
     if not isinstance(backend, HDFBackend):
         return getattr(backend, CHECK, None)
     if not backend.initialized:

@@ -1,4 +1,4 @@
-"""Whether a run may be continued: what it was begun with, as plain data, and how that differs from now."""
+"""Whether an interrupted run may be continued: what it was started with, as plain data, and what differs now."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from emcee.moves import Move
 
 from ..moves.kernels import describe
 from ..tempering.settings import Settings
-from .journal import Contents, Evaluated
+from .journal import Contents, EvaluatedBatch
 
 __all__ = ["differences", "header"]
 
@@ -20,28 +20,43 @@ CLOSE = {"rtol": 1e-9, "atol": 1e-9}
 def header(
     nwalkers: int,
     ndim: int,
-    fingerprint: str | None,
+    log_prob_fn: Callable,
+    coarse_log_prob_fn: Callable | None,
     settings: Settings,
     moves: Sequence[Move],
-    shares: Sequence[float],
+    probabilities: Sequence[float],
 ) -> dict:
-    """What a run is begun with, as JSON gives it back.
+    """What a run is started with, in the form in which JSON returns it.
 
     Parameters
     ----------
     nwalkers, ndim : int
-    fingerprint : str, or None — of the posterior, where it has one.
+        Size of the ensemble.
+    log_prob_fn, coarse_log_prob_fn : callable
+        The densities; identified by their attribute ``fingerprint``, where they have one.
     settings : Settings
-    moves, shares : the mutation kernels, and how often each is taken.
+        Settings of the sampler.
+    moves : sequence of Move
+        The moves.
+    probabilities : sequence of float
+        Probability of each move to be chosen.
     """
-    begun = {"nwalkers": nwalkers, "ndim": ndim, "log_prob_fn": fingerprint}
-    begun |= {name: _plain(value) for name, value in asdict(settings).items()}
-    begun |= {"moves": [describe(move) for move in moves], "shares": list(shares)}
-    return json.loads(json.dumps(begun))
+    described = {"nwalkers": nwalkers, "ndim": ndim, "log_prob_fn": _fingerprint(log_prob_fn)}
+    described |= {name: _plain(value) for name, value in asdict(settings).items()}
+    described |= {"moves": [describe(move) for move in moves], "probabilities": list(probabilities)}
+    coarse = None
+    if coarse_log_prob_fn is not None:
+        coarse = _fingerprint(coarse_log_prob_fn) or "one without a fingerprint"
+    return json.loads(json.dumps(described | {"coarse_log_prob_fn": coarse}))
+
+
+def _fingerprint(function: Callable) -> str | None:
+    """Identity of a user's function, if it states one."""
+    return getattr(function, "fingerprint", None)
 
 
 def _plain(value: Any) -> Any:
-    """A setting as JSON takes it: a function by its name."""
+    """A setting in a form that JSON accepts: a function by its name."""
     return f"{value.__module__}.{value.__qualname__}" if callable(value) else value
 
 
@@ -49,35 +64,41 @@ def differences(
     ours: dict,
     contents: Contents,
     log_prior: Callable[[np.ndarray], np.ndarray],
-    ask: Callable[[np.ndarray], Evaluated],
+    compute: Callable[[np.ndarray], EvaluatedBatch],
 ) -> list[str]:
-    """What keeps a run from being continued, in words; empty if it may be.
+    """What prevents a run from being continued, as text; empty if nothing does.
 
-    Settings are compared, then the log-prior of the first draws, then, for a posterior without a fingerprint, the
-    log-probability of one point, at one evaluation.
+    Settings are compared, then the log-prior of the starting points, then, for a posterior without a fingerprint, the
+    log-probability of one point, at the cost of one evaluation.
 
     Parameters
     ----------
-    ours : dict — the `header` of the sampler that wants to go on.
-    contents : Contents — of the journal.
-    log_prior : function of points (n, ndim).
-    ask : function of points (n, ndim) that evaluates them.
+    ours : dict
+        `header` of the sampler that is to continue the run.
+    contents : Contents
+        Contents of the journal.
+    log_prior : callable
+        Log-prior of points (n, ndim).
+    compute : callable
+        Evaluates points (n, ndim).
     """
     theirs, start = contents.header, contents.start
-    told = [f"{name} was {theirs.get(name)}, is {value}" for name, value in ours.items() if theirs.get(name) != value]
-    if told:
-        return told
+    found = [f"{name} was {theirs.get(name)}, is {value}" for name, value in ours.items() if theirs.get(name) != value]
+    if found:
+        return found
     if not np.allclose(log_prior(start.coords), start.log_prior, **CLOSE):
-        return ["the log-prior of the first draws is another"]
-    return [] if ours["log_prob_fn"] is not None else _compare_one_point(contents.evaluated, ask)
+        return ["the log-prior of the starting points differs"]
+    return [] if ours["log_prob_fn"] is not None else _compare_one_point(contents.evaluated, compute)
 
 
-def _compare_one_point(evaluated: Sequence[Evaluated], ask: Callable[[np.ndarray], Evaluated]) -> list[str]:
+def _compare_one_point(
+    evaluated: Sequence[EvaluatedBatch], compute: Callable[[np.ndarray], EvaluatedBatch]
+) -> list[str]:
     for batch in evaluated:
         row = int(np.argmax(np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)))
         if np.isfinite(batch.log_prob[row]):
-            before, again = batch.log_prob[row], ask(batch.coords[row : row + 1]).log_prob[0]
-            if np.isclose(before, again, **CLOSE):
+            before, now = batch.log_prob[row], compute(batch.coords[row : row + 1]).log_prob[0]
+            if np.isclose(before, now, **CLOSE):
                 return []
-            return [f"log_prob_fn was {before:.10g} at {batch.coords[row]}, is {again:.10g}"]
+            return [f"log_prob_fn was {before:.10g} at {batch.coords[row]}, is {now:.10g}"]
     return []

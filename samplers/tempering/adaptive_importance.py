@@ -1,18 +1,21 @@
-"""Recycling: a ladder climbed by importance sampling, on which nothing evaluated is thrown away.
+"""Recycling: adaptive importance sampling from the prior to the posterior over all evaluated points.
 
-Every point so far, draws of the prior and of all proposals since, is weighted by the target over the mixture of all
-densities it could have come from (deterministic mixture weights). The next beta keeps the effective sample size of
-*all* points at a target; a mixture fitted to them at that beta is the next proposal. A rung is left only when the draws
-made on it are themselves worth three quarters of the target: of many old points some look good by luck, and where the
-likelihood is rough a climb led by the luckiest ends on a summit of its own. Once beta = 1 is reached, draws are added
-until the effective sample size suffices. A posterior that is nearly Gaussian, straightened or split if need be, takes a
-small part of the evaluations of moves this way.
+All points evaluated so far, draws of the prior and of every proposal since, are weighted by the tempered target over
+the mixture of all densities that they were drawn from (deterministic mixture weights, Owen & Zhou 2000). The next beta
+keeps the effective sample size of *all* points at a target. A mixture fitted to the weighted points at that beta is the
+next proposal. A beta is left only when the draws made at it have an effective sample size of three quarters of the
+target: among many old points some have large weights by chance, and where the likelihood is rough, annealing that
+follows these points ends in a local mode. Once beta = 1 is reached, points are drawn until the effective sample size
+suffices. For a posterior that is nearly Gaussian, possibly after a transformation or split into components, this takes
+a small part of the evaluations of annealing by moves.
 
-Proposals adapted to their own weights can be confidently wrong. So the last fit is tried on fresh draws that had no
-part in it, and the result is used only if their weights behave and their evidence agrees (`Recycled.trusted`). If they
-do not, they join the other points, and the next fit is tried, a few times. Points that shaped later proposals end up
-with too little weight, and the smaller of two modes with them: the population that is handed on consists of the draws
-made at beta = 1 only, each weighted by the one proposal it came from.
+Proposals that are adapted to their own weights can be confidently wrong. Therefore the last fit is checked with fresh
+draws that it was not fitted to. The result is used only if their weights are well-behaved and their evidence agrees
+(`Recycled.trusted`). If not, these draws join the other points and the next fit is checked, a few times. Points that
+shaped later proposals end up with too little weight, and with them the smaller of two modes. Therefore the resulting
+population consists only of draws made at beta = 1, each weighted by the one proposal that it was drawn from.
+
+The constants, and why they have their values, are in `samplers.tempering.settings.RecyclingSettings`.
 
 References
 ----------
@@ -20,7 +23,7 @@ Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-
 Owen & Zhou (2000), JASA 95(449), doi:10.1080/01621459.2000.10473909 (deterministic mixture weights)
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,31 +31,22 @@ import numpy as np
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights
+from .population import Density, Population, Report, Stage, Sweep
+from .settings import RecyclingSettings
 from .weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
 
-__all__ = ["Recycled", "recycle"]
-
-TARGET_SHARE = 0.2
-POINTS_PER_DIMENSION = 5
-FRESH_SHARE = 0.75
-LOW_YIELD = 0.03
-LEAST_YIELD = 0.25
-HIGH_YIELD = 0.5
-PATIENCE = 6
-MOST_STAGES = 200
-LARGEST_DIFFERENCE = 0.25
-MOST_CHECKS = 4
-EVENED = 0.25
-MOST_COMPONENTS = 8
+__all__ = ["Recycled", "StartingDensity", "recycle"]
 
 
-class Start(NamedTuple):
-    """Where a climb by recycling sets out: a density that points were drawn from.
+class StartingDensity(NamedTuple):
+    """Density that the starting points were drawn from.
 
     Attributes
     ----------
-    made : int — draws made of it, those outside the support of the prior counted.
-    log_density : function of points (n, ndim) and their records (n,) that returns the logarithm of it, (n,).
+    made : int
+        Number of draws made from it, including those outside the support of the prior.
+    log_density : callable
+        Function of points (n, ndim) and their records (n,) that returns the logarithm of the density (n,).
     """
 
     made: int
@@ -60,18 +54,29 @@ class Start(NamedTuple):
 
 
 class Recycled(NamedTuple):
-    """Outcome of a climb by recycling.
+    """Result of recycling.
 
     Attributes
     ----------
-    doubt : str — why the result may not be trusted; empty if it may.
-    coords : (n, ndim) float — the draws made at beta = 1, those of the check among them.
-    records : (n,) — their records (log_prob, log_prior[, blobs]).
-    log_weights : (n,) float — round by round against the one mixture of the round, whose fit they had no part in; a
-        round counts by its effective sample size.
-    log_evidence, log_evidence_error : float — by the ladder: all points but those of the check.
-    check : EvidenceCheck, or None if beta = 1 was not reached, or a check was not wanted.
-    proposals : list of (int, Mixture) — the mixtures drawn from, in order, and how many draws were made of each.
+    doubt : str
+        Why the result cannot be trusted; empty if it can.
+    coords : (n, ndim) float
+        The draws made at beta = 1, including those of the check.
+    records : (n,) structured array
+        Their records (log_prob, log_prior and, where there are any, blobs).
+    log_weights : (n,) float
+        Log-weights of the draws, round by round against the mixture of the round, which was not fitted to them. The
+        sum of the weights of a round is its effective sample size.
+    log_evidence, log_evidence_error : float
+        Log-evidence from all points but those of the check, and its standard error.
+    check : EvidenceCheck, optional
+        The check with fresh draws; None if beta = 1 was not reached, or no check was wanted.
+    proposals : sequence of (int, Mixture)
+        The proposals in order, and how many draws were made from each.
+    log_evidence_below_one : float
+        Log-evidence at the last beta below 1; 0 without such a stage.
+    evaluations_below_one : int
+        Evaluations up to the last stage below beta = 1, including those of the starting points; 0 without such a stage.
     """
 
     doubt: str
@@ -82,17 +87,19 @@ class Recycled(NamedTuple):
     log_evidence_error: float
     check: EvidenceCheck | None
     proposals: Sequence[tuple[int, Mixture]] = ()
+    log_evidence_below_one: float = 0.0
+    evaluations_below_one: int = 0
 
     @property
     def trusted(self) -> bool:
-        """Whether the weights may be used."""
+        """Whether the result can be trusted."""
         return not self.doubt
 
 
-class _Pool:
-    """All points, their records, and the log of the mixture of all densities they were drawn from."""
+class _Archive:
+    """All points, their records, and the logarithm of the mixture of all densities that they were drawn from."""
 
-    def __init__(self, coords: np.ndarray, records: np.ndarray, start: Start):
+    def __init__(self, coords: np.ndarray, records: np.ndarray, start: StartingDensity):
         self.coords, self.records, self._start = coords, records, start
         self.proposals: list[tuple[int, Mixture]] = []
         self._log_made = np.log(start.made)
@@ -100,7 +107,7 @@ class _Pool:
         self._log_mixture = self._log_made + self._log_start
 
     def add(self, mixture: Mixture, made: int, coords: np.ndarray, records: np.ndarray) -> None:
-        """Enter the draws (n, ndim) that `made` draws of a mixture left inside the support."""
+        """Add the draws (n, ndim) inside the support, of `made` draws from a mixture."""
         log_start = self._start.log_density(coords, records)
         log_mixture = self._log_made + log_start
         for count, earlier in self.proposals:
@@ -115,11 +122,11 @@ class _Pool:
 
     @property
     def log_ratio(self) -> np.ndarray:
-        """Log of the posterior over the start: from the prior, the log-likelihood."""
+        """Logarithm of the posterior over the starting density; from the prior, the log-likelihood."""
         return self.records["log_prob"] - self._log_start
 
     def log_weights(self, beta: float) -> np.ndarray:
-        """Log of the tempered target over the mixture, (n,); their sum estimates the evidence at beta."""
+        """Logarithm of the tempered target over the mixture, (n,); the sum of the weights estimates the evidence."""
         alive = self.records["log_prob"] > -np.inf
         tempered = self._log_start + beta * np.where(alive, self.log_ratio, 0.0) - self._log_mixture
         return np.where(alive, tempered, -np.inf)
@@ -128,116 +135,153 @@ class _Pool:
 def recycle(
     coords: np.ndarray,
     records: np.ndarray,
-    evaluate: Callable[[np.ndarray], np.ndarray],
-    inside: Callable[[np.ndarray], np.ndarray],
+    density: Density,
     random: np.random.RandomState,
-    enter: Callable[..., None],
-    start: Start | None = None,
-    wanted: int | None = None,
+    settings: RecyclingSettings,
+    start: StartingDensity | None = None,
+    size: int | None = None,
     finish: bool = True,
-) -> Recycled:
-    """Climb from draws of the prior, or of another start, to beta = 1 by adaptive mixture importance sampling.
+) -> Generator[tuple[Population, Report], None, Recycled]:
+    """Anneal draws of the prior, or of another starting density, to beta = 1 by adaptive importance sampling.
 
     Parameters
     ----------
-    coords, records : (n, ndim) and (n,) — draws of the prior and their records; n sets the size of everything.
-    evaluate : function of points (m, ndim) that returns their records (m,).
-    inside : function of points (m, ndim) that tells which lie in the support of the prior.
+    coords, records : (n, ndim) float, (n,) structured array
+        Starting points and their records.
+    density : Density
+        Evaluates points.
     random : RandomState
-    enter : called for each beta below 1, before its draws are made, with the keywords of a `Stage` that are known here:
-        beta, effective_sample_size, acceptance (the share of the latest draws that their weights are worth),
-        log_evidence and log_evidence_error (both so far).
-    start : Start, optional — what the points were drawn from instead of the prior; the path from it to the posterior is
-        start^(1 - beta) posterior^beta, and the evidence remains that of the posterior.
-    wanted : int, optional — what sets the size of everything, if not the number of points.
-    finish : bool — False: end as soon as the draws at beta = 1 are worth as much as those of a rung.
+        Source of random numbers.
+    settings : RecyclingSettings
+        Constants.
+    start : StartingDensity, optional
+        What the points were drawn from; the prior by default. The path from it to the posterior is
+        start^(1 - beta) posterior^beta; the evidence is that of the posterior in any case.
+    size : int, optional
+        Effective sample size wanted at beta = 1, and number of draws of the check; n by default.
+    finish : bool
+        False: end as soon as the draws at beta = 1 satisfy the rule by which a beta is left.
+
+    Yields
+    ------
+    Population, Stage or Sweep
+        For each beta below 1, before its draws are made: all points with their weights, and the stage. Its acceptance
+        is the yield of the latest draws. Then the same points and a `Sweep`, as a tick of the progress bar.
+
+    Returns
+    -------
+    Recycled
     """
-    ndim, n = coords.shape[1], len(coords) if wanted is None else wanted
-    start = Start(len(coords), lambda _, records: records["log_prior"]) if start is None else start
-    target = max(TARGET_SHARE * len(coords), POINTS_PER_DIMENSION * (ndim + 1.0))
-    pool = _Pool(coords, records, start)
-    edges = find_support_bounds(inside, coords)
+    ndim, size = coords.shape[1], len(coords) if size is None else size
+    start = StartingDensity(len(coords), lambda _, records: records["log_prior"]) if start is None else start
+    target = max(settings.target_share * len(coords), settings.points_per_dimension * (ndim + 1.0))
+    enough_fresh = settings.fresh_share * target
+    archive = _Archive(coords, records, start)
+    bounds = find_support_bounds(density.inside, coords)
     beta, fresh, yields, checks = 0.0, 0.0, [], 0
+    increments: list[float] = []
+    evaluations_before, evaluations_below_one = density.evaluations - len(coords), 0
     final: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    alive = effective_sample_size(pool.log_weights(0.0))
+    alive = effective_sample_size(archive.log_weights(0.0))
     if alive < target:
-        doubt = f"only {alive:.0f} of {len(coords)} first draws have a likelihood above zero"
+        doubt = f"only {alive:.0f} of {len(coords)} starting points have a likelihood above zero"
         return Recycled(doubt, coords, records, np.zeros(len(coords)), float("-inf"), float("inf"), None)
     while True:
-        log_weights, last_beta = pool.log_weights(beta), beta
+        log_weights, last_beta = archive.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
-        if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= FRESH_SHARE * target):
-            beta, fresh = next_beta(pool.log_ratio, beta, target, log_weights), 0.0
-            log_weights = pool.log_weights(beta)
+        if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= enough_fresh):
+            beta, fresh = next_beta(archive.log_ratio, beta, target, log_weights), 0.0
+            log_weights = archive.log_weights(beta)
             effective = effective_sample_size(log_weights)
         log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
-        # proposals were chosen by weights worth `target` points: their luck lives on in all that follows
-        luck = 1.0 / target if yields else 0.0
-        error = float(np.sqrt(max(1.0 / effective - 1.0 / len(log_weights), 0.0) + luck))
+        # proposals were chosen by weights with an effective sample size of `target`: this error stays in what follows
+        inherited = 1.0 / target if yields else 0.0
+        error = float(np.sqrt(max(1.0 / effective - 1.0 / len(log_weights), 0.0) + inherited))
         if last_beta < beta < 1.0:
-            share = yields[-1] if yields else effective / len(coords)
-            enter(
+            increments.append(log_evidence - sum(increments))
+            evaluations_below_one = density.evaluations - evaluations_before
+            stage = Stage(
                 beta=beta,
                 effective_sample_size=effective,
-                acceptance=share,
-                log_evidence=log_evidence,
+                acceptance=yields[-1] if yields else effective / len(coords),
+                moves=0,
+                distinct_ancestors=int(effective),
+                log_evidence_increment=increments[-1],
                 log_evidence_error=error,
             )
-        mixture = _evened(fit_mixture(pool.coords, coarse_weights(log_weights), MOST_COMPONENTS, edges))
-        finished = beta == 1.0 and effective >= n
-        new, made = draw_inside(mixture, n if finished else int(round(2.0 * target)), random, inside)
-        new_records = evaluate(new)
-        new_weights = _against(mixture, new_records, new, start, beta)
-        worth = effective_sample_size(new_weights)
-        fresh += worth
-        yields.append(worth / max(len(new), 1))
-        pool.add(mixture, made, new, new_records)
+            population = Population(beta, archive.coords, archive.records, effective, (), log_weights)
+            yield population, stage
+            yield population, Sweep(stage.acceptance)
+        fitted = fit_mixture(archive.coords, coarse_weights(log_weights), settings.max_components, bounds)
+        mixture = _with_even_share(fitted, settings.even_share)
+        finished = beta == 1.0 and effective >= size
+        new, made = draw_inside(mixture, size if finished else int(round(2.0 * target)), random, density.inside)
+        new_records = density.evaluate(new)
+        new_weights = _weights_against(mixture, new_records, new, start, beta)
+        fresh_size = effective_sample_size(new_weights)
+        fresh += fresh_size
+        yields.append(fresh_size / max(len(new), 1))
+        archive.add(mixture, made, new, new_records)
         if beta == 1.0:
             final.append((new, new_records, _of_round(new_weights)))
         checks += finished
         check = evidence_from_weights(new_weights, made) if finished else None
-        doubt = _doubt(check, log_evidence, beta, yields)
-        # draws that tell a fit from the truth also mend it: check again, as long as that is cheap
-        reached = not finish and beta == 1.0 and effective >= target and fresh >= FRESH_SHARE * target
-        if (finished and (not doubt or checks == MOST_CHECKS)) or (doubt and not finished) or reached:
+        doubt = _doubt(settings, check, log_evidence, beta, yields)
+        # draws that contradict a fit also improve it: check again, as long as that is cheap
+        reached = not finish and beta == 1.0 and effective >= target and fresh >= enough_fresh
+        if (finished and (not doubt or checks == settings.max_checks)) or (doubt and not finished) or reached:
             columns = (
                 np.concatenate(column) for column in zip(*final or [(new, new_records, new_weights)], strict=True)
             )
-            return Recycled(doubt, *columns, log_evidence, error, check, pool.proposals)
+            return Recycled(
+                doubt,
+                *columns,
+                log_evidence,
+                error,
+                check,
+                archive.proposals,
+                sum(increments),
+                evaluations_below_one,
+            )
 
 
-def _evened(mixture: Mixture) -> Mixture:
-    """The mixture with a quarter of its weight spread evenly: a small component is not missed by few draws."""
-    weights = (1.0 - EVENED) * mixture.weights + EVENED / len(mixture.weights)
+def _with_even_share(mixture: Mixture, share: float) -> Mixture:
+    """The mixture with a share of its weight spread evenly over its components."""
+    weights = (1.0 - share) * mixture.weights + share / len(mixture.weights)
     return mixture._replace(weights=weights)
 
 
 def _of_round(log_weights: np.ndarray) -> np.ndarray:
-    """Log-weights whose sum is their effective sample size."""
+    """Log-weights scaled so that the sum of the weights is their effective sample size."""
     effective = effective_sample_size(log_weights)
     if effective == 0.0:
         return log_weights
     return log_weights - log_mean_weight(log_weights) - np.log(len(log_weights)) + np.log(effective)
 
 
-def _doubt(check: EvidenceCheck | None, log_evidence: float, beta: float, yields: list[float]) -> str:
-    """Why to give up, or not to use what was reached; empty if there is no reason."""
-    recent = float(np.mean(yields[-PATIENCE:]))
-    if len(yields) >= PATIENCE and recent < LOW_YIELD:
-        return f"new draws are worth {100 * recent:.2g} % of their number"
+def _doubt(
+    settings: RecyclingSettings, check: EvidenceCheck | None, log_evidence: float, beta: float, yields: list[float]
+) -> str:
+    """Why to give up, or not to use the result; empty if there is no reason."""
+    recent = float(np.mean(yields[-settings.patience :]))
+    if len(yields) >= settings.patience and recent < settings.min_yield:
+        return f"the effective sample size of fresh draws is {100 * recent:.2g} % of their number"
     if check is None:
-        return f"beta = {beta:.3g} only after {MOST_STAGES} rounds" if len(yields) >= MOST_STAGES else ""
-    if not check.reliable and yields[-1] < HIGH_YIELD:
+        too_long = len(yields) >= settings.max_rounds
+        return f"only beta = {beta:.3g} was reached in {settings.max_rounds} rounds" if too_long else ""
+    if not check.reliable and yields[-1] < settings.high_yield:
         return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
-    if yields[-1] < LEAST_YIELD:
-        return f"fresh draws are worth {100 * yields[-1]:.2g} % of their number"
-    if abs(check.log_evidence - log_evidence) > LARGEST_DIFFERENCE:
+    if yields[-1] < settings.trusted_yield:
+        return f"the effective sample size of the draws of the check is {100 * yields[-1]:.2g} % of their number"
+    if abs(check.log_evidence - log_evidence) > settings.max_evidence_difference:
         return f"fresh draws change the log-evidence by {check.log_evidence - log_evidence:.2g}"
     return ""
 
 
-def _against(mixture: Mixture, records: np.ndarray, coords: np.ndarray, start: Start, beta: float) -> np.ndarray:
-    """Log-weights of draws against the one mixture they came from."""
+def _weights_against(
+    mixture: Mixture, records: np.ndarray, coords: np.ndarray, start: StartingDensity, beta: float
+) -> np.ndarray:
+    """Log-weights of draws against the mixture that they were drawn from."""
     alive = records["log_prob"] > -np.inf
     log_prob = np.where(alive, records["log_prob"], 0.0)
     tempered = (1.0 - beta) * start.log_density(coords, records) + beta * log_prob - log_density(mixture, coords)

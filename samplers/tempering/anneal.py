@@ -1,31 +1,33 @@
-"""The climb from draws of the prior to beta = 1: by recycling where that may be trusted, else by moves.
+"""Annealing from draws of the prior to beta = 1: by recycling where its result can be trusted, else by moves.
 
-By moves it is Sequential Monte Carlo: choose the next beta, weigh, resample, move. By recycling it is importance
-sampling along the ladder (see `samplers.tempering.adaptive_importance`), thinned to as many points as there are walkers, which then are
-moved. Both end with an estimate of the evidence from draws that had no part in the climb. With a cheaper model to climb
-on first, recycling sets out from where that led to instead of the prior (see `samplers.tempering.multilevel`).
+Annealing by moves is Sequential Monte Carlo: choose the next beta, weigh, resample, move. Annealing by recycling is
+adaptive importance sampling (`samplers.tempering.adaptive_importance`); its weighted draws are resampled to as many
+points as there are walkers, which then are moved. Both end with an estimate of the evidence from draws that were not
+used for the annealing. With a cheaper (coarse) model, recycling on that model comes first, and recycling on the fine
+model starts from its proposals instead of from the prior (`samplers.tempering.multilevel`).
+
+`anneal` is a generator of pairs (population, report). It keeps no reference to whoever consumes it: storing, timing and
+showing are up to the consumer.
 """
 
 import logging
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Generator, Iterator
 
 import numpy as np
-from emcee.model import Model
-from emcee.moves import Move
 
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
-from .adaptive_importance import Start, recycle
-from .diagnostics import check_climb, check_ladder, warn
+from .adaptive_importance import Recycled, StartingDensity, recycle
+from .diagnostics import check_annealing, check_stages, warn
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights
-from .genealogy import follow
+from .genealogy import trace_founders
 from .multilevel import draw_start
-from .mutation import Moved, grow_chains, move_together, tempered_log_prob
+from .mutation import MoveSchedule, Mutated, grow_chains, move_together
+from .population import Density, Population, Report, Restart, Stage, Sweep
+from .resampling import systematic
 from .settings import Settings
 from .weights import (
     EvidenceError,
-    Stage,
     coarse_weights,
     effective_sample_size,
     log_mean_weight,
@@ -33,219 +35,217 @@ from .weights import (
     normalised_weights,
 )
 
-__all__ = ["Climbed", "Tempering", "climb"]
+__all__ = ["anneal"]
 
 logger = logging.getLogger(__name__)
 
+# A start from the coarse model needs no weights of its own, and the draws at beta = 1 decide what the result is worth:
+# half the walkers suffice, but not fewer points than these.
 FEWEST_TO_START = 250
 START_PER_DIMENSION = 10
 
+Steps = Iterator[tuple[Population, Report]]
 
-class Tempering(NamedTuple):
-    """What a climb works with.
 
-    Attributes
+def anneal(
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+    coarse: Density | None = None,
+) -> Steps:
+    """Carry draws of the prior to beta = 1.
+
+    Parameters
     ----------
-    evaluate : function of points (n, ndim) that returns their records (log_prob, log_prior[, blobs]).
-    evaluate_coarse : the same for a cheaper model to climb on first, or None.
-    inside : function of points (n, ndim) that tells which lie in the support of the prior.
+    population : Population
+        Draws of the prior. They are evaluated if they have no records.
+    density : Density
+        The posterior.
     random : RandomState
-    moves, shares : the mutation kernels, and how often each is taken.
+        Source of random numbers.
+    schedule : MoveSchedule
+        The moves.
     settings : Settings
-    map : how a move that evaluates by itself maps a function.
-    ladder : list of Stage — filled by `enter`.
-    enter : called with the fields of a finished stage, and `apart`: evaluations since the last one that are not its.
-    show : called with beta, effective sample size and acceptance after each sweep.
+        How to anneal.
+    coarse : Density, optional
+        A cheaper version of the posterior, to recycle on first.
+
+    Yields
+    ------
+    population : Population
+        The points as they are now.
+    report : Sweep, Stage, Restart or EvidenceCheck
+        `Sweep`: the points have been moved once. `Stage`: a stage is finished. `Restart`: all stages so far are void.
+        `EvidenceCheck`: the independent estimate of the evidence (at most one, before or after the last stage). The
+        population of the last pair is at beta = 1, equally weighted.
     """
-
-    evaluate: Callable[[np.ndarray], np.ndarray]
-    evaluate_coarse: Callable[[np.ndarray], np.ndarray] | None
-    inside: Callable[[np.ndarray], np.ndarray]
-    random: np.random.RandomState
-    moves: Sequence[Move]
-    shares: Sequence[float]
-    settings: Settings
-    map: Callable
-    ladder: list[Stage]
-    enter: Callable[..., None]
-    show: Callable[[float, float, float], None]
+    if coarse is not None and (yield from _from_coarse(population, density, coarse, random, schedule, settings)):
+        return
+    if population.records is None:
+        population = population._replace(records=density.evaluate(population.coords))
+    if settings.recycle and (yield from _by_recycling(population, density, random, schedule, settings)).trusted:
+        return
+    yield from _by_moves(population, density, random, schedule, settings)
 
 
-class Climbed(NamedTuple):
-    """A population at beta = 1.
-
-    Attributes
-    ----------
-    coords, records : (n, ndim) and (n,)
-    generations : list of (n,) int — founders of each point (see `samplers.tempering.genealogy`).
-    check : EvidenceCheck, or None if none is wanted.
-    """
-
-    coords: np.ndarray
-    records: np.ndarray
-    generations: list[np.ndarray]
-    check: EvidenceCheck | None
-
-
-def climb(coords: np.ndarray, records: np.ndarray | None, tempering: Tempering) -> Climbed:
-    """Carry draws of the prior (n, ndim) and their records (n,), None if still to be made, to beta = 1."""
-    if tempering.evaluate_coarse is not None:
-        found = _from_coarse(coords, tempering.evaluate_coarse, tempering)
-        if found is not None:
-            return found
-    records = tempering.evaluate(coords) if records is None else records
-    found = _by_recycling(coords, records, tempering) if tempering.settings.recycle else None
-    return _by_moves(coords, records, tempering) if found is None else found
-
-
-def _by_moves(coords: np.ndarray, records: np.ndarray, tempering: Tempering) -> Climbed:
+def _by_moves(
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+) -> Steps:
     """Sequential Monte Carlo."""
-    settings, (n, ndim) = tempering.settings, coords.shape
-    beta, target, generations = 0.0, float(n), []
+    n, ndim = population.coords.shape
+    target, stages = float(n), []
     error = EvidenceError(n)
-    tempering.ladder.clear()
-    while beta < 1.0:
+    while population.beta < 1.0:
+        coords, records = population.coords, population.records
         log_likelihood = records["log_prob"] - records["log_prior"]
         target = settings.target(target, n)
-        last_beta, beta = beta, next_beta(log_likelihood, beta, target)
-        log_weights = (beta - last_beta) * log_likelihood
+        beta = next_beta(log_likelihood, population.beta, target)
+        log_weights = (beta - population.beta) * log_likelihood
         weights = normalised_weights(log_weights)
         standard_error = error.weigh(weights)
-        _calibrate(coords, coarse_weights(log_weights), tempering)
+        schedule.calibrate(coords, coarse_weights(log_weights), density.inside)
 
-        ancestors = settings.resample(weights, tempering.random)
+        ancestors = settings.resample(weights, random)
         error.resample(ancestors)
-        generations = follow(generations, ancestors)
-        coords, records = coords[ancestors], records[ancestors]
-        distinct = len(np.unique(coords, axis=0))
+        founders = trace_founders(population.founders, ancestors)
         effective = effective_sample_size(log_weights)
-        moved = _mutate(coords, records, ancestors, beta, effective, tempering)
-        coords, records = moved.coords, moved.records
-        tempering.enter(
-            beta=beta,
-            effective_sample_size=effective,
-            acceptance=moved.acceptance,
-            moves=moved.moves,
-            distinct_ancestors=distinct,
-            log_evidence_increment=log_mean_weight(log_weights),
-            log_evidence_error=standard_error,
+        population = Population(beta, coords[ancestors], records[ancestors], effective, founders)
+        distinct = len(np.unique(population.coords, axis=0))
+        mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
+        population = mutated.population
+        stages.append(
+            Stage(
+                beta=beta,
+                effective_sample_size=effective,
+                acceptance=mutated.acceptance,
+                moves=mutated.moves,
+                distinct_ancestors=distinct,
+                log_evidence_increment=log_mean_weight(log_weights),
+                log_evidence_error=standard_error,
+            )
         )
-        check_ladder(tempering.ladder, n, ndim)
-    check_climb(tempering.ladder, n, ndim, moved.memory)
-    check = None if settings.check_draws == 0 else _check_evidence(coords, tempering)
-    return Climbed(coords, records, generations, check)
-
-
-def _from_coarse(
-    coords: np.ndarray, evaluate: Callable[[np.ndarray], np.ndarray], tempering: Tempering
-) -> Climbed | None:
-    """Climb on a cheaper model, then from there to the posterior; None where what is found may not be trusted."""
-    n, random, inside = len(coords), tempering.random, tempering.inside
-
-    def enter(beta, effective_sample_size, acceptance, **_):
-        tempering.show(beta, effective_sample_size, acceptance)
-
-    # a start needs no weights of its own, and the draws at beta = 1 decide what the end is worth: half the size will do
-    few = min(n, max(FEWEST_TO_START, n // 2, START_PER_DIMENSION * (coords.shape[1] + 1)))
-    coarse = recycle(coords[:few], evaluate(coords[:few]), evaluate, inside, random, enter, finish=False)
-    if coarse.doubt:
-        warn(f"the climb on the coarse model failed ({coarse.doubt}): climbing on the fine model alone")
-        return None
-    drawn, start = draw_start(coarse.proposals, coords, few, random, inside)
-    found = _by_recycling(drawn, tempering.evaluate(drawn), tempering, start, n)
-    spent = few + sum(made for made, _ in coarse.proposals)
-    way = sum(stage.evaluations for stage in tempering.ladder[:-1])
-    if found is None:
-        warn(
-            "the coarse posterior is too far from the fine one to lead to it: climbing on the fine model alone. Use a "
-            "closer coarse model, or none"
-        )
-    elif way > spent:
-        warn(
-            f"the coarse posterior is far from the fine one: the way from it took {way} evaluations of the fine model, "
-            f"more than the climb on the coarse one ({spent}). A closer coarse model may be worth its cost"
-        )
-    return found
+        yield population, stages[-1]
+        check_stages(stages, n, ndim)
+    check_annealing(stages, n, ndim, mutated.correlation)
+    if settings.check_draws != 0:
+        yield population, _check_evidence(population.coords, density, random, settings.check_draws)
 
 
 def _by_recycling(
-    coords: np.ndarray, records: np.ndarray, tempering: Tempering, start: Start | None = None, wanted: int | None = None
-) -> Climbed | None:
-    """Adaptive importance sampling over all points; None where its result may not be trusted."""
-    n, random, ladder = len(coords) if wanted is None else wanted, tempering.random, tempering.ladder
-    ladder.clear()
-
-    def enter(log_evidence, acceptance, effective_sample_size, **fields):
-        tempering.enter(
-            effective_sample_size=effective_sample_size,
-            acceptance=acceptance,
-            moves=0,
-            distinct_ancestors=int(effective_sample_size),
-            log_evidence_increment=log_evidence - sum(stage.log_evidence_increment for stage in ladder),
-            **fields,
-        )
-        tempering.show(fields["beta"], effective_sample_size, acceptance)
-
-    found = recycle(coords, records, tempering.evaluate, tempering.inside, random, enter, start, wanted)
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+    start: StartingDensity | None = None,
+    size: int | None = None,
+) -> Generator[tuple[Population, Report], None, Recycled]:
+    """Adaptive importance sampling, resampled to `size` points (the number of points by default) and moved."""
+    size = len(population.coords) if size is None else size
+    found = yield from recycle(population.coords, population.records, density, random, settings.recycling, start, size)
     if not found.trusted:
-        logger.info("recycling is not trusted here, because %s: climbing by moves", found.doubt)
-        return None
+        logger.info("recycling is not trusted here, because %s", found.doubt)
+        yield population, Restart(found.doubt)
+        return found
     weights = normalised_weights(found.log_weights)
-    _calibrate(found.coords, coarse_weights(found.log_weights), tempering)
-    # the weights of few thousand points, thinned to as many points as there are walkers
-    ancestors = np.searchsorted(np.cumsum(weights), (np.arange(n) + random.uniform()) / n, side="right")
-    ancestors = np.minimum(ancestors, len(weights) - 1)
+    schedule.calibrate(found.coords, coarse_weights(found.log_weights), density.inside)
+    ancestors = systematic(weights, random, size)
     effective = effective_sample_size(found.log_weights)
-    moved = _mutate(found.coords[ancestors], found.records[ancestors], ancestors, 1.0, effective, tempering)
-    wanted = tempering.settings.check_draws != 0
-    tempering.enter(
-        apart=found.check.evaluations if wanted else 0,
-        beta=1.0,
-        effective_sample_size=effective,
-        acceptance=moved.acceptance,
-        moves=moved.moves,
-        distinct_ancestors=len(np.unique(ancestors)),
-        log_evidence_increment=found.log_evidence - sum(stage.log_evidence_increment for stage in ladder),
-        log_evidence_error=found.log_evidence_error,
+    population = Population(1.0, found.coords[ancestors], found.records[ancestors], effective, (ancestors,))
+    if settings.check_draws != 0:
+        yield population, found.check
+    mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
+    yield (
+        mutated.population,
+        Stage(
+            beta=1.0,
+            effective_sample_size=effective,
+            acceptance=mutated.acceptance,
+            moves=mutated.moves,
+            distinct_ancestors=len(np.unique(ancestors)),
+            log_evidence_increment=found.log_evidence - found.log_evidence_below_one,
+            log_evidence_error=found.log_evidence_error,
+        ),
     )
-    return Climbed(moved.coords, moved.records, [ancestors], found.check if wanted else None)
+    return found
 
 
-def _check_evidence(coords: np.ndarray, tempering: Tempering) -> EvidenceCheck:
-    """The evidence from fresh draws of a mixture fitted to the final population."""
-    inside, wanted = tempering.inside, tempering.settings.check_draws
-    mixture = fit_mixture(coords, np.full(len(coords), 1.0 / len(coords)), bounds=find_support_bounds(inside, coords))
-    drawn, made = draw_inside(mixture, len(coords) if wanted is None else wanted, tempering.random, inside)
-    return evidence_from_weights(tempering.evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
+def _from_coarse(
+    population: Population,
+    density: Density,
+    coarse: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+) -> Generator[tuple[Population, Report], None, bool]:
+    """Recycle on a cheaper model, then from there to the posterior; returns whether the result can be trusted."""
+    coords = population.coords
+    n, ndim = coords.shape
+    few = min(n, max(FEWEST_TO_START, n // 2, START_PER_DIMENSION * (ndim + 1)))
+    records = coarse.evaluate(coords[:few])
+    found = yield from _only_sweeps(recycle(coords[:few], records, coarse, random, settings.recycling, finish=False))
+    if found.doubt:
+        warn(
+            f"annealing on the coarse model failed ({found.doubt}), so the fine model alone is used. Check the coarse "
+            "model, or pass none"
+        )
+        return False
+    coarse_cost = few + sum(made for made, _ in found.proposals)
+    drawn, start = draw_start(found.proposals, coords, few, random, density.inside)
+    population = population._replace(coords=drawn, records=density.evaluate(drawn))
+    found = yield from _by_recycling(population, density, random, schedule, settings, start, n)
+    if not found.trusted:
+        warn(
+            "the coarse posterior is too far from the fine one to lead to it, so annealing starts again on the fine "
+            "model alone. Use a closer coarse model, or none"
+        )
+    elif found.evaluations_below_one > coarse_cost:
+        warn(
+            f"the coarse posterior is far from the fine one: the way from it took {found.evaluations_below_one} "
+            f"evaluations of the fine model, more than the annealing on the coarse model ({coarse_cost}). A closer "
+            "coarse model may be worth its cost"
+        )
+    return found.trusted
 
 
-def _calibrate(coords: np.ndarray, weights: np.ndarray, tempering: Tempering) -> None:
-    for move in tempering.moves:
-        if hasattr(move, "calibrate"):
-            move.calibrate(coords, weights, tempering.inside)
+def _only_sweeps(
+    steps: Generator[tuple[Population, Report], None, Recycled],
+) -> Generator[tuple[Population, Sweep], None, Recycled]:
+    """The sweeps of a recycling on the coarse model; its stages are not stages of the run."""
+    while True:
+        try:
+            population, report = next(steps)
+        except StopIteration as end:
+            return end.value
+        if isinstance(report, Sweep):
+            yield population, report
+
+
+def _check_evidence(
+    coords: np.ndarray, density: Density, random: np.random.RandomState, draws: int | None
+) -> EvidenceCheck:
+    """The evidence from fresh draws of a mixture fitted to the final points; by default as many draws as points."""
+    n = len(coords)
+    mixture = fit_mixture(coords, np.full(n, 1.0 / n), edges=find_support_bounds(density.inside, coords))
+    drawn, made = draw_inside(mixture, n if draws is None else draws, random, density.inside)
+    return evidence_from_weights(density.evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
 
 
 def _mutate(
-    coords: np.ndarray,
-    records: np.ndarray,
+    population: Population,
     ancestors: np.ndarray,
-    beta: float,
-    effective: float,
-    tempering: Tempering,
-) -> Moved:
-    """Move resampled points at beta."""
-
-    def compute(points):
-        found = tempering.evaluate(points)
-        return tempered_log_prob(found, beta), found
-
-    common: dict[str, Any] = {
-        "beta": beta,
-        "model": Model(tempering.evaluate, compute, tempering.map, tempering.random),
-        "pick": lambda: tempering.random.choice(tempering.moves, p=tempering.shares),
-        "settings": tempering.settings,
-        "show": lambda share: tempering.show(beta, effective, share),
-    }
-    if tempering.settings.chains == "leaders":
-        return grow_chains(coords, records, ancestors, **common)
-    return move_together(coords, records, **common)
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+) -> Generator[tuple[Population, Sweep], None, Mutated]:
+    """Generator that moves resampled points at their beta."""
+    if settings.chains == "leaders":
+        return grow_chains(population, ancestors, density, random, schedule, settings)
+    return move_together(population, density, random, schedule, settings)

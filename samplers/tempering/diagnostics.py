@@ -1,48 +1,53 @@
-"""Warnings of a run that has gone wrong without an error.
+"""Warnings about runs that ended without an error but whose result is doubtful.
 
-A collapsed population, moves that do not move or not enough, a rung that carries all, an evidence nobody confirms.
+Collapsed populations, moves that are rejected or too few, one stage that dominates the error, evidences that disagree.
 """
 
+import sys
 import warnings
 from collections.abc import Sequence
 
 import numpy as np
 
 from .evidence_check import EvidenceCheck
-from .weights import Stage
+from .population import Stage
 
-__all__ = ["SamplingWarning", "check_climb", "check_evidence", "check_ladder", "warn"]
+__all__ = ["SamplingWarning", "check_annealing", "check_evidence", "check_stages", "warn"]
 
 LOW_ACCEPTANCE = 0.01
 LOW_YIELD = 0.05
-# moves whose answers were right left correlations of up to 0.8, those of TMCMC as published 0.98 and more
-HIGH_MEMORY = 0.9
+# runs with right answers ended with correlations of up to 0.8, those of TMCMC as published with 0.98 and more
+HIGH_CORRELATION = 0.9
 LARGE_ERROR = 0.35
 LARGE_SHARE = 0.8
+OUR_PACKAGES = ("samplers", "emcee")
 
 
 class SamplingWarning(UserWarning):
-    """Something in the run makes its result doubtful."""
+    """The result of a run is doubtful; the message says why and what to do."""
 
 
 def warn(message: str) -> None:
-    """Warn the caller of the sampler."""
-    warnings.warn(message, SamplingWarning, stacklevel=3)
+    """Issue a `SamplingWarning` that points at the line of the user's code that called the sampler."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in OUR_PACKAGES:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, SamplingWarning, stacklevel=level)
 
 
 def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
     return stage.distinct_ancestors < max(ndim + 2, nwalkers // 50)
 
 
-def check_ladder(ladder: Sequence[Stage], nwalkers: int, ndim: int) -> None:
-    """Warn if the last stage is the first one to be collapsed, or stuck: once a climb for each reason.
+def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> None:
+    """Warn if the last stage is the first one that is collapsed or stuck.
 
     Collapsed: fewer distinct points survived the resampling than 2 % of the walkers, or than span the parameters.
     Stuck: less than 1 % of the proposals were accepted.
     """
-    stage, number = ladder[-1], len(ladder)
-    collapsed = [_collapsed(s, nwalkers, ndim) for s in ladder]
-    stuck = [s.acceptance < LOW_ACCEPTANCE for s in ladder]
+    stage, number = stages[-1], len(stages)
+    collapsed = [_collapsed(s, nwalkers, ndim) for s in stages]
+    stuck = [s.acceptance < LOW_ACCEPTANCE for s in stages]
     if collapsed[-1] and not any(collapsed[:-1]):
         warn(
             f"collapse at stage {number} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points of "
@@ -55,50 +60,52 @@ def check_ladder(ladder: Sequence[Stage], nwalkers: int, ndim: int) -> None:
         )
 
 
-def check_climb(ladder: Sequence[Stage], nwalkers: int, ndim: int, memory: float) -> None:
-    """Warn if a finished climb by moves ended among points that had not moved enough, or stands on one bad rung.
+def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlation: float) -> None:
+    """Warn if annealing by moves ended with points that had not moved enough, or if one stage dominates the error.
 
-    Not moved enough: the largest correlation of the last population with its resampled start, `memory`, is above 0.9.
-    Left out where `check_ladder` found the moves stuck, which says as much.
+    Not moved enough: the largest correlation of the final population with its resampled start, `correlation`, is above
+    0.9. Not reported where `check_stages` found the moves stuck.
 
-    One bad rung: a stage whose weights alone give the ladder's log-evidence a standard error of some 0.35, and at least
-    0.8 of the variance of all stages. The choice of beta keeps the stages alike, so this is a stage where no choice was
-    left: most of the draws of the prior are impossible, say. Left out for a collapsed stage.
+    One dominant stage: its weights alone give the log-evidence a standard error of 0.35 or more, and at least 0.8 of
+    the variance of all stages. The choice of beta keeps the stages alike, so there was no choice at this stage: for
+    example, most draws of the prior have zero likelihood. Not reported for a collapsed stage.
     """
-    if memory > HIGH_MEMORY and not any(s.acceptance < LOW_ACCEPTANCE for s in ladder):
+    if correlation > HIGH_CORRELATION and not any(s.acceptance < LOW_ACCEPTANCE for s in stages):
         warn(
-            f"the points remember where they were resampled: after the moves at beta = {ladder[-1].beta:.3g} their "
-            f"correlation with the start is {memory:.2f}, so copies are still copies, and modes keep the weights that "
-            "resampling gave them. Use more moves (max_moves, burn_in) or longer ones"
+            f"the moves at beta = {stages[-1].beta:.3g} were too short: particles are still correlated "
+            f"({correlation:.2f}) with their resampled start, so copies have not separated, and modes keep the weights "
+            "that the resampling gave them. Use more moves (max_moves, burn_in) or longer ones"
         )
-    variances = np.array([1.0 / s.effective_sample_size - 1.0 / nwalkers for s in ladder])
+    variances = np.array([1.0 / s.effective_sample_size - 1.0 / nwalkers for s in stages])
     worst = int(np.argmax(variances))
-    stage, total = ladder[worst], float(variances.sum())
-    dominated = total > LARGE_ERROR**2 and variances[worst] > LARGE_SHARE * total
-    if dominated and not _collapsed(stage, nwalkers, ndim):
+    stage, total = stages[worst], float(variances.sum())
+    dominates = total > LARGE_ERROR**2 and variances[worst] > LARGE_SHARE * total
+    if dominates and not _collapsed(stage, nwalkers, ndim):
         if worst == 0:
-            cause = "few draws of the prior are possible at all. Mend the runs that fail, narrow the prior or use"
+            cause = (
+                "few draws of the prior have a likelihood above zero. Fix the runs that fail, narrow the prior or use"
+            )
         else:
-            cause = "the likelihood falls off a cliff there. Use a larger ess_ratio or"
+            cause = "the likelihood decreases steeply there. Use a larger ess_ratio or"
         warn(
-            f"all stands on stage {worst + 1} (beta = {stage.beta:.3g}): its weights are worth "
-            f"{stage.effective_sample_size:.2g} of {nwalkers} points, which alone makes an error of "
-            f"{np.sqrt(variances[worst]):.2f} in the log-evidence; {cause} more walkers"
+            f"stage {worst + 1} (beta = {stage.beta:.3g}) dominates the error of the evidence: its effective sample "
+            f"size is {stage.effective_sample_size:.2g} of {nwalkers}, which alone gives the log-evidence a standard "
+            f"error of {np.sqrt(variances[worst]):.2f}; {cause} more walkers"
         )
 
 
 def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> None:
-    """Warn if an independent estimate says nothing, or differs from the ladder's by more than three joint errors."""
+    """Warn if the independent estimate is unusable, or differs from the other by more than three joint errors."""
     if not check.reliable and check.effective_sample_size < LOW_YIELD * check.evaluations:
         warn(
-            f"no mixture follows the final points: {check.evaluations} draws from the best one are worth "
-            f"{check.effective_sample_size:.2g}, so the evidence and the posterior stand on the ladder alone. Use more "
+            f"no mixture fits the final points: {check.evaluations} draws from the best one have an effective sample "
+            f"size of {check.effective_sample_size:.2g}, so evidence and posterior could not be checked. Use more "
             "walkers or more moves, and compare two runs"
         )
     joint = float(np.hypot(error, check.error))
     if check.reliable and abs(log_evidence - check.log_evidence) > 3.0 * joint + 1e-6:
         warn(
-            f"the ladder gives the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling of the final "
-            f"points {check.log_evidence:.2f} +- {check.error:.2f}. The posterior may be right all the same; for the "
+            f"the stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
+            f"points gives {check.log_evidence:.2f} +- {check.error:.2f}. The posterior may still be right; for the "
             "evidence use more walkers or more moves"
         )

@@ -1,14 +1,15 @@
-"""Importance sampling from a mixture: the evidence from independent draws, and whether its weights may be trusted.
+"""Importance sampling from a mixture: an estimate of the evidence, and whether its weights can be trusted.
 
 A mixture fitted to a population is a proposal from which independent points are drawn inside the support of the prior.
-The mean of posterior / proposal over them estimates the evidence without any ladder, and without a bias as long as the
-draws had no part in the fit. How far the estimate may be trusted is read from the weights themselves: the largest
-follow a generalised Pareto law, and where its shape exceeds 0.7 the mean is ruled by points that were not drawn.
+The mean of posterior / proposal over the draws estimates the evidence without tempering, and without bias as long as
+the proposal was not fitted to the draws. How reliable the estimate is follows from the weights themselves: the largest
+ones have a generalised Pareto distribution, and where its shape exceeds 0.7, points that were not drawn dominate the
+mean.
 
 References
 ----------
-Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72) (the diagnosis)
-Zhang & Stephens (2009), Technometrics 51(3), doi:10.1198/tech.2009.08017 (the fit of the shape)
+Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72) (the diagnostic)
+Zhang & Stephens (2009), Technometrics 51(3), doi:10.1198/tech.2009.08017 (estimation of the shape)
 """
 
 from collections.abc import Callable
@@ -27,15 +28,20 @@ ROUNDS = 50
 
 
 class EvidenceCheck(NamedTuple):
-    """The evidence by importance sampling, independent of the ladder.
+    """The evidence by importance sampling, independent of the tempering stages.
 
     Attributes
     ----------
     log_evidence : float
-    error : float — standard error of `log_evidence`; not to be believed unless `reliable`.
-    effective_sample_size : float — of the weights.
-    pareto_shape : float — of the largest weights; below 0.7 the variance of the mean behaves.
-    evaluations : int — points handed to ``log_prob_fn`` for this.
+        Logarithm of the evidence.
+    error : float
+        Standard error of `log_evidence`; meaningless unless `reliable`.
+    effective_sample_size : float
+        Of the weights.
+    pareto_shape : float
+        Shape of the distribution of the largest weights; below 0.7 the error of the mean is finite in practice.
+    evaluations : int
+        Points for which ``log_prob_fn`` was called.
     """
 
     log_evidence: float
@@ -46,21 +52,32 @@ class EvidenceCheck(NamedTuple):
 
     @property
     def reliable(self) -> bool:
-        """Whether the weights are even enough for the estimate and its error to be believed."""
+        """Whether the weights are even enough for the estimate and its error to be meaningful."""
         return self.pareto_shape < LARGEST_SHAPE and self.effective_sample_size >= FEW_WEIGHTS
 
 
 def draw_inside(
     mixture: Mixture, n: int, random: np.random.RandomState, inside: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, int]:
-    """At most `n` draws of a mixture that lie inside a region, and how many were made to get them.
+    """At most `n` draws of a mixture that lie inside a region, and the number of draws made.
 
     Parameters
     ----------
     mixture : Mixture
+        What to draw from.
     n : int
+        Number of draws wanted.
     random : RandomState
-    inside : function of points (m, ndim) that tells which (m,) lie inside; called some 50 times at most.
+        Source of random numbers.
+    inside : callable
+        Function of points (m, ndim) that returns whether each lies inside (m,); called up to 50 times.
+
+    Returns
+    -------
+    coords : (at most n, ndim) float
+        The draws inside.
+    made : int
+        Number of draws made to obtain them.
     """
     kept, found, made = [], 0, 0
     for _ in range(ROUNDS):
@@ -75,7 +92,7 @@ def draw_inside(
 
 
 def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
-    """Evidence from the log-weights (n,) of the draws inside, of `made` draws in all."""
+    """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws."""
     full = np.full(made, -np.inf)
     full[: len(log_weights)] = log_weights
     effective = effective_sample_size(full)
@@ -85,10 +102,10 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
 
 
 def pareto_shape(log_weights: np.ndarray) -> float:
-    """Shape of the generalised Pareto law of the largest weights, given by their logarithms (n,).
+    """Shape of the generalised Pareto distribution of the largest weights, given by their logarithms (n,).
 
-    The largest min(n / 5, 3 sqrt(n)) weights count. Weights without a tail have shape -inf, and too few weights of
-    which to tell one have inf.
+    The largest min(n / 5, 3 sqrt(n)) weights are used. The shape is -inf for weights without a tail, and inf for too
+    few weights.
     """
     finite = log_weights[log_weights > -np.inf]
     n = len(log_weights)
@@ -111,5 +128,5 @@ def pareto_shape(log_weights: np.ndarray) -> float:
     posterior = np.exp(profile - profile.max())
     theta = float(theta @ posterior / posterior.sum())
     shape = float(np.mean(np.log1p(-theta * tail)))
-    # a weak prior towards 0.5 steadies the estimate of few points
+    # a weak prior towards 0.5 stabilises the estimate from few weights (Vehtari et al. 2024)
     return (count * shape + 5.0) / (count + 10.0)

@@ -1,14 +1,16 @@
-r"""Families: points that descend from one, and the error of a posterior mean that takes them for what they are.
+r"""Genealogy of a population: founders of the points, and the standard error of a mean that accounts for them.
 
-Resampling makes copies, and moves tell the copies apart only slowly: points of common descent are no independent draws.
-Whole families are. With :math:`\bar x` the mean over all points and :math:`x_i` what point i contributes to it,
+Resampling copies points, and moves separate the copies only gradually: points with a common ancestor, their founder,
+are not independent. The groups of points with different founders are. With :math:`\bar x` the mean over all points and
+:math:`x_i` the contribution of point i to it,
 
 .. math:: \mathrm{Var}(\bar x) \approx N^{-2} \sum_k \Big( \sum_{i \in k} (x_i - \bar x) \Big)^2
 
-sums over families k. Copies that still agree count as one point, copies that have parted count as several, and nobody
-has to say which. Where the points are the walkers of a chain, :math:`x_i` is the mean along the walker, so that its own
-correlation in time is counted too. The longer ago the founders lived, the more of the climb is accounted for, and the
-fewer families are left to average over: as in the fixed-lag estimator, a compromise is struck.
+sums over the groups k of points that share a founder. Copies that still agree count as one point, and copies that have
+separated count as several, without any estimate of their correlation. Where the points are the walkers of a chain,
+:math:`x_i` is the mean along walker i, which also accounts for the autocorrelation of the chain. Older founders account
+for more of the annealing but leave fewer groups to average over. As in the fixed-lag estimator of Olsson & Douc (2019),
+the oldest generation that still has enough founders is used.
 
 References
 ----------
@@ -16,62 +18,73 @@ Lee & Whiteley (2018), Biometrika 105(3), doi:10.1093/biomet/asy028 (variance fr
 Olsson & Douc (2019), Bernoulli 25(2), doi:10.3150/18-BEJ1029 (founders a few generations back)
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
-__all__ = ["follow", "standard_error_of_mean"]
+__all__ = ["standard_error_of_mean", "trace_founders"]
 
-QUORUM = 0.1
+MIN_FOUNDER_SHARE = 0.1
 
 
-def follow(generations: list[np.ndarray], ancestors: np.ndarray, quorum: float = QUORUM) -> list[np.ndarray]:
-    """Families of a population after one more resampling, by founders of ever younger generations.
+def trace_founders(
+    founders: Sequence[np.ndarray], ancestors: np.ndarray, min_share: float = MIN_FOUNDER_SHARE
+) -> tuple[np.ndarray, ...]:
+    """Founders of each point after one more resampling, for several generations of founders.
 
     Parameters
     ----------
-    generations : list of (n,) int — what this function returned last; empty before the first resampling.
-    ancestors : (n,) int — former index of each point.
-    quorum : float — founders so long ago that fewer than this share of n families are left are forgotten.
+    founders : sequence of (n,) int
+        Previous result of this function; empty before the first resampling.
+    ancestors : (n,) int
+        Index of each point before the resampling.
+    min_share : float
+        A generation is dropped once it has fewer than this share of n founders left.
 
     Returns
     -------
-    list of (n,) int — for each generation of founders, the oldest first, the founder of each point. Never empty: the
-    parents themselves are kept, however few they are.
+    tuple of (n,) int
+        Founder of each point, per generation, the oldest generation first. The last one, the points before this
+        resampling, is always kept.
     """
-    followed = [founders[ancestors] for founders in generations] + [ancestors]
-    while len(followed) > 1 and len(np.unique(followed[0])) < quorum * len(ancestors):
-        followed.pop(0)
-    return followed
+    traced = [generation[ancestors] for generation in founders] + [ancestors]
+    while len(traced) > 1 and len(np.unique(traced[0])) < min_share * len(ancestors):
+        traced.pop(0)
+    return tuple(traced)
 
 
-def standard_error_of_mean(chain: np.ndarray, families: np.ndarray) -> np.ndarray:
-    """Standard error of the mean of a chain, whose walkers belong to families.
+def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarray:
+    """Standard error of the mean of a chain whose walkers have common founders.
 
     Parameters
     ----------
     chain : (nsteps, nwalkers, ndim) float
-    families : (nwalkers,) int — the same number for walkers of the same family.
+        Positions of the walkers.
+    founders : (nwalkers,) int
+        Founder of each walker; the same number for walkers with the same founder.
 
     Returns
     -------
-    (ndim,) float — in the parameters' units; inf if all walkers are of one family, which tells nothing.
+    (ndim,) float
+        In the units of the parameters; inf if all walkers have one founder.
 
     Raises
     ------
     ValueError
         If the shapes do not fit.
     """
-    chain, families = np.asarray(chain, dtype=float), np.asarray(families)
-    if chain.ndim != 3 or families.shape != chain.shape[1:2] or chain.size == 0:
+    chain, founders = np.asarray(chain, dtype=float), np.asarray(founders)
+    if chain.ndim != 3 or founders.shape != chain.shape[1:2] or chain.size == 0:
         raise ValueError(
-            f"a chain (nsteps, nwalkers, ndim) and the family of each walker are needed; got {chain.shape} and "
-            f"{families.shape}"
+            f"expected a chain (nsteps, nwalkers, ndim) and the founder of each walker (nwalkers,); got {chain.shape} "
+            f"and {founders.shape}"
         )
-    _, family = np.unique(families, return_inverse=True)
-    count = family.max() + 1
+    _, group = np.unique(founders, return_inverse=True)
+    count = group.max() + 1
     if count == 1:
         return np.full(chain.shape[2], np.inf)
     deviations = chain.mean(axis=0)
     deviations -= deviations.mean(axis=0)
     sums = np.zeros((count, chain.shape[2]))
-    np.add.at(sums, family, deviations)
+    np.add.at(sums, group, deviations)
     return np.sqrt(count / (count - 1) * np.sum(sums**2, axis=0)) / chain.shape[1]

@@ -1,13 +1,14 @@
-"""A start near the posterior, from a climb on a cheaper model.
+"""Multilevel start: draws near the posterior, from recycling on a cheaper model.
 
-The proposals of a climb by recycling lead from the prior to the posterior of the cheaper (coarse) model. Each is a
-mixture with a density, so all of them together are a distribution to draw from: half of it the last one, half spread
-over the prior and every rung below. The fine model climbs from there instead of from the prior. Where the two
-posteriors are alike that is hardly a climb; where they lie apart, some rung is wide enough to hold both. No coarse
-likelihood enters a weight, so the answer is that of the fine model alone.
+The proposals of recycling lead from the prior to the posterior of the cheaper (coarse) model. Each is a mixture with a
+known density, so together they form a distribution to draw from: half of the draws come from the last proposal, the
+other half evenly from the prior and all earlier proposals. The fine model starts from these draws instead of from the
+prior. If the two posteriors are similar, few stages remain; if they differ, some earlier proposal is wide enough to
+cover both. No coarse likelihood enters a weight, so the result is that of the fine model alone.
 
-The best coarse models are not biased but know less: the first seconds of a record, say. A larger step or fewer strips
-can move a sharp posterior by many of its standard deviations, and the way back costs more than they save.
+The best coarse models are less informed, not biased: the first seconds of a record, for example. A larger time step or
+fewer strips can shift a sharp posterior by many of its standard deviations, and the way back then costs more than the
+coarse model saves.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +16,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..proposals.mixture import Mixture, log_density
-from .adaptive_importance import Start
+from .adaptive_importance import StartingDensity
 from .evidence_check import draw_inside
 
 __all__ = ["draw_start"]
@@ -29,22 +30,34 @@ def draw_start(
     n: int,
     random: np.random.RandomState,
     inside: Callable[[np.ndarray], np.ndarray],
-) -> tuple[np.ndarray, Start]:
-    """Some n draws (n, ndim) of the proposals of a climb and of the prior, and their density.
+) -> tuple[np.ndarray, StartingDensity]:
+    """About n draws of the proposals of a recycling run and of the prior, and their density.
 
     Parameters
     ----------
-    proposals : of a climb, as `samplers.tempering.adaptive_importance.Recycled` has them.
-    prior : (m, ndim) float — draws of the prior, of which the first few are taken.
+    proposals : sequence of (int, Mixture)
+        As in `samplers.tempering.adaptive_importance.Recycled`.
+    prior : (m, ndim) float
+        Draws of the prior, of which the first few are taken.
     n : int
+        Number of draws wanted; rounded per proposal.
     random : RandomState
-    inside : function of points (m, ndim) that tells which lie in the support of the prior.
+        Source of random numbers.
+    inside : callable
+        Function of points (m, ndim); whether each lies in the support of the prior.
+
+    Returns
+    -------
+    coords : (about n, ndim) float
+        The draws.
+    start : StartingDensity
+        Their density.
     """
-    *rungs, (_, last) = proposals
-    few = max(1, int(round((1.0 - LAST_SHARE) * n / (len(rungs) + 1))))
+    *earlier, (_, last) = proposals
+    few = max(1, int(round((1.0 - LAST_SHARE) * n / (len(earlier) + 1))))
     coords = [prior[: 2 * few]]
     parts: list[tuple[int, Mixture]] = []
-    for mixture, count in [(mixture, few) for _, mixture in rungs] + [(last, int(LAST_SHARE * n))]:
+    for mixture, count in [(mixture, few) for _, mixture in earlier] + [(last, int(LAST_SHARE * n))]:
         drawn, made = draw_inside(mixture, count, random, inside)
         coords.append(drawn)
         parts.append((made, mixture))
@@ -57,4 +70,4 @@ def draw_start(
             total = np.logaddexp(total, np.log(count / made) + log_density(mixture, points))
         return total
 
-    return np.concatenate(coords), Start(made, log_start)
+    return np.concatenate(coords), StartingDensity(made, log_start)

@@ -1,6 +1,11 @@
-"""Moving at a fixed beta: the tempered density, when a population has moved enough, and chains grown from leaders."""
+"""Mutation at a fixed beta: moves of the ensemble, and the rule that ends them.
 
-from collections.abc import Callable
+Resampling copies points, and the moves separate the copies. Moving stops once the population is nearly uncorrelated
+with the resampled one it started from (`StartCorrelation`). With ``chains="leaders"``, chains grow from the distinct
+points instead, as in Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816).
+"""
+
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,58 +13,107 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import Move
 
+from .population import Density, Population, Sweep
 from .settings import Settings
 
-__all__ = ["Memory", "Moved", "grow_chains", "move_together", "tempered_log_prob"]
+__all__ = ["MoveSchedule", "Mutated", "StartCorrelation", "grow_chains", "move_together", "tempered_log_prob"]
 
 STALL_SWEEPS = 3
 
 
-class Moved(NamedTuple):
+class MoveSchedule(NamedTuple):
+    """The moves of a sampler.
+
+    Attributes
+    ----------
+    moves : sequence of emcee Move
+        Mutation kernels.
+    probabilities : (n_moves,) float
+        Probability of each move to be chosen for a sweep.
+    """
+
+    moves: Sequence[Move]
+    probabilities: np.ndarray
+
+    def choose(self, random: np.random.RandomState) -> Move:
+        """The move of the next sweep."""
+        return random.choice(self.moves, p=self.probabilities)
+
+    def calibrate(
+        self, coords: np.ndarray, weights: np.ndarray, inside: Callable[[np.ndarray], np.ndarray] | None
+    ) -> None:
+        """Fit the moves that can be fitted to points (n, ndim) with normalised weights (n,)."""
+        for move in self.moves:
+            calibrate = getattr(move, "calibrate", None)  # emcee's own moves have none
+            if calibrate is not None:
+                calibrate(coords, weights, inside)
+
+
+class Mutated(NamedTuple):
     """A population after its moves at one beta.
 
     Attributes
     ----------
-    coords, records : (n, ndim) and (n,) — the population.
-    acceptance : float — mean over the sweeps.
-    moves : int — number of sweeps.
-    memory : float — largest correlation with the start that is left (see `Memory`).
+    population : Population
+        The moved points.
+    acceptance : float
+        Share of accepted proposals over all sweeps.
+    moves : int
+        Number of sweeps.
+    correlation : float
+        Largest correlation left with the resampled population (`StartCorrelation`).
     """
 
-    coords: np.ndarray
-    records: np.ndarray
+    population: Population
     acceptance: float
     moves: int
-    memory: float
+    correlation: float
 
 
 def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
-    """(1 - beta) log_prior + beta log_prob of records (n,) with these fields; -inf outside the prior's support."""
+    """(1 - beta) log_prior + beta log_prob of records (n,); -inf outside the support of the prior."""
     outside = records["log_prior"] == -np.inf
     log_prior = np.where(outside, 0.0, records["log_prior"])
     return np.where(outside, -np.inf, (1.0 - beta) * log_prior + beta * records["log_prob"])
 
 
-class Memory:
-    """How well a population still remembers where it started, sweep after sweep.
+def _model(density: Density, beta: float, random: np.random.RandomState) -> Model:
+    """The tempered density as emcee's moves evaluate it; the records of the points are its blobs."""
 
-    Remembered are the parameters and the log-likelihood, which the next weights depend on. The measure is the largest
-    of their correlations, over the walkers, between start and now.
+    def compute_log_prob(coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        records = density.evaluate(coords)
+        return tempered_log_prob(records, beta), records
+
+    return Model(density.evaluate, compute_log_prob, density.map, random)
+
+
+class StartCorrelation:
+    """Correlation of a population with the points it started from, sweep by sweep.
+
+    The largest absolute correlation, over the walkers, between start and now of the parameters and of the
+    log-likelihood, which the next weights depend on.
 
     Parameters
     ----------
-    coords : (n, ndim) float — points right after the resampling, of finite log-likelihood.
-    records : (n,) with the fields log_prob and log_prior.
+    coords : (n, ndim) float
+        Points directly after the resampling, with finite log-likelihoods.
+    records : (n,) structured array
+        With the fields log_prob and log_prior.
+
+    Attributes
+    ----------
+    values : list of float
+        The correlation after each sweep.
     """
 
     def __init__(self, coords: np.ndarray, records: np.ndarray):
         self._start = self._centred(coords, records)
-        self.correlations: list[float] = []
+        self.values: list[float] = []
 
     @staticmethod
     def _centred(coords: np.ndarray, records: np.ndarray) -> np.ndarray:
-        remembered = np.column_stack([coords, records["log_prob"] - records["log_prior"]])
-        return remembered - remembered.mean(axis=0)
+        columns = np.column_stack([coords, records["log_prob"] - records["log_prior"]])
+        return columns - columns.mean(axis=0)
 
     def update(self, coords: np.ndarray, records: np.ndarray) -> None:
         """Enter the population after a sweep."""
@@ -67,90 +121,118 @@ class Memory:
         scale = np.sqrt(np.sum(self._start**2, axis=0) * np.sum(now**2, axis=0))
         varied = scale > 0.0
         correlation = np.abs(np.sum(self._start * now, axis=0)[varied] / scale[varied])
-        self.correlations.append(float(np.max(correlation, initial=0.0)))
+        self.values.append(float(np.max(correlation, initial=0.0)))
 
-    def enough(self, settings: Settings) -> bool:
-        """Whether to stop: the most moves made, the start forgotten, or nothing more forgotten for three sweeps."""
-        sweeps = self.correlations
-        if len(sweeps) < settings.min_moves:
+    def is_low_enough(self, settings: Settings) -> bool:
+        """Whether to stop moving: `max_moves` made, low correlation, or no decrease over the last three sweeps."""
+        values = self.values
+        if len(values) < settings.min_moves:
             return False
-        if len(sweeps) >= settings.max_moves or sweeps[-1] < settings.max_correlation:
+        if len(values) >= settings.max_moves or values[-1] < settings.max_correlation:
             return True
-        return len(sweeps) > STALL_SWEEPS and min(sweeps[:-STALL_SWEEPS]) <= min(sweeps[-STALL_SWEEPS:])
+        return len(values) > STALL_SWEEPS and min(values[:-STALL_SWEEPS]) <= min(values[-STALL_SWEEPS:])
 
 
 def move_together(
-    coords: np.ndarray,
-    records: np.ndarray,
-    beta: float,
-    model: Model,
-    pick: Callable[[], Move],
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
     settings: Settings,
-    show: Callable[[float], None],
-) -> Moved:
-    """Move equally weighted points at beta until they have forgotten where they started, as the settings say.
+) -> Generator[tuple[Population, Sweep], None, Mutated]:
+    """Move all points equally often, until they are nearly uncorrelated with their start.
 
     Parameters
     ----------
-    coords, records : (n, ndim) and (n,) — the population.
-    beta : float
-    model : emcee Model — its function gives the tempered density and, as blobs, the records.
-    pick : returns the move of the next sweep.
+    population : Population
+        Equally weighted points, with the beta at which they are moved.
+    density : Density
+        Evaluates points.
+    random : RandomState
+        Source of random numbers.
+    schedule : MoveSchedule
+        The moves.
     settings : Settings
-    show : called with the acceptance of each sweep.
+        Of these, `min_moves`, `max_moves` and `max_correlation`.
+
+    Yields
+    ------
+    Population, Sweep
+        After each sweep.
+
+    Returns
+    -------
+    Mutated
     """
-    memory = Memory(coords, records)
-    state = State(coords, log_prob=tempered_log_prob(records, beta), blobs=records)
+    beta, records = population.beta, population.records
+    model = _model(density, beta, random)
+    correlation = StartCorrelation(population.coords, records)
+    state = State(population.coords, log_prob=tempered_log_prob(records, beta), blobs=records)
     acceptance = []
-    while not memory.enough(settings):
-        move = pick()
+    while not correlation.is_low_enough(settings):
+        move = schedule.choose(random)
         state, accepted = move.propose(model, state)
         move.tune(state, accepted)
-        memory.update(state.coords, state.blobs)
+        correlation.update(state.coords, state.blobs)
         acceptance.append(float(np.mean(accepted)))
-        show(acceptance[-1])
-    return Moved(state.coords, state.blobs, float(np.mean(acceptance)), len(acceptance), memory.correlations[-1])
+        population = population._replace(coords=state.coords, records=state.blobs)
+        yield population, Sweep(acceptance[-1])
+    return Mutated(population, float(np.mean(acceptance)), len(acceptance), correlation.values[-1])
 
 
 def grow_chains(
-    coords: np.ndarray,
-    records: np.ndarray,
+    population: Population,
     ancestors: np.ndarray,
-    beta: float,
-    model: Model,
-    pick: Callable[[], Move],
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
     settings: Settings,
-    show: Callable[[float], None],
-) -> Moved:
-    """Grow a chain from each leader, as long as the leader was drawn often (Ching & Chen 2007).
+) -> Generator[tuple[Population, Sweep], None, Mutated]:
+    """Grow a chain from each distinct point (leader), one step per copy of it (Ching & Chen 2007).
 
-    All chains make ``settings.burn_in`` steps first; then every step of a chain is a point of the new population.
-    Chains of the same age move together, so the moves must be able to move any number of points.
+    All chains first make ``settings.burn_in`` steps; then every step of a chain is a point of the new population.
+    Chains of the same length move together, so the moves must be able to move any number of points.
 
     Parameters
     ----------
-    coords, records, ancestors : (n, ndim), (n,), (n,) int — the resampled population and where each point came from.
-    beta, model, pick, settings, show : as in `move_together`, which returns the same.
+    population : Population
+        Resampled points, with the beta at which they are moved.
+    ancestors : (n,) int
+        Index of each point before the resampling; equal for copies.
+    density, random, schedule, settings
+        As in `move_together`.
+
+    Yields
+    ------
+    Population, Sweep
+        After each step of the chains; points that their chain has not reached yet are those of the start.
+
+    Returns
+    -------
+    Mutated
     """
+    beta, coords, records = population.beta, population.coords, population.records
+    model = _model(density, beta, random)
     _, first, owner, counts = np.unique(ancestors, return_index=True, return_inverse=True, return_counts=True)
     place = np.argsort(owner, kind="stable")
     start = np.concatenate([[0], np.cumsum(counts)[:-1]])
     chains = State(coords[first], log_prob=tempered_log_prob(records[first], beta), blobs=records[first])
-    memory = Memory(coords, records)
+    correlation = StartCorrelation(coords, records)
     coords, records = coords.copy(), records.copy()
+    population = population._replace(coords=coords, records=records)
     accepted_steps, steps = 0, 0
-    for age in range(-settings.burn_in, int(counts.max())):
-        growing = np.flatnonzero(counts > age)
-        move = pick()
+    for length in range(-settings.burn_in, int(counts.max())):
+        growing = np.flatnonzero(counts > length)
+        move = schedule.choose(random)
         state = State(chains.coords[growing], log_prob=chains.log_prob[growing], blobs=chains.blobs[growing])
         state, accepted = move.propose(model, state)
         move.tune(state, accepted)
         chains.coords[growing], chains.log_prob[growing] = state.coords, state.log_prob
         chains.blobs[growing] = state.blobs
-        if age >= 0:
-            rows = place[start[growing] + age]
+        if length >= 0:
+            rows = place[start[growing] + length]
             coords[rows], records[rows] = state.coords, state.blobs
         accepted_steps, steps = accepted_steps + int(np.sum(accepted)), steps + len(growing)
-        show(float(np.mean(accepted)))
-    memory.update(coords, records)
-    return Moved(coords, records, accepted_steps / steps, settings.burn_in + 1, memory.correlations[-1])
+        yield population, Sweep(float(np.mean(accepted)))
+    correlation.update(coords, records)
+    return Mutated(population, accepted_steps / steps, settings.burn_in + 1, correlation.values[-1])

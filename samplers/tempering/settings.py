@@ -1,43 +1,142 @@
-"""How a ladder is climbed: the settings shared by the tempered samplers, checked when they are made."""
+"""Settings of the annealing from the prior to the posterior, checked when they are made.
 
-from collections.abc import Callable
-from dataclasses import dataclass
+Every default is written here, once. A setting that cannot act on the chosen path is refused (`refuse_unused`).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 
 from .resampling import RESAMPLING
 
-__all__ = ["Settings"]
+__all__ = ["RecyclingSettings", "Settings", "changed_settings", "refuse_unused"]
+
+
+@dataclass(frozen=True)
+class RecyclingSettings:
+    """Constants of adaptive importance sampling (`samplers.tempering.adaptive_importance`).
+
+    The *target* is the effective sample size wanted at each beta: ``max(target_share * n, points_per_dimension *
+    (ndim + 1))`` for annealing that starts from n points. The *yield* of a round is the effective sample size of its
+    fresh draws divided by their number. Values without a reference are our choice, from trials on posteriors with
+    known answers.
+
+    Attributes
+    ----------
+    target_share : float
+        Target as a share of the number of starting points. A small target allows large steps of beta; the fresh draws
+        of a round, twice the target in number, then restore the effective sample size.
+    points_per_dimension : float
+        Smallest target per dimension (and one more). With fewer than five effective points per dimension, the
+        covariances of the fitted mixture cannot be estimated.
+    fresh_share : float
+        A beta is left once the draws made at it have an effective sample size of this share of the target. Among many
+        old points some have large weights by chance; where the likelihood is rough, annealing that follows these points
+        ends in a local mode.
+    max_components : int
+        Largest number of components of a proposal.
+    even_share : float
+        Share of a proposal's weight that is spread evenly over its components, so that a component of small weight
+        receives draws too.
+    min_yield : float
+        Recycling is given up when the mean yield of the last `patience` rounds is smaller. Moves then need fewer
+        evaluations.
+    patience : int
+        Number of rounds over which the yield is averaged for `min_yield`.
+    max_rounds : int
+        Recycling is given up after this number of rounds without a check at beta = 1.
+    max_checks : int
+        Largest number of checks with fresh draws at beta = 1. Draws that contradict a fit also improve it, so a failed
+        check is repeated.
+    trusted_yield : float
+        Smallest yield of the check for which the result is used.
+    high_yield : float
+        Yield of the check at which the Pareto shape of its weights is no longer required to be below 0.7 (Vehtari et
+        al. 2024, JMLR 25(72)): the weights are even, and the shape of so short a tail is uncertain.
+    max_evidence_difference : float
+        Largest difference between the log-evidence of the check and that of the earlier points for which the result
+        is used.
+    """
+
+    target_share: float = 0.2
+    points_per_dimension: float = 5.0
+    fresh_share: float = 0.75
+    max_components: int = 8
+    even_share: float = 0.25
+    min_yield: float = 0.03
+    patience: int = 6
+    max_rounds: int = 200
+    max_checks: int = 4
+    trusted_yield: float = 0.25
+    high_yield: float = 0.5
+    max_evidence_difference: float = 0.25
+
+    def __post_init__(self):
+        for name in ("target_share", "fresh_share"):
+            value = getattr(self, name)
+            if not 0.0 < value <= 1.0:
+                raise ValueError(f"{name} must lie in (0, 1]; got {value}")
+        for name in ("even_share", "min_yield", "trusted_yield", "high_yield"):
+            value = getattr(self, name)
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1]; got {value}")
+        for name in ("max_components", "patience", "max_rounds", "max_checks"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1; got {value!r}")
+        if not self.points_per_dimension > 0.0:
+            raise ValueError(f"points_per_dimension must be positive; got {self.points_per_dimension}")
+        if not self.max_evidence_difference >= 0.0:
+            raise ValueError(f"max_evidence_difference must not be negative; got {self.max_evidence_difference}")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How the ladder is climbed.
+    """Settings of a tempered sampler.
 
     Attributes
     ----------
-    ess_ratio : float — the effective sample size wanted of each stage, as a share: of the number of walkers
-        (`ess_rule` "constant") or of the last stage's target ("declining"), 0 < ess_ratio < 1.
-    ess_rule : "constant" or "declining".
-    ess_floor : float — the declining target stops there.
-    resampling : name of a scheme in `samplers.tempering.resampling`, or a function of (weights, random) that returns indices.
-    min_moves, max_moves : int — sweeps of the ensemble a stage; equal for a fixed number.
-    max_correlation : float — between the two, moving stops once the correlation of every parameter and of the
-        log-likelihood with the resampled start is below this, or falls no further.
-    chains : "equal", every resampled point is moved as long as the others, or "leaders", a chain grows from each
-        distinct one, as many steps as it was drawn (then the number of moves is `burn_in` + 1).
-    burn_in : int — steps of a chain before its points count, with "leaders".
-    fast_sweeps : int — sweeps after every move over the parameters whose change costs no simulation, where
-        `log_prob_fn` has an attribute ``fast_parameters`` with their indices (`samplers.moves.fast_parameters`); 0 for none.
-    recycle : bool — climb by importance sampling over every point evaluated (`samplers.tempering.adaptive_importance`), and by moves only
-        where that may not be trusted.
-    check_draws : int, optional — evaluations spent at the end on an evidence independent of the ladder; by default as
-        many as there are walkers, none with 0.
-    max_failure_share : float — the run stops with an error once more than this share of the evaluations failed (by an
-        exception or by NaN; a returned -inf is no failure); 0 stops at the first one.
+    ess_ratio : float
+        Effective sample size wanted of each stage, as a share of the number of walkers (`ess_rule` "constant") or of
+        the previous stage's target ("declining"); between 0 and 1.
+    ess_rule : {"constant", "declining"}
+        What `ess_ratio` refers to.
+    ess_floor : float
+        Lower limit of the declining target.
+    coefficient_of_variation : float, optional
+        Coefficient of variation wanted of the incremental weights of each stage. It takes the place of `ess_ratio`: n
+        weights with this coefficient have an effective sample size of n / (1 + coefficient²).
+    resampling : str or callable
+        Name of a scheme in `samplers.tempering.resampling`, or a function of (weights, random) that returns indices.
+    min_moves, max_moves : int
+        Smallest and largest number of sweeps of the ensemble per stage; equal for a fixed number.
+    max_correlation : float
+        Between these two numbers, moving stops once the correlation of every parameter and of the log-likelihood with
+        their values after the resampling is below this value, or decreases no further.
+    chains : {"equal", "leaders"}
+        With "equal", every resampled point is moved equally often. With "leaders", a chain grows from each distinct
+        resampled point, one step per copy of it; each point is then moved `burn_in` + 1 times.
+    burn_in : int
+        With "leaders", steps of a chain before its points count.
+    fast_sweeps : int
+        Sweeps over the fast parameters after every move, where `log_prob_fn` has an attribute ``fast_parameters``
+        (`samplers.moves.fast_parameters`); 0 for none.
+    recycle : bool, optional
+        Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.adaptive_importance`), and
+        by moves only where its result cannot be trusted. None leaves the choice to the sampler.
+    recycling : RecyclingSettings
+        Constants of the recycling.
+    check_draws : int, optional
+        Evaluations for an estimate of the evidence that is independent of the annealing. None: as many as there are
+        walkers; 0: no such estimate.
+    max_failure_share : float
+        The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
+        (a returned -inf is not a failure); 0 stops at the first failure.
     """
 
     ess_ratio: float = 0.5
     ess_rule: str = "constant"
     ess_floor: float = 0.0
+    coefficient_of_variation: float | None = None
     resampling: str | Callable = "systematic"
     min_moves: int = 2
     max_moves: int = 7
@@ -45,7 +144,8 @@ class Settings:
     chains: str = "equal"
     burn_in: int = 0
     fast_sweeps: int = 2
-    recycle: bool = False
+    recycle: bool | None = None
+    recycling: RecyclingSettings = RecyclingSettings()
     check_draws: int | None = None
     max_failure_share: float = 0.5
 
@@ -56,6 +156,9 @@ class Settings:
             raise ValueError(f'ess_rule must be "constant" or "declining"; got {self.ess_rule!r}')
         if not self.ess_floor >= 0.0:
             raise ValueError(f"ess_floor must not be negative; got {self.ess_floor}")
+        variation = self.coefficient_of_variation
+        if variation is not None and not 0.0 < variation < float("inf"):
+            raise ValueError(f"coefficient_of_variation must be positive and finite; got {variation}")
         if not callable(self.resampling) and self.resampling not in RESAMPLING:
             raise ValueError(f"resampling must be a function or one of {sorted(RESAMPLING)}; got {self.resampling!r}")
         if not 1 <= self.min_moves <= self.max_moves:
@@ -68,6 +171,8 @@ class Settings:
             raise ValueError(f"burn_in must not be negative; got {self.burn_in}")
         if not isinstance(self.fast_sweeps, int) or self.fast_sweeps < 0:
             raise ValueError(f"fast_sweeps must be a whole number, 0 for none; got {self.fast_sweeps!r}")
+        if not isinstance(self.recycling, RecyclingSettings):
+            raise ValueError(f"recycling must be a RecyclingSettings; got {self.recycling!r}")
         if self.check_draws is not None and not self.check_draws >= 0:
             raise ValueError(f"check_draws must not be negative; got {self.check_draws}")
         if not 0.0 <= self.max_failure_share <= 1.0:
@@ -75,10 +180,75 @@ class Settings:
 
     @property
     def resample(self) -> Callable:
-        """The resampling scheme itself."""
+        """The resampling scheme."""
         return self.resampling if callable(self.resampling) else RESAMPLING[self.resampling]
 
     def target(self, last_target: float, n_walkers: int) -> float:
-        """Effective sample size wanted of a stage, from that of the stage before (n_walkers before the first)."""
-        base = n_walkers if self.ess_rule == "constant" else last_target
-        return max(self.ess_ratio * base, self.ess_floor)
+        """Effective sample size wanted of a stage, from that of the previous stage (n_walkers before the first)."""
+        variation = self.coefficient_of_variation
+        ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
+        return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
+
+
+def changed_settings(settings: Settings) -> tuple[str, ...]:
+    """Names of the settings that differ from their defaults."""
+    return tuple(field.name for field in fields(settings) if getattr(settings, field.name) != field.default)
+
+
+def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unused: Mapping[str, str]) -> None:
+    """Raise an error for a setting that differs from its default but cannot act on the chosen path.
+
+    With recycling, the settings that only its fallback on moves would use are refused as well: a run should not depend
+    on them by accident.
+
+    Parameters
+    ----------
+    settings : Settings
+        As the user gave them.
+    recycles : bool
+        Whether the annealing is by recycling.
+    fast_sweeps_act : bool
+        Whether there are fast parameters to sweep over.
+    unused : mapping of str to str
+        Names of settings that the sampler never uses, with what to do.
+
+    Raises
+    ------
+    ValueError
+        With the name of the setting, why it cannot act, and what to do.
+    """
+    reasons = dict(unused)
+    if settings.ess_rule == "constant":
+        reasons.setdefault("ess_floor", 'it is the lower limit of a declining target: pass ess_rule="declining" too')
+    if settings.coefficient_of_variation is not None:
+        reasons.setdefault("ess_ratio", "coefficient_of_variation takes its place: pass one of them")
+    if settings.chains == "equal":
+        reasons.setdefault("burn_in", 'it belongs to chains="leaders"')
+    else:
+        for name in ("min_moves", "max_moves", "max_correlation"):
+            reasons.setdefault(name, 'with chains="leaders" each point is moved burn_in + 1 times: pass burn_in')
+    if settings.min_moves == settings.max_moves:
+        reasons.setdefault("max_correlation", "min_moves and max_moves are equal, so it never decides")
+    if settings.fast_sweeps > 0 and not fast_sweeps_act:
+        reasons.setdefault(
+            "fast_sweeps",
+            "log_prob_fn has no fast_parameters beside slow ones, or a pool without vectorize=True evaluates it in "
+            "workers that cache nothing",
+        )
+    if recycles:
+        for name in ("ess_ratio", "ess_rule", "ess_floor", "coefficient_of_variation", "resampling"):
+            reasons.setdefault(
+                name,
+                "it belongs to annealing by moves, and recycling is on (the default of SMCSampler with 250 walkers or "
+                "more and no moves given): pass recycle=False",
+            )
+        if settings.check_draws != 0:
+            reasons.setdefault(
+                "check_draws",
+                "the check of recycling takes as many draws as there are walkers: pass 0 for no check, or recycle=False",
+            )
+    else:
+        reasons.setdefault("recycling", "the annealing is by moves: pass recycle=True")
+    for name in changed_settings(settings):
+        if name in reasons:
+            raise ValueError(f"{name}={getattr(settings, name)!r} cannot act here: {reasons[name]}")

@@ -55,7 +55,7 @@ def test_signatures_are_emcees(Sampler):
     keep = set(theirs) - deprecated
     assert parameters(Sampler, keep) == parameters(emcee.EnsembleSampler, keep)
     ours = inspect.signature(Sampler).parameters
-    assert [p.name for p in ours.values() if p.kind is not p.KEYWORD_ONLY] == [n for n in theirs if n in keep]
+    assert [p.name for p in ours.values() if p.kind is p.POSITIONAL_OR_KEYWORD] == [n for n in theirs if n in keep]
     for name in ("sample", "run_mcmc", "reset", "compute_log_prob", "get_chain", "get_last_sample"):
         mine, yours = getattr(Sampler, name), getattr(emcee.EnsembleSampler, name)
         assert [(p.name, p.default) for p in inspect.signature(mine).parameters.values()] == [

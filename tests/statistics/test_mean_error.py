@@ -6,7 +6,7 @@ from scipy import stats
 
 from samplers import SMCSampler
 from samplers.moves.kernels import RandomWalkMove
-from samplers.tempering.genealogy import follow, standard_error_of_mean
+from samplers.tempering.genealogy import standard_error_of_mean, trace_founders
 from samplers.tempering.resampling import multinomial
 from tests.contract.targets import Box, Gaussian
 from tests.statistics.test_posteriors import MODES, runs
@@ -61,18 +61,18 @@ def test_founders_are_followed_while_there_are_enough(rng):
     n, generations, lineage = 200, [], np.arange(200)
     for _ in range(4):
         ancestors = multinomial(np.full(n, 1 / n), rng)
-        generations = follow(generations, ancestors, quorum=0.1)
+        generations = trace_founders(generations, ancestors, min_share=0.1)
         lineage = lineage[ancestors]
     assert len(generations) == 4
     assert np.array_equal(generations[0], lineage) and np.array_equal(generations[-1], ancestors)
-    few = follow(generations, np.repeat([3, 7], n // 2), quorum=0.1)
+    few = trace_founders(generations, np.repeat([3, 7], n // 2), min_share=0.1)
     assert len(few) == 1 and set(few[0]) == {3, 7}
 
 
 def test_what_does_not_fit_is_refused():
     assert np.all(standard_error_of_mean(np.zeros((2, 5, 3)), np.zeros(5)) == np.inf)
     for chain, families in ((np.zeros((5, 3)), np.arange(5)), (np.zeros((2, 5, 3)), np.arange(4))):
-        with pytest.raises(ValueError, match="the family of each walker"):
+        with pytest.raises(ValueError, match="the founder of each walker"):
             standard_error_of_mean(chain, families)
 
 

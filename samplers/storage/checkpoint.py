@@ -1,0 +1,178 @@
+"""Checkpoint of a run: what is stored while it runs, and what an interrupted run has left.
+
+A run is a deterministic function of its start and of what ``log_prob_fn`` returns. To resume it, the annealing is
+repeated from the start in the journal, and every evaluation that the journal contains is looked up instead of computed.
+The chain then continues from the last stored step.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from emcee.backends import Backend, HDFBackend
+
+from ..tempering.population import Stage
+from ..tempering.results import AnnealingResult
+from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
+from .compatibility import differences
+from .journal import Contents, EvaluatedBatch, RunStart
+
+__all__ = ["Checkpoint", "ReplayedEvaluations"]
+
+
+class ReplayedEvaluations:
+    """Evaluations of an interrupted run, found by their points, which must be equal to the last bit.
+
+    Parameters
+    ----------
+    batches : sequence of EvaluatedBatch
+        The evaluations in the journal.
+    """
+
+    def __init__(self, batches: Sequence[EvaluatedBatch]):
+        self._batches = batches
+        self._place = {
+            row.tobytes(): (number, index)
+            for number, batch in enumerate(batches)
+            for index, row in enumerate(batch.coords)
+        }
+
+    def find(self, coords: np.ndarray) -> EvaluatedBatch | None:
+        """The evaluations of points (n, ndim), or None unless all of them are known."""
+        found = [self._place.get(row.tobytes()) for row in np.ascontiguousarray(coords)]
+        if None in found:
+            return None
+        log_prob = np.array([self._batches[number].log_prob[index] for number, index in found])
+        reasons = {
+            row: self._batches[number].reasons[index]
+            for row, (number, index) in enumerate(found)
+            if index in self._batches[number].reasons
+        }
+        blobs = None
+        if self._batches[found[0][0]].blobs is not None:
+            blobs = np.stack([self._batches[number].blobs[index] for number, index in found])
+        return EvaluatedBatch(coords, log_prob, blobs, reasons)
+
+
+class Checkpoint:
+    """Stores the ladder of a run in its backend, keeps its journal, and resumes an interrupted run.
+
+    Without an HDF5 file that can be written there is no journal: the methods that concern it then do nothing.
+
+    Parameters
+    ----------
+    backend : emcee Backend or HDFBackend, optional
+        Backend of the chain; in memory by default.
+
+    Attributes
+    ----------
+    backend : emcee Backend or JournaledBackend
+        Backend to use in place of the given one.
+    """
+
+    def __init__(self, backend: Backend | HDFBackend | None):
+        if type(backend) is HDFBackend and not backend.read_only:
+            backend = JournaledBackend.of(backend)
+        self.backend = Backend() if backend is None else backend
+        self._journaled = self.backend if isinstance(self.backend, JournaledBackend) else None
+        self._replayed: ReplayedEvaluations | None = None
+        self._earlier_stages: tuple[Stage, ...] = ()
+
+    # ------------------------------------------------------------------ the ladder
+
+    def stored_result(self) -> AnnealingResult:
+        """Ladder and check in the backend."""
+        return AnnealingResult(read_ladder(self.backend), read_check(self.backend))
+
+    def store_result(self, result: AnnealingResult) -> None:
+        """Store ladder and check in the backend, after it was reset."""
+        for index, stage in enumerate(result.ladder):
+            write_stage(self.backend, index, stage)
+        self.store_check(result)
+
+    def store_stage(self, index: int, stage: Stage) -> Stage:
+        """Store a stage; returns it with its original wall time if it is a repeated stage of an interrupted run."""
+        if index < len(self._earlier_stages):
+            earlier = self._earlier_stages[index]
+            if earlier == stage._replace(seconds=earlier.seconds):
+                stage = earlier
+        write_stage(self.backend, index, stage)
+        return stage
+
+    def store_check(self, result: AnnealingResult) -> None:
+        """Store the check of a finished annealing, if there is one."""
+        if result.check is not None:
+            write_check(self.backend, result.check)
+
+    # ------------------------------------------------------------------ the journal
+
+    @property
+    def interrupted(self) -> Contents | None:
+        """Journal of an interrupted run in the backend that has not been resumed yet."""
+        return None if self._journaled is None else self._journaled.contents
+
+    @property
+    def wants_start(self) -> bool:
+        """Whether the start of the annealing is to be entered with `begin`."""
+        return self._journaled is not None and self._replayed is None
+
+    def begin(self, header: dict, start: RunStart) -> None:
+        """Enter the start of the annealing."""
+        self._journaled.begin(header, start)
+
+    def resume(
+        self,
+        header: dict,
+        log_prior: Callable[[np.ndarray], np.ndarray],
+        compute: Callable[[np.ndarray], EvaluatedBatch],
+    ) -> Contents:
+        """Continue the interrupted run: its evaluations are found by `find` until the end of the call.
+
+        Parameters
+        ----------
+        header : dict
+            `samplers.storage.compatibility.header` of the sampler that continues the run.
+        log_prior, compute : callable
+            Functions of points (n, ndim): the log-prior, and an evaluation that is not stored.
+
+        Returns
+        -------
+        Contents
+            Of the journal.
+
+        Raises
+        ------
+        ValueError
+            If the run was made with other settings, another prior or another log-probability.
+        """
+        contents = self.interrupted
+        if differing := differences(header, contents, log_prior, compute):
+            raise ValueError(
+                f"{self.backend.filename} contains another run, which cannot be continued here: {'; '.join(differing)}."
+                " Use the settings and functions that it was started with, or another file"
+            )
+        self._journaled.continue_run(contents)
+        self._replayed = ReplayedEvaluations(contents.evaluated)
+        self._earlier_stages = read_ladder(self.backend)
+        return contents
+
+    def find(self, coords: np.ndarray) -> EvaluatedBatch | None:
+        """Evaluations of points (n, ndim) by the interrupted run, or None unless all of them are known."""
+        return None if self._replayed is None else self._replayed.find(coords)
+
+    def evaluated(self, batch: EvaluatedBatch) -> None:
+        """Enter a batch of evaluated points."""
+        if self._journaled is not None:
+            self._journaled.evaluated(batch)
+
+    def begin_call(self, nsteps: int) -> None:
+        """Enter the number of steps that a call asks for."""
+        if self._journaled is not None:
+            self._journaled.call(nsteps)
+
+    def end_call(self, complete: bool) -> None:
+        """Write pending steps, and enter whether the call was completed; evaluations are no longer looked up."""
+        self._replayed, self._earlier_stages = None, ()
+        if self._journaled is not None:
+            self._journaled.flush()
+            if complete:
+                self._journaled.done()

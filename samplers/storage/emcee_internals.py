@@ -1,0 +1,82 @@
+"""The parts of emcee that are not its public interface: private attributes of a sampler, and the HDF5 schema.
+
+They are used in this module only, and pinned by `tests.contract.test_emcee_contract`, which says what to change if a
+later version of emcee (``emcee>=3.1.4,<4``) differs.
+"""
+
+from collections.abc import Sequence
+
+import h5py
+import numpy as np
+from emcee import EnsembleSampler, State
+from emcee.moves import Move
+
+from .journal import Step
+
+__all__ = [
+    "append_steps",
+    "get_moves",
+    "get_previous_state",
+    "get_random",
+    "holds_steps",
+    "set_moves",
+    "set_previous_state",
+]
+
+
+def get_random(sampler: EnsembleSampler) -> np.random.RandomState:
+    """The random generator of a sampler."""
+    return sampler._random
+
+
+def get_moves(sampler: EnsembleSampler) -> tuple[Sequence[Move], np.ndarray]:
+    """The moves of a sampler, and the probability of each to be chosen."""
+    return sampler._moves, sampler._weights
+
+
+def set_moves(sampler: EnsembleSampler, moves: Sequence[Move]) -> None:
+    """Replace the moves of a sampler; their probabilities stay."""
+    sampler._moves = moves
+
+
+def get_previous_state(sampler: EnsembleSampler) -> State | None:
+    """The state from which ``run_mcmc(None, ...)`` continues."""
+    return sampler._previous_state
+
+
+def set_previous_state(sampler: EnsembleSampler, state: State | None) -> None:
+    """Set the state from which ``run_mcmc(None, ...)`` continues; emcee sets it in some cases only."""
+    sampler._previous_state = state
+
+
+def append_steps(group: h5py.Group, steps: Sequence[Step]) -> None:
+    """Write steps to the group of a chain, as repeated calls of ``HDFBackend.save_step`` would.
+
+    Parameters
+    ----------
+    group : h5py.Group
+        Group of the chain, in which ``HDFBackend.grow`` has made room.
+    steps : sequence of Step
+        At least one.
+    """
+    start, stop = group.attrs["iteration"], group.attrs["iteration"] + len(steps)
+    group["chain"][start:stop] = np.stack([step.coords for step in steps])
+    group["log_prob"][start:stop] = np.stack([step.log_prob for step in steps])
+    if steps[0].blobs is not None:
+        group["blobs"][start:stop] = np.stack([step.blobs for step in steps])
+    group["accepted"][:] += np.sum([step.accepted for step in steps], axis=0)
+    for i, value in enumerate(steps[-1].random_state):
+        group.attrs[f"random_state_{i}"] = value
+    group.attrs["iteration"] = stop
+
+
+def holds_steps(group: h5py.Group, steps: Sequence[Step]) -> bool:
+    """Whether the chain in a group consists of these steps."""
+    if group.attrs["iteration"] != len(steps):
+        return False
+    if not steps:
+        return True
+    stored = group["chain"][: len(steps)], group["log_prob"][: len(steps)], group["accepted"][...]
+    coords, log_prob = np.stack([step.coords for step in steps]), np.stack([step.log_prob for step in steps])
+    expected = coords.astype(stored[0].dtype), log_prob.astype(stored[1].dtype), sum(step.accepted for step in steps)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(stored, expected, strict=True))

@@ -1,0 +1,128 @@
+"""What annealing passes on and reports: populations, stages, sweeps.
+
+`samplers.tempering.anneal.anneal` yields pairs of a `Population`, which the next step needs, and a `Report`, which a
+reader wants to see.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from .evidence_check import EvidenceCheck
+
+__all__ = ["Density", "Population", "Report", "Restart", "Stage", "Sweep"]
+
+
+class Density(Protocol):
+    """A posterior density with its prior, as annealing evaluates it.
+
+    Attributes
+    ----------
+    evaluations : int
+        Number of points evaluated so far.
+    map : callable
+        How an emcee move that evaluates points by itself maps a function over them: ``map`` or ``pool.map``.
+    """
+
+    evaluations: int
+
+    @property
+    def map(self) -> Callable: ...
+
+    def evaluate(self, coords: np.ndarray) -> np.ndarray:
+        """Records (n,) of points (n, ndim), with the fields log_prob, log_prior and, where there are any, blobs."""
+
+    def inside(self, coords: np.ndarray) -> np.ndarray:
+        """Whether each of the points (n, ndim) lies in the support of the prior: (n,) bool."""
+
+
+class Population(NamedTuple):
+    """Points at one beta.
+
+    Attributes
+    ----------
+    beta : float
+        Tempering exponent, 0 for draws of the prior and 1 for draws of the posterior.
+    coords : (n, ndim) float
+        The points.
+    records : (n,) structured array, or None
+        Fields log_prob, log_prior and, where there are any, blobs. None: the points have not been evaluated.
+    effective_sample_size : float
+        Of the weights that led to this population.
+    founders : tuple of (n,) int
+        See `samplers.tempering.genealogy.trace_founders`; empty before the first resampling.
+    log_weights : (n,) float, optional
+        Logarithms of the weights at `beta`; None for equally weighted points.
+    """
+
+    beta: float
+    coords: np.ndarray
+    records: np.ndarray | None
+    effective_sample_size: float
+    founders: tuple[np.ndarray, ...] = ()
+    log_weights: np.ndarray | None = None
+
+
+class Stage(NamedTuple):
+    """A finished tempering stage.
+
+    Attributes
+    ----------
+    beta : float
+        Tempering exponent of the stage, 0 < beta <= 1.
+    effective_sample_size : float
+        Of the incremental weights that led to this stage.
+    acceptance : float
+        Share of the proposals of this stage that were accepted.
+    moves : int
+        Sweeps of the whole ensemble made at this beta, without those over fast parameters; 0 for a stage of recycling.
+    distinct_ancestors : int
+        Number of different points that survived the resampling.
+    log_evidence_increment : float
+        Logarithm of the mean incremental weight.
+    log_evidence_error : float
+        Standard error of the sum of the increments so far.
+    evaluations : int
+        Points for which ``log_prob_fn`` was called in this stage (the first stage includes the draws of the prior).
+        Sweeps over fast parameters count, so this can exceed the number of simulations. Entered by the sampler.
+    seconds : float
+        Wall time of the stage [s]. Entered by the sampler.
+    """
+
+    beta: float
+    effective_sample_size: float
+    acceptance: float
+    moves: int
+    distinct_ancestors: int
+    log_evidence_increment: float
+    log_evidence_error: float
+    evaluations: int = 0
+    seconds: float = 0.0
+
+
+class Sweep(NamedTuple):
+    """One sweep of the ensemble, or one stage of recycling: a tick of the progress bar.
+
+    Attributes
+    ----------
+    acceptance : float
+        Share of the proposals that were accepted; of recycling, the yield of the latest draws.
+    """
+
+    acceptance: float
+
+
+class Restart(NamedTuple):
+    """Annealing starts again: the stages reported so far are void.
+
+    Attributes
+    ----------
+    reason : str
+        Why their result cannot be trusted.
+    """
+
+    reason: str
+
+
+Report = Stage | Sweep | Restart | EvidenceCheck

@@ -1,0 +1,62 @@
+"""Results of annealing: the stages, the evidence and its error, the founders of the walkers."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .evidence_check import EvidenceCheck
+from .population import Stage
+
+__all__ = ["AnnealingResult"]
+
+
+class AnnealingResult(NamedTuple):
+    """What annealing has found so far.
+
+    Attributes
+    ----------
+    ladder : tuple of Stage
+        The sequence of tempering stages.
+    check : EvidenceCheck, optional
+        The independent estimate of the evidence.
+    founders : (nwalkers,) int, optional
+        Founder of each walker (`samplers.tempering.genealogy`); None where it is not known.
+    """
+
+    ladder: tuple[Stage, ...] = ()
+    check: EvidenceCheck | None = None
+    founders: np.ndarray | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether beta = 1 has been reached."""
+        return bool(self.ladder) and self.ladder[-1].beta == 1.0
+
+    def require_finished(self) -> Sequence[Stage]:
+        """The stages, or ValueError before beta = 1 is reached."""
+        if not self.finished:
+            reached = f"the ladder ends at beta = {self.ladder[-1].beta:.3g}" if self.ladder else "there is no ladder"
+            raise ValueError(f"the evidence is known at beta = 1, and {reached}: call run_mcmc first")
+        return self.ladder
+
+    @property
+    def log_evidence_ladder(self) -> float:
+        """Log-evidence by tempering: the sum of the increments of all stages."""
+        return float(sum(stage.log_evidence_increment for stage in self.require_finished()))
+
+    @property
+    def evidence(self) -> tuple[float, float]:
+        """Log-evidence and its standard error.
+
+        Of the estimates by tempering and by the check, the one with the smaller error. If they differ by more than
+        three times their joint error, the error is at least half their difference.
+        """
+        value, error = self.log_evidence_ladder, self.ladder[-1].log_evidence_error
+        check = self.check
+        if check is None or not check.reliable:
+            return value, error
+        difference, joint = abs(value - check.log_evidence), np.hypot(error, check.error)
+        if check.error < error:
+            value, error = check.log_evidence, check.error
+        return value, max(error, 0.5 * difference) if difference > 3.0 * joint else error
