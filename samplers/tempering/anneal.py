@@ -232,7 +232,7 @@ def _check_evidence(
 ) -> EvidenceCheck:
     """The evidence from fresh draws of a mixture fitted to the final points; by default as many draws as points."""
     n = len(coords)
-    mixture = fit_mixture(coords, np.full(n, 1.0 / n), edges=find_support_bounds(density.inside, coords))
+    mixture = fit_mixture(coords, np.full(n, 1.0 / n), bounds=find_support_bounds(density.inside, coords))
     drawn, made = draw_inside(mixture, n if draws is None else draws, random, density.inside)
     return evidence_from_weights(density.evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
 

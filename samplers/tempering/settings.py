@@ -72,15 +72,15 @@ class RecyclingSettings:
 
     def __post_init__(self):
         for name in ("target_share", "fresh_share"):
-            value = getattr(self, name)
+            value = vars(self)[name]
             if not 0.0 < value <= 1.0:
                 raise ValueError(f"{name} must lie in (0, 1]; got {value}")
         for name in ("even_share", "min_yield", "trusted_yield", "high_yield"):
-            value = getattr(self, name)
+            value = vars(self)[name]
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1]; got {value}")
         for name in ("max_components", "patience", "max_rounds", "max_checks"):
-            value = getattr(self, name)
+            value = vars(self)[name]
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1; got {value!r}")
         if not self.points_per_dimension > 0.0:
@@ -192,7 +192,7 @@ class Settings:
 
 def changed_settings(settings: Settings) -> tuple[str, ...]:
     """Names of the settings that differ from their defaults."""
-    return tuple(field.name for field in fields(settings) if getattr(settings, field.name) != field.default)
+    return tuple(field.name for field in fields(settings) if vars(settings)[field.name] != field.default)
 
 
 def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unused: Mapping[str, str]) -> None:
@@ -251,4 +251,4 @@ def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unu
         reasons.setdefault("recycling", "the annealing is by moves: pass recycle=True")
     for name in changed_settings(settings):
         if name in reasons:
-            raise ValueError(f"{name}={getattr(settings, name)!r} cannot act here: {reasons[name]}")
+            raise ValueError(f"{name}={vars(settings)[name]!r} cannot act here: {reasons[name]}")
