@@ -1,23 +1,26 @@
-# %% [markdown]
-# # Updating a reinforced-concrete bridge column with SMC
-#
-# The main job of this library, end to end: a nonlinear fiber finite-element model of a full-scale bridge column
-# (Ramancha, Astroza, Conte, Restrepo & Todd, "Bayesian nonlinear finite element model updating of a full-scale
-# bridge-column using sequential Monte Carlo") is updated with the acceleration and the displacement of its top.
-# Five structural parameters and two noise levels are sampled by SMC; the paper's Table 2 and Figures 3 to 5 are left in
-# a folder.
-#
-# The measurements of the paper are not public. **The data used here are synthetic**: the response of a finer model at
-# the paper's posterior means, plus white noise of the paper's levels, under a synthetic base motion (bundled) or under
-# any record you name:
-#
-#     python tutorials/02_bridge_column.py                                       # all data, the default sampler
-#     python tutorials/02_bridge_column.py --preset reduced                      # a quarter of the samples; minutes
-#     python tutorials/02_bridge_column.py --preset ramancha2022                 # the paper's own algorithm; hours
-#     python tutorials/02_bridge_column.py --record motion.AT2 --scale 0.85      # another base motion (AT2, V2, CSV)
-#     python tutorials/02_bridge_column.py --preset reduced --classes            # which geometry, which softening?
+"""
+Updating a reinforced-concrete bridge column with SMC
+======================================================
 
-# %%
+A nonlinear fiber finite-element model of a full-scale bridge column is updated with the acceleration and the
+displacement of its top. Five structural parameters and two noise levels are sampled by sequential Monte Carlo (SMC).
+The script writes Table 2 and Figures 3 to 5 of the paper that it follows: Ramancha, Astroza, Conte, Restrepo & Todd
+(2022), "Bayesian nonlinear finite element model updating of a full-scale bridge-column using sequential Monte Carlo".
+
+The measurements of the paper are not public. **The data used here are synthetic**: the response of a finer model at the
+posterior means of the paper, plus white noise with the noise levels of the paper. The base motion is a bundled
+synthetic motion or any record that you name::
+
+    python tutorials/02_bridge_column.py                                       # all data, the default sampler
+    python tutorials/02_bridge_column.py --preset reduced                      # a quarter of the samples; minutes
+    python tutorials/02_bridge_column.py --preset ramancha2022                 # the algorithm of the paper; hours
+    python tutorials/02_bridge_column.py --record motion.AT2 --scale 0.85      # another base motion (AT2, V2, CSV)
+    python tutorials/02_bridge_column.py --preset reduced --classes            # compare model classes by evidence
+
+With ``FAST=1`` the script keeps one sample in 16 and uses 40 walkers. It then shows how the tutorial works; its numbers
+are not results.
+"""
+
 import argparse
 import csv
 import json
@@ -34,13 +37,18 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fe_likelihoods import problems
-from fe_likelihoods.models.rc_column import PARAMETERS
-from fe_likelihoods.signals import records
-from fe_likelihoods.units import from_si
-from samplers import RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, SMCSampler
-from samplers.reporting.figures import ladder_plot, pair_plot
-from samplers.reporting.summary import ladder_table, summary, to_arviz
+from fe_likelihoods import Record, average_predictions, from_si, problems, propagate, read_at2, read_csv, read_v2
+from samplers import (
+    RAMANCHA_2022_CONSTANT,
+    RAMANCHA_2022_LITERAL,
+    SMCSampler,
+    compare_models,
+    ladder_plot,
+    ladder_table,
+    pair_plot,
+    summary,
+    to_arviz,
+)
 
 # walkers, one sample kept in `every`, sweeps at beta = 1, settings of the sampler
 PRESETS = {
@@ -51,17 +59,17 @@ PRESETS = {
     "ramancha2022-constant": (1000, 1, 1, RAMANCHA_2022_CONSTANT),
 }
 
-parser = argparse.ArgumentParser(description="Update the bridge column with SMC; tables and figures into a folder.")
+parser = argparse.ArgumentParser(description="Update the bridge column with SMC; write tables and figures to a folder.")
 parser.add_argument("--record", type=Path, help="base motion: .csv, .at2, .v2 or .zip (default: bundled, synthetic)")
-parser.add_argument("--units", help="unit of the record's acceleration, where the file does not state it")
-parser.add_argument("--scale", type=float, default=1.0, help="factor on the record")
+parser.add_argument("--units", help="unit of the acceleration, if the file of the record does not state it")
+parser.add_argument("--scale", type=float, default=1.0, help="factor by which the record is multiplied")
 parser.add_argument("--preset", choices=PRESETS, default="fast" if os.environ.get("FAST") else "default")
-parser.add_argument("--walkers", type=int, help="number of particles (default: that of the preset)")
-parser.add_argument("--every", type=int, help="keep one sample in EVERY (default: that of the preset)")
-parser.add_argument("--seed", type=int, default=1)
-parser.add_argument("--classes", action="store_true", help="compare classes of models by evidence too")
-parser.add_argument("--resume", action="store_true", help="go on with the killed run in OUT, begun with these options")
-parser.add_argument("--out", type=Path, default=Path("results"))
+parser.add_argument("--walkers", type=int, help="number of particles (default: from the preset)")
+parser.add_argument("--every", type=int, help="keep one sample in EVERY (default: from the preset)")
+parser.add_argument("--seed", type=int, default=1, help="seed of the sampler and of the synthetic noise")
+parser.add_argument("--classes", action="store_true", help="also compare model classes by their evidence")
+parser.add_argument("--resume", action="store_true", help="continue an interrupted run in OUT, with the same options")
+parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the results")
 args = parser.parse_args()
 
 walkers, every, sweeps, settings = PRESETS[args.preset]
@@ -69,21 +77,22 @@ walkers, every = args.walkers or walkers, args.every or every
 args.out.mkdir(parents=True, exist_ok=True)
 
 
-# %% [markdown]
-# ## The data and the posterior
-#
-# `problems.bridge_column` puts together what the paper describes: the model, normal priors truncated at zero on the
-# five multiples of nominal values, half-normal priors on the noise levels, and the likelihood of its equation (3).
-
-
 # %%
-def read_record(path: Path) -> records.Record:
-    """A record of any format the library reads."""
+# The data and the posterior
+# --------------------------
+#
+# ``problems.bridge_column`` combines the parts that the paper describes: the model; normal priors, truncated at zero,
+# on the multiples of five nominal values; half-normal priors on the noise levels; and the likelihood of its equation
+# (3).
+
+
+def read_record(path: Path) -> Record:
+    """Read a record in any format that the library supports."""
     if path.suffix.lower() == ".at2":
-        return records.read_at2(path, units=args.units)
+        return read_at2(path, units=args.units)
     if path.suffix.lower() in (".v2", ".v2c", ".zip"):
-        return records.read_v2(path)
-    return records.read_csv(path, units=args.units)
+        return read_v2(path)
+    return read_csv(path, units=args.units)
 
 
 if args.record is None:
@@ -98,50 +107,45 @@ posterior = problems.bridge_column(record=record, measurements=measurements, eve
 model, measured = posterior.likelihood.model, posterior.likelihood.measurements
 truth = np.array([*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_NOISE.values()])
 
-print("the damping pair a0, a1 is not expected at its truth: the prior's mean is 6.3 prior sd from the true a1")
 print(f"base motion: {record.name} x {args.scale:g}; measurements: {measurements.description}")
-print(f"{measured.n_steps} samples at {measured.dt:g} s of {[c.name for c in measured.channels]}")
+print(f"{measured.n_steps} samples at {measured.dt:g} s of {', '.join(c.name for c in measured.channels)}")
 if every > 1:
     print(
-        f"REDUCED SETTING ({args.preset}): one sample in {every} is kept and the model takes steps {every} times\n"
-        "  longer, so the posterior is wider, and the parameters make up for the damping that long steps add."
+        f"REDUCED SETTING ({args.preset}): one sample in {every} is kept, and the time step is {every} times longer.\n"
+        "The posterior is therefore wider, and its parameters compensate for the numerical damping of long steps."
     )
 
+# %%
+# Do not expect the damping coefficients ``a0`` and ``a1`` at their true values: the true ``a1`` is 6.3 prior standard
+# deviations away from the mean of the prior.
+
+figure, axes = plt.subplots(3, 1, figsize=(9, 6.5), sharex=True, layout="constrained")
+rows = [
+    (record.time, from_si(record.acceleration, "g"), "Input: acceleration of the base", "acceleration [g]"),
+    *(
+        (measured.time, from_si(measured.channel(name), unit), f"Output: {quantity} of the top", f"{name} [{unit}]")
+        for name, unit, quantity in (
+            ("displacement", "in", "relative displacement"),
+            ("acceleration", "g", "absolute acceleration"),
+        )
+    ),
+]
+for axis, (instants, values, title, label) in zip(axes, rows, strict=True):
+    axis.plot(instants, values, color="#1f5a8c", linewidth=0.7)
+    axis.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
+    axis.set(title=title, ylabel=label, ylim=np.array([-1.1, 1.1]) * np.abs(values).max())
+axes[-1].set(xlabel="time [s]", xlim=(0.0, record.duration))
+figure.suptitle("Figure 3: measurement data for model updating (synthetic)")
+figure.savefig(args.out / "fig3_data.png", dpi=150)
 
 # %%
-def plot_data(path: Path) -> None:
-    """Fig. 3: input acceleration, output displacement and acceleration."""
-    figure, axes = plt.subplots(3, 1, figsize=(9, 6.5), sharex=True, layout="constrained")
-    rows = [
-        (record.time, from_si(record.acceleration, "g"), "Input: acceleration of the base", "Acc. [g]"),
-        *(
-            (measured.time, from_si(measured.channel(name), unit), f"Output: {label} of the top", axis)
-            for name, unit, label, axis in (
-                ("displacement", "in", "relative displacement", "Disp. [in]"),
-                ("acceleration", "g", "absolute acceleration", "Acc. [g]"),
-            )
-        ),
-    ]
-    for axis, (instants, values, title, label) in zip(axes, rows, strict=True):
-        axis.plot(instants, values, color="#1f5a8c", linewidth=0.7)
-        axis.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
-        axis.set(title=title, ylabel=label, ylim=np.array([-1.1, 1.1]) * np.abs(values).max())
-    axes[-1].set(xlabel="Time [s]", xlim=(0.0, record.duration))
-    figure.suptitle("Measurement data for model updating (synthetic)")
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-
-
-plot_data(args.out / "fig3_data.png")
-
-# %% [markdown]
-# ## Sampling
+# Sampling
+# --------
 #
-# SMC climbs from the prior (beta = 0) to the posterior (beta = 1); the chain holds the draws at beta = 1. Chain and
-# ladder are kept in `chain.h5` while the run goes on, and every evaluation in the journal beside it: a run that was
-# killed goes on with `--resume`, and ends as if it had not been.
+# SMC anneals from the prior (beta = 0) to the posterior (beta = 1); the chain contains the draws at beta = 1. Chain and
+# tempering stages are stored in ``chain.h5`` during the run, and every evaluation is stored in a journal next to it. An
+# interrupted run can be continued with ``--resume``, and gives the same result as an uninterrupted one.
 
-# %%
 backend = emcee.backends.HDFBackend(args.out / "chain.h5")
 if not args.resume:
     backend.reset(walkers, posterior.ndim)
@@ -153,11 +157,17 @@ sampler.run_mcmc(None, sweeps, progress=True)
 seconds = time.perf_counter() - start
 samples = sampler.get_chain(flat=True)
 report = posterior.report()
-
-# %% [markdown]
-# ## Table 2: reported values and posterior
+print(ladder_table(sampler))
+(args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
+ladder_plot(sampler).savefig(args.out / "ladder.png", dpi=150)
 
 # %%
+# Table 2: reported values and posterior
+# --------------------------------------
+#
+# The prior, the reported (nominal) value, the posterior mean and coefficient of variation (CV), and the values with
+# which the synthetic data were made.
+
 DISPLAY = {
     "Ec": "ksi",
     "Es": "ksi",
@@ -170,13 +180,13 @@ DISPLAY = {
 
 
 def table2() -> list[dict[str, str]]:
-    """One row a parameter: prior, reported value, posterior mean and coefficient of variation, truth of the data."""
+    """One row per parameter: prior, reported value, posterior mean and coefficient of variation, true value."""
     rows = []
     moments = summary(samples, posterior.parameter_names)
     for i, name in enumerate(posterior.parameter_names):
         unit, mean, true, cv = DISPLAY[name], moments.mean[i], truth[i], moments.cv[i]
         distance = (mean - true) / moments.sd[i]
-        if name in PARAMETERS:
+        if name in model.parameter_names:
             nominal = model.nominal[name]
             reported = nominal if unit in ("1/s", "s") else from_si(nominal, unit).item()
             shown = f"{reported:.5g} {unit}"
@@ -209,38 +219,56 @@ with (args.out / "table2.csv").open("w", newline="") as file:
     writer.writerows(rows)
 print("\n".join(lines))
 
-# %% [markdown]
-# ## Figures 4 and 5, corner plot, ladder
-
 # %%
+# Figure 4: the posterior
+# -----------------------
+#
+# First in the form of the paper, then as a usual corner plot. The lines mark the true values of the synthetic data.
+
 LABELS = ["$E_c$ [x nominal]", "$E_s$ [x nominal]", "$a_0$ [x nominal]", "$a_1$ [x nominal]", "$f_t$ [x nominal]"]
 LABELS += [r"$\sigma_a$ [g]", r"$\sigma_d$ [in]"]
 
 
 def to_display(x: np.ndarray) -> np.ndarray:
-    """Parameters (..., 7) with the noise levels in g and in."""
+    """Convert the noise levels of parameters (..., 7) to g and in."""
     return np.concatenate([x[..., :5], from_si(x[..., 5:6], "g"), from_si(x[..., 6:], "in")], axis=-1)
 
 
 shown, true_shown = to_display(samples), to_display(truth)
-figure = pair_plot(shown, LABELS, truth=true_shown)
-figure.savefig(args.out / "fig4_pair.png", dpi=130)
-plt.close(figure)
+pair_plot(shown, LABELS, truth=true_shown).savefig(args.out / "fig4_pair.png", dpi=130)
+lowest, highest = np.minimum(shown.min(axis=0), true_shown), np.maximum(shown.max(axis=0), true_shown)
+margin = 0.05 * (highest - lowest)
 figure = corner.corner(
-    shown, labels=LABELS, truths=true_shown, show_titles=True, title_fmt=".4g", quantiles=[0.05, 0.5, 0.95]
+    shown,
+    range=list(zip(lowest - margin, highest + margin, strict=True)),  # the true values are always inside
+    labels=LABELS,
+    titles=[label.split(" [")[0] for label in LABELS],
+    truths=true_shown,
+    show_titles=True,
+    title_fmt=".3g",
+    quantiles=[0.05, 0.5, 0.95],
+    smooth=1.0,
+    max_n_ticks=3,
 )
 figure.savefig(args.out / "corner.png", dpi=110)
-plt.close(figure)
-figure = ladder_plot(sampler)
-figure.savefig(args.out / "ladder.png", dpi=150)
-plt.close(figure)
-(args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
-
 
 # %%
+# Figure 5: the response before and after the update
+# --------------------------------------------------
+#
+# RRMSE is the relative root-mean-square error of a channel.
+
+
 def rrmse(predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Relative root-mean-square error of each channel."""
+    """Relative root-mean-square error per channel."""
     return np.sqrt(np.sum((predicted - observed) ** 2, axis=1) / np.sum(observed**2, axis=1))
+
+
+def error_line(title: str, error: np.ndarray) -> str:
+    """The errors of all channels in words."""
+    return f"{title}: RRMSE " + ", ".join(
+        f"{c.name} {100 * e:.1f} %" for c, e in zip(measured.channels, error, strict=True)
+    )
 
 
 n_structural = len(model.parameter_names)
@@ -261,24 +289,22 @@ for column, (title, response) in enumerate(predictions.items()):
             axis.set_ylabel(f"{channel.quantity} [{channel.unit}]")
 axes[0, 0].legend(loc="upper right", ncols=2)
 for axis in axes[-1]:
-    axis.set(xlabel="Time [s]", xlim=(0.0, record.duration))
+    axis.set(xlabel="time [s]", xlim=(0.0, record.duration))
 figure.savefig(args.out / "fig5_response.png", dpi=150)
-plt.close(figure)
-
-# %% [markdown]
-# ## Classes of models (`--classes`)
-#
-# The paper leaves open how the geometry is followed and how concrete softens in tension; both change the response by
-# tens of per cent. Evidences weigh such choices: here the model that is updated against one with linear geometry and
-# one whose concrete is nearly brittle in tension. Predictions are averaged with the probabilities of the classes.
+for title, error in errors.items():
+    print(error_line(title, error))
 
 # %%
+# Model classes (``--classes``)
+# -----------------------------
+#
+# The paper does not state how geometric nonlinearity is treated or how concrete softens in tension. Both change the
+# response by tens of per cent. The evidence compares such choices: here the updated model, the same model with linear
+# geometry, and a model whose concrete is nearly brittle in tension. The predictions of the classes are averaged with
+# the posterior probabilities of the classes.
+
 classes = {}
 if args.classes:
-    from fe_likelihoods.prediction.averaging import average_predictions
-    from fe_likelihoods.prediction.propagation import propagate
-    from samplers.reporting.model_comparison import compare_models
-
     concrete = model.concrete
     variants = {
         "linear geometry": {"geometry": "linear"},
@@ -300,17 +326,15 @@ if args.classes:
     }
     averaged = average_predictions(predictions_of, comparison.probabilities)
     for name, predicted in (*predictions_of.items(), ("averaged", averaged)):
-        error = rrmse(predicted.mean, measured.values)
-        print(
-            f"{name}: RRMSE "
-            + ", ".join(f"{c.name} {100 * e:.1f} %" for c, e in zip(measured.channels, error, strict=True))
-        )
+        print(error_line(name, rrmse(predicted.mean, measured.values)))
     classes = {name: [float(run.log_evidence), float(run.log_evidence_error)] for name, run in runs.items()}
 
-# %% [markdown]
-# ## What it cost, and the data for arviz
-
 # %%
+# Cost, and results for ArviZ
+# ---------------------------
+#
+# ``posterior.nc`` can be read by ``arviz.from_netcdf``.
+
 to_arviz(sampler).to_netcdf(str(args.out / "posterior.nc"))
 result = {
     "record": f"{record.name} x {args.scale:g}",
@@ -333,11 +357,6 @@ result = {
     "log_evidence_of_classes": classes,
 }
 (args.out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
-for title, error in errors.items():
-    print(
-        f"{title}: RRMSE "
-        + ", ".join(f"{c.name} {100 * e:.1f} %" for c, e in zip(measured.channels, error, strict=True))
-    )
 print(
     f"log evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}; {len(sampler.ladder)} stages, "
     f"{report['simulations']} simulations ({report['failure_count']} failed) in {seconds:.0f} s\n"

@@ -1,22 +1,27 @@
-# %% [markdown]
-# # Updating a seismically isolated bridge with TMCMC, and predicting with what is left uncertain
-#
-# The second system: a rigid deck on two flexible piers, across sliding bearings with friction that depends on
-# velocity, rubber devices and fluid dampers, on a shake table. Ten multiples of the nominal values of friction and
-# dampers and one noise level are sampled by TMCMC with 1000 samples a stage; the figures of the paper (5 to 7) are left
-# in a folder, the uncertainty is propagated to motions that were not used, and two classes of models are compared by
-# their evidence.
-#
-# **Synthetic data, nominal values assumed**: neither the measurements nor most of the values of the tested bridge are
-# public. The data are responses of the model at other parameters than the nominal ones, plus white noise of 5 % of each
-# channel's root mean square, under a stochastic table motion of our own.
-#
-#     python tutorials/03_isolated_bridge.py                       # TMCMC, 1000 samples a stage
-#     python tutorials/03_isolated_bridge.py --sampler smc         # the same posterior by SMC
-#     python tutorials/03_isolated_bridge.py --preset published    # TMCMC as published, and its alarms
-#     python tutorials/03_isolated_bridge.py --data means          # data that do not tell the piers apart: two modes
+"""
+Updating a seismically isolated bridge with TMCMC, and predicting with the remaining uncertainty
+================================================================================================
 
-# %%
+The second system is a rigid deck on two flexible piers on a shake table. Between deck and piers are sliding bearings
+with velocity-dependent friction, rubber devices and fluid dampers. Ten multiples of nominal values of friction and
+dampers and one noise level are sampled by TMCMC with 1000 samples per stage. The script draws Figures 5 to 7 of the
+paper that it follows, propagates the uncertainty to motions that were not used, and compares two model classes by
+their evidence.
+
+**The data are synthetic and the nominal values are assumed**: neither the measurements nor most of the values of the
+tested bridge (Tsopelas et al., 1994, report NCEER 94-0002) are public. The data are responses of the model at
+parameters that differ from the nominal ones, under a stochastic table motion, plus white noise of 5 % of the root
+mean square of each channel::
+
+    python tutorials/03_isolated_bridge.py                       # TMCMC, 1000 samples per stage
+    python tutorials/03_isolated_bridge.py --sampler smc         # the same posterior by SMC
+    python tutorials/03_isolated_bridge.py --preset published    # TMCMC as published, and its warnings
+    python tutorials/03_isolated_bridge.py --data means          # data that do not distinguish the piers: two modes
+
+With ``FAST=1`` the script uses 50 walkers and steps of 1 ms. It then shows how the tutorial works; its numbers are
+not results.
+"""
+
 import argparse
 import json
 import os
@@ -31,69 +36,87 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from fe_likelihoods.data.make_isolated_bridge import table_motion
+from matplotlib.ticker import MaxNLocator
 from scipy.stats import gaussian_kde
 
-from fe_likelihoods import problems
-from fe_likelihoods.models.isolated_bridge import Bearing
-from fe_likelihoods.plots.predictions import plot_bands, plot_fragility
-from fe_likelihoods.prediction.fragility import fragility
-from fe_likelihoods.prediction.propagation import fit_measures, propagate
-from fe_likelihoods.prediction.quantities import peak
-from fe_likelihoods.prediction.reliability import exceedance
-from samplers import CHING_CHEN_2007, SMCSampler, TMCMCSampler
-from samplers.reporting.figures import ladder_plot
-from samplers.reporting.model_comparison import compare_models
-from samplers.reporting.summary import ladder_table, summary, to_arviz
-from samplers.tempering.diagnostics import SamplingWarning
+from fe_likelihoods import (
+    Bearing,
+    exceedance,
+    fit_measures,
+    fragility,
+    peak,
+    plot_bands,
+    plot_fragility,
+    problems,
+    propagate,
+    table_motion,
+)
+from samplers import (
+    CHING_CHEN_2007,
+    SamplingWarning,
+    SMCSampler,
+    TMCMCSampler,
+    compare_models,
+    ladder_plot,
+    ladder_table,
+    summary,
+    to_arviz,
+)
 
-# walkers, sweeps at beta = 1, step of integration [s], samples that are propagated, settings of the sampler
+# walkers, sweeps at beta = 1, time step [s], number of propagated samples, settings of the sampler
 PRESETS = {
     "default": (1000, 2, 0.5e-3, 1000, {}),
     "published": (1000, 1, 0.5e-3, 1000, CHING_CHEN_2007),
     "fast": (50, 4, 1.0e-3, 50, {"max_moves": 3}),
 }
 
-parser = argparse.ArgumentParser(description="Update the isolated bridge with TMCMC; tables and figures in a folder.")
+parser = argparse.ArgumentParser(
+    description="Update the isolated bridge with TMCMC; write tables and figures to a folder."
+)
 parser.add_argument("--preset", choices=PRESETS, default="fast" if os.environ.get("FAST") else "default")
 parser.add_argument("--sampler", choices=("tmcmc", "smc"), default="tmcmc")
-parser.add_argument("--data", choices=("twin", "means"), default="twin", help="one mode, or two")
+parser.add_argument(
+    "--data", choices=("twin", "means"), default="twin", help="posterior with one mode (twin) or two (means)"
+)
 parser.add_argument("--channels", type=int, choices=(5, 6, 10), help="measured channels of the twin (default: 6)")
 parser.add_argument("--noise", choices=("shared", "per channel"), default="shared")
-parser.add_argument("--walkers", type=int, help="samples a stage (default: that of the preset)")
-parser.add_argument("--step", type=float, help="step of integration [s] (default: that of the preset)")
-parser.add_argument("--seed", type=int, default=1)
-parser.add_argument("--resume", action="store_true", help="go on with the killed run in OUT, begun with these options")
-parser.add_argument("--out", type=Path, default=Path("results-isolated-bridge"))
+parser.add_argument("--walkers", type=int, help="samples per stage (default: from the preset)")
+parser.add_argument("--step", type=float, help="time step of the model [s] (default: from the preset)")
+parser.add_argument("--seed", type=int, default=1, help="seed of sampler, propagation and motions")
+parser.add_argument("--resume", action="store_true", help="continue an interrupted run in OUT, with the same options")
+parser.add_argument("--out", type=Path, default=Path("results-isolated-bridge"), help="folder of the results")
 args = parser.parse_args()
 walkers, sweeps, step, propagated, settings = PRESETS[args.preset]
 walkers, step = args.walkers or walkers, args.step or step
 args.out.mkdir(parents=True, exist_ok=True)
 begin = time.perf_counter()
 
-# %% [markdown]
-# ## The data and the posterior
-#
-# At a step of .5 ms displacements are within 3e-5 of their peaks, forces within .1 %, accelerations within .3 %: far
-# below the noise. The paper has one sigma for all channels, each in units of its measured root mean square.
 
 # %%
+# The data and the posterior
+# --------------------------
+#
+# With a time step of 0.5 ms displacements are accurate to 3e-5 of their peaks, forces to 0.1 % and accelerations to
+# 0.3 %, far below the noise. As in the paper, one sigma is shared by all channels; it is relative to the measured root
+# mean square of each channel.
+
 problem = dict(data=args.data, channels=args.channels, noise=args.noise, step=step)
 posterior = problems.isolated_bridge(**problem)
 model, measured = posterior.likelihood.model, posterior.likelihood.measurements
 names, n_structural = posterior.parameter_names, len(model.parameter_names)
 truth = np.array([problems.ISOLATED_BRIDGE_TRUTH[args.data][name] for name in model.parameter_names])
 print(measured.description)
-print(f"{measured.n_steps} samples at {measured.dt:g} s of {[c.name for c in measured.channels]}")
+print(f"{measured.n_steps} samples at {measured.dt:g} s of {', '.join(c.name for c in measured.channels)}")
 if args.preset == "fast":
-    print("REDUCED SETTING (fast): few samples and long steps; expect a rough posterior")
+    print("REDUCED SETTING (fast): few samples and long time steps; these numbers are not results")
 
-# %% [markdown]
-# ## Sampling
-#
-# The sampler's warnings are worth reading: they say when the draws are not to be trusted.
 
 # %%
+# Sampling
+# --------
+#
+# Read the warnings of the sampler: they say when the draws are not reliable.
+
 backend = emcee.backends.HDFBackend(args.out / "chain.h5")
 if not args.resume:
     backend.reset(walkers, posterior.ndim)
@@ -105,17 +128,17 @@ with warnings.catch_warnings(record=True) as caught:
         walkers, posterior.ndim, posterior, vectorize=True, backend=backend, seed=args.seed, **dict(settings)
     )
     sampler.run_mcmc(None, sweeps, progress=True)
-alarms = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
+messages = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
 seconds = time.perf_counter() - start
 report = posterior.report()
 samples = sampler.get_chain(flat=True)
-for alarm in alarms:
-    print(f"WARNING: {alarm}")
+for message in messages:
+    print(f"WARNING: {message}")
 
 moments = summary(samples, names)
 lines = [f"{'parameter':<10} {'truth':>7} {'mean':>8} {'sd':>8} {'cv':>7} {'(mean-truth)/sd':>16}"]
 for i, name in enumerate(names):
-    # the level of the noise is known as a share of the clean response, sigma is one of the measured: alike within .2 %
+    # the true noise level is relative to the clean response, sigma to the measured one: they differ by 0.2 %
     true = truth[i] if i < n_structural else problems.ISOLATED_BRIDGE_NOISE[args.data]
     known = i < n_structural or name == "sigma"
     z = f"{(moments.mean[i] - true) / moments.sd[i]:+.2f}" if known else "-"
@@ -124,16 +147,15 @@ for i, name in enumerate(names):
 (args.out / "parameters.txt").write_text("\n".join(lines) + "\n")
 print("\n".join(lines))
 (args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
-figure = ladder_plot(sampler)
-figure.savefig(args.out / "ladder.png", dpi=150)
-plt.close(figure)
+ladder_plot(sampler).savefig(args.out / "ladder.png", dpi=150)
 
-# %% [markdown]
-# ## Figure 5: parameters, and the fit of every sample
-#
-# J is the sum of squared residuals of a channel over the sum of squares of the measured channel.
 
 # %%
+# Figure 5: parameters, and fit of every sample
+# ---------------------------------------------
+#
+# J is the sum of squared residuals of a channel divided by the sum of squares of the measured channel.
+
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 LABELS = [
     *(rf"${symbol}$" for symbol in (r"f_{\min,1}", r"\Delta f_1", "a_1", r"f_{\min,2}", r"\Delta f_2", "a_2")),
@@ -173,21 +195,23 @@ for j in range(fit.shape[1]):
     )
     right.hlines(mean, j - 0.3, j + 0.3, color=ORANGE, linewidth=1.6, label="mean" if j == 0 else None)
     right.hlines(
-        [mean - sd, mean + sd], j - 0.2, j + 0.2, color=ORANGE, linestyle=":", label="mean +- sd" if j == 0 else None
+        [mean - sd, mean + sd], j - 0.2, j + 0.2, color=ORANGE, linestyle=":", label="mean ± sd" if j == 0 else None
     )
     right.plot(j, nominal_fit[j], "v", color=GREY, label="nominal parameters" if j == 0 else None)
 right.set_yscale("log")
 right.set_xticks(range(fit.shape[1]), [f"$J_{j + 1}$\n{c.name}" for j, c in enumerate(measured.channels)])
-right.set(ylabel="fit J [-]", title="Fit with the measured time histories")
+right.set(ylabel="misfit J [-]", title="Misfit of the measured time histories")
 right.legend(*(part[:4] for part in right.get_legend_handles_labels()), frameon=False, fontsize="small")
-figure.suptitle("Synthetic data, nominal values assumed", fontsize="small")
+figure.suptitle("Figure 5 (synthetic data, assumed nominal values)", fontsize="small")
 figure.savefig(args.out / "fig5_parameters_and_fit.png", dpi=150)
-plt.close(figure)
 
-# %% [markdown]
-# ## Figure 6: marginal densities
 
 # %%
+# Figure 6: marginal densities
+# ----------------------------
+#
+# The lines mark the parameters with which the synthetic data were made.
+
 columns = 4
 figure, axes = plt.subplots(
     -(-len(names) // columns), columns, figsize=(11, 2.3 * -(-len(names) // columns)), layout="constrained"
@@ -202,42 +226,59 @@ for i, axis in enumerate(axes.flat[: len(names)]):
     if i < n_structural:
         axis.axvline(truth[i], color=ORANGE, linewidth=1.0)
     axis.set(xlabel=LABELS[i], yticks=[])
-    axis.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(4))
-figure.suptitle("Marginal posterior densities; lines: truth (synthetic data, nominal values assumed)", fontsize="small")
+    axis.xaxis.set_major_locator(MaxNLocator(4))
+figure.suptitle(
+    "Figure 6: marginal posterior densities; lines: truth (synthetic data, assumed nominal values)", fontsize="small"
+)
 figure.savefig(args.out / "fig6_marginals.png", dpi=150)
-plt.close(figure)
-figure = corner.corner(samples, labels=LABELS, truths=[*truth, *[None] * (len(names) - n_structural)])
+truths = [*truth, *[None] * (len(names) - n_structural)]
+lowest, highest = samples.min(axis=0), samples.max(axis=0)
+lowest[:n_structural] = np.minimum(lowest[:n_structural], truth)
+highest[:n_structural] = np.maximum(highest[:n_structural], truth)
+margin = 0.05 * (highest - lowest)
+figure = corner.corner(
+    samples,
+    range=list(zip(lowest - margin, highest + margin, strict=True)),  # the true values are always inside
+    labels=LABELS,
+    truths=truths,
+    smooth=1.0,
+    max_n_ticks=3,
+)
 figure.savefig(args.out / "corner.png", dpi=80)
-plt.close(figure)
 
-# %% [markdown]
-# ## Figure 7: predicted histories with their uncertainty
-#
-# Mean, variance and quantiles of every channel at every instant over the posterior samples (equations 9 to 13). The
-# band of the response is thin, as in the paper; with the noise it must hold about nine tenths of what was measured.
 
 # %%
+# Figure 7: predicted histories with their uncertainty
+# ----------------------------------------------------
+#
+# The prediction is the mean, the variance and the quantiles of every channel at every time over the posterior samples
+# (equations 9 to 13 of the paper). The band of the response alone is narrow, as in the paper. The band that includes
+# the noise should contain about 90 % of the measured samples.
+
 draws = samples[rng.choice(len(samples), min(propagated, len(samples)), replace=False)]
 prediction = propagate(posterior, draws, noise=True, seed=args.seed)
 response = propagate(posterior, draws, progress=False, seed=args.seed)
 four = ("Ub_1", "shear_1", "acc_p1", "drift_1")
 four = four if args.data == "twin" else ("mean_Ub", "mean_shear", "mean_acc_p", "mean_drift")
 figure = plot_bands(response, measured, four)
-figure.suptitle("Predicted response (mean, 5 to 95 %) and data: synthetic, nominal values assumed", fontsize="small")
+figure.suptitle("Figure 7: predicted response and synthetic data (assumed nominal values)", fontsize="small")
 figure.savefig(args.out / "fig7_predictions.png", dpi=150)
-plt.close(figure)
 errors, covered = response.rrmse(measured), prediction.coverage(measured)
 for channel, error, share in zip(measured.channels, errors, covered, strict=True):
-    print(f"{channel.name:<10} RRMSE {100 * error:5.2f} %, inside the 90 % band with noise {100 * share:5.1f} %")
+    print(
+        f"{channel.name:<10} RRMSE {100 * error:5.2f} %, samples inside the 90 % band with noise {100 * share:5.1f} %"
+    )
 
-# %% [markdown]
-# ## Motions to come: peak displacement, exceedance, fragility
-#
-# The same posterior under motions that were not measured: six other draws of the stochastic model that made the table's
-# motion, at several strengths. The devices are made for bearing displacements of 50 mm. What the parameters leave
-# uncertain is little here; that no two motions are alike is more, and the fragility curve holds both.
 
 # %%
+# Future motions: peak displacement, exceedance, fragility
+# --------------------------------------------------------
+#
+# The posterior also predicts the response to motions that were not measured: six other draws of the stochastic model of
+# the table motion, each at several intensities. The devices are designed for bearing displacements of 50 mm. The
+# uncertainty of the parameters contributes little here; the differences between motions contribute more. The fragility
+# curve includes both.
+
 bearing = "Ub_1" if args.data == "twin" else "mean_Ub"
 strengths, n_motions, few_draws = ((0.6, 0.9, 1.2, 1.5, 1.8), 6, 50) if args.preset != "fast" else ((0.8, 1.4), 2, 10)
 motions = [table_motion(seed) for seed in range(101, 101 + n_motions)]
@@ -245,8 +286,8 @@ future = propagate(posterior, draws[: 4 * few_draws], quantity=peak(bearing), re
 low, high = 1e3 * future.quantile(0.05), 1e3 * future.quantile(0.95)
 beyond = exceedance(future, 1.01 * future.mean)
 print(
-    f"peak of {bearing} under another motion: {1e3 * future.mean:.2f} mm, {low:.2f} to {high:.2f} mm (90 %); "
-    f"more than 1 % above the mean with probability {beyond.probability:.3f} ({beyond.lower:.3f} to {beyond.upper:.3f})"
+    f"peak of {bearing} under another motion: mean {1e3 * future.mean:.2f} mm, 90 % interval {low:.2f}-{high:.2f} mm;\n"
+    f"probability of more than 1.01 times the mean: {beyond.probability:.3f} ({beyond.lower:.3f} to {beyond.upper:.3f})"
 )
 curve = fragility(
     posterior,
@@ -260,15 +301,15 @@ curve = fragility(
 figure = plot_fragility(curve)
 figure.suptitle(f"P(peak of {bearing} > 50 mm | data, motion)", fontsize="small")
 figure.savefig(args.out / "fragility.png", dpi=150)
-plt.close(figure)
 
-# %% [markdown]
-# ## Does friction depend on velocity? Two classes of models
-#
-# The class without velocity dependence has four parameters less. Its evidence says how much worse it explains the data
-# than its simplicity can make up for.
 
 # %%
+# Does friction depend on velocity? Two model classes
+# ---------------------------------------------------
+#
+# The model class without velocity dependence has four parameters fewer. The evidence shows whether its simplicity
+# outweighs its poorer fit.
+
 constant = problems.isolated_bridge(
     **problem,
     bearings=(Bearing(f_min=0.09, df=0.0, a=0.0), Bearing(f_min=0.09, df=0.0, a=0.0)),
@@ -277,13 +318,14 @@ constant = problems.isolated_bridge(
 cheap = {"max_moves": 3} if args.preset == "fast" else {}
 rival = SMCSampler(500 if walkers >= 500 else 30, constant.ndim, constant, vectorize=True, seed=args.seed, **cheap)
 rival.run_mcmc(None, 1, progress=True)
-comparison = compare_models({"mu(v)": sampler, "constant mu": rival})
+comparison = compare_models({"friction depends on velocity": sampler, "constant friction": rival})
 print(comparison.table())
 
-# %% [markdown]
-# ## What it cost
 
 # %%
+# Cost
+# ----
+
 to_arviz(sampler).to_netcdf(str(args.out / "posterior.nc"))
 result = {
     "data": measured.description,
@@ -302,7 +344,7 @@ result = {
     "rrmse": dict(zip([c.name for c in measured.channels], errors.tolist(), strict=True)),
     "coverage": dict(zip([c.name for c in measured.channels], covered.tolist(), strict=True)),
     "fragility": {"intensity": curve.intensity.tolist(), "probability": curve.probability.tolist()},
-    "alarms": alarms,
+    "warnings": messages,
     "simulations": report["simulations"],
     "failures": report["failure_count"],
     "seconds_sampling": seconds,
@@ -312,6 +354,6 @@ result = {
 (args.out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
 print(
     f"log evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}; {len(sampler.ladder)} stages, "
-    f"{report['simulations']} simulations ({report['failure_count']} failed) in {seconds:.0f} s, the whole in "
-    f"{result['seconds']:.0f} s\ntables and figures are in {args.out}/"
+    f"{report['simulations']} simulations ({report['failure_count']} failed) in {seconds:.0f} s, "
+    f"{result['seconds']:.0f} s in total\ntables and figures are in {args.out}/"
 )
