@@ -16,6 +16,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         to_pints,
         to_pymc,
     )
+    from .data.make_isolated_bridge import (
+        table_motion,
+    )
     from .models.executable import (
         ExecutableModel,
     )
@@ -114,7 +117,12 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     )
     from .probability.residuals import (
         ResidualChecks,
+<<<<<<< HEAD
         plot_residuals,
+=======
+        effective_samples,
+        innovations,
+>>>>>>> 0a8783c (Tutorials 04 and 05 for sphinx-gallery; figures of 05 with legend, true values and units; the façade has table_motion, innovations and effective_samples)
         residual_checks,
     )
     from .signals.channels import (
@@ -210,11 +218,13 @@ __all__ = [
     "TruncatedNormal",
     "Uniform",
     "average_predictions",
+    "effective_samples",
     "exceedance",
     "fit_fragility",
     "fit_measures",
     "fragility",
     "from_si",
+    "innovations",
     "nautilus_prior",
     "peak",
     "peak_ground_acceleration",
@@ -233,7 +243,11 @@ __all__ = [
     "read_v2",
     "residual_checks",
     "response_spectrum",
+<<<<<<< HEAD
     "rrmse",
+=======
+    "table_motion",
+>>>>>>> 0a8783c (Tutorials 04 and 05 for sphinx-gallery; figures of 05 with legend, true values and units; the façade has table_motion, innovations and effective_samples)
     "to_bilby",
     "to_pints",
     "to_pymc",
@@ -248,6 +262,7 @@ _EXPORTS = {
         "to_pints",
         "to_pymc",
     ),
+    "data.make_isolated_bridge": ("table_motion",),
     "models.executable": ("ExecutableModel",),
     "models.function": ("FunctionModel",),
     "models.isolated_bridge": ("IsolatedBridge",),
@@ -322,7 +337,12 @@ _EXPORTS = {
     ),
     "probability.residuals": (
         "ResidualChecks",
+<<<<<<< HEAD
         "plot_residuals",
+=======
+        "effective_samples",
+        "innovations",
+>>>>>>> 0a8783c (Tutorials 04 and 05 for sphinx-gallery; figures of 05 with legend, true values and units; the façade has table_motion, innovations and effective_samples)
         "residual_checks",
     ),
     "signals.channels": (

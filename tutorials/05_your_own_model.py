@@ -1,17 +1,19 @@
-# %% [markdown]
-# # Your own model: a Python function, OpenSees, any program; with a cache and on many processes
-#
-# One structure three times: a mass on a bilinear spring as a Python function, as OpenSees commands, and as a program
-# that reads and writes text (`own_models.py`, `own_program.py`). Each becomes a posterior in a few lines, and all three
-# agree. What goes wrong in a run (an exception, NaN, a hang, a crash of the process, too much output) is a simulation
-# that failed: -inf, counted, with its parameters, its reason and its duration in `posterior.report()`.
-#
-#     python tutorials/05_your_own_model.py                     # two processes of this machine
-#     python tutorials/05_your_own_model.py --pool dask         # two workers of dask.distributed
-#
-# The data are **synthetic**: the response of the function at known parameters, plus white noise.
+"""
+Your own model: a Python function, OpenSees, any program
+========================================================
 
-# %%
+One structure is modelled three times: a mass on a bilinear spring as a Python function, as OpenSees commands, and as
+a program that reads and writes text files (``own_models.py``, ``own_program.py``). Each model becomes a posterior in
+a few lines, with a cache and on several processes, and all three posteriors agree. A run that fails (by an exception,
+NaN, a time limit, a crash of the process, or too much output) gives a log-probability of -inf. It is counted in
+``posterior.report()`` with its parameters, its reason and its duration::
+
+    python tutorials/05_your_own_model.py                     # two processes on this machine
+    python tutorials/05_your_own_model.py --pool dask         # two workers of dask.distributed
+
+The data are **synthetic**: the response of the function at known parameters plus white noise.
+"""
+
 import argparse
 import importlib.util
 import json
@@ -27,40 +29,48 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import own_models
+from matplotlib.lines import Line2D
 
-from fe_likelihoods.models.executable import ExecutableModel
-from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.models.opensees import OpenSeesModel
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, Prior, TruncatedNormal
-from fe_likelihoods.signals.channels import Measurements
-from samplers import SMCSampler
-from samplers.reporting.summary import summary
+from fe_likelihoods import (
+    ExecutableModel,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    Measurements,
+    OpenSeesModel,
+    Posterior,
+    Prior,
+    TruncatedNormal,
+)
+from samplers import SMCSampler, summary
 
 TRUTH = np.array([1.15, 0.85])
-NOISE = np.array([0.3, 2e-3])  # m/s2, m
+NOISE = np.array([0.3, 2e-3])  # standard deviations [m/s², m]
 
 
-def parsed() -> argparse.Namespace:
-    """Options."""
-    parser = argparse.ArgumentParser(description="Update a model of your own; figures into a folder.")
+def parse_arguments() -> argparse.Namespace:
+    """Options of the command line."""
+    parser = argparse.ArgumentParser(description="Update your own model; write figures to a folder.")
     parser.add_argument("--pool", choices=("local", "dask", "none"), default="local")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, default=2, help="number of worker processes")
     parser.add_argument("--walkers", type=int, default=24 if os.environ.get("FAST") else 200)
-    parser.add_argument("--cache", type=Path, help="file of simulations (default: in OUT)")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("results-own-model"))
+    parser.add_argument("--cache", type=Path, help="file of the simulation cache (default: in OUT)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the noise and of the sampler")
+    parser.add_argument("--out", type=Path, default=Path("results-own-model"), help="folder of the results")
     return parser.parse_args()
 
 
-# %% [markdown]
-# ## Three models of one structure
-
-
 # %%
+# Three models of one structure
+# -----------------------------
+#
+# ``FunctionModel`` takes a function of the parameters, ``ExecutableModel`` a command with templates of its input files,
+# and ``OpenSeesModel`` a function that builds and runs an OpenSees model. OpenSees is left out if ``openseespy`` is not
+# installed.
+
+
 def models(out: Path) -> dict:
-    """The structure as a function, as a program, and in OpenSees where that is installed."""
+    """The structure as a function, as a program, and in OpenSees if it is installed."""
     common = dict(
         parameter_names=own_models.NAMES,
         channels=own_models.CHANNELS,
@@ -86,14 +96,14 @@ def models(out: Path) -> dict:
 
 
 def measurements(seed: int) -> Measurements:
-    """Synthetic: the function's response at the truth plus white noise."""
+    """Synthetic measurements: the response of the function at the true parameters plus white noise."""
     clean = own_models.bilinear(TRUTH)
     noise = NOISE[:, None] * np.random.default_rng(seed).standard_normal(clean.shape)
     return Measurements(own_models.CHANNELS, own_models.RECORD.dt, clean + noise, "SYNTHETIC: bilinear oscillator")
 
 
-def posterior_of(model, data: Measurements, pool, cache: Path) -> Posterior:
-    """Prior, noise per channel, pool and cache: the same for every model."""
+def make_posterior(model, data: Measurements, pool, cache: Path) -> Posterior:
+    """Posterior with the same prior, noise, pool and cache for every model."""
     prior = Prior(
         {name: TruncatedNormal(1.0, 0.3) for name in model.parameter_names}
         | {"sigma_acceleration": HalfNormal(2.0), "sigma_displacement": HalfNormal(0.02)}
@@ -101,31 +111,32 @@ def posterior_of(model, data: Measurements, pool, cache: Path) -> Posterior:
     return Posterior(FELikelihood(model, data, pool=pool, cache=cache, max_failure_share=0.5), prior)
 
 
-# %% [markdown]
-# ## Pools
-#
-# `pool=2` is a pool of two processes of this machine: it loses no work when a worker dies, and its workers end with
-# the script, even after `kill -9`. Beyond one machine the supported engine is dask.distributed:
-#
-# ```python
-# from dask.distributed import Client, LocalCluster
-# client = Client(LocalCluster(n_workers=2, threads_per_worker=1))        # this machine
-#
-# from dask_jobqueue import SLURMCluster                                  # pip install dask-jobqueue
-# cluster = SLURMCluster(queue="compute", cores=32, processes=32, memory="64GB", walltime="08:00:00")
-# cluster.scale(jobs=8)                                                   # 256 workers
-# client = Client(cluster)
-#
-# likelihood = FELikelihood(model, measurements, pool=client, cache="simulations.db")
-# ```
-# Model and data go to a worker once, afterwards only parameters; the cache stays with this process. Point TMPDIR to a
-# folder that all machines see. Second choice: `mpi4py.futures.MPIPoolExecutor`, `mpiexec -n 65 python -m mpi4py.futures
-# script.py`. What comes back is the same to the last bit on all of them.
-
-
 # %%
-def engine(kind: str, workers: int):
-    """What goes into ``pool=``, and what to close in the end."""
+# Pools
+# -----
+#
+# ``pool=2`` starts two processes on this machine. No simulation is lost when a worker dies, and the workers end with
+# the script, even after ``kill -9``. For several machines use dask.distributed:
+#
+# .. code-block:: python
+#
+#     from dask.distributed import Client, LocalCluster
+#     client = Client(LocalCluster(n_workers=2, threads_per_worker=1))        # this machine
+#
+#     from dask_jobqueue import SLURMCluster                                  # pip install dask-jobqueue
+#     cluster = SLURMCluster(queue="compute", cores=32, processes=32, memory="64GB", walltime="08:00:00")
+#     cluster.scale(jobs=8)                                                   # 256 workers
+#     client = Client(cluster)
+#
+#     likelihood = FELikelihood(model, measurements, pool=client, cache="simulations.db")
+#
+# Model and data are sent to each worker once, afterwards only parameters. The cache stays with the process of the
+# sampler. TMPDIR must be a folder that all machines can read. The second choice is ``mpi4py.futures.MPIPoolExecutor``
+# with ``mpiexec -n 65 python -m mpi4py.futures script.py``. The results are the same to the last bit on all of them.
+
+
+def make_pool(kind: str, workers: int):
+    """Value of ``pool=``, and the objects to close at the end."""
     if kind == "none":
         return None, []
     if kind == "local":
@@ -137,23 +148,69 @@ def engine(kind: str, workers: int):
     return client, [client, cluster]
 
 
-# %% [markdown]
-# ## Sampling all three
-#
-# Starting processes inside a script asks for the guard `if __name__ == "__main__"`: workers read the script too.
-
-
 # %%
+# Sampling all three
+# ------------------
+#
+# Worker processes import the script, so a script that starts them needs the guard ``if __name__ == "__main__"``.
+
+
+def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
+    """Structural parameters of all posteriors on common axes."""
+    colours = dict(zip(draws, ("#1f5a8c", "#d9822b", "#5b8c5a"), strict=False))
+    together = np.concatenate([x[:, :2] for x in draws.values()] + [TRUTH[None]])
+    margin = 0.05 * np.ptp(together, axis=0)
+    figure = plt.figure(figsize=(6.5, 6.5))
+    for name, x in draws.items():
+        corner.corner(
+            x[:, :2],
+            fig=figure,
+            range=list(zip(together.min(axis=0) - margin, together.max(axis=0) + margin, strict=True)),
+            labels=[f"{name} [x nominal]" for name in own_models.NAMES],
+            color=colours[name],
+            plot_datapoints=False,
+            plot_density=False,
+            no_fill_contours=True,
+            levels=(0.5, 0.9),
+            smooth=1.0,
+            truths=TRUTH,
+            truth_color="#8a8f98",
+            max_n_ticks=4,
+        )
+    for k in (0, 3):  # corner scales each diagonal panel to the last histogram only
+        diagonal = figure.axes[k]
+        diagonal.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in diagonal.patches))
+    handles = [Line2D([], [], color=colour, label=name) for name, colour in colours.items()]
+    handles.append(Line2D([], [], color="#8a8f98", marker="s", label="truth (synthetic)"))
+    figure.legend(handles=handles, loc="upper right", frameon=False, bbox_to_anchor=(0.95, 0.93))
+    figure.text(0.6, 0.66, "contours contain 50 and 90 %", fontsize="small")
+    figure.savefig(path, dpi=130)
+
+
+def plot_loop(theta: np.ndarray, path: Path) -> None:
+    """Hysteresis of the function at the given parameters (2,)."""
+    acceleration, displacement = own_models.bilinear(theta)
+    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+    axes.plot(1e3 * displacement, -acceleration, color="#1f5a8c", linewidth=0.8)
+    axes.set(
+        xlabel="displacement [mm]",
+        ylabel="force of spring and damper per mass [m/s²]",
+        title="Hysteresis at the posterior mean",
+    )
+    axes.grid(alpha=0.25)
+    figure.savefig(path, dpi=130)
+
+
 def main() -> None:
-    """Sample, compare, plot."""
-    args = parsed()
+    """Sample the posterior of each model, compare and plot."""
+    args = parse_arguments()
     args.out.mkdir(parents=True, exist_ok=True)
     cache = args.cache or args.out / "simulations.db"
     data = measurements(args.seed)
-    pool, to_close = engine(args.pool, args.workers)
+    pool, to_close = make_pool(args.pool, args.workers)
     results, draws = {}, {}
     for name, model in models(args.out).items():
-        posterior = posterior_of(model, data, pool, cache)
+        posterior = make_posterior(model, data, pool, cache)
         start = time.perf_counter()
         sampler = SMCSampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=args.seed, max_moves=3)
         sampler.run_mcmc(None, 4, progress=not os.environ.get("FAST"))
@@ -172,29 +229,15 @@ def main() -> None:
         print(
             f"{name:<9} stiffness {moments.mean[0]:.4f} +- {moments.sd[0]:.4f}, strength {moments.mean[1]:.4f} +- "
             f"{moments.sd[1]:.4f} (truth {TRUTH[0]}, {TRUTH[1]}); log evidence {sampler.log_evidence:.2f}; "
-            f"{report['simulations']} simulations, {report['disk_hits']} from disk, {report['failure_count']} failed, "
+            f"{report['simulations']} simulations, {report['disk_hits']} read from the cache file, "
+            f"{report['failure_count']} failed, "
             f"{results[name]['seconds']:.1f} s"
         )
     for thing in to_close:
         thing.close()
 
-    figure = None
-    colours = dict(zip(draws, ("#1f5a8c", "#d9822b", "#5b8c5a"), strict=False))
-    for name, x in draws.items():
-        figure = corner.corner(
-            x[:, :2], fig=figure, labels=own_models.NAMES, color=colours[name], plot_datapoints=False, truths=TRUTH
-        )
-    figure.suptitle("function, program and OpenSees: one posterior (synthetic data)", fontsize="small")
-    figure.savefig(args.out / "corner.png", dpi=130)
-    plt.close(figure)
-    response = own_models.bilinear(draws["function"].mean(axis=0)[:2])
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-    axes.plot(1e3 * response[1], -response[0], color="#1f5a8c", linewidth=0.8)
-    axes.set(
-        xlabel="displacement [mm]", ylabel="spring and damper force per mass [m/s²]", title="At the posterior mean"
-    )
-    figure.savefig(args.out / "loops.png", dpi=130)
-    plt.close(figure)
+    plot_corner(draws, args.out / "corner.png")
+    plot_loop(draws["function"].mean(axis=0)[:2], args.out / "loops.png")
     (args.out / "summary.json").write_text(json.dumps(results, indent=2) + "\n")
     print(f"figures and summary.json are in {args.out}/")
 
