@@ -161,10 +161,11 @@ def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
     together = np.concatenate([x[:, :2] for x in draws.values()] + [TRUTH[None]])
     margin = 0.05 * np.ptp(together, axis=0)
     figure = plt.figure(figsize=(6.5, 6.5))
-    for name, x in draws.items():
+    for width, (name, x) in zip((4.0, 2.0, 0.8), draws.items(), strict=False):  # equal curves stay visible
         corner.corner(
             x[:, :2],
             fig=figure,
+            bins=12,
             range=list(zip(together.min(axis=0) - margin, together.max(axis=0) + margin, strict=True)),
             labels=[f"{name} [x nominal]" for name in own_models.NAMES],
             color=colours[name],
@@ -172,10 +173,12 @@ def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
             plot_density=False,
             no_fill_contours=True,
             levels=(0.5, 0.9),
+            contour_kwargs={"linewidths": width},
+            hist_kwargs={"linewidth": width},
             smooth=1.0,
             truths=TRUTH,
             truth_color="#8a8f98",
-            max_n_ticks=4,
+            max_n_ticks=3,
         )
     for k in (0, 3):  # corner scales each diagonal panel to the last histogram only
         diagonal = figure.axes[k]

@@ -1,21 +1,20 @@
-# %% [markdown]
-# # A real bar of reinforcing steel in cycles: what a wrong error does to six parameters
-#
-# A bar was strained to and fro and its stress recorded. The law of the bars of `RCColumn` (OpenSees'
-# `ReinforcingSteel`) is calibrated on the first half of the test and predicts the second. One simulation takes a tenth
-# of a millisecond: the place to look closely at residuals that are not white, at what they do to a posterior when one
-# believes that they are (`cyclic_tests.py`), and at parameters that make up for what the law cannot do.
-#
-#     python tutorials/09_steel_coupon.py                      # data in ../shared/measured/steel_coupon
-#     python tutorials/09_steel_coupon.py --data FOLDER        # or elsewhere
-#
-# The data are not part of this project; a run without them says where to get them.
+"""
+A real bar of reinforcing steel under cyclic strain: how a wrong error model affects six parameters
+===================================================================================================
 
-# %%
+A bar was strained in cycles and its stress was recorded. The steel law of ``RCColumn`` (``ReinforcingSteel`` of
+OpenSees) is calibrated on the first half of the test and predicts the second half. One simulation takes a tenth of a
+millisecond. This makes it easy to study residuals that are not white, their effect on a posterior that assumes white
+noise (``cyclic_tests.py``), and parameters that compensate for errors of the law::
+
+    python tutorials/09_steel_coupon.py --data FOLDER
+
+FOLDER contains ``stress.1.coords`` and ``calDataField.csv`` from an example of quoFEM, in the repository
+NHERI-SimCenter/quoFEM on GitHub (https://github.com/NHERI-SimCenter/quoFEM, BSD licence).
+"""
+
 import argparse
-import os
 import time
-from pathlib import Path
 
 import matplotlib
 
@@ -23,50 +22,51 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from cyclic_tests import (
-    data_folder,
+    find_folder,
     fit_noises,
-    keep_posterior,
-    keep_residuals,
-    keep_summary,
     predict,
     prediction_row,
     report,
+    save_posterior,
+    save_residuals,
+    save_summary,
     scatter,
     table,
 )
+from real_data import FAST, add_common_options
 
-from fe_likelihoods.models.rc_column import Steel
-from fe_likelihoods.models.steel_coupon import SteelCoupon
-from fe_likelihoods.probability.priors import TruncatedNormal
-from fe_likelihoods.signals.channels import Measurements
+from fe_likelihoods import Measurements, Steel, SteelCoupon, TruncatedNormal
 
-SOURCE = "NHERI-SimCenter/quoFEM on GitHub (BSD licence; an example of quoFEM)"
+SOURCE = "https://github.com/NHERI-SimCenter/quoFEM (an example of quoFEM)"
 FILES = ("stress.1.coords", "calDataField.csv")
 BLUE, ORANGE = "#1f5a8c", "#d9822b"
 MPA = 1e6
 
-parser = argparse.ArgumentParser(description="Calibrate a law of steel on a coupon test; figures into a folder.")
-parser.add_argument("--data", type=Path, help="folder of the coupon test (default: of FE_SHARED, or ../shared)")
-parser.add_argument("--walkers", type=int, default=60 if os.environ.get("FAST") else 500)
-parser.add_argument("--seed", type=int, default=1)
-parser.add_argument("--out", type=Path, default=Path("results-steel-coupon"))
+parser = argparse.ArgumentParser(description="Calibrate a steel law on a coupon test, and predict.")
+add_common_options(parser, "results-steel-coupon")
+parser.add_argument("--walkers", type=int, default=60 if FAST else 500, help="number of particles")
 args = parser.parse_args()
 
 begin = time.perf_counter()
-folder = data_folder(args.data, FILES, SOURCE)
+folder = find_folder(args.data, FILES, SOURCE)
+if FAST:
+    print("REDUCED SETTING (fast): few walkers; these numbers are not results")
 args.out.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## The test, and the law
-#
-# Nominal values are **assumed**: those of an ordinary bar. The shape of the curves between reversals, and how much of
-# the modulus is lost at a reversal, are fixed in the law.
 
 # %%
+# The test and the steel law
+# --------------------------
+#
+# The nominal values are **assumed**: those of an ordinary bar. The shape of the curves between reversals and the
+# reduction of the modulus at a reversal are fixed in the law.
+
 strain = np.loadtxt(folder / FILES[0])
 stress = MPA * np.loadtxt(folder / FILES[1], delimiter=",").ravel()
 if strain.shape != stress.shape:
-    raise SystemExit(f"{len(strain)} strains and {len(stress)} stresses in {folder}: these are not of one test.")
+    raise SystemExit(
+        f"{len(strain)} strains and {len(stress)} stresses in {folder}: the files are not from the same test"
+    )
 half = len(strain) // 2
 whole = SteelCoupon(
     strain, Steel(fy=450 * MPA, fu=650 * MPA, es=200e9, esh=5e9, hardening_strain=0.01, ultimate_strain=0.12)
@@ -79,13 +79,13 @@ print(
     f"{np.abs(stress).max() / MPA:.0f} MPa; scatter of neighbouring samples {sensor / MPA:.1f} MPa"
 )
 
-# %% [markdown]
-# That scatter bounds the noise of the sensor from above. Residuals will be twenty times larger: what is left is the
-# error of the model.
-#
-# Priors, **assumed**: the modulus is known to 3 %, the strengths to some per cent, hardening hardly at all.
 
 # %%
+# The scatter of neighbouring samples is an upper bound of the noise of the sensor. The residuals will be twenty times
+# larger: they are the error of the model.
+#
+# The priors are **assumed**: the modulus is known to 3 %, the strengths to 10 %, and hardening is hardly known.
+
 prior = {
     "fy": TruncatedNormal(1.0, 0.1),
     "fu": TruncatedNormal(1.0, 0.1),
@@ -103,35 +103,41 @@ fits = fit_noises(
     sensor,
     walkers=args.walkers,
     seed=args.seed,
-    progress=not os.environ.get("FAST"),
+    progress=not FAST,
 )
 seconds_sampling = time.perf_counter() - start
 
-# %%
 names = list(prior)
 title = "Steel coupon, first half: multiples of nominal values, regions of 50 and 90 %"
-posterior_table = keep_posterior(fits, prior, MPA, "MPa", title, args.out)
+posterior_table = save_posterior(fits, prior, MPA, "MPa", title, args.out)
 
-# %% [markdown]
-# ## Residuals
 
 # %%
-checks = keep_residuals(fits, MPA, "MPa", args.out)
+# Residuals
+# ---------
 
-# %% [markdown]
-# ## What the posterior says, and what it does not
-#
-# White noise counts 171 witnesses where the residuals are worth a tenth of them, and is two to three times too sure of
-# strengths and hardening. AR(1) corrects that where a parameter acts slowly (`fu`, `Esh`), and not where it acts at
-# once: successive differences of the stress, which an AR(1) error leaves nearly alone, tell much about `Es`.
-#
-# All three pull `Es` to the edge of its prior or far beyond, and that is no property of this bar. After a reversal the
-# law has .82 Es + Es / (5.55 + 1000 x largest strain), here .84 Es; the bar has 200 GPa, which takes an `Es` of 1.2 x
-# 200. No idea of the error repairs a parameter that carries the error of the model: that takes another law.
-#
-# ## Prediction of the second half
+checks = save_residuals(fits, MPA, "MPa", args.out)
+
 
 # %%
+# What the posterior says, and what it does not
+# ---------------------------------------------
+#
+# With white noise 171 samples count as independent. The residuals are worth a tenth of them, and the posterior standard
+# deviations of strengths and hardening are two to three times too small. AR(1) errors correct this for parameters that
+# act slowly (``fu``, ``Esh``), but not for parameters that act at once: differences of successive stresses, which an
+# AR(1) error hardly changes, contain much information about ``Es``.
+#
+# Under all three error models ``Es`` is at the edge of its prior or far beyond it. This is not a property of the bar.
+# After a reversal the modulus of the law is 0.82 Es + Es / (5.55 + 1000 x largest strain), here 0.84 Es; the bar has
+# 200 GPa, which requires an ``Es`` of 1.2 x 200 GPa. No error model corrects a parameter that compensates for an error
+# of the law: that requires another law.
+#
+# Prediction of the second half
+# -----------------------------
+#
+# The bands are those of the response alone (narrow) and those with noise (wide).
+
 parts = {"first half (calibration)": slice(0, half), "second half (prediction)": slice(half, len(strain))}
 before = whole.simulate(np.ones(len(names)))[0]
 predictions = {name: predict(fit, 400, args.seed, whole) for name, fit in fits.items()}
@@ -161,14 +167,14 @@ for column, (label, part) in zip(axes.T, parts.items(), strict=True):
         axis.grid(alpha=0.25)
 axes[0, 0].legend(frameon=False, fontsize="small")
 axes[1, 0].legend(frameon=False, fontsize="small", loc="upper left")
-figure.suptitle("Steel coupon, calibrated on the first half with errors AR(1)")
+figure.suptitle("Steel coupon, calibrated on the first half with AR(1) errors")
 figure.savefig(args.out / "loops.png", dpi=130)
-plt.close(figure)
 
-# %% [markdown]
-# ## What it cost
 
 # %%
+# Cost
+# ----
+
 settings_and_results = {
     "walkers": args.walkers,
     "seed": args.seed,
@@ -177,4 +183,4 @@ settings_and_results = {
     "seconds_sampling": seconds_sampling,
     "seconds": time.perf_counter() - begin,
 }
-keep_summary(report(fits, prior, checks, MPA) | settings_and_results, args.out)
+save_summary(report(fits, prior, checks, MPA) | settings_and_results, args.out)

@@ -1,13 +1,15 @@
-"""What the tutorials on tests of materials and members share: one posterior for each idea of the error, tables.
+"""Shared parts of the tutorials on cyclic tests: one posterior per error model, predictions, tables and figures.
 
-What separates a measurement from a simulation is two things. **Measurement error**: what the sensor adds; it is known
-from the sensor or from the scatter of neighbouring samples, and new at each of them. **Model error**: what the model
-cannot do at any parameters; larger by far here, the same in every repetition of the test, and lasting from sample to
-sample. White noise takes both for one and counts each sample as a witness of its own. Three ideas are compared:
+Two errors separate a measurement from a simulation. The **measurement error** is what the sensor adds. It is known
+from the sensor or from the scatter of neighbouring samples, and it is independent at each sample. The **model error**
+is what the model cannot reproduce with any parameters. It is much larger here, the same in every repetition of the
+test, and correlated from sample to sample. White noise treats both as one independent error per sample. Three error
+models are compared:
 
-* ``white``: independent errors, n witnesses;
-* ``effective``: the same, but n_eff witnesses, as many as the residuals of the white posterior are worth;
-* ``AR(1)``: errors that last, their lag-one correlation unknown, above a sensor's noise that is known.
+* ``white``: independent errors;
+* ``effective``: the same, but the n samples count as n_eff independent samples, estimated from the residuals of the
+  posterior with white noise;
+* ``AR(1)``: errors with an unknown lag-one correlation, plus the known noise of the sensor.
 """
 
 import json
@@ -19,51 +21,49 @@ import corner
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from real_data import find
+from real_data import find_file
 
-from fe_likelihoods.prediction.prediction import Prediction
-from fe_likelihoods.prediction.propagation import propagate
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, Prior, Uniform
-from fe_likelihoods.probability.residuals import (
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    FELikelihood,
+    GaussianNoise,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    Prediction,
+    Prior,
     ResidualChecks,
+    Uniform,
     effective_samples,
     innovations,
     plot_residuals,
+    propagate,
     residual_checks,
 )
-from fe_likelihoods.signals.channels import Measurements
-from samplers import SMCSampler
-from samplers.reporting.summary import summary
-
-__all__ = [
-    "Fit",
-    "bands",
-    "data_folder",
-    "fit_noises",
-    "keep_posterior",
-    "keep_residuals",
-    "keep_summary",
-    "predict",
-    "prediction_row",
-    "report",
-    "rrmse",
-    "scatter",
-    "table",
-]
+from samplers import SMCSampler, summary
 
 COLOURS = {"white": "#d9822b", "effective": "#5b8c5a", "AR(1)": "#1f5a8c"}
 
 
-def data_folder(given: Path | None, files: tuple[str, ...], source: str) -> Path:
-    """Folder of the measured data, or the end of the script with the words that say where to get them."""
-    return {find(given, file, source).parent for file in files}.pop()
+def find_folder(given: Path | None, files: tuple[str, ...], source: str) -> Path:
+    """Folder that contains the measured data; SystemExit with their source if it is not given or lacks a file."""
+    return {find_file(given, file, source).parent for file in files}.pop()
 
 
 class Fit(NamedTuple):
-    """Posterior under one idea of the error, its samples (n, ndim), and what it cost."""
+    """Posterior under one error model, and its samples.
+
+    Attributes
+    ----------
+    posterior : Posterior
+        The posterior.
+    samples : (n, ndim) float
+        Samples of the posterior.
+    log_evidence : float
+        Logarithm of the evidence.
+    simulations, failures : int
+        Number of simulations, and of failed ones.
+    """
 
     posterior: Posterior
     samples: np.ndarray
@@ -84,9 +84,29 @@ def fit_noises(
     progress: bool,
     **settings: Any,
 ) -> dict[str, Fit]:
-    """Posteriors under the three ideas of the error, of a model with one channel.
+    """Sample the posteriors of a model with one channel under the three error models.
 
-    sigma : scale of the half-normal prior of the error. sensor : known noise of the sensor [both SI].
+    Parameters
+    ----------
+    model : Model
+        The model.
+    measurements : Measurements
+        The measured channel.
+    prior : mapping of str to Distribution
+        Priors of the structural parameters.
+    sigma : float
+        Scale of the half-normal prior of the error [SI].
+    sensor : float
+        Known standard deviation of the noise of the sensor [SI].
+    walkers, seed, progress
+        Of `SMCSampler` and its method `run_mcmc`.
+    **settings
+        More settings of `SMCSampler`.
+
+    Returns
+    -------
+    dict of str to Fit
+        By error model: "white", "effective", "AR(1)".
     """
     (channel,) = model.channels
     known = {channel.name: sensor}
@@ -107,14 +127,14 @@ def fit_noises(
 
     fits = {"white": fit(GaussianNoise(model.channels), {})}
     residuals = fits["white"].posterior.likelihood.residuals(fits["white"].samples.mean(axis=0))
-    worth = {channel.name: float(effective_samples(residuals)[0])}
-    fits["effective"] = fit(GaussianNoise(model.channels, sensor=known, effective_samples=worth), {})
+    effective = {channel.name: float(effective_samples(residuals)[0])}
+    fits["effective"] = fit(GaussianNoise(model.channels, sensor=known, effective_samples=effective), {})
     fits["AR(1)"] = fit(AutoregressiveNoise(model.channels, sensor=known), {f"rho_{channel.name}": Uniform(0.0, 1.0)})
     return fits
 
 
 def _posterior_rows(fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: float, unit: str) -> list[dict[str, str]]:
-    """Mean and standard deviation of every parameter under every idea of the error; sigma in `unit` of `scale` [SI]."""
+    """Mean and standard deviation of every parameter under every error model; sigma in `unit` of `scale` [SI]."""
     moments = {name: summary(fit.samples, fit.posterior.parameter_names) for name, fit in fits.items()}
     rows = []
     for i, parameter in enumerate(fits["AR(1)"].posterior.parameter_names):
@@ -130,8 +150,8 @@ def _posterior_rows(fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: fl
     return rows
 
 
-def _corners(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> Figure:
-    """Structural parameters under the three ideas of the error: regions of 50 and 90 %."""
+def _plot_corner(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> Figure:
+    """Structural parameters under the three error models: regions of 50 and 90 %."""
     n = len(prior)
     ranges = []
     for i in range(n):
@@ -143,7 +163,7 @@ def _corners(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> F
         figure = corner.corner(
             fit.samples[:, :n],
             fig=figure,
-            labels=list(prior),
+            labels=[f"{parameter} [x nominal]" for parameter in prior],
             color=COLOURS[name],
             plot_datapoints=False,
             plot_density=False,
@@ -152,11 +172,8 @@ def _corners(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> F
             hist_kwargs={"density": True},
             range=ranges,
         )
-    tallest = [
-        max(axis.patches[k].get_xy()[:, 1].max() for k in range(len(axis.patches))) for axis in figure.axes[:: n + 1]
-    ]
-    for axis, height in zip(figure.axes[:: n + 1], tallest, strict=True):
-        axis.set_ylim(0.0, 1.1 * height)
+    for axes in figure.axes[:: n + 1]:  # corner scales each diagonal panel to the last histogram only
+        axes.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches))
     handles = [plt.Line2D([], [], color=COLOURS[name]) for name in fits]
     figure.legend(handles, list(fits), loc="upper right", bbox_to_anchor=(0.95, 0.9), frameon=False, fontsize=18)
     figure.suptitle(title)
@@ -166,11 +183,9 @@ def _corners(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> F
 def report(
     fits: Mapping[str, Fit], prior: Mapping[str, Any], checks: Mapping[str, ResidualChecks], scale: float
 ) -> dict[str, Any]:
-    """What the fits say, in numbers: sigma in units of `scale` [SI]."""
-    names, moments = (
-        list(prior),
-        {name: (fit.samples.mean(axis=0), fit.samples.std(axis=0)) for name, fit in fits.items()},
-    )
+    """Numbers of the fits, for ``summary.json``; sigma in units of `scale` [SI]."""
+    names = list(prior)
+    moments = {name: (fit.samples.mean(axis=0), fit.samples.std(axis=0)) for name, fit in fits.items()}
     return {
         "mean": {name: dict(zip(names, mean.tolist(), strict=False)) for name, (mean, _) in moments.items()},
         "sd": {name: dict(zip(names, sd.tolist(), strict=False)) for name, (_, sd) in moments.items()},
@@ -185,90 +200,85 @@ def report(
     }
 
 
-def _residual_figure(fit: Fit, name: str, scale: float, unit: str) -> tuple[Figure, ResidualChecks, str]:
-    """Checks of the residuals at the posterior mean; of AR(1), what is new in each of them. And the checks in words."""
+def _plot_residuals(fit: Fit, name: str, scale: float, unit: str) -> tuple[Figure, ResidualChecks, str]:
+    """Figure, checks and a sentence: residuals at the posterior mean, or under AR(1) their innovations."""
     mean, likelihood = fit.samples.mean(axis=0), fit.posterior.likelihood
-    shown, what = likelihood.residuals(mean), f"residuals, errors taken as {name}"
+    shown, title = likelihood.residuals(mean), f"residuals of the fit with {name} errors"
     if name == "AR(1)":
-        shown, what = (
-            innovations(shown, mean[-1:]),
-            f"innovations of residuals, errors taken as AR(1) with rho {mean[-1]:.2f}",
-        )
+        shown = innovations(shown, mean[-1:])
+        title = f"innovations of the residuals of the fit with AR(1) errors, rho {mean[-1]:.2f}"
     checks = residual_checks(shown)
     figure = plot_residuals(shown, likelihood.model.channels, 1.0)
-    figure.suptitle(what, fontsize="small")
-    for axis, label in zip(figure.axes, ("sample", "lag [samples]", "quantile of a normal [-]"), strict=True):
-        axis.set_xlabel(label)
-    words = (
-        f"{what}: lag one {checks.lag_one[0]:.2f}, worth {checks.n_effective[0]:.0f} of {shown.size} samples, "
+    figure.suptitle(title, fontsize="small")
+    for axes, label in zip(figure.axes, ("sample", "lag [samples]", "quantile of a normal [-]"), strict=True):
+        axes.set_xlabel(label)
+    sentence = (
+        f"{title}: lag-one correlation {checks.lag_one[0]:.2f}, n_eff {checks.n_effective[0]:.0f} of {shown.size}, "
         f"mean {checks.mean[0] / scale:.2f}, sd {checks.standard_deviation[0] / scale:.2f} {unit}"
     )
-    return figure, checks, words
+    return figure, checks, sentence
 
 
-def keep_posterior(
+def save_posterior(
     fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: float, unit: str, title: str, out: Path
 ) -> str:
-    """Table of the posteriors, printed, and their corner plot in ``corner.png``."""
+    """Print and return the table of the posteriors; save their corner plot as ``corner.png``."""
     text = table(_posterior_rows(fits, prior, scale, unit))
     print(text)
-    figure = _corners(fits, prior, title)
-    figure.savefig(out / "corner.png", dpi=90)
-    plt.close(figure)
+    _plot_corner(fits, prior, title).savefig(out / "corner.png", dpi=90)
     return text
 
 
-def keep_residuals(fits: Mapping[str, Fit], scale: float, unit: str, out: Path) -> dict[str, ResidualChecks]:
-    """Checks of the residuals under white noise and of the innovations under AR(1): in words, and as figures."""
+def save_residuals(fits: Mapping[str, Fit], scale: float, unit: str, out: Path) -> dict[str, ResidualChecks]:
+    """Print and return the checks of the residuals under white and AR(1) errors; save their figures."""
     checks = {}
     for name, file in (("white", "residuals_white.png"), ("AR(1)", "residuals_ar1.png")):
-        figure, checks[name], words = _residual_figure(fits[name], name, scale, unit)
+        figure, checks[name], sentence = _plot_residuals(fits[name], name, scale, unit)
         figure.savefig(out / file, dpi=130)
-        plt.close(figure)
-        print(words)
+        print(sentence)
     return checks
 
 
-def keep_summary(result: dict, out: Path) -> None:
-    """Numbers of the run, with its seconds, into ``summary.json``; what it cost is printed."""
+def save_summary(result: dict, out: Path) -> None:
+    """Write the numbers of a run to ``summary.json`` and print its cost."""
     (out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
     print(
         f"{sum(result['simulations'].values())} simulations ({sum(result['failures'].values())} failed) in "
-        f"{result['seconds_sampling']:.0f} s, the whole in {result['seconds']:.0f} s; tables and figures are in {out}/"
+        f"{result['seconds_sampling']:.0f} s, {result['seconds']:.0f} s in total; tables and figures are in {out}/"
     )
 
 
 def predict(fit: Fit, n: int, seed: int, model: Any) -> tuple[Prediction, Prediction]:
-    """Response of `model` alone, and what a sensor would read, over `n` samples of a posterior."""
+    """Predict with `n` samples of a posterior: the response of `model` alone, and the response with noise."""
     chosen = np.random.default_rng(seed).choice(len(fit.samples), min(n, len(fit.samples)), replace=False)
-    # any measurements will do: what is predicted depends on parameters and noise alone
-    none = Measurements(model.channels, model.dt, np.zeros((1, model.n_steps)))
-    likelihood = FELikelihood(_Remembering(model), none, fit.posterior.likelihood.noise)
+    # the prediction depends only on parameters and noise: the measurements of the likelihood are not used
+    unused = Measurements(model.channels, model.dt, np.zeros((1, model.n_steps)))
+    likelihood = FELikelihood(_CachedResponses(model), unused, fit.posterior.likelihood.noise)
     posterior = Posterior(likelihood, fit.posterior.prior)
     return tuple(
         propagate(posterior, fit.samples[chosen], noise=noise, seed=seed, progress=False) for noise in (False, True)
     )
 
 
-class _Remembering:
-    """A model whose responses are kept, so that a prediction with noise does not simulate again."""
+class _CachedResponses:
+    """A model that caches its responses, so that the prediction with noise needs no further simulations."""
 
     def __init__(self, model: Any) -> None:
         self.parameter_names, self.channels = model.parameter_names, model.channels
         self.dt, self.n_steps, self.fingerprint = model.dt, model.n_steps, model.fingerprint
-        self._model, self._kept = model, {}
+        self._model, self._responses = model, {}
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         key = np.asarray(theta).tobytes()
-        if key not in self._kept:
-            self._kept[key] = self._model.simulate(theta)
-        return self._kept[key]
+        if key not in self._responses:
+            self._responses[key] = self._model.simulate(theta)
+        return self._responses[key]
 
 
 def prediction_row(
     predictions: Mapping[str, tuple[Prediction, Prediction]], nominal: np.ndarray, measured: np.ndarray, part: slice
 ) -> tuple[dict[str, str], dict]:
-    """Errors and coverages of a part of the history, as a row of a table and as numbers."""
+    """RRMSE and coverage in a part of the history, as a row of a table and as numbers."""
     row = {"RRMSE nominal": f"{100 * rrmse(nominal, measured, part):.1f} %"}
     numbers = {"nominal": rrmse(nominal, measured, part)}
     for name, (alone, noisy) in predictions.items():
@@ -286,9 +296,9 @@ def rrmse(predicted: np.ndarray, measured: np.ndarray, part: slice = slice(None)
 
 
 def scatter(x: np.ndarray, y: np.ndarray, width: int = 7) -> float:
-    """Noise of the sensor of y, from the samples: median scatter about a parabola in x through `width` neighbours.
+    """Upper bound of the noise of y: median scatter about a parabola in x through `width` neighbouring samples.
 
-    Only where x goes one way. It is an upper bound, as the true curve is no parabola.
+    Only windows in which x is monotonic are used. The true curve is not a parabola, hence an upper bound.
     """
     found = []
     for start in range(len(x) - width + 1):
@@ -301,8 +311,8 @@ def scatter(x: np.ndarray, y: np.ndarray, width: int = 7) -> float:
     return float(np.median(found))
 
 
-def bands(axes: Any, x: np.ndarray, low: np.ndarray, high: np.ndarray, **style: Any) -> None:
-    """A band along a path that goes to and fro in x: one polygon for each way."""
+def fill_bands(axes: Any, x: np.ndarray, low: np.ndarray, high: np.ndarray, **style: Any) -> None:
+    """Fill a band along a path that reverses in x: one polygon per monotonic part."""
     ways = np.sign(np.diff(x))
     turns = np.flatnonzero(ways[1:] * ways[:-1] < 0) + 1
     for start, stop in zip([0, *turns], [*turns, len(x) - 1], strict=True):
@@ -312,7 +322,7 @@ def bands(axes: Any, x: np.ndarray, low: np.ndarray, high: np.ndarray, **style: 
 
 
 def table(rows: list[dict[str, str]]) -> str:
-    """Rows with the same keys as aligned text."""
+    """Format rows with equal keys as an aligned table."""
     widths = {key: max(len(key), *(len(row[key]) for row in rows)) for key in rows[0]}
     lines = ["  ".join(f"{key:<{width}}" for key, width in widths.items())]
     lines += ["  ".join(f"{row[key]:<{width}}" for key, width in widths.items()) for row in rows]
