@@ -117,12 +117,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     )
     from .probability.residuals import (
         ResidualChecks,
-<<<<<<< HEAD
-        plot_residuals,
-=======
         effective_samples,
         innovations,
->>>>>>> 0a8783c (Tutorials 04 and 05 for sphinx-gallery; figures of 05 with legend, true values and units; the façade has table_motion, innovations and effective_samples)
+        plot_residuals,
         residual_checks,
     )
     from .signals.channels import (
@@ -243,11 +240,8 @@ __all__ = [
     "read_v2",
     "residual_checks",
     "response_spectrum",
-<<<<<<< HEAD
     "rrmse",
-=======
     "table_motion",
->>>>>>> 0a8783c (Tutorials 04 and 05 for sphinx-gallery; figures of 05 with legend, true values and units; the façade has table_motion, innovations and effective_samples)
     "to_bilby",
     "to_pints",
     "to_pymc",
@@ -337,12 +331,9 @@ _EXPORTS = {
     ),
     "probability.residuals": (
         "ResidualChecks",
-<<<<<<< HEAD
-        "plot_residuals",
-=======
         "effective_samples",
         "innovations",
->>>>>>> 0a8783c (Tutorials 04 and 05 for sphinx-gallery; figures of 05 with legend, true values and units; the façade has table_motion, innovations and effective_samples)
+        "plot_residuals",
         "residual_checks",
     ),
     "signals.channels": (

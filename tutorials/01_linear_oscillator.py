@@ -42,6 +42,7 @@ from fe_likelihoods import (
     plot_bands,
     problems,
     propagate,
+    rrmse,
     to_si,
 )
 from samplers import SMCSampler, TMCMCSampler, comparison_table, to_arviz
@@ -257,9 +258,9 @@ save(figure, "corner")
 theta = {"nominal values": np.ones(2), "posterior mean": samples["SMC"].mean(axis=0)[:2]}
 figure, rows = plt.subplots(2, 1, figsize=(9, 5), sharex=True, sharey=True, layout="constrained")
 for axes, (label, values) in zip(rows, theta.items(), strict=True):
-    response = propagate(model, values[None], quantiles=(), progress=False)
-    error = response.rrmse(measured)[1]
-    data, simulated = (from_si(x, "cm") for x in (measured.channel("displacement"), response.mean[1]))
+    response = model.simulate(values)
+    error = rrmse(response, measured.values)[1]
+    data, simulated = (from_si(x, "cm") for x in (measured.channel("displacement"), response[1]))
     axes.plot(measured.time, data, ".", color=ORANGE, markersize=2.5, label="measured (synthetic)")
     axes.plot(measured.time, simulated, color=BLUE, linewidth=1.0, label=f"{label}: RRMSE {100 * error:.0f} %")
     axes.legend(frameon=False, fontsize="small", ncols=2, loc="upper left")

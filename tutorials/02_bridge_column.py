@@ -37,7 +37,17 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fe_likelihoods import Record, average_predictions, from_si, problems, propagate, read_at2, read_csv, read_v2
+from fe_likelihoods import (
+    Record,
+    average_predictions,
+    from_si,
+    problems,
+    propagate,
+    read_at2,
+    read_csv,
+    read_v2,
+    rrmse,
+)
 from samplers import (
     RAMANCHA_2022_CONSTANT,
     RAMANCHA_2022_LITERAL,
@@ -257,11 +267,6 @@ figure.savefig(args.out / "corner.png", dpi=110)
 # --------------------------------------------------
 #
 # RRMSE is the relative root-mean-square error of a channel.
-
-
-def rrmse(predicted: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Relative root-mean-square error per channel."""
-    return np.sqrt(np.sum((predicted - observed) ** 2, axis=1) / np.sum(observed**2, axis=1))
 
 
 def error_line(title: str, error: np.ndarray) -> str:

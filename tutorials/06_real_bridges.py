@@ -53,6 +53,7 @@ from fe_likelihoods import (
     propagate,
     read_v2,
     residual_checks,
+    rrmse,
 )
 from samplers import compare_models
 
@@ -290,7 +291,7 @@ def prediction_rows(
             values = measured.values[k]
             strong = real_data.strong_motion(values)
             row = {"noise": noise, "case": name, "channel": channel.name}
-            row["rrmse_of_the_end"] = float(np.sqrt(np.square(end - values).sum() / np.square(values).sum()))
+            row["rrmse_of_the_end"] = float(rrmse(end, values))
             row["delay"] = delay(values, response.mean[k], measured.dt)
             row["rrmse"] = float(response.rrmse(measured)[k])
             row["coverage"] = float(total.coverage(measured)[k])

@@ -39,7 +39,6 @@ from cyclic_tests import (
     predict,
     prediction_row,
     report,
-    rrmse,
     save_posterior,
     save_residuals,
     save_summary,
@@ -60,6 +59,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     from_si,
     read_imposed_test,
+    rrmse,
     to_si,
 )
 

@@ -39,6 +39,7 @@ from fe_likelihoods import (
     plot_residuals,
     propagate,
     residual_checks,
+    rrmse,
 )
 from samplers import SMCSampler, summary
 
@@ -279,8 +280,8 @@ def prediction_row(
     predictions: Mapping[str, tuple[Prediction, Prediction]], nominal: np.ndarray, measured: np.ndarray, part: slice
 ) -> tuple[dict[str, str], dict]:
     """RRMSE and coverage in a part of the history, as a row of a table and as numbers."""
-    row = {"RRMSE nominal": f"{100 * rrmse(nominal, measured, part):.1f} %"}
-    numbers = {"nominal": rrmse(nominal, measured, part)}
+    before = float(rrmse(nominal[part], measured[part]))
+    row, numbers = {"RRMSE nominal": f"{100 * before:.1f} %"}, {"nominal": before}
     for name, (alone, noisy) in predictions.items():
         data = Measurements(alone.channels, alone.dt, measured[None])
         error = float(alone.rrmse(data, part)[0])
@@ -288,11 +289,6 @@ def prediction_row(
         row[f"{name}: RRMSE, in bands"] = f"{100 * error:.1f} %, {100 * inside[0]:.0f} and {100 * inside[1]:.0f} %"
         numbers[name] = {"rrmse": error, "coverage_response": inside[0], "coverage": inside[1]}
     return row, numbers
-
-
-def rrmse(predicted: np.ndarray, measured: np.ndarray, part: slice = slice(None)) -> float:
-    """Relative root-mean-square error of a part of the one channel."""
-    return float(np.sqrt(np.sum((predicted[part] - measured[part]) ** 2) / np.sum(measured[part] ** 2)))
 
 
 def scatter(x: np.ndarray, y: np.ndarray, width: int = 7) -> float:
