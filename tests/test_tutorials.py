@@ -117,7 +117,7 @@ def check_residuals(figure: Figure, labels: list[str], horizontal: str = "time [
     for history, correlation, quantiles in rows:
         values = history.lines[0].get_ydata()
         assert inside(correlation, 0.0, 1.0), "the autocorrelation at lag zero"
-        assert np.allclose(np.sort(values), np.sort(quantiles.lines[0].get_ydata()))
+        assert np.allclose(np.sort(values), np.sort(quantiles.lines[1].get_ydata()))
 
 
 # 01

@@ -1,6 +1,6 @@
 """
 Updating a reinforced-concrete bridge column with SMC
-======================================================
+=====================================================
 
 A nonlinear fiber finite-element model of a full-scale bridge column is updated with the acceleration and the
 displacement of its top. Five structural parameters and two noise levels are sampled by sequential Monte Carlo (SMC).
