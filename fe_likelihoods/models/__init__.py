@@ -1,1 +1,7 @@
-"""Structural models: the built-in ones and wrappers for a user's own."""
+"""Structural models: built-in structures, and wrappers for models of your own.
+
+* Built-in structures: `rc_column`, `isolated_bridge`, `linear_oscillator`, `linear_structure`, `steel_coupon`. Modules
+  named after a structure, such as `rc_column_parts` and `isolated_bridge_channels`, belong to it.
+* Wrappers: `function`, `executable`, `opensees`, all based on `external`.
+* Shared by several models: `base`, `threaded`, `validation`, `circular_section`.
+"""

@@ -35,11 +35,11 @@ from ..kernels.newmark import Dynamics
 from ..kernels.static import Iteration
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
-from ..simulation.model import SimulationFailed
-from ..units import G0, find_unit, to_si
+from ..units import G0, find_unit
 from .circular_section import Confinement, gauss_lobatto
-from .rc_column_analysis import BaseMotion, ColumnHistory, ImposedMotion, set_materials
+from .rc_column_analysis import BaseMotion, ColumnHistory, ImposedMotion, check_physical_values, set_materials
 from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
+from .rc_column_presets import lhpost_arguments
 from .rc_column_section import ReinforcedSection
 from .threaded import ThreadedModel
 from .validation import (
@@ -48,7 +48,6 @@ from .validation import (
     check_names,
     check_nominal,
     check_theta,
-    check_values,
     invalid,
 )
 
@@ -71,7 +70,6 @@ PARAMETERS = {
     "mass": "mass at the top [kg]",
     "penetration": "length of strain penetration into the foundation [m]",
 }
-_MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 _CHANNELS = {
     "acceleration": ("absolute acceleration", "m/s2"),
     "displacement": ("relative displacement", "m"),
@@ -191,10 +189,9 @@ class RCColumn(ThreadedModel):
     def lhpost(cls, loading: Record | DisplacementHistory, **changes) -> RCColumn:
         """Build the full-scale column tested on the LHPOST shake table (UC San Diego, 2010).
 
-        Height, diameter, Ec, Es, ft, damping and weight are those of Ramancha et al. (2022); the other values are those
-        of published models of the same column. The paper does not give, and this model assumes: the peak strain
-        2 fc/Ec, tension softening over a strain of 0.001 to a tenth of ft, and no rotational inertia of the
-        superstructure.
+        The values and their sources are in `fe_likelihoods.models.rc_column_presets.lhpost_arguments`. Ramancha et al.
+        do not give, and this model assumes: the peak strain 2 fc/Ec, tension softening over a strain of 0.001 to a
+        tenth of ft, and no rotational inertia of the superstructure.
 
         Parameters
         ----------
@@ -207,23 +204,7 @@ class RCColumn(ThreadedModel):
         -------
         RCColumn
         """
-        ksi, inch = to_si(1.0, "ksi").item(), to_si(1.0, "in").item()
-        weight = to_si(522.0, "kip").item()
-        values = dict(
-            loading=loading,
-            diameter=48.0 * inch,
-            height=288.0 * inch,
-            cover=2.0 * inch,
-            concrete=Concrete(fc=6.1 * ksi, ec=3320.0 * ksi, ft=0.306 * ksi),
-            steel=Steel(75.2 * ksi, 102.4 * ksi, 28400.0 * ksi, 456.0 * ksi, 0.0110, 0.1220),
-            bars=Bars(number=18, diameter=1.41 * inch, area=1.56 * inch**2),
-            hoops=Hoops(diameter=0.625 * inch, spacing=6.0 * inch, fy=54.8 * ksi, area=0.62 * inch**2),
-            mass=weight / G0,
-            a0=0.737,
-            a1=0.0002016,
-            units=(("acceleration", "g"), ("displacement", "in"), ("force", "kip")),
-        )
-        return cls(**(values | changes))
+        return cls(loading, **(lhpost_arguments() | changes))
 
     def __post_init__(self) -> None:
         self._check_arguments()
@@ -327,7 +308,7 @@ class RCColumn(ThreadedModel):
     def _run(self, theta: np.ndarray) -> ColumnHistory:
         """Simulate for multiples `theta` of the nominal parameters."""
         values = self.physical_values(theta)
-        self._check_values(values)
+        check_physical_values(values, self.steel)
         prepared = self._prepared
         column = allocate(
             n_elements=self.n_elements,
@@ -358,18 +339,6 @@ class RCColumn(ThreadedModel):
     def _channel_names(self) -> tuple[str, ...]:
         return ("acceleration", "displacement") if isinstance(self.loading, Record) else ("force",)
 
-    def _check_values(self, values: dict[str, float]) -> None:
-        """Raise SimulationFailed for physical values that describe no column."""
-        check_values(values, _MAY_BE_ZERO)
-        if values["fy"] / values["Es"] >= self.steel.hardening_strain:
-            raise SimulationFailed(
-                "the steel has no yield plateau: fy/Es is not below the strain at onset of hardening"
-            )
-        if values["fu"] <= values["fy"]:
-            raise SimulationFailed(
-                f"the steel has no hardening: fu = {values['fu']:.4g} Pa is not above fy = {values['fy']:.4g} Pa"
-            )
-
     def _check_arguments(self) -> None:
         """Raise ValueError for arguments from which no column can be built."""
         if not isinstance(self.loading, Record | DisplacementHistory):
@@ -395,7 +364,7 @@ class RCColumn(ThreadedModel):
         check_integer("substeps", self.substeps, 1, 1000)
         check_integer("max_iterations", self.max_iterations, 2, 1000)
         check_integer("halvings", self.halvings, 0, 30)
-        self.section  # noqa: B018  checks its dimensions
+        _ = self.section  # checks its dimensions
         if self.geometry not in ("corotational", "linear"):
             raise invalid('geometry "corotational" or "linear"', self.geometry, "the default is corotational")
 

@@ -20,8 +20,11 @@ from ..simulation.model import SimulationFailed
 from .base import History
 from .circular_section import Confinement
 from .rc_column_parts import Concrete, Steel
+from .validation import check_values
 
-__all__ = ["BaseMotion", "ColumnHistory", "ImposedMotion", "set_materials"]
+__all__ = ["BaseMotion", "ColumnHistory", "ImposedMotion", "check_physical_values", "set_materials"]
+
+_MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 
 _IMPOSED_ROWS = (
     "displacement",
@@ -116,6 +119,19 @@ class ImposedMotion(NamedTuple):
         if status:
             raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings))
         return ColumnHistory(_IMPOSED_ROWS, history[:, self.kept], retries)
+
+
+def check_physical_values(values: dict[str, float], steel: Steel) -> None:
+    """Raise SimulationFailed for physical parameter `values` [SI] that describe no column."""
+    check_values(values, _MAY_BE_ZERO)
+    if values["fy"] / values["Es"] >= steel.hardening_strain:
+        raise SimulationFailed(
+            "the steel has no yield plateau: fy/Es is not below the strain at the onset of hardening"
+        )
+    if values["fu"] <= values["fy"]:
+        raise SimulationFailed(
+            f"the steel has no hardening: fu = {values['fu']:.4g} Pa is not above fy = {values['fy']:.4g} Pa"
+        )
 
 
 def set_materials(

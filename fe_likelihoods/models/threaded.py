@@ -39,7 +39,7 @@ class ThreadedModel(BuiltInModel):
             Responses, NaN in rows that failed, and the reasons of the failures.
         """
         thetas = check_thetas(thetas, self.parameter_names)
-        self._prepared  # noqa: B018  computed once here, not once per thread
+        _ = self._prepared  # computed here, so that not every thread computes it
         return SimulationBatch(*map_threads(self._respond, thetas, (len(self.channels), self.n_steps)))
 
     def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
@@ -59,7 +59,7 @@ class ThreadedModel(BuiltInModel):
         """
         thetas = check_thetas(thetas, self.parameter_names)
         measured = check_measured(measured, self.channels, self.n_steps)
-        self._prepared  # noqa: B018  computed once here, not once per thread
+        _ = self._prepared  # computed here, so that not every thread computes it
 
         def misfit(theta: np.ndarray) -> np.ndarray:
             return np.square(self._respond(theta) - measured).sum(axis=1)
