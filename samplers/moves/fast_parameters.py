@@ -23,15 +23,26 @@ from emcee.moves import Move
 
 from .kernels import Inside, RandomWalkMove
 
-__all__ = ["WithFastSweeps", "with_fast_sweeps"]
+__all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
 
 # Optimal for a random walk in two dimensions; it is 0.44 in one dimension and 0.23 in many. Gelman, Roberts & Gilks
 # (1996), Efficient Metropolis jumping rules, Bayesian Statistics 5, 599-608.
 TARGET_ACCEPTANCE = 0.35
 
 
-class _FastWalk(RandomWalkMove):
-    """Random walk in some coordinates, with their covariance conditional on the others, which stay fixed."""
+class FastWalk(RandomWalkMove):
+    """Random walk in some coordinates, with their covariance conditional on the others, which stay fixed.
+
+    Parameters
+    ----------
+    indices : sequence of int
+        Indices of the coordinates that change.
+
+    Raises
+    ------
+    ValueError
+        If `indices` is empty or contains an invalid index.
+    """
 
     def __init__(self, indices: Sequence[int]):
         super().__init__(adapt=True, target=TARGET_ACCEPTANCE)
@@ -78,13 +89,23 @@ class WithFastSweeps(Move):
             raise ValueError(f"sweeps must be at least 1, got {sweeps}; to make no fast sweeps, use the move itself")
         self.move = move
         self.sweeps = sweeps
-        self._walk = _FastWalk(indices)
+        self._walk = FastWalk(indices)
         self._accepted = np.empty(0)
 
     @property
     def indices(self) -> tuple[int, ...]:
         """Indices of the fast parameters, in ascending order."""
         return self._walk.indices
+
+    @property
+    def walk(self) -> FastWalk:
+        """The random walk in the fast parameters."""
+        return self._walk
+
+    @property
+    def fast_acceptance(self) -> float:
+        """Mean acceptance of the fast sweeps after the latest move; NaN before the first one."""
+        return float(np.mean(self._accepted)) if len(self._accepted) else float("nan")
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit the walk, and the wrapped move if it has ``calibrate``, to points (n, ndim) with weights (n,)."""

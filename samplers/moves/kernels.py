@@ -85,6 +85,11 @@ class _FittedMove(MHMove):
         """Fit the proposal to points (n, ndim) with normalised weights (n,)."""
         self._mean, self._root = location_and_root(coords, weights)
 
+    @property
+    def root(self) -> np.ndarray | None:
+        """Lower-triangular root (ndim, ndim) of the fitted covariance or scale matrix; None before the first fit."""
+        return self._root
+
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Propose a new point for each walker.
 
@@ -127,6 +132,11 @@ class RandomWalkMove(_FittedMove):
         self.adapt = adapt
         self.target = target
         self._log_factor = 0.0
+
+    @property
+    def log_scale_factor(self) -> float:
+        """Logarithm of the factor by which ``tune`` has changed the scale so far."""
+        return self._log_factor
 
     def _draw(self, coords, random):
         ndim = coords.shape[1]
@@ -220,10 +230,15 @@ class MixtureMove(MHMove):
         self.target = target
         self._mixture: Mixture | None = None
         self._bounds: SupportBounds | None = None
-        self._kernels = (self._independence, self._local_walk, self._differences)
+        self._kernels = (self.draw_independence, self.draw_local_walk, self.draw_differences)
         self._log_factors = [0.0, 0.0, 0.0]
         self._current: int | None = None  # index of the kernel of the latest sweep; None right after a calibration
         self._independence_accepted = False
+
+    @property
+    def mixture(self) -> Mixture | None:
+        """The fitted mixture; None before the first fit."""
+        return self._mixture
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit the mixture to points (n, ndim) with normalised weights (n,).
@@ -267,7 +282,16 @@ class MixtureMove(MHMove):
     def _draw(self, coords, random):
         return self._kernels[self._current](coords, random)
 
-    def _independence(self, coords, random):
+    def draw_independence(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Propose independent draws from the mixture for points (n, ndim).
+
+        Returns
+        -------
+        proposed : ndarray, shape (n, ndim)
+            Proposed points.
+        log_ratio : ndarray, shape (n,)
+            Logarithm of the ratio of proposal densities q(x | x') / q(x' | x), for the acceptance probability.
+        """
         proposed = draw(self._mixture, len(coords), random)
         if self._inside is not None:
             for _ in range(REDRAWS):
@@ -277,7 +301,8 @@ class MixtureMove(MHMove):
                 proposed[outside] = draw(self._mixture, len(outside), random)
         return proposed, log_density(self._mixture, coords) - log_density(self._mixture, proposed)
 
-    def _local_walk(self, coords, random):
+    def draw_local_walk(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Propose steps of the local random walk; parameters and results are those of `draw_independence`."""
         n, ndim = coords.shape
         before = log_responsibilities(self._mixture, coords)
         cumulated = np.cumsum(np.exp(before), axis=1)
@@ -299,7 +324,8 @@ class MixtureMove(MHMove):
         possible = (before > -np.inf) & (after > -np.inf)
         return proposed, np.where(possible, np.where(possible, before, 0.0) - np.where(possible, after, 0.0), -np.inf)
 
-    def _differences(self, coords, random):
+    def draw_differences(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Propose steps along differences of points; parameters and results are those of `draw_independence`."""
         n, ndim = coords.shape
         first, second = (
             np.searchsorted(self._cumulated, random.uniform(size=n) * self._cumulated[-1], side="right")

@@ -28,7 +28,7 @@ from samplers import (
     TemperedSampler,
     TMCMCSampler,
 )
-from samplers.moves.fast_parameters import WithFastSweeps, _FastWalk
+from samplers.moves.fast_parameters import FastWalk, WithFastSweeps
 from tests.contract.targets import Gaussian, WithBlobs
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
@@ -112,14 +112,14 @@ class WrongMove(WithFastSweeps):
 
     def __init__(self, move, indices):
         super().__init__(move, indices, sweeps=5)
-        walk, draw = self._walk, self._walk._draw
+        walk, draw = self.walk, self.walk.get_proposal
 
         def drift(coords, random):
             proposed, factors = draw(coords, random)
-            proposed[:, walk.indices] += walk._root.diagonal()
+            proposed[:, walk.indices] += walk.root.diagonal()
             return proposed, factors
 
-        self._walk.get_proposal = drift
+        walk.get_proposal = drift
 
 
 def test_wrong_fast_sweeps_are_detected(seed):
@@ -180,11 +180,11 @@ def test_the_walk_has_the_conditional_covariance(rng):
     covariance = np.array([[1.0, 0.9, 0.2], [0.9, 1.0, 0.5], [0.2, 0.5, 2.0]]) * np.outer([1, 1e6, 1], [1, 1e6, 1])
     points = rng.multivariate_normal(np.zeros(3), covariance, size=100_000)
     for fast, slow in (([1], [0, 2]), ([0, 2], [1])):
-        walk = _FastWalk(fast)
+        walk = FastWalk(fast)
         walk.calibrate(points, np.full(len(points), 1.0 / len(points)))
         cross = covariance[np.ix_(fast, slow)]
         expected = covariance[np.ix_(fast, fast)] - cross @ np.linalg.solve(covariance[np.ix_(slow, slow)], cross.T)
-        assert walk._root @ walk._root.T == pytest.approx(expected, rel=0.05)
+        assert walk.root @ walk.root.T == pytest.approx(expected, rel=0.05)
 
 
 def test_only_tuning_adapts_the_scale(ensemble):
@@ -192,13 +192,13 @@ def test_only_tuning_adapts_the_scale(ensemble):
     move = WithFastSweeps(RandomWalkMove(), [1])
     fixed = emcee.EnsembleSampler(64, 2, lambda x: target(x[None])[0][0], moves=move)
     fixed.run_mcmc(state.coords[:64], 5)
-    assert move._walk._log_factor == 0.0
+    assert move.walk.log_scale_factor == 0.0
     move.calibrate(10.0 * state.coords, np.full(len(state.coords), 1 / len(state.coords)))  # much too wide
     for _ in range(20):
         state, accepted = move.propose(model, state)
         move.tune(state, accepted)
-    assert -3.0 < move._walk._log_factor < -1.5  # about -log 10
-    assert np.mean(move._accepted) == pytest.approx(0.35, abs=0.1)
+    assert -3.0 < move.walk.log_scale_factor < -1.5  # about -log 10
+    assert move.fast_acceptance == pytest.approx(0.35, abs=0.1)
 
 
 @pytest.mark.filterwarnings("ignore:stuck")
