@@ -7,7 +7,7 @@ default integration step, at parameters that differ from the nominal values, at 
 noise is added, with a given fraction of the root mean square of each channel.
 
 `isolated_bridge_means.h5` has only means over the two piers. The piers are structurally identical, so that these data
-do not distinguish them, and the posterior has exactly two modes (see `IsolatedBridge.exchanged`).
+do not distinguish them, and the posterior has exactly two modes (see `IsolatedBridge.exchange_piers`).
 
 Run the script with ``make data``. It writes the same files every time.
 """

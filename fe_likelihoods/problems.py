@@ -410,7 +410,7 @@ def isolated_bridge(
     data : {"twin", "means"}
         Bundled synthetic test. "twin" has a known truth and one mode. "means" has only means over the two piers, so
         that the devices of the piers can be exchanged: its posterior has exactly two modes, whose masses are known
-        (`IsolatedBridge.exchanged`).
+        (`IsolatedBridge.exchange_piers`).
     channels : tuple of str, 5, 6 or 10, optional
         Measured channels to use. Default: six of "twin", all of any other data.
     noise : {"shared", "per channel", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`

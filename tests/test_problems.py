@@ -333,8 +333,8 @@ def test_the_means_do_not_tell_the_piers_apart():
     posterior = problems.isolated_bridge(data="means")
     model = posterior.likelihood.model
     truth = np.array(list(problems.ISOLATED_BRIDGE_TRUTH["means"].values()))
-    other = model.exchanged(truth)
-    np.testing.assert_allclose(model.exchanged(other), truth, rtol=1e-14)
+    other = model.exchange_piers(truth)
+    np.testing.assert_allclose(model.exchange_piers(other), truth, rtol=1e-14)
     assert np.abs(other - truth).max() > 0.4
     at = [posterior.log_likelihood(np.append(theta, 0.1)) for theta in (truth, other, 0.5 * (truth + other))]
     assert at[0] == pytest.approx(at[1], abs=1e-6)

@@ -148,7 +148,7 @@ def draws(label: str, sampler) -> np.ndarray:
 
 def other_mode(posterior: Posterior, truth: np.ndarray) -> np.ndarray:
     """The true parameters with the devices of the two piers exchanged: the second mode."""
-    return np.append(posterior.likelihood.model.exchanged(truth[:10]), truth[10])
+    return np.append(posterior.likelihood.model.exchange_piers(truth[:10]), truth[10])
 
 
 def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict, messages: dict) -> None:

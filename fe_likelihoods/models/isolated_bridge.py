@@ -227,7 +227,7 @@ class IsolatedBridge(ThreadedModel):
         kept = np.concatenate([values[:N_STATES], values[14:16], rows])[:, :: self.every]
         return BridgeHistory(names, kept, beyond, iterations)
 
-    def exchanged(self, thetas: np.ndarray) -> np.ndarray:
+    def exchange_piers(self, thetas: np.ndarray) -> np.ndarray:
         """Exchange the devices of the two piers: multiples (..., 10) with the same physical values at the other pier.
 
         If the piers are equal and the data do not identify them, the likelihood is the same at both points. The map

@@ -151,7 +151,7 @@ def exact_weight(samples: np.ndarray, posterior: Posterior) -> float:
     first = samples[:, 1] < samples[:, 4]
     larger = first if first.mean() > 0.5 else ~first
     inside = samples[larger]
-    other = np.column_stack([model.exchanged(inside[:, :10]), inside[:, 10]])
+    other = np.column_stack([model.exchange_piers(inside[:, :10]), inside[:, 10]])
     ratio = float(np.mean(np.exp(posterior.log_prior(other) - posterior.log_prior(inside))))
     return 1.0 / (1.0 + ratio) if first.mean() > 0.5 else ratio / (1.0 + ratio)
 
