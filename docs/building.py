@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+import types
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
@@ -64,5 +65,5 @@ def show_kernels_as_functions(app, env, docnames) -> None:
 
 
 def skip_fields(app, what, name, obj, skip, options):
-    """Leave out the fields of NamedTuples, which the docstring of their class describes."""
-    return True if type(obj).__name__ == "_tuplegetter" else None
+    """Leave out fields of NamedTuples, which the docstring of their class describes, and aliases of types."""
+    return True if type(obj).__name__ == "_tuplegetter" or isinstance(obj, types.GenericAlias) else None

@@ -1,7 +1,7 @@
-"""The pictures of README and documentation: `make figures` leaves them in docs/figures, small and alike on every run.
+"""Make the figures of README and documentation (`make figures`): small files in docs/figures, the same on every run.
 
-Those of the oscillator are made by tutorial 01, that of the update by tutorial 02 in its reduced setting (minutes);
-the section and the loops are drawn by the models themselves.
+Tutorial 01 makes those of the oscillator. Tutorial 02 in its reduced setting makes that of the update, which takes
+minutes. The models draw their section and their hysteresis loops.
 """
 
 import os
@@ -21,7 +21,7 @@ from fe_likelihoods import problems
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
-OF_TUTORIALS = {
+FIGURES_OF_TUTORIALS = {  # script and options: name of its figure, name here
     "01_linear_oscillator.py": {name: f"oscillator_{name}" for name in ("record", "corner", "fit", "prediction")},
     "02_bridge_column.py --preset reduced": {"fig5_response": "column_response"},
 }
@@ -29,7 +29,7 @@ WIDEST = 1100  # pixels
 
 
 def shrink(source: Path, name: str) -> None:
-    """A picture into docs/figures, with 128 colours: a third of its size, and no difference to the eye."""
+    """Save a figure in docs/figures with 128 colours, which look the same and need a third of the space."""
     picture = Image.open(source).convert("RGB")
     picture.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
     picture = picture.quantize(128, dither=Image.Dither.NONE)
@@ -37,7 +37,7 @@ def shrink(source: Path, name: str) -> None:
 
 
 def model_figures() -> dict:
-    """Figures that models draw of themselves, by name."""
+    """Figures that the models draw, by name."""
     posterior = problems.bridge_column(every=8)
     column = posterior.likelihood.model
     strong = replace(column, loading=column.loading.scale(2.5))
@@ -55,12 +55,12 @@ def model_figures() -> dict:
 if __name__ == "__main__":
     TARGET.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        for tutorial, pictures in OF_TUTORIALS.items():
+        for tutorial, figures in FIGURES_OF_TUTORIALS.items():
             script, *options = tutorial.split()
             command = [sys.executable, ROOT / "tutorials" / script, *options, "--out", folder]
             subprocess.run(command, check=True, env={k: v for k, v in os.environ.items() if k != "FAST"})
-            for name, as_ in pictures.items():
-                shrink(Path(folder) / f"{name}.png", as_)
+            for name, new_name in figures.items():
+                shrink(Path(folder) / f"{name}.png", new_name)
         for name, figure in model_figures().items():
             figure.savefig(Path(folder) / f"{name}.png", dpi=85)
             shrink(Path(folder) / f"{name}.png", name)
