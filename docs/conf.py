@@ -22,6 +22,7 @@ release = metadata.version("fe-likelihoods")
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # a copy of MathJax in the pages: formulas are shown without a network
     "numpydoc",
     "sphinx.ext.viewcode",
     "sphinx_gallery.gen_gallery",
@@ -29,7 +30,9 @@ extensions = [
 exclude_patterns = ["_build", "tutorials/*.ipynb", "tutorials/*.json", "tutorials/*.py"]
 html_theme = "furo"
 html_title = f"fe-likelihoods {release}"
-html_show_sphinx = False
+html_show_sphinx = html_show_copyright = False
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 default_role = "code"
 
 numpydoc_show_class_members = False  # autodoc shows the members with their docstrings
