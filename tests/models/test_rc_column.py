@@ -438,6 +438,7 @@ def test_copies_in_other_processes_give_the_same_response(column, pushed):
         copy = pickle.loads(pickle.dumps(model))
         assert copy.fingerprint == model.fingerprint
         np.testing.assert_array_equal(copy.simulate(theta), model.simulate(theta))
+        assert len(pickle.dumps(model)) == len(pickle.dumps(replace(model))), "prepared inputs are not sent"
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         (response,) = pool.map(column.simulate, [PAPER])
     np.testing.assert_array_equal(response, column.simulate(PAPER))

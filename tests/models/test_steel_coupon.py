@@ -68,6 +68,12 @@ def test_fingerprint_depends_on_the_strains(coupon):
     assert replace(coupon, unit="ksi").fingerprint == coupon.fingerprint
 
 
+def test_the_response_is_plotted_per_step(coupon):
+    pytest.importorskip("matplotlib").use("agg")
+    (axes,) = coupon.plot_response(np.ones(6)).axes
+    assert axes.get_xlabel() == "step" and "MPa" in axes.get_ylabel()
+
+
 @pytest.mark.parametrize(
     ("theta", "words"),
     [
