@@ -1,4 +1,4 @@
-"""Units: factors against their definitions, spellings of file headers, and what is refused."""
+"""Units: factors against their definitions, spellings in file headers, and errors."""
 
 import numpy as np
 import pytest
@@ -48,13 +48,13 @@ def test_spellings_of_file_headers(spelling):
 
 
 @pytest.mark.parametrize("spelling", ["mN", "mPa", "mpa", "mn"])
-def test_milli_is_never_read_as_mega(spelling):
+def test_milli_is_not_read_as_mega(spelling):
     with pytest.raises(ValueError, match="unknown unit"):
         find_unit(spelling)
     assert find_unit("MPA").factor == 1e6
 
 
-def test_unknown_unit_lists_what_is_known():
+def test_error_for_an_unknown_unit_lists_the_known_ones():
     with pytest.raises(ValueError, match="'furlong'.*in/s2.*kip.*ksi"):
         to_si(1.0, "furlong")
     with pytest.raises(ValueError, match="unknown unit None"):

@@ -1,4 +1,4 @@
-"""Uncertainty propagation: closed forms, what streams against what is computed at once, and models that misbehave."""
+"""Uncertainty propagation: closed forms, streaming against direct computation, limits of memory, failing models."""
 
 import logging
 import tracemalloc
@@ -10,7 +10,6 @@ from scipy import stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.plots.predictions import plot_bands
 from fe_likelihoods.prediction.averaging import average_predictions
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
@@ -28,7 +27,7 @@ NOISE = np.array([0.3, 0.05])
 
 
 class Line:
-    """Responses linear in the parameters: of Gaussian parameters they are Gaussian. May fail at small offsets."""
+    """Responses linear in the parameters, Gaussian for Gaussian parameters. With `fails`, small offsets fail."""
 
     parameter_names = NAMES
     channels = (Channel("a", "acceleration", "g"), Channel("b", "displacement", "cm"))
@@ -75,7 +74,7 @@ def test_gaussian_closed_form_within_its_stated_errors(rng):
     model = Line()
     p = quiet(model, draws(rng, 4000))
     mean, variance = closed_form(model)
-    # few independent numbers are behind the many steps (two parameters), so four standard errors hold for all of them
+    # All steps depend on two parameters only, so that four standard errors are enough for all of them together.
     assert np.all(np.abs(p.mean - mean) < 4.0 * p.standard_error)
     assert np.allclose(p.standard_error, np.sqrt(p.variance / 4000))
     assert np.all(np.abs(p.variance / variance - 1.0) < 4.0 * np.sqrt(2.0 / 4000))
@@ -85,11 +84,11 @@ def test_gaussian_closed_form_within_its_stated_errors(rng):
         density = stats.norm.pdf(stats.norm.ppf(probability)) / np.sqrt(variance)
         asymptotic = np.sqrt(probability * (1.0 - probability) / 4000) / density
         assert np.all((error > 0.5 * asymptotic) & (error < 2.0 * asymptotic))
-    # negative control: the errors are not so wide that anything passes
+    # Negative control: the errors are not so large that any mean would pass.
     assert np.any(np.abs(p.mean - 1.05 * mean) > 4.0 * p.standard_error)
 
 
-def test_streaming_is_all_at_once_and_copies_count(rng):
+def test_streaming_agrees_with_direct_computation_and_copies_count(rng):
     model = Line()
     samples = draws(rng, 300)[rng.integers(0, 300, size=500)]
     responses = np.array([Line().simulate(theta) for theta in samples])
@@ -110,7 +109,7 @@ def test_streaming_is_all_at_once_and_copies_count(rng):
 
 
 def test_a_small_spread_about_a_large_value(rng):
-    """The mean of squares less the squared mean would give nonsense here."""
+    """The mean of squares minus the squared mean has no correct digit here."""
     numbers = 1e9 + 1e-2 * rng.normal(size=5000)
     moments = RunningMoments()
     for part in np.split(numbers, 50):
@@ -120,7 +119,7 @@ def test_a_small_spread_about_a_large_value(rng):
 
 
 @pytest.mark.parametrize("huge", [1e50, 1e200])
-def test_responses_that_have_blown_up_stay_numbers(rng, huge):
+def test_unstable_responses_give_numbers(rng, huge):
     class Unstable(Line):
         def simulate(self, theta):
             return super().simulate(theta) * (huge if theta[0] > 1.3 else 1.0)
@@ -132,7 +131,7 @@ def test_responses_that_have_blown_up_stay_numbers(rng, huge):
 
 
 class Big:
-    """Long responses, made in batches."""
+    """A model with long responses and batches."""
 
     parameter_names = ("x",)
     channels = tuple(Channel(f"c{k}", "acceleration", "g") for k in range(4))
@@ -150,7 +149,7 @@ class Big:
 
 
 def test_memory_is_bounded(rng, caplog):
-    # 240 MB of responses, 120 MB in single precision; in order, so that a part from one end would be seen
+    # 240 MB of responses, 120 MB in single precision. Sorted, so that a subsample from one end would be noticed.
     samples = np.sort(rng.normal(size=(1500, 1)), axis=0)
     memory = 8 * 2**20
     tracemalloc.start()
@@ -170,7 +169,7 @@ def test_memory_is_bounded(rng, caplog):
     assert np.all(np.abs(p.quantiles[:, 0, 0] - stats.norm.ppf(p.probabilities)) < 5.0 * p.quantile_error[:, 0, 0])
 
 
-def test_numbers_are_kept_all_in_the_order_of_the_samples(rng):
+def test_all_numbers_are_retained_in_the_order_of_the_samples(rng):
     samples = draws(rng, 60)[rng.integers(0, 60, size=100)]
     p = quiet(Line(), samples, quantity=peak("b"), memory_bytes=0)
     expected = [np.abs(Line().simulate(theta)[1]).max() for theta in samples]
@@ -201,10 +200,10 @@ def test_noise_adds_its_variance(rng):
     clean, noisy = quiet(posterior, samples), quiet(posterior, samples, noise=True, seed=3)
     assert np.array_equal(clean.mean, noisy.mean) and np.array_equal(clean.standard_error, noisy.standard_error)
     assert np.allclose(noisy.variance - clean.variance, np.mean(sigma**2, axis=0)[:, None])
-    # the quantiles of the mixture, from one draw a sample, against all of it
+    # Quantiles from one draw of the noise per sample, against the distribution of the mixture.
     mean = np.einsum("cpt,np->nct", posterior.likelihood.model.design, samples[:, :2])
     below = stats.norm.cdf((noisy.quantile(0.05) - mean) / sigma[:, :, None]).mean(axis=0)
-    # 50 quantiles of (nearly) independent noise, 3000 draws each
+    # 50 quantiles of nearly independent noise, 3000 draws each.
     assert np.all(np.abs(below - 0.05) < 4.5 * np.sqrt(0.05 * 0.95 / 3000))
     peaks = quiet(posterior, samples, noise=True, quantity=peak("a"), seed=3)
     assert peaks.mean > quiet(posterior, samples, quantity=peak("a")).mean + 10.0 * peaks.standard_error
@@ -229,7 +228,7 @@ def oscillator(rng):
 
 
 def test_coverage_of_measurements(oscillator, rng):
-    """Measurements from the same posterior predictive lie in the 5-95 % band nine times out of ten."""
+    """90 % of the measurements drawn from the predictive distribution lie in the 5-95 % band."""
     sigma = np.array([0.05, 0.002])
     truth = np.array([1.05, 0.9])
     measured = oscillator.simulate(truth) + sigma[:, None] * rng.normal(size=(2, 400))
@@ -237,10 +236,10 @@ def test_coverage_of_measurements(oscillator, rng):
     samples = np.hstack([rng.normal(truth, 1e-4, size=(600, 2)), np.tile(sigma, (600, 1))])
     measurements = posterior.likelihood.measurements
     noisy = quiet(posterior, samples, noise=True, seed=0)
-    # 400 independent samples in each channel, and a band whose own level is known from 600 draws
+    # 400 independent samples per channel, and the error of a band from 600 draws.
     error = np.sqrt(0.9 * 0.1 * (1 / 400 + 1 / (600 * 400) * 2))
     assert np.all(np.abs(noisy.coverage(measurements) - 0.9) < 4.0 * error)
-    assert np.all(quiet(posterior, samples).coverage(measurements) < 0.2)  # the response is known far better
+    assert np.all(quiet(posterior, samples).coverage(measurements) < 0.2)  # the band of the response is much narrower
     swapped = measurements.select(["displacement", "acceleration"])
     assert np.array_equal(noisy.coverage(swapped), noisy.coverage(measurements))
     expected = np.sqrt(np.square(noisy.mean - measured).sum(axis=1) / np.square(measured).sum(axis=1))
@@ -269,7 +268,7 @@ def test_fit_measures(oscillator, rng):
     assert np.allclose(fit_measures(posterior, samples), expected)
     assert posterior.likelihood.simulations == 6
     assert np.array_equal(fit_measures(posterior, samples[:, :2]), fit_measures(posterior, samples))
-    assert posterior.likelihood.simulations == 6  # remembered
+    assert posterior.likelihood.simulations == 6  # cached
     samples[2, 0] = -1.0
     assert np.isnan(fit_measures(posterior, samples)).all(axis=1).tolist() == [False, False, True, False, False, False]
     with pytest.raises(ValueError, match="not zero"):
@@ -333,7 +332,7 @@ def test_effective_sample_size_widens_the_errors(rng):
     samples = draws(rng, 400)
     full, quarter = quiet(Line(), samples), quiet(Line(), samples, effective_sample_size=100)
     assert np.allclose(quarter.standard_error, 2.0 * full.standard_error)
-    ratio = np.median(quarter.quantile_error[1] / full.quantile_error[1])  # of the median, whose tails are even
+    ratio = np.median(quarter.quantile_error[1] / full.quantile_error[1])  # of the median, with symmetric tails
     assert 1.4 < ratio < 2.8
 
 
@@ -411,19 +410,3 @@ def test_refused_otherwise(oscillator, rng):
     posterior.likelihood.noise = Mute()
     with pytest.raises(ValueError, match="Mute cannot be drawn from.*standard_deviations"):
         quiet(posterior, np.ones((5, 3)), noise=True)
-
-
-def test_plot_bands(oscillator, rng):
-    samples = np.hstack([rng.normal(1.0, 0.02, size=(40, 2)), np.full((40, 2), 0.01)])
-    posterior = with_noise(oscillator, oscillator.simulate([1.0, 1.0]))
-    p = quiet(posterior, samples, noise=True)
-    figure = plot_bands(p, posterior.likelihood.measurements)
-    acceleration, displacement = figure.axes
-    assert acceleration.get_ylabel() == "acceleration [g]" and displacement.get_ylabel() == "displacement [cm]"
-    assert np.allclose(displacement.lines[-1].get_ydata(), 100.0 * p.mean[1])
-    assert "5-95 % with noise" in [text.get_text() for text in acceleration.get_legend().get_texts()]
-    assert len(plot_bands(p, channels=["displacement"]).axes) == 1
-    with pytest.raises(ValueError, match="some of acceleration, displacement"):
-        plot_bands(p, channels=["force"])
-    with pytest.raises(ValueError, match="the measurements have 200"):
-        plot_bands(p, posterior.likelihood.measurements.decimate(2))

@@ -1,0 +1,18 @@
+"""Fixtures of the tests of figures."""
+
+import matplotlib
+import pytest
+
+from fe_likelihoods.signals.records import Record
+
+
+@pytest.fixture(autouse=True)
+def figures_without_a_window():
+    matplotlib.use("Agg")
+    yield
+    matplotlib.pyplot.close("all")
+
+
+@pytest.fixture
+def record(rng):
+    return Record("noise", 0.02, rng.normal(size=300))

@@ -1,0 +1,88 @@
+"""Figures of predictions: bands and fragility curves, against the values that they show."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    FELikelihood,
+    HalfNormal,
+    LinearOscillator,
+    Measurements,
+    Posterior,
+    Prior,
+    TruncatedNormal,
+    fragility,
+    peak,
+    plot_bands,
+    plot_fragility,
+    propagate,
+)
+from fe_likelihoods.units import G0
+from tests.plots.reading import shows, texts
+
+
+@pytest.fixture
+def posterior(record):
+    model = LinearOscillator(record, period=0.6)
+    prior = {name: TruncatedNormal(1.0, 0.5) for name in model.parameter_names}
+    prior |= {f"sigma_{channel.name}": HalfNormal(1.0) for channel in model.channels}
+    measured = Measurements(model.channels, model.dt, model.simulate([1.0, 1.0]))
+    return Posterior(FELikelihood(model, measured), Prior(prior))
+
+
+@pytest.fixture
+def samples(rng):
+    return np.hstack([rng.normal(1.0, 0.02, size=(40, 2)), np.full((40, 2), 0.01)])
+
+
+def test_bands(posterior, samples):
+    prediction = propagate(posterior, samples, noise=True, progress=False)
+    figure = prediction.plot(posterior.likelihood.measurements)
+    acceleration, displacement = figure.axes
+    assert acceleration.get_ylabel() == "acceleration [g]" and displacement.get_ylabel() == "displacement [cm]"
+    assert displacement.get_xlabel() == "time [s]" and displacement.get_xlim() == (0.0, prediction.time[-1])
+    assert texts(acceleration) == ["5-95 % with noise", "measured", "mean"]
+    for axes, k, factor in ((acceleration, 0, 1 / G0), (displacement, 1, 100.0)):
+        measured, mean = axes.lines
+        np.testing.assert_allclose(mean.get_ydata(), factor * prediction.mean[k])
+        np.testing.assert_allclose(measured.get_ydata(), factor * posterior.likelihood.measurements.values[k])
+        band = axes.collections[0].get_paths()[0].vertices[:, 1]
+        assert band.min() == pytest.approx(factor * prediction.quantile(0.05)[k].min())
+        assert band.max() == pytest.approx(factor * prediction.quantile(0.95)[k].max())
+        assert shows(axes, axes.lines) and axes.get_ylim()[0] <= band.min() <= band.max() <= axes.get_ylim()[1]
+
+
+def test_channels_of_bands_can_be_chosen(posterior, samples):
+    prediction = propagate(posterior, samples, progress=False)
+    measured = posterior.likelihood.measurements
+    assert [axes.get_ylabel() for axes in plot_bands(prediction, channels=["displacement"]).axes] == [
+        "displacement [cm]"
+    ]
+    first, second = plot_bands(prediction, measured.select(["displacement"])).axes
+    assert len(first.lines) == 1 and len(second.lines) == 2, "channels without measurements are drawn without them"
+    assert texts(first) == ["5-95 %", "mean"]
+    with pytest.raises(ValueError, match="some of acceleration, displacement"):
+        plot_bands(prediction, channels=["force"])
+    with pytest.raises(ValueError, match="the measurements have 150"):
+        plot_bands(prediction, measured.decimate(2))
+    with pytest.raises(ValueError, match="histories"):
+        plot_bands(propagate(posterior, samples, quantity=peak("displacement"), progress=False))
+
+
+def test_fragility(posterior, record, rng):
+    samples = rng.normal(1.0, 0.2, size=(40, 2))
+    records = [record.scale(factor) for factor in (0.7, 0.9, 1.0, 1.1, 1.4)]
+    limit = float(np.median(propagate(posterior, samples, quantity=peak("displacement"), progress=False).values))
+    result = fragility(posterior, samples, records, peak("displacement"), limit, progress=False)
+    (axes,) = plot_fragility(result).axes
+    points, curve = axes.lines
+    np.testing.assert_allclose(points.get_xdata(), result.intensity / G0)
+    np.testing.assert_allclose(points.get_ydata(), result.probability)
+    np.testing.assert_allclose(curve.get_ydata(), result.curve.probability(G0 * curve.get_xdata()), atol=1e-12)
+    assert shows(axes, axes.lines)
+    assert axes.get_xlabel() == "peak ground acceleration [g]"
+    assert axes.get_ylabel() == "probability of exceedance [-]"
+    assert "records" in texts(axes) and any(text.startswith("median ") for text in texts(axes))
+    (axes,) = plot_fragility(result._replace(curve=None), "intensity", unit=None, si_unit="m/s2").axes
+    assert axes.get_xlabel() == "intensity [m/s2]" and len(axes.lines) == 1
+    np.testing.assert_allclose(axes.lines[0].get_xdata(), result.intensity)

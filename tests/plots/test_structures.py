@@ -1,0 +1,78 @@
+"""Figures of structures: responses, hysteresis loops and sections, against the values of the models."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.isolated_bridge import IsolatedBridge
+from fe_likelihoods.models.rc_column import Patches, RCColumn
+from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
+from fe_likelihoods.signals.records import DisplacementHistory
+from tests.plots.reading import shows, texts
+
+
+def test_response_of_the_bridge():
+    data = isolated_bridge_data()
+    bridge = IsolatedBridge(data.record.trim(0.0, 2.0), outputs=10, every=2, step=1e-3)
+    figure = bridge.plot_response(np.ones(10), data.measurements.trim(0.0, 2.0))
+    assert [axes.get_ylabel() for axes in figure.axes][:2] == ["Ub_1 [mm]", "Fb_1 [kN]"] and len(figure.axes) == 10
+    assert all("RRMSE" in texts(axes)[1] for axes in figure.axes)
+    first, second = bridge.plot_hysteresis(np.ones(10)).axes
+    history = replace(bridge, every=1).history(np.ones(10))
+    x, y = second.lines[2].get_data()  # after the two lines through the origin
+    np.testing.assert_allclose(x, 1e3 * history["Ub_2"])
+    np.testing.assert_allclose(y, 1e-3 * history["Fb_2"])
+    assert shows(second, [second.lines[2]])
+    assert second.get_xlabel() == "bearing displacement [mm]" and first.get_ylabel() == "isolator force [kN]"
+
+
+def test_hysteresis_of_a_shaken_column():
+    motion = bridge_column_data().record.resample(8 / 256).trim(5.0, 8.0)
+    column = RCColumn.lhpost(motion, parameters=("Ec",))
+    history = column.history([0.6])
+    section, top = column.plot_hysteresis([0.6]).axes
+    assert section.get_xlabel() == "curvature [1/in]" and section.get_ylabel() == "moment [kip in]"
+    kip = 4448.2216152605
+    x, y = section.lines[2].get_data()
+    np.testing.assert_allclose(x, 0.0254 * history["base curvature"])
+    np.testing.assert_allclose(y, history["base moment"] / (kip * 0.0254))
+    x, y = top.lines[2].get_data()
+    np.testing.assert_allclose(x, history["relative displacement"] / 0.0254)
+    np.testing.assert_allclose(y, history["force"] / kip)
+    assert np.polyfit(x, y, 1)[0] > 0.0 and np.ptp(y) > 10.0
+    assert shows(section, [section.lines[2]]) and shows(top, [top.lines[2]])
+
+
+def test_the_response_to_an_imposed_displacement_is_drawn_over_steps():
+    history = DisplacementHistory("push", np.linspace(0.0, 0.1, 12))
+    column = RCColumn.lhpost(history, parameters=("Ec",), units=(("force", "MN"),))
+    (axes,) = column.plot_response([1.0]).axes
+    assert axes.get_xlabel() == "step" and axes.get_ylabel() == "force [MN]"
+    section, top = column.plot_hysteresis([1.0]).axes
+    assert section.get_ylabel() == "moment [MN m]" and top.get_xlabel() == "displacement [m]"
+    np.testing.assert_allclose(top.lines[2].get_xdata(), history.displacement, atol=1e-12)
+
+
+@pytest.mark.parametrize("mesh", [40, Patches(20, 10, 2)])
+def test_section(record, mesh):
+    column = RCColumn.lhpost(record, mesh=mesh)
+    axes = column.plot_section()
+    cover, core = axes.patches
+    assert 2 * cover.radius == pytest.approx(48.0) and 2 * core.radius == pytest.approx(48.0 - 4.0 - 0.625)
+    lines, bars = axes.collections
+    concrete, _, steel = column.section.fibers()
+    centers = np.array([path.get_extents().get_points().mean(axis=0) for path in bars.get_paths()])
+    assert len(centers) == 18
+    np.testing.assert_allclose(np.unique(np.round(centers[:, 0], 9)), np.unique(np.round(steel[:, 0] / 0.0254, 9)))
+    if mesh == 40:
+        edges = np.array([segment[0, 0] for segment in lines.get_segments()])
+        assert len(edges) == 39
+        inside = np.searchsorted(edges, concrete[:, 0] / 0.0254)
+        assert np.all(np.bincount(inside, minlength=40) <= 1), "no strip has two fibers of the core"
+    else:
+        assert len(lines.get_segments()) == 9 + 1 + 20
+    for low, high in (axes.get_xlim(), axes.get_ylim()):
+        assert low < -cover.radius < cover.radius < high
+    assert axes.get_xlabel() == "position in the direction of loading [in]"
+    assert axes.get_aspect() == 1.0 and "18 bars, diameter 1.41 in" in texts(axes)

@@ -1,0 +1,35 @@
+"""A structure whose fragility is known."""
+
+import numpy as np
+
+from fe_likelihoods.signals.channels import Channel
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.model import SimulationFailed
+from fe_likelihoods.units import G0
+
+__all__ = ["DISPERSION", "MEDIAN", "Flexible"]
+
+MEDIAN, DISPERSION = 0.4 * G0, 0.35
+
+
+class Flexible:
+    """Displacement = flexibility times base acceleration. With a lognormal flexibility the fragility is lognormal."""
+
+    parameter_names = ("log_flexibility",)
+    channels = (Channel("displacement", "relative displacement", "cm"),)
+    fingerprint = "flexible"
+
+    def __init__(self, record, collapse=np.inf):
+        self.record, self.collapse = record, collapse
+        self.dt, self.n_steps = record.dt, record.n_steps
+
+    def with_record(self, record):
+        if not isinstance(record, Record):
+            raise ValueError(f"expected a Record; got {type(record).__name__}")
+        return type(self)(record, self.collapse)
+
+    def simulate(self, theta):
+        displacement = 0.1 / MEDIAN * np.exp(theta[0]) * self.record.acceleration
+        if np.abs(displacement).max() > self.collapse:
+            raise SimulationFailed("collapse")
+        return displacement[None]

@@ -1,0 +1,123 @@
+"""Fragility: a structure whose capacity is known, failed simulations, and points that determine no curve."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.prediction.fragility import fit_fragility, fragility
+from fe_likelihoods.prediction.quantities import peak
+from fe_likelihoods.simulation.model import SimulationFailed
+from fe_likelihoods.units import G0
+from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible
+
+
+def test_a_known_fragility_is_found(record, rng):
+    samples = rng.normal(0.0, DISPERSION, size=(800, 1))
+    records = [record.scale(a * G0) for a in (0.15, 0.25, 0.35, 0.45, 0.6, 0.9)]
+    settings = dict(unit="cm", seed=1, progress=False)
+    result = fragility(Flexible(record), samples, records, peak("displacement"), 10.0, **settings)
+    assert np.allclose(result.intensity, np.array([0.15, 0.25, 0.35, 0.45, 0.6, 0.9]) * G0)
+    exact = stats.norm.cdf(np.log(result.intensity / MEDIAN) / DISPERSION)
+    assert np.all(np.abs(result.probability - exact) < 4.0 * np.sqrt(exact * (1.0 - exact) / 800))
+    curve = result.curve
+    assert abs(curve.median - MEDIAN) < 4.0 * curve.median_error < 0.1 * MEDIAN
+    assert abs(curve.dispersion - DISPERSION) < 4.0 * curve.dispersion_error < 0.3 * DISPERSION
+    # All records share the samples, so that the error is that of the median of 800 lognormal draws.
+    assert curve.median_error == pytest.approx(MEDIAN * DISPERSION / np.sqrt(800), rel=0.6)
+    assert curve.probability(MEDIAN) == pytest.approx(0.5, abs=0.08)
+    fewer = fragility(
+        Flexible(record), samples, records, peak("displacement"), 10.0, effective_sample_size=200, **settings
+    )
+    assert fewer.curve.median_error == pytest.approx(2.0 * curve.median_error, rel=0.4)
+    other = fragility(
+        Flexible(record),
+        samples,
+        records,
+        peak("displacement"),
+        10.0,
+        intensity=lambda r: np.std(r.acceleration),
+        **settings,
+    )
+    scale = np.std(record.acceleration)
+    assert other.curve.median == pytest.approx(scale * curve.median)
+
+
+def test_a_curve_from_too_few_exceedances_has_an_infinite_error(record, rng):
+    """One exceedance among 60 samples determines the slope, and a third of the resamplings do not contain it."""
+    samples = np.linspace(-0.2, 0.2, 60)[:, None]
+    records = [record.scale(MEDIAN * np.exp(-0.197)), record.scale(MEDIAN * np.exp(0.1))]
+    curve = fragility(Flexible(record), samples, records, peak("displacement"), 0.1, progress=False).curve
+    assert curve.median > 0.0 and np.isinf(curve.median_error) and np.isinf(curve.dispersion_error)
+
+
+def test_collapse_can_count_as_an_exceedance(record, rng):
+    """If simulations fail beyond the limit, exceedances are missing unless failures count as exceedances."""
+    samples = rng.normal(0.0, DISPERSION, size=(300, 1))
+    records = [record.scale(a * G0) for a in (0.3, 0.4, 0.6)]
+    model = Flexible(record, collapse=0.15)
+    arguments = (samples, records, peak("displacement"), 0.1)
+    whole = fragility(Flexible(record), *arguments, progress=False)
+    counted = fragility(model, *arguments, progress=False, failures_exceed=True)
+    assert np.allclose(counted.probability, whole.probability)
+    left_out = fragility(model, *arguments, progress=False)
+    assert left_out.probability[-1] < whole.probability[-1] - 0.04
+    assert np.array_equal(left_out.n_failed, counted.n_failed) and left_out.n_failed[-1] > 100
+    with pytest.raises(SimulationFailed, match="record 'motion': nothing to predict"):
+        fragility(Flexible(record, collapse=1e-6), *arguments, progress=False)
+    assert fragility(Flexible(record, collapse=1e-6), *arguments, progress=False, failures_exceed=True).curve is None
+
+
+def test_fit_is_the_maximum_of_the_likelihood(rng):
+    x, n = np.array([0.1, 0.2, 0.3, 0.5, 0.8]), np.full(5, 40.0)
+    k = np.array([1.0, 9.0, 17.0, 31.0, 38.0])
+    curve = fit_fragility(x, k, n)
+
+    def log_likelihood(median, dispersion):
+        return stats.binom.logpmf(k, n, stats.norm.cdf(np.log(x / median) / dispersion)).sum()
+
+    best = log_likelihood(curve.median, curve.dispersion)
+    for step in (0.99, 1.01):
+        assert log_likelihood(step * curve.median, curve.dispersion) < best
+        assert log_likelihood(curve.median, step * curve.dispersion) < best
+
+
+@pytest.mark.parametrize(
+    ("k", "message"),
+    [
+        ([0, 0, 0], "none of the trials exceed"),
+        ([9, 9, 9], "all of the trials exceed"),
+        ([0, 0, 9], "do not determine the slope"),
+        ([0, 4, 9], "do not determine the slope"),
+        ([8, 4, 1], "does not rise"),
+        ([9, 9, 0], "does not rise"),
+        ([1, 12, 2], "0 <= exceedances <= trials"),
+        ([1, 2], "shapes"),
+    ],
+)
+def test_points_that_do_not_determine_a_curve_are_refused(k, message):
+    with pytest.raises(ValueError, match=message):
+        fit_fragility([0.1, 0.2, 0.4], k, [9, 9, 9])
+
+
+def test_refused_before_any_simulation(record, monkeypatch):
+    model, samples = LinearOscillator(record), np.ones((5, 2))
+    monkeypatch.setattr(LinearOscillator, "simulate", lambda self, theta: pytest.fail("no simulation may run"))
+
+    def refused(message, quantity=peak("displacement"), threshold=0.1, records=(record,), samples=samples, **settings):
+        with pytest.raises(ValueError, match=message):
+            fragility(model, samples, records, quantity, threshold, progress=False, **settings)
+
+    refused("expected a unit of displacement", unit="g")
+    refused("one threshold; got an array", threshold=[0.1, 0.2])
+    refused("one number as quantity", quantity="displacement")
+    refused("one number as quantity", quantity=[peak("displacement"), peak("acceleration")])
+    refused("no channel 'force'", quantity=peak("force"))
+    refused("needs one record or more", records=[])
+    refused("expected a Record as excitation", records=[record, 3.0])
+    refused("must be positive and finite", records=[record, record.scale(0.0)])
+    refused("2 parameters", samples=np.ones((5, 3)))
+    refused("first is sample 0", samples=np.full((5, 2), np.nan))
+    refused("sets record itself", record=record)
+    refused("effective_sample_size", effective_sample_size=-1)
+    refused("level", level=2.0)

@@ -1,0 +1,418 @@
+"""Readers of ground motions and measured responses, on real files where these exist.
+
+There is no real AT2 file among the reference data, so both forms of its header are written here with synthetic numbers.
+The same holds for the newer CSMIP form and for COSMOS V2. The older CSMIP form is read from real zip archives.
+"""
+
+import csv
+import re
+import zipfile
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.signals.channels import Channel
+from fe_likelihoods.signals.readers import read_at2, read_columns, read_csv, read_imposed_test, read_v2
+from fe_likelihoods.units import G0, to_si
+
+# Peak ground acceleration [g], number of samples and step [s]: the table in the README of the records.
+REAL_RECORDS = {
+    "coalinga_1983_parkfield_fz14_000": (0.261, 3250, 0.02),
+    "coalinga_1983_parkfield_fz14_090": (0.273, 3251, 0.02),
+    "el_centro_1940_ns_peknold": (0.319, 1559, 0.02),
+    "imperial_valley_1979_meloland_freefield_270": (0.299, 5694, 0.01),
+    "imperial_valley_1979_meloland_freefield_360": (0.311, 5690, 0.01),
+    "kobe_1995_nishi_akashi_090": (0.503, 4096, 0.01),
+    "loma_prieta_1989_apeel2_redwood_city_133": (0.227, 7183, 0.005),
+    "loma_prieta_1989_apeel2_redwood_city_43": (0.278, 7184, 0.005),
+    "loma_prieta_1989_apeel2_redwood_city_up": (0.086, 7165, 0.005),
+    "loma_prieta_1989_sf_1295_shafter_270": (0.072, 6004, 0.005),
+    "loma_prieta_1989_sf_1295_shafter_360": (0.106, 6001, 0.005),
+    "northridge_1994_big_tujunga_352": (0.247, 1887, 0.02),
+    "petrolia_1992_rio_dell_freefield_270": (0.380, 3000, 0.02),
+    "petrolia_1992_rio_dell_freefield_360": (0.543, 3000, 0.02),
+}
+PAINTER = "measured/painter_street_bridge/petrolia_25apr1992_ce89324p.zip"
+MELOLAND = "measured/meloland_bridge/imperialvalley79_ce01336p.zip"
+
+
+TOP = Channel("top", "absolute acceleration", "g")
+DRIFT = Channel("drift", "relative displacement", "in")
+
+
+def write_at2(path, values, header, units="ACCELERATION TIME SERIES IN UNITS OF G"):
+    rows = ["".join(f"{value:15.7E}" for value in values[i : i + 5]) for i in range(0, len(values), 5)]
+    path.write_text("\n".join(["PEER NGA STRONG MOTION DATABASE RECORD", "Somewhere, 1/1/1999", units, header, *rows]))
+    return path
+
+
+class TestAT2:
+    VALUES = np.sin(np.arange(23.0))
+
+    @pytest.mark.parametrize(
+        ("header", "units"),
+        [
+            ("NPTS=     23, DT=   .0050 SEC", "ACCELERATION TIME SERIES IN UNITS OF G"),
+            ("NPTS=  23, DT= .00500 SEC,", "ACCELERATION TIME HISTORY IN UNITS OF G. FILTER POINTS: HP=0.1 Hz"),
+            ("npts= 23 ,  dt=5.0e-3 sec", "acceleration time series in units of g"),
+            ("   23    0.0050   NPTS, DT", "ACCELERATION TIME HISTORY IN UNITS OF G"),
+            (" 23  .005   npts,   dt", "ACCELERATION TIME HISTORY IN UNITS   OF   G"),
+        ],
+    )
+    def test_both_forms_of_the_header(self, tmp_path, header, units):
+        record = read_at2(write_at2(tmp_path / "NIS090.AT2", self.VALUES, header, units))
+        np.testing.assert_allclose(record.acceleration, self.VALUES * G0, atol=1e-7 * G0)
+        assert (record.dt, record.name, record.source) == (0.005, "NIS090", "NIS090.AT2: Somewhere, 1/1/1999")
+
+    def test_units_from_the_caller(self, tmp_path):
+        path = write_at2(tmp_path / "a.at2", self.VALUES, "NPTS= 23, DT= .01 SEC", "ACCELERATION")
+        assert read_at2(path, units="cm/s2").acceleration[1] == pytest.approx(0.01 * np.sin(1), rel=1e-6)
+        with pytest.raises(ValueError, match=r"a.at2 does not state the unit of its acceleration: give units="):
+            read_at2(path)
+
+    @pytest.mark.parametrize(
+        ("header", "units", "given", "message"),
+        [
+            ("NPTS= 24, DT= .01 SEC", "UNITS OF G", None, "line 4 announces 24 samples, the file has 23"),
+            ("NPTS= 22, DT= .01 SEC", "UNITS OF G", None, "line 4 announces 22 samples, the file has 23"),
+            ("NPTS= 23, DT= .01 SEC", "UNITS OF G", "cm/s2", "states the unit 'G' but units = 'cm/s2'"),
+            ("NPTS= 23, DT= .01 SEC", "VELOCITY TIME SERIES IN UNITS OF CM/SEC", None, "a unit of velocity"),
+            ("NPTS= 23, DT= .01 SEC", "UNITS OF PARSEC", None, "unknown unit 'PARSEC'"),
+            ("NPTS= 23, DT= 0.0 SEC", "UNITS OF G", None, "positive number of seconds"),
+            ("no header at all", "UNITS OF G", None, "expected a header line 'NPTS="),
+        ],
+    )
+    def test_refusals(self, tmp_path, header, units, given, message):
+        with pytest.raises(ValueError, match=message):
+            read_at2(write_at2(tmp_path / "a.at2", self.VALUES, header, units), units=given)
+
+    @pytest.mark.parametrize(("word", "message"), [("NaN", "finite number, got 'NaN'"), ("*****", r"number, got '\*")])
+    def test_bad_samples_are_named_with_their_line(self, tmp_path, word, message):
+        path = write_at2(tmp_path / "a.at2", self.VALUES, "NPTS= 23, DT= .01 SEC")
+        lines = path.read_text().splitlines()
+        path.write_text("\n".join([*lines[:5], " ".join([word, *lines[5].split()[1:]]), *lines[6:]]))
+        with pytest.raises(ValueError, match=rf"a.at2, line 6: expected a {message}"):
+            read_at2(path)
+
+    def test_missing_file(self, tmp_path):
+        with pytest.raises(ValueError, match="cannot read .*none.at2: No such file"):
+            read_at2(tmp_path / "none.at2")
+
+
+class TestCSV:
+    @pytest.mark.parametrize("name", REAL_RECORDS)
+    def test_real_records(self, shared, name):
+        record = read_csv(shared / f"records/{name}.csv")
+        peak, n_steps, dt = REAL_RECORDS[name]
+        assert (record.n_steps, record.dt) == (n_steps, dt)
+        # The table rounds to three places the peak that each file states with four.
+        assert np.abs(record.acceleration).max() / G0 == pytest.approx(peak, abs=5.6e-4)
+
+    def test_every_real_record_is_tested(self, shared):
+        assert {path.stem for path in (shared / "records").glob("*.csv")} == set(REAL_RECORDS)
+
+    @pytest.mark.parametrize(
+        ("text", "given"),
+        [
+            ("time_s,acc_g\n0,1\n0.5,2\n1,3\n", {}),
+            ("# units: g\ntime_s,acc\n0,1\n0.5,2\n1,3\n", {}),
+            ("time_ms,acc\n0,1\n500,2\n1000,3\n", {"units": "g"}),
+            ("# units: g; dt = 0.5 s\nacc\n1\n2\n3\n", {}),
+            ("acc[g]\n1\n2\n3\n", {"dt": 0.5}),
+            ("1\n2\n3\n", {"dt": 0.5, "units": "g"}),
+            ("Time (s)  a (g)  b (g)\n0 1 9\n0.5 2 9\n1 3 9\n".replace(" (", "("), {"column": "a(g)"}),
+            ("\ufefftime_s,acc_g\r\n0,1\r\n0.5,2\r\n1,3\r\n", {}),
+        ],
+    )
+    def test_ways_to_state_unit_and_step(self, tmp_path, text, given):
+        path = tmp_path / "a.csv"
+        path.write_text(text, encoding="utf-8")
+        record = read_csv(path, **given)
+        np.testing.assert_allclose(record.acceleration, np.array([1, 2, 3]) * G0)
+        assert record.dt == 0.5
+
+    @pytest.mark.parametrize(
+        ("text", "given", "message"),
+        [
+            ("time_s,acc\n0,1\n1,2\n", {}, "does not state the unit of its acceleration"),
+            ("time_s,acc_g\n0,1\n1,2\n", {"units": "cm/s2"}, "states the unit 'g' but units = 'cm/s2'"),
+            ("# units: cm/s2\ntime_s,acc_g\n0,1\n1,2\n", {}, r"states the unit 'g' but units = 'cm/s2'"),
+            ("time_s,disp_in\n0,1\n1,2\n", {}, "expected a unit of acceleration, got 'in'"),
+            ("acc_g\n1\n2\n", {}, "no times .* give dt="),
+            ("time,acc_g\n0,1\n1,2\n", {}, "'time' has no unit; call it time_s"),
+            ("time_s,acc_g\n0,1\n0.5,2\n1,3\n", {"dt": 0.25}, "0.25 s by the argument dt but 0.5 s by the time column"),
+            ("# dt = 0.25 s\ntime_s,acc_g\n0,1\n0.5,2\n1,3\n", {}, "0.25 s by the comments but 0.5 s by the time"),
+            ("# npts = 4\ntime_s,acc_g\n0,1\n1,2\n", {}, "npts in the comments announces 4 samples, the file has 2"),
+            ("time_s,acc_g\n0,1\n1,nan\n", {}, "line 3: expected a finite number, got 'nan'"),
+            ("time_s,acc_g\n0,1\n1,\n", {}, "line 3: expected a number, got ''"),
+            ("time_s,acc_g\n0,1\n1,two\n", {}, "line 3: expected a number, got 'two'"),
+            ("time_s,acc_g\n0,1\n1\n", {}, "line 3: expected 2 cells"),
+            ("time_s,acc_g\n", {}, "expected rows of numbers, found none"),
+            ("time_s,acc_g\n1,1\n0,2\n", {}, "times that increase"),
+            ("0,1\n1,2\n", {}, "2 columns and no header line"),
+            ("time_s,a_g,b_g\n0,1,1\n1,2,2\n", {}, "choose it with column=, the columns are time_s, a_g, b_g"),
+            ("time_s,a_g\n0,1\n1,2\n", {"column": "c"}, "one column of values named 'c'"),
+        ],
+    )
+    def test_refusals(self, tmp_path, text, given, message):
+        path = tmp_path / "a.csv"
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read_csv(path, **given)
+
+    @pytest.mark.parametrize(
+        ("step", "digits"), [(1 / 120, 5), (1 / 128, 3), (0.0125, 3), (0.01, 2), (0.02, 2), (0.005, 4)]
+    )
+    def test_rounding_of_printed_times_is_accepted(self, tmp_path, step, digits):
+        path = tmp_path / "a.csv"
+        path.write_text("time_s,acc_g\n" + "".join(f"{k * step:.{digits}f},0\n" for k in range(4000)))
+        assert read_csv(path).dt == step
+
+    def test_single_precision_times_are_accepted(self, tmp_path):
+        path = tmp_path / "a.csv"
+        times = (np.arange(4000) * np.float32(0.01)).astype(np.float32)
+        path.write_text("time_s,acc_g\n" + "".join(f"{float(time)!r},0\n" for time in times))
+        assert read_csv(path).dt == 0.01
+
+    @pytest.mark.parametrize("change", ["missing", "doubled", "shifted"])
+    @pytest.mark.parametrize(("step", "digits"), [(0.01, 2), (0.02, 2), (0.005, 4)])
+    def test_first_irregular_step_is_named(self, tmp_path, step, digits, change):
+        times = [f"{k * step:.{digits}f}" for k in range(1000)]
+        if change == "missing":
+            del times[500]  # row 500 is line 502 of the file
+        elif change == "doubled":
+            times.insert(500, times[499])
+        else:
+            times[500] = f"{500 * step + 2 * 10**-digits:.{digits}f}"
+        path = tmp_path / "a.csv"
+        path.write_text("time_s,acc_g\n" + "".join(f"{time},0\n" for time in times))
+        with pytest.raises(
+            ValueError, match=rf"a.csv, line 502: expected a uniform time step of about {step:g} s, got"
+        ):
+            read_csv(path)
+
+
+def real_columns(path):
+    with open(path) as file:
+        names, *rows = list(csv.reader(line for line in file if not line.startswith("#")))
+    return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+
+
+class TestV2OnRealZips:
+    @pytest.mark.parametrize(("channel", "direction"), [(12, 270), (14, 360)])
+    def test_petrolia_free_field_is_the_same_as_its_csv(self, shared, channel, direction):
+        record = read_v2(shared / PAINTER, channel=channel, member=f"Structure.zip/CHAN{channel}.V2")
+        same = read_csv(shared / f"records/petrolia_1992_rio_dell_freefield_{direction}.csv")
+        assert record.dt == same.dt
+        np.testing.assert_allclose(record.acceleration, same.acceleration, atol=0.5001e-7 * G0)
+
+    @pytest.mark.parametrize(("channel", "direction"), [(24, 270), (15, 360)])
+    def test_imperial_valley_free_field_is_the_same_as_its_csv(self, shared, channel, direction):
+        record = read_v2(shared / MELOLAND, channel=channel)
+        same = read_csv(shared / f"records/imperial_valley_1979_meloland_freefield_{direction}.csv")
+        assert record.dt == same.dt
+        np.testing.assert_allclose(record.acceleration, same.acceleration, atol=0.5001e-7 * G0)
+
+    @pytest.mark.parametrize(
+        ("archive", "folder", "dt"),
+        [(PAINTER, "petrolia_1992_mainshock", 0.02), (MELOLAND, "imperial_valley_1979", 0.02)]
+        + [(MELOLAND, "imperial_valley_1979", 0.01)],
+    )
+    def test_every_channel_is_the_same_as_the_measured_csv(self, shared, archive, folder, dt):
+        columns = real_columns((shared / archive).parent / folder / f"acc_cm_s2_dt{dt}.csv")
+        with open((shared / archive).parent / folder / "channels.csv") as file:
+            peaks = {row["sta_chan"]: row for row in csv.DictReader(file)}
+        for name, values in columns.items():
+            if name != "time_s":
+                number = int(name.removeprefix("ch"))
+                member = f"Structure.zip/CHAN{number}.V2" if archive == PAINTER else None
+                record = read_v2(shared / archive, channel=number, member=member)
+                assert record.dt == dt
+                # The table ends with its shortest channel and has six significant digits.
+                np.testing.assert_allclose(record.acceleration[: values.size], to_si(values, "cm/s2"), rtol=5e-6)
+                assert record.n_steps == int(peaks[str(number)]["npts"])
+                peak = np.abs(record.acceleration).max() * 100
+                assert peak == pytest.approx(float(peaks[str(number)]["peak_acc_cm_s2"]), abs=1.1e-3)
+
+    def test_ambiguous_and_absent_channels_are_listed(self, shared):
+        with pytest.raises(
+            ValueError, match=r"(?s)found 2; choose.*Structure.zip/CHAN12.V2.*Free Field.zip/CHAN012.V2"
+        ):
+            read_v2(shared / PAINTER, channel=12)
+        with pytest.raises(ValueError, match=r"(?s)channel = 99, .*found 0; .*channel 26: CHAN 13: 270 DEG"):
+            read_v2(shared / MELOLAND, channel=99)
+        with pytest.raises(ValueError, match="none in 0 file.* named 'CHAN99.V2'"):
+            read_v2(shared / MELOLAND, member="CHAN99.V2")
+
+    def test_damage_is_found(self, shared, tmp_path):
+        with zipfile.ZipFile(shared / MELOLAND) as archive:
+            text = archive.read("CHAN02.V2").decode()
+        path = tmp_path / "CHAN02.V2"
+        damages = {
+            "\r\n".join(
+                text.split("\r\n")[:100]
+            ): "line 101: expected 8 numbers of 10 columns, got 0, after 432 of the 1138",
+            text.replace(
+                " 1138 POINTS OF ACCEL", " 1130 POINTS OF ACCEL"
+            ): r"line 188: expected 2 numbers of 10 columns, got 8",
+            text.replace(" 1138 POINTS OF ACCEL", " 1136 POINTS OF ACCEL"): "announces 1136 samples but has more",
+            text.replace(" AT  .020 SEC.  (UNITS", " AT  .010 SEC.  (UNITS"): "step is .010 s here but 0.02 s",
+            text.replace("(UNITS: CM/SEC/SEC)", ""): "expected the unit of acceleration",
+            text.replace("(UNITS: CM/SEC/SEC)", "(UNITS: CM/SEC)"): "a unit of velocity",
+            text.replace("     7.942", "    ******", 1): "expected a number, got",
+            text.replace("CORRECTED", "UNCORRECTED", 1): "expected corrected acceleration",
+        }
+        for damaged, message in damages.items():
+            assert damaged != text
+            path.write_bytes(damaged.encode())
+            with pytest.raises(ValueError, match=message):
+                read_v2(path)
+        path.write_bytes(text.encode())
+        assert read_v2(path).n_steps == 1138
+        truncated = tmp_path / "cut.zip"
+        truncated.write_bytes((shared / MELOLAND).read_bytes()[:50_000])
+        with pytest.raises(ValueError, match="cut.zip: expected a CSMIP or COSMOS V2 file"):
+            read_v2(truncated)
+
+
+def csmip(channel, values, dt, descriptor, width=10, decimals=6):
+    """Lines of a channel in the newer CSMIP form: the data line states the Fortran format, numbers may touch."""
+    header = ["Corrected accelerogram   89146-L2500-12044.02"] + [""] * 6 + [f"Chan  {channel}: 360 Deg"] + [""] * 17
+    reals = [0.0] * 100
+    reals[60] = dt
+
+    def block(numbers, digits):
+        cells = [
+            re.sub(r"^( *-?)0\.", r"\1.", f"{number:{width}.{digits}f}").rjust(width)[-width:] for number in numbers
+        ]
+        return ["".join(cells[i : i + 8]) for i in range(0, len(cells), 8)]
+
+    blocks = [f"{len(values):6d} points of accel data equally spaced at {descriptor}", *block(values, decimals)]
+    velocity = [f"{len(values):6d} points of veloc data equally spaced at {descriptor}", *block(0 * values, decimals)]
+    integers = ["    1" * 16] * 6 + ["    1" * 4]
+    return [
+        *header,
+        *integers,
+        *block(reals, 7),
+        *blocks,
+        *velocity,
+        f"/&  ----------  End of data for channel {channel}",
+    ]
+
+
+def cosmos(channel, values, dt, form="(1E15.6)", quantity="acceleration", units="cm/sec2(04)"):
+    reals = [-999.0] * 100
+    reals[33] = dt
+    header = ["Corrected acceleration    (Format v01.20 with 13 text lines)"] + [""] * 7
+    header += [f"Sta Chan   {channel}: 90 deg (Rcrdr Chan  1) Location:", *[""] * 4]
+    header += [" 100 Integer-header values follow on  10 lines, Format= (10I8)"] + ["    -999" * 10] * 10
+    header += [" 100 Real-header values follow on  20 lines, Format= (5F15.6)"]
+    header += ["".join(f"{real:15.6f}" for real in reals[i : i + 5]) for i in range(0, 100, 5)]
+    header += ['   1 Comment line(s) follow, each starting with a "|":', "| synthetic"]
+    data = f"{len(values):8d} {quantity} pts, approx  1 secs, units={units},Format={form}"
+    return [*header, data, *(f"{value:15.6E}" for value in values), f"End-of-data for Chan  {channel} {quantity}"]
+
+
+class TestV2Forms:
+    def test_newer_csmip_with_touching_numbers_and_several_channels(self, tmp_path, rng):
+        path = tmp_path / "CE89146.V2"
+        values = rng.uniform(-99, -10, size=(3, 21))  # ten columns each, without a blank between them
+        lines = [line for k in range(3) for line in csmip(k + 1, values[k], 0.0125, " .013 sec, in cm/sec2. (8f10.6)")]
+        path.write_text("\n".join(lines))
+        record = read_v2(path, channel=2)
+        np.testing.assert_allclose(record.acceleration, values[1] / 100, atol=1e-8)
+        assert record.dt == 0.0125, "the step is that of the real header, the data line has three decimals only"
+        assert (record.name, record.source) == ("Chan 2: 360 Deg", "CE89146.V2")
+        with pytest.raises(ValueError, match=r"(?s)found 3; choose.*channel 1: .*channel 3: "):
+            read_v2(path)
+
+    def test_cosmos(self, tmp_path, rng):
+        path = tmp_path / "n.BNZ.acc.V2c"
+        values = rng.normal(size=(2, 50))
+        lines = cosmos(1, values[0], 0.02) + cosmos(1, values[0], 0.02, quantity="velocity", units="cm/sec(05)")
+        path.write_text("\n".join(lines + cosmos(7, values[1], 0.005)))
+        for channel, row, dt in [(1, 0, 0.02), (7, 1, 0.005)]:
+            record = read_v2(path, channel=channel)
+            np.testing.assert_allclose(record.acceleration, values[row] / 100, rtol=1e-6)
+            assert record.dt == dt
+
+    def test_cosmos_refusals(self, tmp_path):
+        path = tmp_path / "a.V2c"
+        good = cosmos("?", np.ones(9), 0.02)
+        path.write_text("\n".join(good))
+        assert read_v2(path).n_steps == 9, "a single channel needs no number"
+        for lines, message in [
+            (cosmos(1, np.ones(9), -999.0), "must be the time step"),
+            (cosmos(1, np.ones(9), 0.02, units="counts(50)"), "unknown unit 'counts'"),
+            ([line for line in good if "Real-header" not in line], "Real-header values follow"),
+            (cosmos(1, np.ones(9), 0.02, form="(free)"), r"expected a Format such as \(8F10.5\)"),
+            (good[:-4], "after 6 of the 9 samples"),
+        ]:
+            path.write_text("\n".join(lines))
+            with pytest.raises(ValueError, match=message):
+                read_v2(path)
+
+
+class TestColumns:
+    def test_units_by_column_or_for_all(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text("time_s,acc_g,disp [in]\n0,1,2\n0.01,3,4\n")
+        expected = [[G0, 3 * G0], [0.0508, 0.1016]]
+        for units in (None, ["g", "in"]):
+            found = read_columns(path, (TOP, DRIFT), ("acc_g", "disp [in]"), units, description="two rows")
+            np.testing.assert_allclose(found.values, expected)
+            assert (found.dt, found.description, found.channels) == (0.01, "two rows", (TOP, DRIFT))
+
+    @pytest.mark.parametrize(
+        ("channels", "columns", "units", "message"),
+        [
+            ((TOP,), ("acc_g", "disp"), None, "one column and one unit for each of 1 channels"),
+            ((TOP,), "acc_g", None, "one column and one unit"),
+            ((TOP,), ("acc",), None, "named 'acc', the columns are time_s, acc_g, disp"),
+            ((TOP,), ("time_s",), None, "named 'time_s'"),
+            ((DRIFT,), ("disp",), None, "column 'disp' does not state the unit of its displacement"),
+            ((DRIFT,), ("acc_g",), None, "expected a unit of displacement, got 'g'"),
+            ((TOP,), ("acc_g",), "cm/s2", "states the unit 'g' but units = 'cm/s2'"),
+        ],
+    )
+    def test_refusals(self, tmp_path, channels, columns, units, message):
+        path = tmp_path / "a.csv"
+        path.write_text("time_s,acc_g,disp\n0,1,2\n0.01,3,4\n")
+        with pytest.raises(ValueError, match=message):
+            read_columns(path, channels, columns, units)
+
+    def test_bridge_response_is_that_of_its_v2_files(self, shared):
+        folder = shared / "measured/meloland_bridge"
+        channels = [Channel(f"ch{number}", "acceleration", "g") for number in (5, 7, 9)]
+        path = folder / "imperial_valley_1979/acc_cm_s2_dt0.02.csv"
+        deck = read_columns(path, channels, [channel.name for channel in channels], "cm/s2")
+        assert (deck.dt, deck.values.shape) == (0.02, (3, 1138))
+        for number in (5, 7, 9):
+            original = read_v2(folder / "imperialvalley79_ce01336p.zip", channel=number)
+            np.testing.assert_allclose(deck.channel(f"ch{number}"), original.acceleration, rtol=5e-6)
+
+    def test_shake_table_at_120_hertz(self, shared):
+        channels = [Channel(name, "acceleration", "g") for name in ("ground", "roof")]
+        path = shared / "measured/mini_shake_table/Flexible_3_story__Northridge.csv"
+        response = read_columns(path, channels, ("ground_x", "3rd_x"), "m/s2")
+        assert response.dt == 1 / 120
+        np.testing.assert_allclose(response.values[:, 0], [0.0853, -0.10002], rtol=1e-14)
+
+    def test_cyclic_column(self, shared):
+        path = shared / "measured/rc_column_cyclic/2017_Lehman_415.csv"
+        history, forces = read_imposed_test(path, "disp_in", (Channel("base", "shear force", "kip"),), ("force_kip",))
+        rows = np.loadtxt(path, delimiter=",", skiprows=1)
+        np.testing.assert_allclose(history.displacement, to_si(rows[:, 0], "in"), rtol=1e-14)
+        np.testing.assert_allclose(forces.channel("base"), to_si(rows[:, 1], "kip"), rtol=1e-14)
+        fine, indices = history.subdivide(0.001)
+        assert fine.n_steps > history.n_steps == forces.n_steps == indices.size
+
+    def test_imposed_displacement_needs_a_unit(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text("top,force_kN\n0,1\n5,3\n")
+        force = (Channel("base", "force", "kN"),)
+        with pytest.raises(ValueError, match="column 'top' does not state the unit of its displacement"):
+            read_imposed_test(path, "top", force, ("force_kN",))
+        test = read_imposed_test(path, "top", force, ("force_kN",), displacement_unit="mm")
+        np.testing.assert_allclose(test.history.displacement, [0, 0.005])
+        np.testing.assert_allclose(test.measurements.values, [[1000, 3000]])
