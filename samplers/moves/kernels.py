@@ -19,13 +19,12 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import MHMove, Move
 
+from ..proposals.covariance import invert_roots, location_and_root
 from ..proposals.mixture import (
     Mixture,
     draw,
     fit_mixture,
     from_component_space,
-    invert_roots,
-    location_and_root,
     log_density,
     log_responsibilities,
     to_component_space,

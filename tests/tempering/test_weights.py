@@ -6,7 +6,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from samplers.moves.kernels import RandomWalkMove, StudentTMove
-from samplers.proposals.mixture import location_and_root
+from samplers.proposals.covariance import location_and_root
 from samplers.tempering.resampling import RESAMPLING
 from samplers.tempering.weights import (
     EvidenceError,
