@@ -70,7 +70,7 @@ def test_only_what_must_be_is_overridden():
 
 
 def test_emcees_private_names_exist():
-    """The names that tempered.py relies on; if emcee renames one, this says so."""
+    """The private attributes that `samplers.storage.emcee_internals` uses; if emcee renames one, this says so."""
     sampler = emcee.EnsembleSampler(8, 2, Gaussian(2))
     for name in ("_random", "_moves", "_weights"):
         assert hasattr(sampler, name), name
@@ -78,6 +78,36 @@ def test_emcees_private_names_exist():
     assert isinstance(sampler._previous_state, emcee.State)
     assert isinstance(sampler._random, np.random.RandomState)
     assert sampler.log_prob_fn.f.ndim == 2
+
+
+@pytest.mark.parametrize("posterior", [Gaussian(), WithBlobs()], ids=["no blobs", "blobs"])
+def test_emcees_file_is_written_as_emcee_writes_it(posterior, tmp_path):
+    """The same groups, datasets and attributes, step by step by emcee and several steps at once by us."""
+    import h5py
+
+    from samplers.storage.emcee_internals import append_steps, holds_steps
+    from samplers.storage.journal import Step
+
+    theirs = emcee.backends.HDFBackend(str(tmp_path / "theirs.h5"))
+    sampler = emcee.EnsembleSampler(N, 3, posterior, backend=theirs)
+    states = [emcee.State(state, copy=True) for state in sampler.sample(start(posterior), iterations=3)]
+    accepted = np.zeros(N, dtype=bool)
+    steps = [Step(s.coords, s.log_prob, accepted, s.blobs, s.random_state) for s in states]
+    steps[0] = steps[0]._replace(accepted=theirs.accepted)  # all of them; emcee stores their sum
+    ours = emcee.backends.HDFBackend(str(tmp_path / "ours.h5"))
+    ours.reset(N, 3)
+    ours.grow(3, states[0].blobs)
+    with h5py.File(ours.filename, "a") as file:
+        append_steps(file["mcmc"], steps)
+    with h5py.File(ours.filename) as file, h5py.File(theirs.filename) as other:
+        assert set(file["mcmc"]) == set(other["mcmc"]) and set(file["mcmc"].attrs) == set(other["mcmc"].attrs)
+        for name in file["mcmc"]:
+            assert file["mcmc"][name][...].tobytes() == other["mcmc"][name][...].tobytes(), name
+        for name in file["mcmc"].attrs:
+            assert np.all(file["mcmc"].attrs[name] == other["mcmc"].attrs[name]), name
+        assert holds_steps(other["mcmc"], steps)
+        assert not holds_steps(other["mcmc"], steps[:2])
+        assert not holds_steps(other["mcmc"], [*steps[:2], steps[2]._replace(log_prob=steps[1].log_prob)])
 
 
 @every

@@ -1,0 +1,108 @@
+"""Annealing without a sampler: a generator of populations and reports, which whoever consumes it may stop or show."""
+
+import numpy as np
+import pytest
+
+from samplers.moves.kernels import MixtureMove
+from samplers.tempering.anneal import anneal
+from samplers.tempering.evidence_check import EvidenceCheck
+from samplers.tempering.mutation import MoveSchedule
+from samplers.tempering.population import Population, Restart, Stage, Sweep
+from samplers.tempering.results import AnnealingResult
+from samplers.tempering.settings import RecyclingSettings, Settings
+from tests.contract.targets import Gaussian
+
+N = 100
+
+
+class CountedDensity:
+    """The smallest object that annealing accepts."""
+
+    map = map
+
+    def __init__(self, posterior):
+        self.posterior, self.evaluations = posterior, 0
+
+    def inside(self, coords):
+        return np.isfinite(self.posterior.log_prior(coords))
+
+    def evaluate(self, coords):
+        self.evaluations += len(coords)
+        records = np.zeros(len(coords), dtype=[("log_prob", float), ("log_prior", float)])
+        records["log_prob"], records["log_prior"] = self.posterior(coords), self.posterior.log_prior(coords)
+        return records
+
+
+def steps_of(settings, coarse=None, n=N, seed=1):
+    """Steps of a seeded annealing of a sharp Gaussian, and its density."""
+    posterior, random = Gaussian(3, sd=0.02), np.random.RandomState(seed)
+    density = CountedDensity(posterior)
+    start = Population(0.0, posterior.sample_prior(n, random), None, float(n))
+    schedule = MoveSchedule([MixtureMove()], np.ones(1))
+    return anneal(start, density, random, schedule, settings, coarse), density
+
+
+@pytest.mark.parametrize("recycle", [False, True])
+def test_pairs_of_population_and_report(recycle):
+    steps, density = steps_of(Settings(recycle=recycle))
+    steps = list(steps)
+    assert all(isinstance(population, Population) for population, _ in steps)
+    stages = [report for _, report in steps if isinstance(report, Stage)]
+    assert [stage.beta for stage in stages] == sorted({stage.beta for stage in stages})
+    for population, report in steps:
+        if isinstance(report, Stage):
+            assert population.beta == report.beta
+            assert population.effective_sample_size == report.effective_sample_size
+    (check,) = [report for _, report in steps if isinstance(report, EvidenceCheck)]
+    last, _ = steps[-1]
+    assert last.beta == 1.0 and last.coords.shape == (N, 3) and last.log_weights is None
+    assert len(last.founders[0]) == N
+    value, error = AnnealingResult(tuple(stages), check).evidence
+    assert abs(value - density.posterior.log_evidence) < 5 * error + 0.1
+
+
+def test_one_sweep_per_tick():
+    steps, _ = steps_of(Settings(recycle=False))
+    sweeps = 0
+    for _, report in steps:
+        if isinstance(report, Sweep):
+            assert 0.0 <= report.acceptance <= 1.0
+            sweeps += 1
+        elif isinstance(report, Stage):
+            assert report.moves == sweeps
+            sweeps = 0
+
+
+def test_points_of_recycling_carry_weights():
+    steps, _ = steps_of(Settings(recycle=True))
+    population, stage = next(step for step in steps if isinstance(step[1], Stage))
+    assert stage.moves == 0 and 0.0 < stage.beta < 1.0
+    assert len(population.log_weights) == len(population.coords) == len(population.records) >= N
+
+
+def test_nothing_runs_ahead_of_its_consumer():
+    steps, density = steps_of(Settings(recycle=False))
+    assert density.evaluations == 0
+    _, first = next(steps)
+    assert isinstance(first, Sweep) and density.evaluations <= 2 * N
+    steps.close()
+
+
+def test_a_restart_makes_earlier_stages_void():
+    """Here no check can ever agree, so recycling gives up at beta = 1, and moves start from the prior again."""
+    settings = Settings(recycle=True, recycling=RecyclingSettings(max_evidence_difference=0.0))
+    reports = [report for _, report in steps_of(settings)[0] if not isinstance(report, Sweep)]
+    (place,) = [i for i, report in enumerate(reports) if isinstance(report, Restart)]
+    assert "fresh draws change the log-evidence" in reports[place].reason
+    before, after = reports[:place], [report for report in reports[place:] if isinstance(report, Stage)]
+    assert before and all(stage.moves == 0 for stage in before)
+    assert after[0].beta < 1.0 and after[-1].beta == 1.0 and all(stage.moves > 0 for stage in after)
+
+
+def test_stages_on_the_coarse_model_are_shown_but_not_reported():
+    n = 250
+    coarse = CountedDensity(Gaussian(3, sd=0.03))
+    steps, _ = steps_of(Settings(recycle=True), coarse, n)
+    kinds = [type(report) for _, report in steps]
+    assert kinds[0] is Sweep and coarse.evaluations > 0
+    assert kinds.count(Stage) < kinds.count(Sweep)

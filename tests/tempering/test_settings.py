@@ -1,0 +1,216 @@
+"""A setting changes the run or is refused: it is never ignored."""
+
+from dataclasses import fields, replace
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import (
+    CHING_CHEN_2007,
+    RAMANCHA_2022_LITERAL,
+    MixtureMove,
+    RecyclingSettings,
+    Settings,
+    SMCSampler,
+    TemperedSampler,
+    TMCMCSampler,
+)
+from tests.contract.targets import Box, Gaussian
+
+PATHS = {
+    "recycling": (SMCSampler, {"recycle": True}),
+    "moves": (SMCSampler, {"recycle": False}),
+    "equal chains": (TMCMCSampler, {}),
+    "chains from leaders": (TMCMCSampler, {"chains": "leaders"}),
+    "leaders, recycling": (TemperedSampler, {"chains": "leaders", "recycle": True}),
+}
+# per setting: another value, and what else is given so that it can act at all
+CHANGES = {
+    "ess_ratio": (0.8, {}),
+    "ess_rule": ("declining", {}),
+    "ess_floor": (30.0, {"ess_rule": "declining"}),
+    "coefficient_of_variation": (0.5, {}),
+    "resampling": ("multinomial", {}),
+    "min_moves": (7, {}),
+    "max_moves": (3, {"max_correlation": 1e-6}),
+    "max_correlation": (1e-6, {}),
+    "chains": ("leaders", {}),
+    "burn_in": (2, {"chains": "leaders"}),
+    "fast_sweeps": (4, {}),
+    "recycle": (None, {}),  # the other value than that of the path
+    "recycling": (RecyclingSettings(target_share=0.6), {}),
+    "check_draws": (0, {}),
+    "max_failure_share": (0.0, {}),
+}
+ACTS = {
+    "recycling": {"min_moves", "max_moves", "max_correlation", "fast_sweeps", "recycle", "recycling", "check_draws"},
+    "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
+    | {"fast_sweeps", "recycle", "check_draws"},
+    "equal chains": {"coefficient_of_variation", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
+    | {"burn_in", "fast_sweeps", "check_draws"},
+    "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "fast_sweeps", "check_draws"},
+    "leaders, recycling": {"burn_in", "fast_sweeps", "recycle", "recycling", "check_draws"},
+}
+
+
+class Target(Gaussian):
+    """A sharp Gaussian with a fast parameter; optionally, some of its points fail."""
+
+    fast_parameters = (2,)
+
+    def __init__(self, fails=False, **target):
+        super().__init__(**target)
+        self.fails = fails
+
+    def __call__(self, x):
+        log_prob = super().__call__(x)
+        return np.where(x[..., 1] < -1.5, np.nan, log_prob)[()] if self.fails else log_prob
+
+
+def outcome(Sampler, posterior=None, nwalkers=60, **kwargs):
+    """Everything that a run returns except wall times; the error of a run that stops."""
+    posterior = Target(sd=0.02) if posterior is None else posterior
+    sampler = Sampler(nwalkers, posterior.ndim, posterior, vectorize=True, seed=3, **kwargs)
+    try:
+        sampler.run_mcmc(None, 1)
+    except RuntimeError as error:
+        return str(error)
+    stages = [stage._replace(seconds=0.0) for stage in sampler.ladder]
+    return sampler.get_chain().tobytes(), stages, sampler.log_evidence_check
+
+
+class TwoModes(Box):
+    """Modes of very different widths, and failing points between them."""
+
+    def __init__(self):
+        super().__init__([0, 0], [1, 1], self._log_likelihood)
+
+    def _log_likelihood(self, x):
+        wide, narrow = (np.sum(((x - centre) / width) ** 2, axis=-1) for centre, width in ((0.3, 0.1), (0.8, 0.03)))
+        return np.logaddexp(-0.5 * wide, 3.0 - 0.5 * narrow)
+
+
+RECYCLING_CHANGES = {
+    "target_share": (0.6, {}),
+    "points_per_dimension": (10.0, {}),
+    "fresh_share": (0.05, {}),
+    "max_components": (1, {}),
+    "even_share": (0.0, {}),
+    "min_yield": (0.9, {}),
+    "patience": (2, {"min_yield": 0.9}),
+    "max_rounds": (2, {}),
+    "max_checks": (1, {"max_evidence_difference": 0.0}),
+    "trusted_yield": (0.95, {}),
+    "high_yield": (1.0, {}),
+    "max_evidence_difference": (0.0, {}),
+}
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("name", [field.name for field in fields(RecyclingSettings)])
+def test_every_constant_of_the_recycling_changes_the_run(name):
+    value, needed = RECYCLING_CHANGES[name]
+    nwalkers = 24 if name == "high_yield" else 100  # so few that the shape of the tail is unknown
+    plain = RecyclingSettings(**needed)
+    posterior = Gaussian(6, sd=1e-3) if name == "fresh_share" else TwoModes()  # sharp, so that draws are worth little
+    runs = [
+        outcome(SMCSampler, posterior, nwalkers, recycle=True, recycling=settings)
+        for settings in (plain, replace(plain, **{name: value}))
+    ]
+    assert runs[0] != runs[1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"target_share": 0.0},
+        {"fresh_share": 1.1},
+        {"even_share": -0.1},
+        {"patience": 0},
+        {"max_components": 1.5},
+        {"points_per_dimension": 0.0},
+        {"max_evidence_difference": -1.0},
+    ],
+    ids=str,
+)
+def test_impossible_constants_of_the_recycling(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        RecyclingSettings(**settings)
+
+
+def test_the_changes_cover_all_settings():
+    assert set(CHANGES) == {field.name for field in fields(Settings)}
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_setting_changes_the_run_or_is_refused(name, path):
+    Sampler, given = PATHS[path]
+    value, needed = CHANGES[name]
+    value = not given.get("recycle", False) if name == "recycle" else value
+    posterior = Target(sd=0.02, fails=name == "max_failure_share")
+    if name in needed or given.get(name) == value:
+        pytest.skip("the path has this value")
+    try:
+        plain = outcome(Sampler, posterior, **given | needed)
+        changed = outcome(Sampler, posterior, **given | needed | {name: value})
+    except ValueError as error:
+        assert "cannot act here" in str(error) and any(word in str(error) for word in (name, *needed))
+        acts = False
+    else:
+        assert plain != changed
+        acts = True
+    assert acts == (name in ACTS[path] or name == "max_failure_share")
+
+
+@pytest.mark.parametrize("settings", [{"ess_ratio": 0.95}, {"resampling": "multinomial"}, {"ess_rule": "declining"}])
+def test_settings_of_moves_with_300_walkers_are_refused_with_advice(settings):
+    """From 250 walkers on recycling is the default, and these would act only if it failed."""
+    with pytest.raises(ValueError, match="pass recycle=False"):
+        SMCSampler(300, 3, Gaussian(), vectorize=True, **settings)
+    SMCSampler(300, 3, Gaussian(), vectorize=True, recycle=False, **settings)
+
+
+@pytest.mark.parametrize(
+    "settings, match",
+    [
+        ({"check_draws": 50, "recycle": True}, "check_draws"),
+        ({"max_correlation": 0.1, "min_moves": 5, "max_moves": 5}, "never decides"),
+        ({"fast_sweeps": 5}, "no fast_parameters"),
+        ({"chains": "leaders"}, "TMCMCSampler"),
+        ({"ess_ratio": 0.6, "coefficient_of_variation": 2.0}, "cannot act here"),
+    ],
+    ids=str,
+)
+def test_more_that_cannot_act(settings, match):
+    with pytest.raises(ValueError, match=match):
+        SMCSampler(60, 3, Gaussian(), vectorize=True, **settings)
+
+
+def test_settings_as_an_object_as_keywords_and_as_a_preset():
+    expected = outcome(SMCSampler, ess_ratio=0.7, max_moves=4)
+    assert outcome(SMCSampler, settings=Settings(ess_ratio=0.7, max_moves=4)) == expected
+    assert outcome(SMCSampler, settings=Settings(ess_ratio=0.3, max_moves=4), ess_ratio=0.7) == expected
+    sampler = SMCSampler(300, 3, Gaussian(), **RAMANCHA_2022_LITERAL)
+    assert sampler.settings == Settings(
+        recycle=False, **{k: v for k, v in RAMANCHA_2022_LITERAL.items() if k in CHANGES and k != "recycle"}
+    )
+    assert TMCMCSampler(300, 3, Gaussian(), **CHING_CHEN_2007).settings.chains == "leaders"
+    with pytest.raises(TypeError, match="unexpected keyword argument 'essratio'.*ess_ratio"):
+        SMCSampler(60, 3, Gaussian(), essratio=0.7)
+    with pytest.raises(ValueError, match="settings must be"):
+        SMCSampler(60, 3, Gaussian(), settings={"ess_ratio": 0.7})
+
+
+def test_a_coefficient_of_variation_of_one_is_an_ess_ratio_of_a_half():
+    assert outcome(TMCMCSampler) == outcome(TMCMCSampler, coefficient_of_variation=1.0)
+    assert outcome(TMCMCSampler) == outcome(TemperedSampler, moves=MixtureMove(), ess_ratio=0.5)
+
+
+def test_defaults_of_the_samplers():
+    posterior, moves = Gaussian(), emcee.moves.StretchMove()
+    assert TMCMCSampler(300, 3, posterior).settings == replace(Settings(), recycle=False)
+    assert SMCSampler(300, 3, posterior).settings == replace(Settings(), recycle=True)
+    assert SMCSampler(300, 3, posterior, moves=moves).settings == replace(Settings(), recycle=False)
