@@ -118,6 +118,12 @@ class JournaledBackend(HDFBackend):
             raise
         self._written = time.perf_counter()
 
+    def close(self) -> None:
+        """Write pending steps and close the journal, so that another process may continue the run."""
+        self.flush()
+        if self._journal is not None:
+            self._journal.close()
+
     # ------------------------------------------------------------------ the journal
 
     def begin(self, header: dict, start: RunStart) -> None:

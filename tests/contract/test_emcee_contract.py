@@ -1,4 +1,4 @@
-"""What emcee promises of a sampler holds for ours, in memory and in HDF5: the same tests for each."""
+"""emcee's contract of a sampler: the same tests for its sampler and ours, in memory and in HDF5."""
 
 import inspect
 import multiprocessing
@@ -19,7 +19,7 @@ every = pytest.mark.parametrize("Sampler", SAMPLERS, ids=lambda s: s.__name__)
 
 @pytest.fixture(params=["memory", "hdf5"])
 def make_backend(request, tmp_path):
-    """A function that opens the backend, the same one each time it is called in a test."""
+    """A function that opens the backend, the same one in each call within a test."""
     memory = emcee.backends.Backend()
 
     def make():
@@ -183,7 +183,7 @@ def test_named_text_and_single_blobs(Sampler, make_backend):
 
 
 class Fragile(Gaussian):
-    """Has no answer for a small part of the prior."""
+    """Raises an exception in a small part of the prior."""
 
     def __call__(self, x):
         if np.any(x[..., 0] < 0.0) and np.any(x[..., 1] > 0.3):
@@ -192,7 +192,7 @@ class Fragile(Gaussian):
 
 
 class Broken(Gaussian):
-    """Has no answer at all."""
+    """Raises an exception everywhere."""
 
     def __call__(self, x):
         raise TypeError("no such argument")
@@ -211,7 +211,7 @@ def test_args_and_kwargs(Sampler):
     chain = sampler.get_chain(flat=True)
     assert np.allclose(sampler.get_log_prob(flat=True), posterior(chain))
     assert sampler.log_prob_fn.args == [posterior, 0.0]
-    assert not hasattr(sampler, "args")  # arviz would take it for the data
+    assert not hasattr(sampler, "args")  # arviz would take it for data
 
 
 def of_names(x):
@@ -242,7 +242,7 @@ def test_seed_pool_and_vectorize_give_the_same_chain(Sampler):
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
 def test_a_pool_of_processes(Sampler):
-    """The same chain, and an exception in a worker takes one point only."""
+    """The same chain, and an exception in a worker affects one point only."""
     chain = run(Sampler).get_chain()
     fragile = Fragile()
     with multiprocessing.get_context("fork").Pool(2) as pool:
@@ -268,7 +268,7 @@ def test_a_broken_function_stops_with_its_reason(Sampler):
 def test_pickle(Sampler, make_backend):
     with ThreadPool(1) as pool:
         sampler = run(Sampler, make_backend(), pool=pool)
-        if Sampler is not emcee.EnsembleSampler:  # emcee's own pickling takes the pool from the living sampler
+        if Sampler is not emcee.EnsembleSampler:  # emcee's pickling removes the pool from the living sampler
             pickle.dumps(sampler)
             assert sampler.pool is pool
         sampler.pool = None
@@ -276,7 +276,7 @@ def test_pickle(Sampler, make_backend):
         assert copy.pool is None
         assert np.array_equal(copy.get_chain(), sampler.get_chain())
         if isinstance(sampler.backend, emcee.backends.HDFBackend):
-            return  # both would write to one file
+            return  # both would write to the same file
         first, second = sampler.run_mcmc(None, 3), copy.run_mcmc(None, 3)
         assert np.array_equal(first.coords, second.coords)
         if Sampler is not emcee.EnsembleSampler:
@@ -364,7 +364,7 @@ def test_emcees_moves_are_kernels(Sampler, moves):
 
 
 def test_our_moves_are_emcees():
-    """Inside a plain EnsembleSampler nobody calibrates; the moves fit themselves to the first ensemble."""
+    """A plain EnsembleSampler does not calibrate moves; they fit themselves to the first ensemble."""
     from samplers.moves.fast_parameters import WithFastSweeps
     from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
 

@@ -1,4 +1,4 @@
-"""What our samplers add to emcee's contract: the ladder, the evidence, where they are kept, and when they refuse."""
+"""What the samplers add to emcee's contract: ladder, evidence, their storage, errors and warnings."""
 
 import subprocess
 import sys
@@ -48,7 +48,9 @@ def test_stages_account_for_everything():
     check = sampler.log_evidence_check
     assert check.evaluations == N
     assert sum(s.evaluations for s in sampler.ladder) + N == sampler.evaluations == posterior.calls
-    assert all(s.evaluations == N * s.moves for s in sampler.ladder[1:])  # a prior without edges rejects nothing unseen
+    assert all(
+        s.evaluations == N * s.moves for s in sampler.ladder[1:]
+    )  # the prior is unbounded, so all proposals are evaluated
     assert all(2 <= s.moves <= 7 and 0 < s.acceptance <= 1 for s in sampler.ladder)
     assert all(abs(s.effective_sample_size / (0.5 * N) - 1) < 1e-4 for s in sampler.ladder[:-1])
     assert sampler.ladder[-1].effective_sample_size >= 0.5 * N
@@ -94,7 +96,7 @@ def test_two_estimates_that_disagree_widen_the_error():
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_recycling_needs_walkers():
-    """By default; with few of them a mode can be lost unnoticed."""
+    """By default, since with few walkers a mode can be lost unnoticed."""
     posterior = Gaussian()
     assert [SMCSampler(n, 3, posterior).settings.recycle for n in (249, 250)] == [False, True]
     assert SMCSampler(N, 3, posterior, recycle=True).settings.recycle
@@ -102,7 +104,7 @@ def test_recycling_needs_walkers():
 
 
 def test_recycling_that_fails_falls_back_to_moves(caplog):
-    """A ring in two dimensions and an exponential corner in six: no mixture proposes well in it."""
+    """A ring in two dimensions and an exponential corner in six, which no mixture fits."""
 
     def log_likelihood(x):
         ring = -0.5 * ((np.hypot(x[..., 0] - 0.5, x[..., 1] - 0.5) - 0.4) / 0.002) ** 2
@@ -134,24 +136,24 @@ def test_resampling_by_name_or_function(resampling):
     assert annealed(resampling=resampling).ladder[-1].beta == 1.0
 
 
-def test_climb_once_then_go_on():
+def test_annealing_is_done_once():
     posterior = Gaussian()
     sampler = annealed(posterior, nsteps=2)
     ladder = sampler.ladder
     state = sampler.run_mcmc(None, 2)
     sampler.run_mcmc(state, 2)
-    sampler.run_mcmc(state.coords, 0)  # other coordinates than the last: draws of the prior, a new climb
+    sampler.run_mcmc(state.coords, 0)  # coordinates other than the last: draws of the prior, annealed again
     assert sampler.ladder != ladder
     sampler = annealed(posterior := Gaussian(), nsteps=2)
     last, ladder, calls = sampler.get_last_sample(), sampler.ladder, posterior.calls
-    sampler.run_mcmc(last.coords, 2)  # emcee's old habit: burn in, then start from the positions
+    sampler.run_mcmc(last.coords, 2)  # as in older emcee scripts: burn in, then continue from the positions
     assert sampler.ladder == ladder
     assert posterior.calls == calls + 2 * N
     sampler.reset()
     assert sampler.ladder == ladder == read_ladder(sampler.backend)
 
 
-def test_climb_without_steps_then_steps():
+def test_annealing_without_steps_then_steps():
     sampler = annealed(nsteps=0)
     ladder = sampler.ladder
     assert isinstance(sampler.run_mcmc(None, 2), emcee.State)
@@ -159,7 +161,7 @@ def test_climb_without_steps_then_steps():
     assert sampler.iteration == 2
 
 
-def test_a_state_that_knows_its_log_prob_saves_evaluations():
+def test_a_state_with_log_prob_saves_evaluations():
     posterior = Gaussian()
     draws = posterior.sample_prior(N, np.random.default_rng(0))
     plain = SMCSampler(N, 3, posterior, vectorize=True, seed=1)
@@ -170,7 +172,7 @@ def test_a_state_that_knows_its_log_prob_saves_evaluations():
     assert spared.evaluations == plain.evaluations - N
 
 
-def test_samplers_without_a_seed_do_not_share_a_stream():
+def test_samplers_without_a_seed_have_different_streams():
     np.random.seed(5)  # noqa: NPY002
     first, second = annealed(seed=None).get_chain(), annealed(seed=None).get_chain()
     assert not np.array_equal(first, second)
@@ -203,7 +205,7 @@ def test_published_tmcmc_grows_chains_from_leaders():
 
 
 def test_points_of_a_chain_follow_each_other():
-    """Every point of the new population is one step from the last point of its leader's chain."""
+    """Every point of the new population is one step away from the previous point of its chain."""
     from samplers.tempering.mutation import MoveSchedule, grow_chains
     from samplers.tempering.population import Population
 
@@ -254,7 +256,7 @@ def test_ladder_beside_the_chain(tmp_path):
     assert again.iteration == 5 and again.ladder == sampler.ladder
 
 
-def test_a_new_climb_replaces_the_ladder(tmp_path):
+def test_a_new_annealing_replaces_the_ladder(tmp_path):
     backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
     sampler = annealed(Gaussian(sd=0.01), backend=backend)
     long = len(sampler.ladder)
@@ -266,7 +268,7 @@ def test_a_new_climb_replaces_the_ladder(tmp_path):
 
 
 class Interrupted(Gaussian):
-    """Raises after some calls."""
+    """Raises an error after a number of calls."""
 
     def __init__(self, error, after, **kwargs):
         super().__init__(**kwargs)
@@ -279,7 +281,7 @@ class Interrupted(Gaussian):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("solver died")])
-def test_an_exception_leaves_what_was_done(tmp_path, error):
+def test_an_exception_leaves_the_finished_stages(tmp_path, error):
     backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
     posterior = Interrupted(error, after=8 * N, sd=0.01)
     sampler = SMCSampler(N, 3, posterior, backend=backend, vectorize=True, seed=2)
@@ -319,7 +321,7 @@ SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, recycle=False,
     assert all(s.moves <= 7 and s.evaluations >= 2 * N for s in ladder)
 
 
-# ---------------------------------------------------------------- refusals, alarms
+# ---------------------------------------------------------------- errors, warnings
 
 
 def test_no_evidence_before_a_run():
@@ -433,7 +435,7 @@ def test_wrong_answers_of_log_prob_fn(vectorize, answer, message):
         sampler.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 1)
 
 
-def test_nan_counts_as_impossible_and_is_reported():
+def test_nan_counts_as_a_failure_and_is_reported():
     def log_likelihood(x):
         return np.where(x[..., 0] < 0.25, np.nan, -x[..., 1])
 
@@ -462,12 +464,12 @@ def test_nothing_is_evaluated_outside_the_prior():
     assert seen.min() >= 0 and seen.max() <= 1
 
 
-def test_collapse_is_loud():
+def test_collapse_is_reported():
     with pytest.warns(SamplingWarning) as caught:
         posterior = Gaussian()
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, moves=emcee.moves.GaussianMove(1e6)).run_mcmc(None, 1)
     messages = [str(w.message) for w in caught]
-    assert len(messages) == 2  # each reason once, however many stages
+    assert len(messages) == 2  # each reason once, for any number of stages
     assert "were accepted, so the points did not move" in messages[0]
     assert "survived the resampling" in messages[1]
     with pytest.warns(SamplingWarning, match="distinct points of 40 survived"):
@@ -475,27 +477,27 @@ def test_collapse_is_loud():
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, ess_ratio=0.03, recycle=False).run_mcmc(None, 1)
 
 
-def alarms(Sampler, posterior, nwalkers=200, **settings):
-    """The messages of one run."""
+def warnings_of(Sampler, posterior, nwalkers=200, **settings):
+    """Messages of the warnings of one run."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SamplingWarning)
         Sampler(nwalkers, posterior.ndim, posterior, vectorize=True, **{"seed": 1, **settings}).run_mcmc(None, 1)
     return [str(warning.message) for warning in caught]
 
 
-def test_moves_too_short_are_loud():
-    """The published steps of TMCMC leave the points where they were resampled; ten full steps of a walk do not."""
-    found = [m for m in alarms(TMCMCSampler, Gaussian(2), **CHING_CHEN_2007) if "still correlated" in m]
+def test_moves_too_short_are_reported():
+    """The published steps of TMCMC leave points near their resampled start; ten full steps of a random walk do not."""
+    found = [m for m in warnings_of(TMCMCSampler, Gaussian(2), **CHING_CHEN_2007) if "still correlated" in m]
     assert len(found) == 1 and "0.9" in found[0]
     for preset in (RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL, {}, {"recycle": False}):
-        assert not [m for m in alarms(SMCSampler, Gaussian(3), **preset) if "still correlated" in m]
+        assert not [m for m in warnings_of(SMCSampler, Gaussian(3), **preset) if "still correlated" in m]
     burnt = {**CHING_CHEN_2007, "moves": RandomWalkMove(), "burn_in": 15}
-    assert not [m for m in alarms(TMCMCSampler, Gaussian(2), **burnt) if "still correlated" in m]
+    assert not [m for m in warnings_of(TMCMCSampler, Gaussian(2), **burnt) if "still correlated" in m]
 
 
-@pytest.mark.parametrize("dead, loud", [(0.5, False), (0.97, True)])
-def test_a_stage_that_carries_all_is_loud(dead, loud):
-    """Where most of the prior is impossible the first stage stands on few points, whatever beta is chosen."""
+@pytest.mark.parametrize("dead, warned", [(0.5, False), (0.97, True)])
+def test_a_dominant_stage_is_reported(dead, warned):
+    """Where most of the prior has zero likelihood, the first stage has few effective points at any beta."""
 
     def log_likelihood(x):
         return np.where(x[..., 0] > 1.0 - dead, -np.inf, -10.0 * x[..., 1])
@@ -503,13 +505,15 @@ def test_a_stage_that_carries_all_is_loud(dead, loud):
     box = Box([0, 0], [1, 1], log_likelihood)
     for seed in range(1, 5):
         messages = [
-            m for m in alarms(SMCSampler, box, seed=seed, recycle=False) if "dominates the error of the evidence" in m
+            m
+            for m in warnings_of(SMCSampler, box, seed=seed, recycle=False)
+            if "dominates the error of the evidence" in m
         ]
-        assert len(messages) == loud
-        assert not loud or "few draws of the prior have a likelihood above zero" in messages[0]
+        assert len(messages) == warned
+        assert not warned or "few draws of the prior have a likelihood above zero" in messages[0]
 
 
-# ---------------------------------------------------------------- reports
+# ---------------------------------------------------------------- reporting
 
 
 def test_to_arviz_writes_netcdf(tmp_path):
@@ -611,7 +615,7 @@ def test_samplers_side_by_side():
             comparison_table({"nothing": nothing})
 
 
-def test_tempered_sampler_works_alone():
+def test_the_base_class_samples():
     posterior = Gaussian()
     sampler = TemperedSampler(N, 3, posterior, vectorize=True, seed=1)
     sampler.run_mcmc(None, 2)

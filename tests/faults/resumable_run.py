@@ -1,6 +1,6 @@
 """A run that a test can kill: ``python -m tests.faults.resumable_run PATH SAMPLER STEPS [SECONDS]``.
 
-The posterior takes SECONDS a batch, so that there is time to kill it anywhere; blobs travel along.
+The posterior takes SECONDS per batch, so that there is time to kill the run anywhere. It returns blobs.
 """
 
 import sys
@@ -17,13 +17,13 @@ SAMPLERS = {
     "moves": (SMCSampler, {"recycle": False}),
     "tmcmc": (TMCMCSampler, {}),
     "leaders": (TMCMCSampler, {"chains": "leaders", "burn_in": 1}),
-    "literal": (SMCSampler, {**RAMANCHA_2022_LITERAL, "ess_floor": 10.0}),  # its own floor is above N
+    "literal": (SMCSampler, {**RAMANCHA_2022_LITERAL, "ess_floor": 10.0}),  # the floor of the preset is above N
     "stretch": (SMCSampler, {"moves": emcee.moves.StretchMove(), "max_moves": 5}),
 }
 
 
 class Slow(WithBlobs):
-    """Takes its time for every batch."""
+    """Waits in every call."""
 
     def __init__(self, seconds, **kwargs):
         super().__init__(**kwargs)
@@ -35,7 +35,7 @@ class Slow(WithBlobs):
 
 
 def make(path, name, seconds=0.0, sd=0.01, **changes):
-    """The sampler on a file; the first run brings the seed, a later one goes on whatever its own seed is."""
+    """The sampler with a file; the seed is that of the first run, later ones continue it whatever their own seed is."""
     Sampler, settings = SAMPLERS[name]
     posterior = Slow(seconds, ndim=NDIM, sd=sd)
     backend = emcee.backends.HDFBackend(str(path))

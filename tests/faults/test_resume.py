@@ -1,4 +1,4 @@
-"""A run that is killed goes on from its file and ends bit for bit as if it had not been."""
+"""A killed run continues from its file, with results equal to the last bit to those of a run that was not killed."""
 
 import os
 import shutil
@@ -29,7 +29,7 @@ def journal_of(path):
 
 
 def same(sampler, whole):
-    """Everything but the wall time."""
+    """Whether everything but the wall time is equal."""
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
     assert np.array_equal(sampler.get_log_prob(), whole.get_log_prob())
     assert np.array_equal(sampler.get_blobs(), whole.get_blobs())
@@ -47,7 +47,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SAMPLERS if name 
 
 @pytest.mark.parametrize("name", ["smc", "moves", *SLOW])
 def test_killed_again_and_again(name, tmp_path, rng):
-    """The same script is started until it ends, and killed by -9 at places of chance along the way."""
+    """The same script is started until it ends, and killed by signal 9 at random places."""
     whole = make(tmp_path / "whole.h5", name)
     whole.run_mcmc(None, STEPS)
     size = journal_of(tmp_path / "whole.h5").stat().st_size
@@ -64,7 +64,7 @@ def test_killed_again_and_again(name, tmp_path, rng):
     sampler = make(path, name)
     assert sampler.iteration == STEPS
     assert same(sampler, whole)
-    for s in (sampler, whole):  # and so does what comes after
+    for s in (sampler, whole):  # and so do later steps
         s.run_mcmc(None, 3)
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
 
@@ -75,12 +75,12 @@ def finished(tmp_path):
     path = tmp_path / "run.h5"
     sampler = make(path, "smc")
     sampler.run_mcmc(None, STEPS)
-    sampler.backend._journal.close()
+    sampler.backend.close()
     return path, sampler
 
 
 def cut(path, share):
-    """The file as a killed process would have left it, after that share of the journal."""
+    """Leave the file as a process killed after that share of the journal would."""
     data = journal_of(path).read_bytes()
     journal_of(path).write_bytes(data[: int(share * len(data))])
 
@@ -96,11 +96,11 @@ def test_cut_off_anywhere(finished, share):
     posterior = sampler.log_prob_fn.f
     sampler.run_mcmc(None, STEPS)
     assert same(sampler, whole)
-    assert posterior.calls == sampler.evaluations - known + (known > 0)  # one to see whether it is the same posterior
+    assert posterior.calls == sampler.evaluations - known + (known > 0)  # one to check that the posterior is the same
     assert sampler.evaluations == whole.evaluations
 
 
-def test_the_rest_can_be_asked_for(finished):
+def test_the_remaining_steps_can_be_requested(finished):
     path, whole = finished
     cut(path, 0.97)
     sampler = make(path, "smc")
@@ -110,13 +110,13 @@ def test_the_rest_can_be_asked_for(finished):
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
 
 
-def test_the_same_draws_go_on_and_others_are_refused(tmp_path):
+def test_the_same_draws_continue_and_others_are_refused(tmp_path):
     draws = Gaussian(NDIM).sample_prior(N, np.random.default_rng(0))
     path = tmp_path / "run.h5"
     sampler = make(path, "smc")
     sampler.run_mcmc(draws, 3)
     whole = sampler.get_chain()
-    sampler.backend._journal.close()
+    sampler.backend.close()
     cut(path, 0.4)
     with pytest.raises(ValueError, match="run from other draws"):
         make(path, "smc").run_mcmc(draws + 1e-9, 3)
@@ -156,8 +156,8 @@ def test_a_damaged_journal_is_refused(finished, place):
 
 
 @pytest.mark.parametrize("damage", ["truncated", "overwritten", "a step lost", "acceptance"])
-def test_a_damaged_chain_is_made_again(finished, damage, caplog):
-    """What a process that dies inside HDF5 can leave."""
+def test_a_damaged_chain_is_rebuilt(finished, damage, caplog):
+    """Damage that a process can leave when it dies inside HDF5."""
     import h5py
 
     path, whole = finished
@@ -188,14 +188,14 @@ def test_a_damaged_file_without_a_journal_is_refused(finished):
         make(path, "smc")
 
 
-def test_a_file_that_is_gone_or_reset_starts_anew(finished):
+def test_a_missing_or_reset_file_starts_a_new_run(finished):
     path, whole = finished
     first = whole.get_chain()[0]
     emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
     sampler = make(path, "smc", seed=6)
     sampler.run_mcmc(None, 2)
     assert sampler.iteration == 2 and not np.array_equal(sampler.get_chain()[0], first)
-    sampler.backend._journal.close()
+    sampler.backend.close()
     path.unlink()
     sampler = make(path, "smc", seed=7)
     sampler.run_mcmc(None, 2)
@@ -203,7 +203,7 @@ def test_a_file_that_is_gone_or_reset_starts_anew(finished):
 
 
 def test_a_lost_journal_leaves_the_chain(finished):
-    """Then the run goes on at beta = 1, as emcee does."""
+    """Then the run continues at beta = 1, as with emcee."""
     path, whole = finished
     journal_of(path).unlink()
     sampler = make(path, "smc")
@@ -211,8 +211,8 @@ def test_a_lost_journal_leaves_the_chain(finished):
     assert sampler.iteration == STEPS + 2 and sampler.ladder == whole.ladder
 
 
-def test_a_new_climb_after_a_resumed_run(finished):
-    """It is entered in the journal as the first one was: a third sampler goes on with it, not with the old one."""
+def test_a_new_annealing_after_a_resumed_run(finished):
+    """It is entered in the journal like the first one: a third sampler continues it, not the old one."""
     path, _ = finished
     sampler = make(path, "smc")
     sampler.run_mcmc(None, 1)
@@ -228,7 +228,7 @@ def test_a_new_climb_after_a_resumed_run(finished):
 
 
 def test_reset_after_burn_in(tmp_path):
-    """The chain is thrown away, the place is not."""
+    """The chain is discarded, the state is not."""
     chains = []
     for broken in (False, True):
         path = tmp_path / f"{broken}.h5"
@@ -236,7 +236,7 @@ def test_reset_after_burn_in(tmp_path):
         sampler.run_mcmc(None, 5)
         sampler.reset()
         if broken:
-            sampler.backend._journal.close()
+            sampler.backend.close()
             sampler = make(path, "smc")
         sampler.run_mcmc(None, 4)
         chains.append(sampler.get_chain())
@@ -245,20 +245,20 @@ def test_reset_after_burn_in(tmp_path):
 
 
 def test_two_runs_on_one_file(finished):
-    """The second one is told, also from another process."""
+    """The second one gets an error, also in another process."""
     path, sampler = finished
     shutil.copy(path, path.with_name("copy.h5"))
     with spawn(path.with_name("new.h5"), "smc", seconds=0.2) as first:
         while not journal_of(path.with_name("new.h5")).exists():
             time.sleep(0.01)
         with spawn(path.with_name("new.h5"), "smc") as second:
-            _, told = second.communicate(timeout=60)
+            _, output = second.communicate(timeout=60)
         first.kill()
-    assert second.returncode != 0 and "another run" in told
+    assert second.returncode != 0 and "another run" in output
 
 
 def test_blobs_that_cannot_be_stored(tmp_path):
-    """Told with the first batch, not at the first step of the chain."""
+    """An error with the first batch, not at the first step of the chain."""
     from samplers import SMCSampler
 
     posterior = Gaussian(NDIM)
@@ -275,7 +275,7 @@ def test_blobs_that_cannot_be_stored(tmp_path):
 
 
 def test_two_samplers_of_one_process(finished):
-    """The later one has the file; the earlier one is told."""
+    """The later one owns the file; the earlier one gets an error."""
     path, _ = finished
     first, second = make(path, "smc"), make(path, "smc")
     first.run_mcmc(None, 1)
@@ -289,8 +289,8 @@ def test_two_samplers_of_one_process(finished):
     assert make(path, "smc").iteration == STEPS + 3
 
 
-def test_failures_are_remembered(tmp_path):
-    """A point that raised counts as impossible, before and after the kill."""
+def test_failures_are_restored(tmp_path):
+    """A point that raised an exception counts as -inf, before and after the kill."""
 
     class Fragile(Gaussian):
         def __call__(self, x):
@@ -315,7 +315,7 @@ def test_failures_are_remembered(tmp_path):
         return sampler
 
     whole = run(tmp_path / "run.h5", 6)
-    whole.backend._journal.close()
+    whole.backend.close()
     cut(tmp_path / "run.h5", 0.8)
     again = run(tmp_path / "run.h5", 6)
     assert np.array_equal(again.get_chain(), whole.get_chain())

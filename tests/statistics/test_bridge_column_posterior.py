@@ -142,7 +142,7 @@ def test_smc_agrees_with_importance_sampling(run, make):
     assert difference < 4.0 * np.hypot(smc.log_evidence_error, check.log_evidence_error)
 
 
-def test_a_climb_on_the_coarse_posterior_agrees(run):
+def test_a_start_on_the_coarse_posterior_agrees(run):
     """Mean, sd and evidence of the fine posterior; half the work, counted in samples of the record simulated."""
     alone, posterior = run(bundled_reduced), bundled_reduced(None)
     sampler = SMCSampler(

@@ -1,4 +1,4 @@
-"""The Monte-Carlo error of posterior means from one run: against independent draws, and against the truth over runs."""
+"""Monte Carlo error of posterior means from one run, compared with independent draws and with errors over many runs."""
 
 import numpy as np
 import pytest
@@ -29,19 +29,19 @@ class TwoModes(Box):
         return np.logaddexp(*parts)
 
 
-def test_walkers_of_their_own_are_independent_draws(rng):
+def test_walkers_without_common_founders_are_independent_draws(rng):
     chain = 3e10 * rng.standard_normal((1, 400, 2))
     expected = chain[0].std(axis=0, ddof=1) / np.sqrt(400)
     assert np.allclose(standard_error_of_mean(chain, np.arange(400)), expected, rtol=1e-12)
-    constant = np.repeat(chain, 7, axis=0)  # sweeps that change nothing add nothing
+    constant = np.repeat(chain, 7, axis=0)  # sweeps without any change add no information
     assert np.allclose(standard_error_of_mean(constant, rng.permutation(400)), expected, rtol=1e-12)
 
 
 def test_copies_count_once(rng):
     chain = rng.standard_normal((1, 400, 2))
     expected = standard_error_of_mean(chain, np.arange(400))
-    copies, families = np.repeat(chain, 5, axis=1), np.repeat(np.arange(400), 5)
-    assert np.allclose(standard_error_of_mean(copies, families), expected, rtol=1e-12)
+    copies, founders = np.repeat(chain, 5, axis=1), np.repeat(np.arange(400), 5)
+    assert np.allclose(standard_error_of_mean(copies, founders), expected, rtol=1e-12)
     assert np.all(standard_error_of_mean(copies, np.arange(2000)) < expected / 2)
 
 
@@ -53,7 +53,7 @@ def test_resampled_weights_give_the_error_of_importance_sampling(rng):
         ancestors = multinomial(weights / weights.sum(), rng)
         estimates.append(x[ancestors].mean())
         errors.append(standard_error_of_mean(x[ancestors][None, :, None], ancestors)[0])
-    # the error of one run is uneven here (few points carry the weight); its square is right on average
+    # the error of one run varies here (few points carry the weight); its square is right on average
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(estimates), rel=0.2)
 
 
@@ -69,11 +69,11 @@ def test_founders_are_followed_while_there_are_enough(rng):
     assert len(few) == 1 and set(few[0]) == {3, 7}
 
 
-def test_what_does_not_fit_is_refused():
+def test_wrong_shapes_are_refused():
     assert np.all(standard_error_of_mean(np.zeros((2, 5, 3)), np.zeros(5)) == np.inf)
-    for chain, families in ((np.zeros((5, 3)), np.arange(5)), (np.zeros((2, 5, 3)), np.arange(4))):
+    for chain, founders in ((np.zeros((5, 3)), np.arange(5)), (np.zeros((2, 5, 3)), np.arange(4))):
         with pytest.raises(ValueError, match="the founder of each walker"):
-            standard_error_of_mean(chain, families)
+            standard_error_of_mean(chain, founders)
 
 
 def scores(posterior, samplers, stated):
@@ -87,13 +87,13 @@ def scores(posterior, samplers, stated):
     [
         *((mode, Gaussian, 120, 0.6) for mode in ("default", "moves", "literal", "tmcmc")),
         ("moves", TwoModes, 120, 0.6),
-        # modes are recycled from draws in even shares: the error is smaller than that of independent draws, as stated
+        # recycling draws evenly from the modes: the error is smaller than stated, which is that of independent draws
         ("default", TwoModes, 250, 0.4),
     ],
     ids=lambda value: getattr(value, "__name__", str(value)),
 )
 def test_mean_error_covers(mode, target, nwalkers, low, seed):
-    """Two standard errors cover the truth in nearly 95 % of 40 cheap runs, and are not idly wide."""
+    """Two standard errors cover the truth in nearly 95 % of 40 short runs, and are not too wide."""
     posterior = target()
     samplers = runs(posterior, seed, count=40, nwalkers=nwalkers, nsteps=2, **MODES[mode])
     covered, ratio = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
@@ -102,19 +102,19 @@ def test_mean_error_covers(mode, target, nwalkers, low, seed):
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_walkers_taken_for_independent_state_too_small_an_error(seed):
-    """Negative control: moves too short to tell copies apart. The families say so, the walkers alone do not."""
+def test_control_walkers_counted_as_independent_give_too_small_an_error(seed):
+    """Negative control: moves too short to separate copies. The error accounts for it only with the founders."""
     posterior = Gaussian(2, sd=0.1)
     samplers = runs(
         posterior, seed, count=40, nwalkers=400, nsteps=1, moves=RandomWalkMove(scale=0.3), min_moves=1, max_moves=1
     )
     alone = [standard_error_of_mean(s.get_chain(), np.arange(s.nwalkers)) for s in samplers]
-    families = [s.mean_error() for s in samplers]
+    founders = [s.mean_error() for s in samplers]
     assert np.max(scores(posterior, samplers, np.array(alone))[1]) > 1.6
-    assert np.all(scores(posterior, samplers, np.array(families))[1] < 1.6)
+    assert np.all(scores(posterior, samplers, np.array(founders))[1] < 1.6)
 
 
-def test_a_chain_that_goes_on_elsewhere_has_no_families():
+def test_a_chain_continued_by_another_sampler_has_no_founders():
     posterior = Gaussian()
     sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=1, recycle=False)
     sampler.run_mcmc(None, 3)

@@ -1,4 +1,4 @@
-"""A climb that begins on a cheaper model: the answer is that of the fine one, whatever the cheaper one is."""
+"""Annealing that starts on a cheaper model: the result is that of the fine model, whatever the cheaper one is."""
 
 import emcee
 import numpy as np
@@ -121,7 +121,7 @@ def test_a_constant_in_the_coarse_likelihood_changes_no_draw(seed):
 
 
 def test_points_one_by_one_and_blobs(seed):
-    """The coarse model is called as the fine one is; its blobs are its own affair."""
+    """The coarse model is called in the same way as the fine one; its blobs are not kept."""
     batch, single = (
         SMCSampler(250, 3, WithBlobs(), vectorize=vectorize, seed=seed, coarse_log_prob_fn=WithBlobs(sd=0.2))
         for vectorize in (True, False)
@@ -158,11 +158,11 @@ def on_file(path, seed=5, **changes):
 
 
 def test_a_run_goes_on(tmp_path):
-    """Bit for bit; nothing of the fine model is evaluated again, the coarse one climbs once more."""
+    """Equal to the last bit; the fine model is not evaluated again, the coarse annealing is repeated."""
     path = tmp_path / "run.h5"
     whole = on_file(path)
     whole.run_mcmc(None, 3)
-    whole.backend._journal.close()
+    whole.backend.close()
     journal = path.with_name(path.name + ".mcmc.journal")
     journal.write_bytes(journal.read_bytes()[: int(0.3 * journal.stat().st_size)])
     sampler = on_file(path, seed=99)

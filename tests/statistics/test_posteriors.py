@@ -21,7 +21,7 @@ MODES = {
 EXACT = [mode for mode in MODES if mode != "published tmcmc"]  # that one collapses
 
 
-both_climbs = pytest.mark.parametrize("recycle", [True, False], ids=["recycling", "moves"])
+both_ways_of_annealing = pytest.mark.parametrize("recycle", [True, False], ids=["recycling", "moves"])
 
 
 def runs(posterior, seed, count=8, nwalkers=200, nsteps=4, Sampler=SMCSampler, **kwargs):
@@ -97,7 +97,7 @@ def test_a_wrong_kernel_is_caught(seed):
     assert not within(spread, samplers)
 
 
-@both_climbs
+@both_ways_of_annealing
 def test_two_modes(recycle, seed):
     """Weights 1:2, ten standard deviations apart."""
     centres, sd, weights = np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.5]]), 0.1, np.array([1.0, 2.0]) / 3
@@ -113,7 +113,7 @@ def test_two_modes(recycle, seed):
     assert within(evidence_deviation(samplers, -3 * np.log(3)), samplers)
 
 
-@both_climbs
+@both_ways_of_annealing
 def test_edges_of_a_truncated_prior(recycle, seed):
     """The posterior is a half-normal with its mode on the edge, times an exponential that piles up at another."""
 
@@ -151,7 +151,7 @@ def test_flat_likelihood(seed):
     assert within(deviations(samplers, [0.5, 1.5]), samplers)
 
 
-@both_climbs
+@both_ways_of_annealing
 def test_very_informative_likelihood(recycle, seed):
     """The posterior is a hundred thousand times narrower than the prior."""
     posterior = Gaussian(2, sd=1e-5)
@@ -160,7 +160,7 @@ def test_very_informative_likelihood(recycle, seed):
     assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
 
 
-@both_climbs
+@both_ways_of_annealing
 def test_dead_regions(recycle, seed):
     """Where the model fails the likelihood is zero: 70 % of the box."""
     posterior = Box([0, 0], [1, 1], lambda x: np.where(x[..., 0] > 0.3, -np.inf, -10.0 * x[..., 1]))

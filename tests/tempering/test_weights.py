@@ -1,4 +1,4 @@
-"""The pure functions: weights, next beta, resampling, the error of the evidence; and the proposals' exactness."""
+"""Weights, next beta, resampling, error of the evidence, and proposals that are drawn from the density they state."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from samplers.tempering.weights import (
 
 
 @pytest.mark.parametrize("offset", [-5000.0, 0.0, 5000.0, 1e8])
-def test_weights_know_no_offset(rng, offset):
+def test_weights_do_not_depend_on_an_offset(rng, offset):
     log_weights = 30 * rng.standard_normal(500)
     log_weights[7] = -np.inf
     shifted = log_weights + offset
@@ -56,17 +56,17 @@ def test_next_beta_meets_the_target_or_is_one(rng, scale, beta):
 def test_next_beta_of_special_likelihoods(rng):
     assert next_beta(np.full(100, -5000.0), 0.0, 99) == 1.0
     half_dead = np.where(np.arange(100) < 50, -np.inf, -1.0)
-    assert next_beta(half_dead, 0.0, 95) == 1.0  # the target is meant per point that is left
+    assert next_beta(half_dead, 0.0, 95) == 1.0  # the target refers to points of finite likelihood
     log_likelihood = np.where(np.arange(100) < 50, -np.inf, -1e4 * rng.uniform(size=100))
     found = next_beta(log_likelihood, 0.0, 80)
     assert effective_sample_size(found * log_likelihood[50:]) == pytest.approx(40, rel=1e-4)
     with pytest.raises(ValueError, match="no point"):
         next_beta(np.full(5, -np.inf), 0.0, 3)
-    cliff = np.append(np.full(99, -1e300), 0.0)  # no representable step keeps the target: climb, do not hang
+    cliff = np.append(np.full(99, -1e300), 0.0)  # no representable step keeps the target: beta still increases
     assert 0.5 < next_beta(cliff, 0.5, 50) < 0.5 + 1e-15
 
 
-def test_next_beta_does_not_snap(rng):
+def test_next_beta_near_one_is_not_rounded_up(rng):
     log_likelihood = -200 * rng.chisquare(3, size=300)
     beta = next_beta(log_likelihood, 0.97, 299)
     assert beta < 0.98
