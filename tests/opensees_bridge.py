@@ -1,13 +1,13 @@
 """The isolated bridge built in OpenSees, a peer for tests and benchmarks.
 
-Beams for the piers, rigid links for the blocks, flat slider bearings whose friction grows with velocity, elastic
-springs of odd powers for the rubber, dampers of Maxwell; Newmark's average acceleration with Newton iterations. The
-sliders stick as springs of stiffness fmin W / Y and slip at the friction of the moment: the elastic-plastic law.
-OpenSees has no part for the half loop of the rubber, whose width grows with displacement, so a bridge that is given
-one is refused.
+It has beams for the piers, rigid links for the blocks, flat slider bearings with velocity-dependent friction, elastic
+springs of odd powers for the rubber and Maxwell dampers. Newmark's average acceleration integrates the equations. The
+sliders stick as springs of stiffness fmin W / Y and slip at the friction of the current velocity (elastic-plastic
+law). OpenSees has no element for the half loop of the rubber, whose width grows with displacement, so a bridge with a
+half loop is refused.
 
-OpenSees holds one model per process and may end that process, so each run has one of its own: it starts
-``python -m tests.opensees_bridge JOB RESULT`` and reads what it leaves.
+OpenSees has one model per process and may end that process. Each run therefore starts a process
+``python -m tests.opensees_bridge JOB RESULT`` and reads its result file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:  # the process that runs OpenSees need not wait for scipy and numba
+if TYPE_CHECKING:  # the process that runs OpenSees does not have to import scipy and numba
     from .scipy_bridge import Definition
 
 __all__ = ["Run", "run"]
@@ -30,16 +30,24 @@ __all__ = ["Run", "run"]
 GRAVITY = 9.81  # m/s2
 MAX_ITERATIONS = 50
 STIFF = 1e10  # N/m: the bearings along the vertical
-DECK, SECOND = 100, 200  # nodes of the deck, and what is added to numbers of pier 1 for those of pier 2
+DECK, SECOND = 100, 200  # nodes of the deck, and offset of the numbers of pier 2 from those of pier 1
 BASE, TIP, CENTRE, TOP = 1, 2, 3, 4  # nodes of pier 1
 BEAM, SLIDER, RUBBER, DAMPER = 1, 2, 3, 4  # its elements
 
 
 class Run(NamedTuple):
-    """Response (12, n) [SI], rows as `scipy_bridge.CHANNELS`; shorter than the record without convergence."""
+    """Result of one run.
+
+    Attributes
+    ----------
+    response : ndarray[12, n]
+        Rows as `scipy_bridge.CHANNELS` [SI]; shorter than the record if OpenSees did not converge.
+    seconds : float
+        CPU time of the analysis alone.
+    """
 
     response: np.ndarray
-    seconds: float  # CPU time of the analysis alone
+    seconds: float
 
 
 def run(
@@ -50,16 +58,24 @@ def run(
     step: float,
     tolerance: float = 1e-10,
 ) -> Run:
-    """Response of the bridge, from rest, to the acceleration (n,) [m/s2] of the table at the step `dt` [s].
+    """Simulate the bridge from rest.
 
     Parameters
     ----------
     bridge : Definition
         At its parameters, without half loop (``loop=(0.0,)``).
+    acceleration : ndarray[n]
+        Acceleration of the table [m/s²].
+    dt : float
+        Step of the samples and of the response [s].
     step : float
-        Of the integration [s], a whole part of `dt`; the response comes at `dt`.
+        Integration step [s], which divides `dt`.
     tolerance : float
         Norm of the last displacement increment [m and rad].
+
+    Returns
+    -------
+    Run
     """
     if any(bridge.loop):
         raise ValueError(f"OpenSees has no half loop for the rubber: expected loop=(0.0,); got {bridge.loop}")
@@ -80,7 +96,7 @@ def run(
 
 
 def _pier(ops, b: dict, i: int) -> None:
-    """Pier `i` with its block and what stands between the block and node DECK + i of the deck."""
+    """Build pier `i` with its block, and the isolators between the block and node DECK + i of the deck."""
     n = SECOND * i
     deck = DECK + i
     heights = {BASE: 0.0, TIP: b["length"], CENTRE: b["length"] + b["centre"], TOP: b["length"] + b["height"]}
@@ -90,7 +106,7 @@ def _pier(ops, b: dict, i: int) -> None:
     ops.fix(n + BASE, 1, 1, 1)
     ops.fix(deck, 0, 0, 1)
     ops.mass(n + CENTRE, b["mass"], 0.0, b["rotary"])
-    # the tip is free to sink: a support at a node that leads others makes those of its followers wrong in OpenSees 3.7
+    # the tip is free vertically: OpenSees 3.7 gives wrong supports if the leading node of a rigid link is fixed
     ops.rigidLink("beam", n + TIP, n + CENTRE)
     ops.rigidLink("beam", n + TIP, n + TOP)
     ops.geomTransf("Linear", 1 + i)
@@ -102,7 +118,7 @@ def _pier(ops, b: dict, i: int) -> None:
     ops.uniaxialMaterial("Elastic", n + 2, 0.0)
     ops.frictionModel("VelDependent", 1 + i, slow, slow + rise, rate)
     stick = slow * weight / b["slip"]
-    # from the deck down: the moment of the weight beside its bearing stays with the deck, as the model has it
+    # oriented from the deck down, so that the moment of the eccentric weight stays with the deck, as in the model
     down = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0)
     materials = ("-P", n + 1, "-Mz", n + 2)
     ops.element("flatSliderBearing", n + SLIDER, deck, n + TOP, 1 + i, stick, *materials, "-orient", *down)
@@ -143,7 +159,7 @@ def _shake(ops, b: dict, acceleration: np.ndarray, dt: float, stride: int, toler
         raise RuntimeError("OpenSees did not converge under gravity")
     ops.loadConst("-time", 0.0)
 
-    # a path ends at its last point: round-off in the clock must not step over it
+    # a path ends at its last point; one more value keeps round-off of the clock from passing the end
     values = np.append(acceleration, acceleration[-1]).tolist()
     ops.timeSeries("Path", 2, "-dt", dt, "-values", *values)
     ops.pattern("UniformExcitation", 2, 1, "-accel", 2)
@@ -153,7 +169,7 @@ def _shake(ops, b: dict, acceleration: np.ndarray, dt: float, stride: int, toler
     ops.recorder("Node", "-binary", files["beams"], "-node", *tips, "-dof", 1, 3, "disp")
     ops.recorder("Node", "-binary", files["blocks"], "-node", *tops, "-dof", 1, "disp")
     ops.recorder("Node", "-binary", files["deck"], "-node", DECK, "-dof", 1, "disp")
-    # with the time series the accelerations are absolute
+    # with the time series, accelerations are absolute
     ops.recorder("Node", "-binary", files["absolute"], "-timeSeries", 2, "-node", DECK, *tops, "-dof", 1, "accel")
     ops.recorder("Element", "-binary", files["isolators"], "-ele", *isolators, "force")
     _analysis(ops, ("Newmark", 0.5, 0.25), "Transient", tolerance)
@@ -166,21 +182,21 @@ def _shake(ops, b: dict, acceleration: np.ndarray, dt: float, stride: int, toler
     at_rest = np.zeros((12, 1))
     at_rest[8:10] = at_rest[11] = acceleration[0]
     stiffness = b["stiffness"]
-    # a turn of OpenSees is counted from x to y, one of the bridge from y to x
+    # rotations have opposite signs in OpenSees and in the bridge
     shears = stiffness[0, 0] * beams[0::2] - stiffness[0, 1] * beams[1::2]
-    # three parts of each isolator, six forces each: the one along x on the node of the block
+    # three elements per isolator with six forces each, of which the one along x on the node of the block is needed
     on_block = -forces.reshape(2, 3, 6, -1)[:, [0, 1, 2], [3, 0, 0]].sum(axis=1)
     rows = [deck - blocks, on_block, blocks, shears, absolute[1:], deck, absolute[:1]]
     return Run(np.hstack([at_rest, np.concatenate(rows)]), seconds)
 
 
 def _read(file: str, count: int) -> np.ndarray:
-    """What a binary recorder has left, (n, count): a byte ends each of its lines."""
+    """Read the file of a binary recorder, (n, count); a byte ends each line."""
     return np.fromfile(file, dtype=[("values", float, (count,)), ("end", "u1")])["values"]
 
 
 def main() -> None:
-    """Run one job: the file of what to run, and the file for the result."""
+    """Run one job; the arguments are the file of the job and the file for the result."""
     import openseespy.opensees as ops
 
     result = Path(sys.argv[2])

@@ -1,12 +1,12 @@
 """The bridge column built in OpenSees, a peer for tests and benchmarks.
 
-The same column as `RCColumn`, from OpenSees' own parts: Concrete04 and ReinforcingSteel fibers, force-based
-elements with Gauss-Lobatto points, corotational transformation, Newmark's average acceleration with Newton iterations.
-`peer_of` translates an `RCColumn` and its parameters from their published definitions into kip and inch (it uses the
-model's fibers and confinement, none of its kernels), and `shake` and `push` run it.
+The same column as `RCColumn`, from elements of OpenSees: Concrete04 and ReinforcingSteel fibers, force-based elements
+with Gauss-Lobatto points, corotational transformation, Newmark's average acceleration with Newton iterations.
+`peer_of` translates an `RCColumn` and its parameters into kip and inch (it uses the fibers and the confinement of the
+model, none of its kernels); `shake` and `push` run it.
 
-OpenSees holds one model per process and may end that process, so each run has one of its own: it starts
-``python -m tests.opensees_column JOB RESULT`` and reads what it leaves.
+OpenSees has one model per process and may end that process. Each run therefore starts a process
+``python -m tests.opensees_column JOB RESULT`` and reads its result file.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import pytest
 
 from fe_likelihoods.units import G0, to_si
 
-if TYPE_CHECKING:  # the process that runs OpenSees need not wait for the compiled model
+if TYPE_CHECKING:  # the process that runs OpenSees does not have to import the compiled model
     from fe_likelihoods.models.rc_column import RCColumn
 
 __all__ = ["PeerColumn", "Push", "Shake", "peer_of", "push", "require_opensees", "shake"]
@@ -36,7 +36,7 @@ MAX_ITERATIONS = 50
 
 
 class PeerColumn(NamedTuple):
-    """What OpenSees is told, in kip, inch and second."""
+    """Input of OpenSees in kip, inch and second."""
 
     core: tuple  # Concrete04: fc, eps_c, eps_cu (negative), Ec, ft, eps_tu, beta
     cover: tuple
@@ -53,7 +53,7 @@ class PeerColumn(NamedTuple):
 
 
 class Shake(NamedTuple):
-    """Response to base acceleration; shorter than the record when OpenSees did not converge."""
+    """Response to base acceleration; shorter than the record if OpenSees did not converge."""
 
     response: (
         np.ndarray
@@ -63,7 +63,7 @@ class Shake(NamedTuple):
 
 
 class Push(NamedTuple):
-    """Response to imposed displacement; shorter than the targets when OpenSees did not converge."""
+    """Response to imposed displacement; shorter than the targets if OpenSees did not converge."""
 
     response: np.ndarray  # (5, n): lateral displacement [in], force [kip], vertical displacement, and rotation of the
     # top, base moment [kip in]
@@ -71,7 +71,7 @@ class Push(NamedTuple):
 
 
 def require_opensees() -> None:
-    """Skip the test, saying so, where OpenSees cannot be imported."""
+    """Skip the test with a message where OpenSees cannot be imported."""
     if importlib.util.find_spec("openseespy") is None:
         pytest.skip("NO OPENSEES: install openseespy (extra 'test') to compare with it")
     probe = subprocess.run([sys.executable, "-c", "import openseespy.opensees"], capture_output=True, text=True)
@@ -81,7 +81,7 @@ def require_opensees() -> None:
 
 
 def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
-    """The column of `model` at multiples `theta` of its nominal parameters."""
+    """Return the column of `model` at multiples `theta` of its nominal parameters."""
     values = dict(model.nominal)
     for name, factor in zip(model.parameters, theta, strict=True):
         values[name] *= float(factor)
@@ -117,15 +117,27 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
 
 
 def shake(column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10) -> Shake:
-    """Gravity, then base acceleration (n,) [in/s2] at the step `dt` [s], in a process of its own.
+    """Apply gravity, then a base acceleration, in a separate process.
 
-    tolerance : norm of the last displacement increment [in and rad].
+    Parameters
+    ----------
+    column : PeerColumn
+    acceleration : ndarray[n]
+        [in/s²]
+    dt : float
+        Step [s].
+    tolerance : float
+        Norm of the last displacement increment [in and rad].
+
+    Returns
+    -------
+    Shake
     """
     return _in_process("_shake", column, np.asarray(acceleration, dtype=float), dt, tolerance)
 
 
 def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10) -> Push:
-    """Gravity, then lateral displacement of the top through `targets` (n,) [in], one step each, in a process."""
+    """Apply gravity, then move the top through `targets` (n,) [in], one step each, in a separate process."""
     return _in_process("_push", column, np.asarray(targets, dtype=float), tolerance)
 
 
@@ -142,7 +154,7 @@ def _in_process(function: str, *arguments) -> Shake | Push:
 
 
 def _build(ops, column: PeerColumn, tolerance: float) -> None:
-    """The column under its gravity load, clock at zero."""
+    """Build the column and apply its gravity load; the clock is reset to zero."""
     n = column.n_elements
     ops.wipe()
     ops.model("basic", "-ndm", 2, "-ndf", 3)
@@ -179,7 +191,7 @@ def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, toleran
     _build(ops, column, tolerance)
     top = column.n_elements + 1
     ops.rayleigh(column.a0, 0.0, 0.0, column.a1)
-    # a path ends at its last point: round-off in the clock must not step over it
+    # a path ends at its last point; one more value keeps round-off of the clock from passing the end
     values = np.append(acceleration, acceleration[-1]).tolist()
     ops.timeSeries("Path", 2, "-dt", dt, "-values", *values)
     ops.pattern("UniformExcitation", 2, 1, "-accel", 2)
@@ -234,12 +246,12 @@ def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float) -> Pus
 
 
 def main() -> None:
-    """Run one job: the file of the function and its arguments, and the file for the result."""
+    """Run one job; the arguments are the file of the job and the file for the result."""
     import openseespy.opensees as ops
 
     function, arguments = pickle.loads(Path(sys.argv[1]).read_bytes())
     result = {"_shake": _shake, "_push": _push}[function](ops, *arguments)
-    # the classes of this module have another name while it runs as a program
+    # the classes of this module have another qualified name while it runs as a program
     plain = (type(result).__name__, tuple(result))
     Path(sys.argv[2]).write_bytes(pickle.dumps(plain))
 

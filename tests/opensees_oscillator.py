@@ -17,10 +17,10 @@ CHANNELS = (
 
 
 class Oscillator:
-    """Unit mass on a spring and a dashpot, by Newmark's average acceleration with `substeps` steps a sample.
+    """Unit mass on a spring and a dashpot, by Newmark's average acceleration with `substeps` steps per sample.
 
-    Parameters of a run: multiples of stiffness and damping ratio. From a stiffness of 9 on it misbehaves: 9 crashes,
-    10 hangs, 11 does not converge.
+    The parameters of a run are multiples of stiffness and damping ratio. Some values of the stiffness simulate faults:
+    9 crashes the process, 10 hangs, 11 does not converge.
     """
 
     def __init__(self, acceleration: np.ndarray, dt: float, substeps: int) -> None:
@@ -40,7 +40,9 @@ class Oscillator:
         ops.mass(2, 1.0)
         ops.uniaxialMaterial("Elastic", 1, omega**2, 2.0 * damping * DAMPING * omega)
         ops.element("zeroLength", 1, 1, 2, "-mat", 1, "-dir", 1, "-doRayleigh", 0)
-        values = np.append(self.acceleration, self.acceleration[-1]).tolist()  # round-off must not step over the end
+        values = np.append(
+            self.acceleration, self.acceleration[-1]
+        ).tolist()  # one more value: round-off must not pass the end
         ops.timeSeries("Path", 1, "-dt", self.dt, "-values", *values)
         ops.pattern("UniformExcitation", 1, 1, "-accel", 1)
         ops.constraints("Plain")

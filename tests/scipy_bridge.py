@@ -1,14 +1,14 @@
 """The isolated bridge as an ordinary differential equation for scipy's `solve_ivp`, a peer for tests and benchmarks.
 
-Written from the definition of the bridge and apart from the library's kernels: the free bodies of the deck and of the
-two blocks on their piers (moments about the centre of mass of a block, not the matrices of the finite elements), rates
-of the friction and of the dampers, and outputs by the equations of motion. `Definition` holds the nominal values once
-more; the peer in OpenSees reads them from here too.
+This implementation shares no code with the kernels of the library. It uses the free bodies of the deck and of the two
+blocks on their piers (moments about the centre of mass of a block, not assembled matrices), rate equations of friction
+and dampers, and outputs from the equations of motion. `Definition` repeats the nominal values; the peer in OpenSees
+reads them from here.
 
-Friction is Wen's smooth law with exponent 2, or a spring that slips at the friction of the moment. For the latter the
-stretch of the spring may exceed the slip for a relaxation time, which makes a differential equation of the law; the
-force itself is cut at the slip. What is left is an error of first order in that time, made where the slip follows the
-velocity down to a reversal: 1e-4 of the peaks at a microsecond.
+Friction is the Bouc-Wen law with exponent 2, or an elastic-plastic spring that slips at the friction of the current
+velocity. The latter becomes a differential equation by letting the stretch of the spring exceed the slip for a short
+relaxation time; the force itself is limited to the slip force. The remaining error is of first order in this time and
+arises where the slip force decreases before a reversal. It is 1e-4 of the peaks at a relaxation time of 1e-6 s.
 """
 
 from typing import NamedTuple
@@ -24,13 +24,13 @@ CHANNELS = (
     *("Ub_1", "Ub_2", "Fb_1", "Fb_2", "drift_1", "drift_2"),
     *("shear_1", "shear_2", "acc_p1", "acc_p2", "Ud", "acc_d"),
 )
-GRAVITY = 9.81  # m/s2: weights are turned into masses with it
-# of the states: displacement and rotation of the five degrees of freedom, their velocities, friction, dampers
+GRAVITY = 9.81  # [m/s²], for masses from weights
+# typical sizes of the states: five degrees of freedom, their velocities, friction, damper forces
 SCALE = np.repeat([1e-2, 1e-1, 1.0, 1e4], [5, 5, 2, 2])
 
 
 class Definition(NamedTuple):
-    """Nominal values [N, m, s, kg], those of a pier or of one of its dampers in pairs."""
+    """Nominal values [N, m, s, kg]; pairs hold the values of the two piers."""
 
     deck_weight: float = 140e3
     weight: tuple[float, float] = (70e3, 70e3)  # on the bearing
@@ -57,7 +57,7 @@ class Definition(NamedTuple):
     beta: float = 0.1
 
     def at(self, theta: np.ndarray) -> "Definition":
-        """The bridge at multiples (10,) of fmin_1, df_1, a_1, fmin_2, df_2, a_2, Kd_1, C0_1, Kd_2, C0_2."""
+        """Return the bridge at multiples (10,) of fmin_1, df_1, a_1, fmin_2, df_2, a_2, Kd_1, C0_1, Kd_2, C0_2."""
         x = np.asarray(theta, dtype=float)
         scaled = {"slow": x[0:6:3], "rise": x[1:6:3], "rate": x[2:6:3], "spring": x[6::2], "dashpot": x[7::2]}
         return self._replace(
@@ -66,14 +66,14 @@ class Definition(NamedTuple):
 
     @property
     def stiffness(self) -> np.ndarray:
-        """Of a cantilever's tip: shear and moment by displacement and rotation, (2, 2)."""
+        """Stiffness (2, 2) of the tip of a cantilever: shear and moment from displacement and rotation."""
         length = self.length
         terms = np.array([[12.0, -6.0 * length], [-6.0 * length, 4.0 * length**2]])
         return self.modulus * self.inertia / length**3 * terms
 
     @property
     def stiffness_damping(self) -> float:
-        """Factor [s] of a pier's stiffness that gives its damping."""
+        """Factor [s] of the stiffness of a pier that gives its damping."""
         lever = self.mass * self.centre
         mass = np.array([[self.mass, lever], [lever, self.rotary + lever * self.centre]])
         return 2.0 * self.damping / np.sqrt(eigh(self.stiffness, mass, eigvals_only=True)[0])
@@ -86,7 +86,7 @@ class Solution(NamedTuple):
     evaluations: int
 
 
-# one record, because scipy hands it over at every evaluation: a tuple of as many arrays costs more than the evaluation
+# one structured array, because scipy passes it at every evaluation, and a tuple of arrays costs more than the evaluation
 _CONSTANTS = np.dtype(
     [(name, float) for name in ("dt", "overshoot", "k_uu", "k_up", "k_pp", "retardation", "deck")]
     + [(name, float) for name in ("mass", "rotary", "height", "centre", "rubber_length", "rubber_limit")]
@@ -116,7 +116,7 @@ def _odd(coefficients, s):
 
 @njit(cache=True)
 def _isolator(c, i, u, v, z, damper, load):
-    """Force of an isolator and the rate of its friction."""
+    """Return the force of an isolator and the rate of its friction variable."""
     friction = c.slow[i] + c.rise[i] * (1.0 - np.exp(-c.rate[i] * abs(v)))
     if c.elastic_plastic:
         bound = friction / c.slow[i] * load
@@ -138,7 +138,7 @@ def _isolator(c, i, u, v, z, damper, load):
 
 @njit(cache=True)
 def _state(t, x, c, motion, lift, rates, out):
-    """Fill the rates (14,) of the state and the channels (12,) at one instant."""
+    """Write the rates (14,) of the state and the channels (12,) at one instant."""
     ground = _sample(motion, c.dt, t)
     load = max(0.0, 1.0 + _sample(lift, c.dt, t) / GRAVITY)
     deck_force = 0.0
@@ -150,7 +150,7 @@ def _state(t, x, c, motion, lift, rates, out):
         moment = c.k_up * u + c.k_pp * turn
         pushed = shear + c.retardation * (c.k_uu * du + c.k_up * dturn) + c.p_uu[i] * u + c.p_up[i] * turn
         turned = moment + c.retardation * (c.k_up * du + c.k_pp * dturn) + c.p_up[i] * u + c.p_pp[i] * turn
-        of_centre = (force - pushed) / c.mass  # absolute acceleration
+        of_centre = (force - pushed) / c.mass  # absolute acceleration of the centre of mass
         angular = ((c.height - c.centre) * force - turned + c.centre * pushed) / c.rotary
         rates[1 + 2 * i], rates[2 + 2 * i] = du, dturn
         rates[6 + 2 * i], rates[7 + 2 * i] = of_centre - c.centre * angular - ground, angular
@@ -220,25 +220,34 @@ def solve(
     vertical: np.ndarray | None = None,
     overshoot: float = 1e-8,
 ) -> Solution:
-    """Response of the bridge, from rest, to the acceleration (n,) [m/s2] of the table at the step `dt` [s].
+    """Simulate the bridge from rest.
 
     Parameters
     ----------
     bridge : Definition
         At its parameters: ``Definition().at(theta)``.
-    friction : "bouc-wen" or "elastic-plastic"
+    acceleration : ndarray[n]
+        Acceleration of the table [m/s²].
+    dt : float
+        Step of the samples [s].
+    friction : str
+        "bouc-wen" or "elastic-plastic".
     method : str
-        A name that `solve_ivp` knows; explicit ones crawl where friction is elastic-plastic.
+        Name of a method of `solve_ivp`; explicit methods are very slow for elastic-plastic friction.
     tolerance : float
-        Relative; the absolute one is a tenth of it, of the usual size of each state.
+        Relative tolerance; the absolute one is a tenth of it, times the typical size of each state.
     every : int
-        Outputs at every so many samples of the record.
+        One output per so many samples of the record.
     p_delta : bool
-        Whether the weights push the piers aside.
-    vertical : (n,) float, optional
-        Vertical acceleration of the table [m/s2], which changes the weight on the bearings.
+        Whether the weights act on the deformed piers.
+    vertical : ndarray[n], optional
+        Vertical acceleration of the table [m/s²], which changes the load on the bearings.
     overshoot : float
-        Relaxation time [s] of the elastic-plastic law; much shorter ones can stall LSODA.
+        Relaxation time [s] of the elastic-plastic law; LSODA may not progress with much shorter ones.
+
+    Returns
+    -------
+    Solution
     """
     motion = np.ascontiguousarray(acceleration, dtype=float)
     lift = np.zeros_like(motion) if vertical is None else np.ascontiguousarray(vertical, dtype=float)
@@ -253,7 +262,7 @@ def solve(
         args=arguments,
         rtol=tolerance,
         atol=0.1 * tolerance * SCALE,
-        # nothing moves before the record does: without a first step the solvers would stride over its beginning
+        # the bridge is at rest before the record begins: without this the first step could jump over its beginning
         first_step=1e-5,
     )
     if not run.success:
@@ -262,5 +271,5 @@ def solve(
 
 
 def peak_errors(response: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Largest difference of each channel relative to the largest value of the reference."""
+    """Return the largest difference of each channel over the largest value of the reference."""
     return np.abs(response - reference).max(axis=-1) / np.abs(reference).max(axis=-1)

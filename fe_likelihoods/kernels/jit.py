@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numba
 
-__all__ = ["kernel", "KERNEL_HASH", "SUM_REORDERING"]
+__all__ = ["kernel", "CACHE_FOLDER", "KERNEL_HASH", "SUM_REORDERING"]
 
 SUM_REORDERING = {"reassoc", "contract", "nsz"}
 """LLVM flags that allow sums to be reordered, which SIMD reductions need. NaN and infinity keep their meaning, which
@@ -36,7 +36,7 @@ KERNEL_HASH: str = _hash_sources()
 """Hash of the sources of all kernels."""
 
 
-def _cache_folder() -> str:
+def _find_cache_folder() -> str:
     """Return the first writable folder below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME, ~/.cache, the temporary folder."""
     user = f"fe_likelihoods-{os.getuid()}" if hasattr(os, "getuid") else "fe_likelihoods"
     roots = [
@@ -58,7 +58,8 @@ def _cache_folder() -> str:
     )
 
 
-_CACHE_FOLDER = _cache_folder()
+CACHE_FOLDER: str = _find_cache_folder()
+"""Folder of the machine code."""
 
 
 def kernel(
@@ -89,7 +90,7 @@ def kernel(
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _CACHE_FOLDER  # numba reads it at decoration; it is restored below
+    numba.config.CACHE_DIR = CACHE_FOLDER  # numba reads it at decoration; it is restored below
     try:
         return numba.njit(
             nogil=True,

@@ -12,14 +12,11 @@ The backbone s_b(x) is odd in x. With z = |x|::
     up to up       s = fsh + (z-shp) Eu + (fsu-fsh)(1-w^p),   w = (up-z)/(up-shp)    strain hardening
     beyond         s = fsu + (z-shp) Eu
 
-Between reversals the path is a curve of Menegotto and Pinto from (xa, sa, Ea) to (xb, sb, Eb)::
-
-    s = sa + Ea (x-xa) [Q - (Q-1)/(1+t^R)^(1/R)],   t = |Ea (x-xa)/(s_ch-sa)|
-
-A branch number selects the curve. Branches 1 and 2 are the backbones in tension and compression. Branches 3, 5, 7 ...
-are the curves of successively nested reversals of which the first goes down from tension; 4, 6, 8 ... are their mirror
-images. A branch b > 2 keeps its curve in the slot of level (b+1)//2. Only the rules of the odd branches are written
-out. An even branch is processed by the same rules with the signs of all strains and stresses changed.
+Between reversals the path is a curve of Menegotto and Pinto (`menegotto_pinto`). A branch number selects the curve.
+Branches 1 and 2 are the backbones in tension and compression. Branches 3, 5, 7 ... are the curves of successively
+nested reversals of which the first goes down from tension; 4, 6, 8 ... are their mirror images. A branch b > 2 keeps its
+curve in the slot of level (b+1)//2. Only the rules of the odd branches are written out. An even branch is processed by the
+same rules with the signs of all strains and stresses changed.
 
 The law is that of the material ReinforcingSteel of OpenSees with its default options: no buckling, no fatigue, no
 isotropic hardening. ``docs/theory/reinforcing_steel.rst`` lists all rules.
@@ -28,8 +25,6 @@ References
 ----------
 G. A. Chang, J. B. Mander, Seismic energy based fatigue damage analysis of bridge columns, part I, report
 NCEER-94-0006, 1994.
-
-M. Menegotto, P. E. Pinto, Method of analysis for cyclically loaded R.C. plane frames, IABSE Symposium, Lisbon, 1973.
 
 L. L. Dodd, J. I. Restrepo-Posada, Model for predicting cyclic behavior of reinforcing steel, Journal of Structural
 Engineering 121(3), 1995, doi:10.1061/(ASCE)0733-9445(1995)121:3(433).
@@ -43,6 +38,7 @@ from __future__ import annotations
 import math
 
 from .jit import SUM_REORDERING, kernel
+from .menegotto_pinto import EA, N_CURVE, SA, SB, SCH, XA, XB, End, evaluate_curve, fit_curve
 
 __all__ = [
     "N_CONSTANTS",
@@ -63,8 +59,7 @@ N_CONSTANTS = 17
 
 # Layout of the memory of one bar: ten scalars, then nine numbers for the curve of each level from 2 to 10.
 BRANCH, OP, ON, XMAX, XMIN, XXMAX, XXMIN, RE, XC, SC, CURVES = range(11)
-XA, SA, EA, XB, SB, EB, RR, QQ, SCH = range(9)
-N_STATE = 10 + 9 * 9
+N_STATE = 10 + 9 * N_CURVE
 
 TRANSITION = 0.0002  # strain over which the plateau turns into hardening
 TIE = 1e-14  # strains closer than this count as equal
@@ -168,102 +163,6 @@ def virgin_stress_tangent(eps, e0, ep, f0):
 
 
 @kernel
-def _fit_residual(a, r, ea, eb, es):
-    """Return g(A) of the Menegotto-Pinto fit, which is zero where the curve ends at (xb, sb) with slope Eb."""
-    return eb - es * (1.0 - a ** (r + 1.0)) / (1.0 - a) + ea * a * (1.0 - a**r) / (1.0 - a)
-
-
-@kernel
-def _fit_root(r, ea, eb, es, r_min):
-    """Return the root A in (0, 1) of `_fit_residual`.
-
-    The search stops when A changes by less than 1e-4, so its steps affect the last digits of the stress. They follow
-    OpenSees, to which the stress histories of the tests belong.
-    """
-    alpha = 0.01
-    for _ in range(60):
-        if _fit_residual(alpha, r, ea, eb, es) * _fit_residual(1.0 - alpha, r, ea, eb, es) <= 0.0:
-            break
-        alpha *= 0.5
-    upper = _fit_residual(1.0 - alpha, r, ea, eb, es)
-    a = min(r_min / r, 0.999999)
-    for _ in range(200):
-        if _fit_residual(a, r, ea, eb, es) * upper < 0.0 and a > 0.0:
-            a = math.sqrt(a)
-        else:
-            break
-    for _ in range(100):
-        step = min(0.49 * (1.0 - a), a / 10.0)
-        if a + step >= 1.0:
-            step = (1.0 - a) / 10.0
-        residual = _fit_residual(a, r, ea, eb, es)
-        if residual == 0.0:
-            return a
-        slope = (_fit_residual(a + step, r, ea, eb, es) - _fit_residual(a - step, r, ea, eb, es)) / (2.0 * step)
-        new = a - residual / slope
-        new = min(new, 0.99999999)
-        if abs(new - a) < 1e-4:
-            return abs(new)
-        if new <= 0.0:
-            new = 0.5 * a
-        a = new
-    return a
-
-
-@kernel
-def _fit(xa, sa, ea, xb, sb, eb, clip, c, curve):
-    """Fit the curve from (xa, sa, ea) to (xb, sb, eb) and write it to `curve` (9,).
-
-    `clip` moves an end slope that is on the wrong side of the slope of the chord to the other side of it.
-    """
-    es = (sb - sa) / (xb - xa) if xb != xa else ea
-    if clip:
-        if es < eb:
-            eb = 0.999 * es
-        if es > ea:
-            ea = 1.001 * es
-    r = 18.0 * (c[FYP] / c[E0]) ** (1.0 / 3.0) * (1.0 - 4.0 * abs(xb - xa))
-    q, sch = 1.0, sb
-    if eb != es and abs(xb - xa) >= 1e-7:
-        if es == ea:
-            r_min, a = 0.0, 0.99999999
-        else:
-            r_min = max(0.0, (eb - es) / (es - ea))
-            if r <= r_min:
-                r = r_min + 0.01
-            # Where the slope of the chord is not between the end slopes there is no curve: A = 0 gives a straight line.
-            a = _fit_root(r, ea, eb, es, r_min) if r_min > 0.0 else 0.0
-        q = (es / ea - a) / (1.0 - a)
-        sch = sa + ea * (xb - xa) * a / (1.0 - a**r) ** (1.0 / r)
-    curve[XA], curve[SA], curve[EA] = xa, sa, ea
-    curve[XB], curve[SB], curve[EB] = xb, sb, eb
-    curve[RR], curve[QQ], curve[SCH] = r, q, sch
-
-
-@kernel
-def _on_curve(x, curve):
-    """Return natural stress and modulus of a Menegotto-Pinto curve at the natural strain `x`."""
-    ea, q, r = curve[EA], curve[QQ], curve[RR]
-    dx = x - curve[XA]
-    if dx == 0.0:
-        return curve[SA], ea
-    t = abs(ea * dx / (curve[SCH] - curve[SA]))
-    # (1 + t^R)^(1/R) and t^R/(1 + t^R). Where the clip makes Ea, Es and Eb nearly equal, R reaches 1e13 and t^R would
-    # overflow to NaN.
-    power = t**r
-    if power < 1e100:
-        root = (1.0 + power) ** (1.0 / r)
-        weight = power / (1.0 + power)
-    else:
-        root, weight = t, 1.0
-    s = curve[SA] + ea * dx * (q - (q - 1.0) / root)
-    chord = (s - curve[SA]) / dx
-    if r > 100.0:
-        return s, ea
-    return s, chord - (chord - q * ea) * weight
-
-
-@kernel
 def _mirror_branch(b):
     """Return the branch of the other sign: 1 <-> 2, 3 <-> 4, ..."""
     return b + 1 if b % 2 == 1 else b - 1
@@ -280,7 +179,7 @@ def _mirror(state):
     state[XC] = -state[XC]
     state[SC] = -state[SC]
     for level in range(9):
-        k = CURVES + 9 * level
+        k = CURVES + N_CURVE * level
         state[k + XA] = -state[k + XA]
         state[k + SA] = -state[k + SA]
         state[k + XB] = -state[k + XB]
@@ -291,7 +190,7 @@ def _mirror(state):
 @kernel
 def _slot(branch):
     """Return the position in the memory of the curve of a branch > 2."""
-    return CURVES + 9 * ((branch + 1) // 2 - 2)
+    return CURVES + N_CURVE * ((branch + 1) // 2 - 2)
 
 
 @kernel
@@ -303,7 +202,7 @@ def _returning_curve(xc, state, c, curve):
     start = xb3 * (xc - xa3) / (xb3 - xa3) + xa2 * (xb3 - xc) / (xb3 - xa3)
     s_start, _ = backbone(start - state[OP], c)
     s_end, e_end = backbone(xb2 - state[ON], c)
-    _fit(start, s_start, ea2, xb2, s_end, e_end, False, c, curve)
+    fit_curve(End(start, s_start, ea2), End(xb2, s_end, e_end), False, c[FYP] / c[E0], curve)
 
 
 @kernel
@@ -355,14 +254,14 @@ def _step(x, tension, state, c):
             if tension and (s_target - sc) / (x_target - xc) < e_target:
                 state[ON] = (s_target - sc) / e_target + xc - m
                 x_target = state[ON] + m
-            _fit(xc, sc, er, x_target, s_target, e_target, False, c, curve)
+            fit_curve(End(xc, sc, er), End(x_target, s_target, e_target), False, c[FYP] / c[E0], curve)
         else:
             r = (state[XMAX] - c[YP]) / (c[SHP] - c[YP])
             m = r * (c[YP] - c[SHP]) - c[YP]
             state[ON] = xc - sc / c[E0]
             s_target, _ = backbone(m, c)
             e_target = 1.0 / (1.0 / c[E0] + r * (1.0 / c[EH] - 1.0 / c[E0]))
-            _fit(xc, sc, er, state[ON] + m, s_target, e_target, True, c, curve)
+            fit_curve(End(xc, sc, er), End(state[ON] + m, s_target, e_target), True, c[FYP] / c[E0], curve)
         state[BRANCH] = 3
         return False, 0.0, 0.0
 
@@ -371,7 +270,7 @@ def _step(x, tension, state, c):
     reached = x >= curve[XB] - TIE if up else x <= curve[XB] + TIE
     reversal = x < xc - TIE if up else x > xc + TIE
     if not reached and not reversal:
-        s, modulus = _on_curve(x, curve)
+        s, modulus = evaluate_curve(x, curve)
         return True, s, modulus
     if reached:
         if b == 3:
@@ -396,28 +295,28 @@ def _step(x, tension, state, c):
         aside = state[_slot(7) :]
         _returning_curve(xc, state, c, aside)
         x_target = curve[XA]
-        s_target, e_target = _on_curve(x_target, aside)
+        s_target, e_target = evaluate_curve(x_target, aside)
         new = 7
     elif b == 7:
         x_target = curve[XA]
-        s_target, e_target = _on_curve(x_target, state[_slot(5) :])
+        s_target, e_target = evaluate_curve(x_target, state[_slot(5) :])
         state[RE] = xc
         new = 9
     elif up:
         if b + 4 <= 20:
             state[RE] = curve[XA]
         x_target = state[RE]
-        s_target, e_target = _on_curve(x_target, state[_slot(b - 2) :])
+        s_target, e_target = evaluate_curve(x_target, state[_slot(b - 2) :])
         new = b + 2
     elif b + 2 <= 20:
         x_target = curve[XA]
-        s_target, e_target = _on_curve(x_target, state[_slot(b - 2) :])
+        s_target, e_target = evaluate_curve(x_target, state[_slot(b - 2) :])
         new = b + 2
     else:
         x_target = state[_slot(b - 4) :][XA]
-        s_target, e_target = _on_curve(x_target, state[_slot(b - 6) :])
+        s_target, e_target = evaluate_curve(x_target, state[_slot(b - 6) :])
         new = b - 2
-    _fit(xc, sc, er, x_target, s_target, e_target, True, c, state[_slot(new) :])
+    fit_curve(End(xc, sc, er), End(x_target, s_target, e_target), True, c[FYP] / c[E0], state[_slot(new) :])
     state[BRANCH] = new
     return False, 0.0, 0.0
 
@@ -469,7 +368,7 @@ def stress_tangent(eps, state, c, trial):
         curve = state[_slot(b) :]
         up = b % 4 <= 1
         if (state[XC] <= x < curve[XB] - TIE) if up else (curve[XB] + TIE < x <= state[XC]):
-            s, modulus = _on_curve(x, curve)
+            s, modulus = evaluate_curve(x, curve)
             return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
     elif b > 0:
         # The stress follows from a backbone alone where the strain goes on, where it reverses below yield (which leaves

@@ -1,8 +1,8 @@
-"""The reference results and the columns they belong to, in kip, inch and second as they were computed.
+"""Reference results and the columns that they belong to, in kip, inch and second, the units of their computation.
 
-Two folders hold them in the same form: `BUNDLED`, a small extract that travels with the tests, and golden/column of
-the reference material outside the project. Also here: the drivers that lead one material or one section through a
-history, and the figures of the nominal column for tests that need no reference.
+Two folders have them in the same form: `BUNDLED`, a small extract that is part of the tests, and ``golden/column`` of
+the reference material outside the project. This module also has drivers that take one material or one section through a
+history, and the values of the nominal column for tests without reference.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from fe_likelihoods.kernels.jit import kernel
 BUNDLED = Path(__file__).parent / "data"
 
 compiled_only = pytest.mark.skipif(
-    bool(numba.config.DISABLE_JIT), reason="too long as pure Python, and `test_jit.py` compares the two"
+    bool(numba.config.DISABLE_JIT),
+    reason="too slow in pure Python; test_jit.py compares it with compiled kernels",
 )
 
 # Nominal column [kip, in]: constants of concrete04 (fc, e0, ecu, Ec, ft, etu, beta) and of reinforcing_steel.
@@ -35,7 +36,7 @@ A0, A1 = 0.737, 0.0002016
 DT = 1.0 / 256.0
 
 STRICT = 1e-9
-ILL_CONDITIONED = 5e-4  # where round-off decides on which side of a clip a curve of the steel falls
+ILL_CONDITIONED = 5e-4  # where round-off decides whether the slope of a curve of the steel is clipped
 
 
 class Fibers(NamedTuple):
@@ -47,7 +48,7 @@ class Fibers(NamedTuple):
 
 
 def load(folder: Path, part: str) -> dict[str, np.ndarray]:
-    """Arrays of one file of reference results; `_meta` is decoded."""
+    """Return the arrays of one file of reference results, with `_meta` decoded."""
     with np.load(folder / f"golden_A_{part}.npz") as file:
         arrays = {key: file[key] for key in file.files}
     if "_meta" in arrays:
@@ -56,13 +57,13 @@ def load(folder: Path, part: str) -> dict[str, np.ndarray]:
 
 
 def fibers_of(arrays: dict[str, np.ndarray], name: str = "rms40") -> Fibers:
-    """Fibers of a section, by material."""
+    """Return the fibers of a section, by material."""
     table = arrays[f"fibers/{name}"]
     return Fibers(*(np.ascontiguousarray(table[:2, table[2] == material].T) for material in (1, 2, 3)))
 
 
 def circle(n_strips: int = 12, n_levels: int = 5) -> Fibers:
-    """A coarse round section of the nominal size: strips with exact area and second moment, bars on a circle."""
+    """Return a coarse circular section: strips with exact area and second moment, bars on a circle."""
 
     def strips(radius, edges):
         edges = np.clip(edges, -radius, radius)
@@ -101,7 +102,7 @@ def column(
     corotational: bool = True,
     element_tolerance: float = 1e-12,
 ) -> frame.Column:
-    """A virgin column with its materials set; by default two elements of three points each."""
+    """Return a virgin column with its materials set; by default two elements of three points each."""
     points, weights = lobatto(n_points)
     out = frame.allocate(
         n_elements=n_elements,
@@ -122,7 +123,7 @@ def column(
 
 
 def reference_column(arrays: dict[str, np.ndarray], prefix: str, fibers: str = "rms40", **options) -> frame.Column:
-    """The column whose materials are stored under `prefix`."""
+    """Return the column whose materials are stored under `prefix`."""
     args = (arrays[f"{prefix}/{material}_args"] for material in ("core", "cover", "steel"))
     return column(fibers_of(arrays, fibers), *args, **options)
 
@@ -142,7 +143,7 @@ def mass(n_elements: int = 2) -> np.ndarray:
 
 
 def concrete_constants(args) -> np.ndarray:
-    """Constants of a concrete; four arguments stand for a concrete without tension."""
+    """Return the constants of a concrete; four arguments mean a concrete without tension."""
     args = list(args) + [0.0, 1.0, 0.1] * (len(args) == 4)
     out = np.zeros(concrete04.N_CONSTANTS)
     concrete04.constants(*map(float, args), out)
@@ -158,7 +159,7 @@ def steel_constants(args) -> np.ndarray:
 
 @kernel
 def concrete_history(strain, c, out):
-    """Stress, tangent, and the memory before each commit (eps_min, eps_max, eps_end) into `out` (5, n)."""
+    """Write stress, tangent and the memory before each commit (eps_min, eps_max, eps_end) to `out` (5, n)."""
     eps_min, eps_max = 0.0, 0.0
     for i in range(strain.shape[0]):
         eps_end, slope, tension_slope = concrete04.unloading(eps_min, eps_max, c)
@@ -168,7 +169,7 @@ def concrete_history(strain, c, out):
 
 
 def steel_history(strain, c, out):
-    """Stress, tangent and branch number into `out` (3, n), from the virgin state."""
+    """Write stress, tangent and branch number to `out` (3, n), from the virgin state."""
     _steel_history(strain, c, np.zeros(reinforcing_steel.N_STATE), out)
 
 
@@ -181,7 +182,7 @@ def _steel_history(strain, c, state, out):
 
 @kernel
 def section_forces(e0, kappa, column, section=0):
-    """N, M and the three tangents of one section of a column, at its committed memory."""
+    """Return N, M and the three tangents of one section of a column, at its committed memory."""
     return fiber_section.forces(e0, kappa, section, column.sections)
 
 
@@ -193,7 +194,7 @@ def section_commit(e0, kappa, column):
 
 @kernel
 def section_history(e0, kappa, column, out):
-    """N, M and the three tangents along a history of committed strains into `out` (5, n)."""
+    """Write N, M and the three tangents along a history of committed strains to `out` (5, n)."""
     for i in range(e0.shape[0]):
         out[0, i], out[1, i], out[2, i], out[3, i], out[4, i] = section_forces(e0[i], kappa[i], column)
         section_commit(e0[i], kappa[i], column)
@@ -201,7 +202,7 @@ def section_history(e0, kappa, column, out):
 
 @kernel
 def restore(u, column, force, stiffness):
-    """Restoring forces and tangent at `u`; False when an element fails."""
+    """Write restoring forces and tangent at `u`; return False when an element fails."""
     return frame.assemble(u, column, force, stiffness)
 
 
@@ -212,7 +213,7 @@ def commit(column):
 
 
 def random_walks(rng, n_walks: int, n_steps: int, amplitude: float):
-    """Histories of strain from zero: free walks, independent jumps, and straight runs between turning points."""
+    """Yield strain histories from zero: random walks, independent jumps, and straight lines between reversals."""
     for number in range(n_walks):
         if number % 3 == 0:
             strain = np.cumsum(rng.normal(size=n_steps)) * amplitude / 10.0

@@ -1,7 +1,7 @@
-"""The column beside a live OpenSees: the same record, the same fibers, another code.
+"""The column compared with OpenSees, run here with the same record and the same fibers.
 
-The stored reference results pin some cases; here OpenSees itself runs, on what this library is used for: the bundled
-record, the tested column as the preset has it, and options of the model, shaken and pushed.
+The stored reference results cover some cases. These tests run OpenSees itself for the bundled record, the preset of the
+tested column and options of the model, under base acceleration and imposed displacement.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def opensees():
 
 @pytest.fixture(scope="module")
 def record():
-    """Six seconds of the bundled record, the growing part and the peak."""
+    """The first six seconds of the bundled record, which include the peak."""
     return bridge_column_data().record.trim(0.0, 6.0)
 
 
@@ -51,14 +51,14 @@ def test_base_acceleration(record, case):
     history = model.history(theta)
     names = ("relative displacement", "absolute acceleration", "vertical displacement")
     got = np.array([history[name] for name in names]) / INCH
-    # crack-like events amplify round-off now and then: up to 2.5e-4 between two correct codes
+    # events like cracks sometimes amplify round-off: two correct programs differ by up to 2.5e-4
     assert rrmse(got, peer.response).max() < 1e-3
     if scale == 1.0:
         assert rrmse(got, peer.response).max() < 1e-8
 
 
-def test_a_wrong_material_would_be_seen(record):
-    """Control: a per cent on one modulus is far more than the two codes differ by."""
+def test_a_wrong_material_is_detected(record):
+    """Control: one per cent of one modulus changes far more than the two programs differ by."""
     model = RCColumn.lhpost(record, **TIGHT)
     peer = shake(peer_of(model, NOMINAL), record.acceleration / INCH, record.dt, TOLERANCE)
     other = model.simulate(NOMINAL + np.array([0.01, 0, 0, 0, 0]))
@@ -68,7 +68,7 @@ def test_a_wrong_material_would_be_seen(record):
 @pytest.mark.parametrize("geometry", ["corotational", "linear"])
 @pytest.mark.parametrize("theta", [NOMINAL, PAPER], ids=["nominal", "paper"])
 def test_imposed_displacement(theta, geometry):
-    """Cracking, yielding and reversals, to 2 % of the height."""
+    """Cracking, yielding and reversals, up to a drift of 2 %."""
     corners = [0.0, 1.0, -1.0, 3.0, -3.0, 6.0, -2.0]  # in
     legs = [
         np.linspace(a, b, round(abs(b - a) / 0.05), endpoint=False)
@@ -79,7 +79,7 @@ def test_imposed_displacement(theta, geometry):
         DisplacementHistory("cycles", targets * INCH),
         parameters=("Ec", "Es", "ft"),
         geometry=geometry,
-        max_increment=1.0,  # as OpenSees: one step for each target
+        max_increment=1.0,  # one step per target, as in OpenSees
         **TIGHT,
     )
     peer = push(peer_of(model, theta[[0, 1, 4]]), targets, TOLERANCE)

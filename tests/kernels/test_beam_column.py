@@ -1,7 +1,7 @@
-"""The force-based element against closed forms, differences, equilibrium, and its own iteration written out again.
+"""The force-based element against closed forms, differences, equilibrium, and a second implementation in numpy.
 
-One element with linear geometry on a fixed base takes any basic deformations v = (elongation, theta_i, theta_j) by the
-displacements (v2 L, v1, v3 - v2) of its free end: everything here goes through the public state determination.
+One element with linear geometry on a fixed base has the basic deformations v = (elongation, theta_i, theta_j) at the
+displacements (v2 L, v1, v3 - v2) of its free end. The tests use only the public assembly of the column.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def single(element_tolerance=1e-12, **options):
 
 
 def advance(column, v):
-    """Bring the element to basic deformations `v`; whether it converged, Q, and K as a matrix."""
+    """Bring the element to the basic deformations `v`; return whether it converged, Q, and K as a matrix."""
     u = np.array([v[1] * column.length, v[0], v[2] - v[1]])
     converged = golden.restore(u, column, np.zeros(3), np.zeros((3, 3)))
     row = column.elements.state[0]
@@ -41,12 +41,12 @@ def symmetric(upper):
 
 
 def section_matrix(xi):
-    """b(xi): section forces (N, M) from basic forces."""
+    """Return b(xi), which gives section forces (N, M) from basic forces."""
     return np.array([[1.0, 0.0, 0.0], [0.0, xi - 1.0, xi]])
 
 
 def stiffness_of_section(column):
-    """EA and EI of the virgin section."""
+    """Return EA and EI of the virgin section."""
     s = column.sections
     modulus = np.where(np.arange(s.y.size) < s.core_count, *s.concrete[:, concrete04.EC])
     steel = s.steel[reinforcing_steel.E0]
@@ -55,9 +55,9 @@ def stiffness_of_section(column):
 
 
 def basic_forces_by_hand(column, v, scheme):
-    """One attempt of Neuenhofer and Filippou's iteration from the present state; Q, or None where it fails.
+    """Return Q after one attempt of Neuenhofer and Filippou's iteration from the present state, or None if it fails.
 
-    scheme: 0 current flexibilities, 1 the initial ones in every pass, 2 the initial ones in the first pass.
+    `scheme` is 0 for current flexibilities, 1 for the initial ones in every pass, 2 for the initial ones in the first.
     """
     row = column.elements.state[0]
     sections = row[HEAD:].reshape(-1, PER_SECTION)
@@ -95,8 +95,8 @@ def basic_forces_by_hand(column, v, scheme):
 def test_elastic_cantilever_is_closed_form(n_elements, n_points):
     """Tip deflection P h^3 / 3 EI, rotation P h^2 / 2 EI, shortening N h / EA.
 
-    Gauss-Lobatto with n points is exact up to degree 2n - 3: from three points on for M^2; two points (the trapezoidal
-    rule) leave the factor 1 + 1/(2 n_elements^2) on the deflection.
+    Gauss-Lobatto with n points is exact up to degree 2n - 3, so M^2 needs three points. Two points (the trapezoidal
+    rule) give a deflection that is too large by the factor 1 + 1/(2 n_elements^2).
     """
     column = golden.column(
         golden.circle(), n_elements=n_elements, n_points=n_points, corotational=False, element_tolerance=1e-30
@@ -104,7 +104,7 @@ def test_elastic_cantilever_is_closed_form(n_elements, n_points):
     ea, ei = stiffness_of_section(column)
     h = golden.HEIGHT
     n = 3 * n_elements
-    # strains of 1e-11: steel (1.5 eps) and concrete are linear to 1e-9, and round-off is far below
+    # at strains of 1e-11, steel (1.5 eps) and concrete are linear to 1e-9, and round-off is much smaller
     p, axial = 1e-11 * ei / (24.0 * h), -1e-12 * ea
     load = np.zeros(n)
     load[-3:-1] = p, axial
@@ -120,7 +120,7 @@ def test_elastic_cantilever_is_closed_form(n_elements, n_points):
 
 @pytest.mark.parametrize("n_points", range(2, 8))
 def test_initial_stiffness_is_that_of_a_beam(n_points):
-    """4 EI/L, 2 EI/L, EA/L to machine precision (two points integrate only linear functions)."""
+    """4 EI/L, 2 EI/L and EA/L to machine precision; two points integrate only linear functions."""
     column = single(n_points=n_points)
     ea, ei = stiffness_of_section(column)
     length = column.length
@@ -132,7 +132,7 @@ def test_initial_stiffness_is_that_of_a_beam(n_points):
 
 
 def states(rng, column, n, size):
-    """Lead the element through `n` random committed deformations, yielding after each."""
+    """Take the element through `n` random committed deformations and yield each."""
     for _ in range(n):
         v = rng.normal(size=3) * size
         if advance(column, v)[0]:
@@ -144,7 +144,7 @@ MILD = np.array([0.02, 2e-3, 2e-3])
 
 
 def test_tangent_is_the_derivative(rng):
-    """Consistent where no fiber changes its branch between the two neighbours."""
+    """The tangent is consistent where no fiber changes its branch between the two neighbouring states."""
     column = single(element_tolerance=1e-22)
     scale = np.diag(1.0 / np.sqrt(np.diag(symmetric(column.elements.state[0, 3:9]))))
     errors = []
@@ -195,12 +195,12 @@ def test_sections_are_in_equilibrium_and_compatible_when_converged(rng):
     assert seen > 50
 
 
-def test_every_rung_of_the_ladder_is_reached(rng):
-    """The element gives what the first converging rung gives, each written out again here, and succeeds beyond them.
+def test_every_scheme_is_reached(rng):
+    """The element returns the result of the first scheme that converges, and succeeds where none of the three does.
 
-    Very large steps: the plain iteration fails now and then, and after it the initial flexibilities in every pass, and
-    in the first pass only. Where all three fail, tenths of the step succeed, and nearly always reach the state that
-    500 small trial steps reach (softening sections may have more than one).
+    At very large steps the plain iteration sometimes fails, and so do the initial flexibilities in every pass and in
+    the first pass only. Where all three fail, tenths of the step succeed. They nearly always reach the state that 500
+    small trial steps reach; softening sections may have more than one state.
     """
     counts = {0: 0, 1: 0, 2: 0, "subdivision": 0}
     gaps = []
@@ -210,12 +210,12 @@ def test_every_rung_of_the_ladder_is_reached(rng):
             before = column.elements.state.copy()
             for v in rng.normal(size=(6, 3)) * 8.0 * MILD:
                 column.elements.state[:] = before
-                attempts = (basic_forces_by_hand(column, v, scheme) for scheme in (0, 1, 2))
-                rung, expected = next(((i, q) for i, q in enumerate(attempts) if q is not None), (None, None))
+                attempts = (basic_forces_by_hand(column, v, number) for number in (0, 1, 2))
+                scheme, expected = next(((i, q) for i, q in enumerate(attempts) if q is not None), (None, None))
                 converged, q, _ = advance(column, v)
-                if rung is not None:
+                if scheme is not None:
                     assert converged
-                    counts[rung] += 1
+                    counts[scheme] += 1
                     np.testing.assert_allclose(q, expected, rtol=1e-7, atol=1e-5)
                 elif converged:
                     counts["subdivision"] += 1
@@ -231,7 +231,7 @@ def test_every_rung_of_the_ladder_is_reached(rng):
 
 
 @pytest.mark.parametrize("v", [(-290.0, 0.0, 0.0), (np.nan, 0.0, 0.0), (0.0, np.inf, 0.0)])
-def test_hopeless_deformation_is_reported_and_leaves_no_trace(v, rng):
+def test_impossible_deformation_is_reported_and_changes_nothing(v, rng):
     column = single()
     list(states(rng, column, 3, MILD))
     before = column.elements.state.copy()
@@ -254,8 +254,8 @@ def test_initial_flexibility_is_that_of_the_section():
     np.testing.assert_allclose(column.elements.initial_flexibility, [1 / ea, 0.0, 1 / ei], rtol=1e-13, atol=1e-20)
 
 
-def test_initialise_column_forgets_everything(rng):
-    """A used column, made virgin again, equals a new one bit by bit."""
+def test_initialise_column_resets_everything(rng):
+    """A used column that is made virgin again equals a new one to the last bit."""
     column, new = single(), single()
     list(states(rng, column, 5, MILD))
     frame.initialise_column(column)

@@ -51,11 +51,11 @@ def test_z_follows_its_differential_equation(start, increment, gamma):
 
     exact = solve_ivp(rate, (0.0, abs(increment)), [start], rtol=1e-11, atol=1e-13, max_step=0.02).y[0, -1]
     z, slope = bouc_wen(increment * 0.13e-3, start, 0.13e-3, math.sqrt(2.0 * gamma - 1.0))
-    assert z == pytest.approx(exact, abs=2e-8)  # the solver steps over the kink at zero
+    assert z == pytest.approx(exact, abs=2e-8)  # the solver does not stop at the kink at zero
     assert slope * 0.13e-3 == pytest.approx(direction * rate(0.0, z), abs=1e-12)
 
 
-def test_z_is_a_function_of_the_path_alone():
+def test_z_depends_on_the_path_only():
     whole, _ = bouc_wen(3e-4, -0.9, 0.13e-3, C)
     z = -0.9
     for _ in range(100):
@@ -92,7 +92,7 @@ def test_rubber_is_the_polynomial_and_its_tangent_beyond():
     assert outer[3] == 0.0
 
 
-def test_an_elastic_plastic_slider_slides_at_the_friction_of_its_speed():
+def test_elastic_plastic_slider_slides_at_the_friction_of_its_velocity():
     capacity = (0.055 + 0.065 * (1.0 - math.exp(-24.0 * 0.1))) * 70e3
     no_rubber = bearings.RubberLaw(*[0.0] * 8, 0.05, 1.2)
     force, *_, slider = elastic_plastic(0.01, 0.01, 0.1, 0.0, 70e3, BEARING, C, no_rubber)

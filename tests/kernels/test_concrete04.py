@@ -1,4 +1,4 @@
-"""Concrete04 against the reference histories, its own formulas, and differences."""
+"""Concrete04 against reference histories, its formulas, and differences."""
 
 import numpy as np
 import pytest
@@ -25,19 +25,19 @@ def args(request):
 
 
 def popovics(strain, args):
-    """Compression envelope and tangent, as in the paper."""
+    """Return stress and tangent of Popovics' envelope in compression."""
     secant = args[FC] / args[E0]
     r = 400.0 if secant >= args[EC] else args[EC] / (args[EC] - secant)
     eta = strain / args[E0]
     with np.errstate(over="ignore", invalid="ignore"):
         stress = args[FC] * eta * r / (r - 1 + eta**r)
         tangent = secant * r * (r - 1) * (1 - eta**r) / (r - 1 + eta**r) ** 2
-    nothing = (strain < args[ECU]) | ~np.isfinite(tangent)  # eta^400 out of range: the limit is zero
+    nothing = (strain < args[ECU]) | ~np.isfinite(tangent)  # eta^400 is out of range; the limit is zero
     return np.where(nothing, 0.0, stress), np.where(nothing, 0.0, tangent)
 
 
 def softening(strain, args):
-    """Tension envelope and tangent."""
+    """Return stress and tangent of the envelope in tension."""
     cracked = args[FT] / args[EC]
     rate = np.log(args[BETA]) / (args[ETU] - cracked)
     stress = args[FT] * args[BETA] ** ((strain - cracked) / (args[ETU] - cracked))
@@ -52,7 +52,7 @@ def histories(arrays):
 
 
 def deviation(args, history, c=None):
-    """Largest deviation of stress / fc and, where the strain is not at a corner of the law, of tangent / Ec."""
+    """Return the largest deviations of stress / fc and, away from the corners of the law, of tangent / Ec."""
     strain, stress, tangent = history
     out = np.zeros((5, strain.size))
     c = golden.concrete_constants(args) if c is None else c
@@ -72,10 +72,10 @@ def test_reference_histories(reference):
     assert len(results) >= 3
     assert not {key: r for key, r in results.items() if not r[0] < golden.STRICT}
     assert not {key: r for key, r in results.items() if not r[1] < golden.STRICT}
-    assert np.mean([r[2] for r in results.values()]) > 0.9  # the corners are the exception
+    assert np.mean([r[2] for r in results.values()]) > 0.9  # few strains are at corners
 
 
-def test_the_comparison_sees_a_strength_one_percent_off():
+def test_a_strength_one_percent_off_is_detected():
     cracked = 0
     for _, args, history in histories(golden.load(golden.BUNDLED, "materials")):
         changed = np.array(args)
@@ -107,7 +107,7 @@ def test_envelope_is_the_formula(args, rng):
 
 def test_initial_tangent_is_the_modulus(args):
     c = golden.concrete_constants(args)
-    below_secant = args[FC] / args[E0] >= args[EC]  # where the envelope takes no notice of Ec
+    below_secant = args[FC] / args[E0] >= args[EC]  # the envelope then ignores Ec
     expected = args[FC] / args[E0] * 400 / 399 if below_secant else args[EC]
     assert envelope(-1e-12, c)[1] == pytest.approx(expected, rel=1e-5)
     assert stress_tangent(0.0, 0.0, 0.0, *unloading(0.0, 0.0, c), c) == (0.0, args[EC])
@@ -147,7 +147,7 @@ def test_unloading_is_karsan_and_jirsa(args):
             assert slope == args[EC]
         assert slope * (eps_min - eps_end) == pytest.approx(stress, rel=1e-13)
         assert slope <= args[EC]
-    # crushed: nothing is left, and the plastic strain is that of the crushing strain
+    # crushed: no stress is left
     assert unloading(1.5 * args[ECU], 0.0, c)[1] == 0.0
 
 
@@ -167,13 +167,13 @@ def test_tangent_is_the_derivative(args, rng):
             2 * step
         )
         tangent = stress_tangent(strain, *memory, c)[1]
-        # round-off of the stress over the step, and the third derivative (r^2/e0^2 times the stress)
+        # the limits allow for round-off over the step and for the third derivative (r^2/e0^2 times the stress)
         assert tangent == pytest.approx(difference, rel=1e-6, abs=1e-5 * args[EC])
         tested += 1
     assert tested > 3900
 
 
-def test_a_trial_leaves_no_trace(args, rng):
+def test_a_trial_changes_nothing(args, rng):
     """The stress at a committed strain does not depend on the trials before it."""
     c = golden.concrete_constants(args)
     strain = next(golden.random_walks(rng, 1, 400, 0.002))
@@ -197,7 +197,7 @@ def test_committing_within_the_memory_changes_nothing():
 
 
 def test_tension_closes_to_zero_strain_and_a_gap_stays_open():
-    """After crushing and cracking: nothing between the plastic strain and zero, tension again from zero."""
+    """After crushing and cracking the stress is zero between the plastic strain and zero; tension starts at zero."""
     c = golden.concrete_constants(golden.COVER)
     eps_end, slope, tension_slope = unloading(-0.003, 0.0005, c)
     memory = -0.003, 0.0005, eps_end, slope, tension_slope
@@ -217,7 +217,7 @@ def test_without_tension_there_is_none(rng):
 
 @pytest.mark.parametrize("ecu", [-0.008, -0.06])
 def test_modulus_below_the_secant_stays_finite(ecu, rng):
-    """r = 400: eta^400 leaves the range of a double far before the strains that a wild trial reaches."""
+    """With r = 400, eta^400 overflows a double at strains that large trial steps reach."""
     args = (-6.0, -0.0026, ecu, 1958.8, 0.744, 0.00138, 0.1)
     c = golden.concrete_constants(args)
     strain = np.concatenate([np.linspace(-0.05, 0.002, 4000), rng.uniform(-0.05, 0.002, 2000)])
@@ -225,6 +225,6 @@ def test_modulus_below_the_secant_stays_finite(ecu, rng):
     golden.concrete_history(strain, c, out)
     assert np.isfinite(out).all()
     assert np.abs(out[0]).max() <= 6.0 * (1 + 1e-12)
-    # one by one on the virgin envelope as well
+    # the virgin envelope as well
     out = np.array([envelope(x, c) for x in strain])
     assert np.isfinite(out).all()

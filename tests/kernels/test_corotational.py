@@ -11,13 +11,13 @@ from . import golden
 from .test_beam_column import stiffness_of_section, symmetric
 
 LENGTH = 1.3
-# Basic stiffness K11 K12 K13 K22 K23 K33 of an imaginary linear element: nothing is zero or equal by chance.
+# Basic stiffness K11 K12 K13 K22 K23 K33 of a fictitious linear element, without zero or equal entries.
 STIFFNESS = np.array([7.0, 0.4, -0.3, 3.0, 1.1, 2.5])
 
 
 @kernel
 def end_forces(u, q0, k, length, corotational, force, stiffness):
-    """End forces and tangent of an element with basic forces q0 + k v at the displacements of both ends (6,)."""
+    """Write end forces and tangent of an element with basic forces q0 + k v at the displacements of both ends (6,)."""
     chord = deformations(u[3] - u[0], u[4] - u[1], u[2], u[5], length, corotational)
     v1, v2, v3 = chord.elongation, chord.theta_i, chord.theta_j
     force[:] = 0.0
@@ -47,7 +47,7 @@ def basic(u, corotational=True):
 
 
 def displaced(rng, size):
-    """Both ends displaced and turned; the chord stays within half a turn."""
+    """Return random displacements and rotations of both ends; the chord rotates by less than half a turn."""
     u = rng.normal(size=6) * size
     u[4] += 0.1
     return u
@@ -59,7 +59,7 @@ def central(function, u, step):
 
 @pytest.mark.parametrize("angle", [1e-9, 0.01, 0.5, 1.5, 3.0, -2.5])
 def test_rigid_motion_deforms_nothing(angle):
-    """Turned by `angle` (counter-clockwise) about a point anywhere, and shifted."""
+    """A rotation by `angle` (counter-clockwise) about an arbitrary point, and a translation."""
     centre, shift = np.array([0.7, -0.4]), np.array([0.3, -1.1])
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     u = np.zeros(6)
@@ -69,13 +69,13 @@ def test_rigid_motion_deforms_nothing(angle):
     np.testing.assert_allclose(basic(u), 0.0, atol=1e-15 * 10)
     force, _ = element(u)
     np.testing.assert_allclose(force, 0.0, atol=1e-13)
-    # control: for the linear variant a large turn is a deformation
+    # control: in the linear variant a large rotation is a deformation
     if abs(angle) > 0.1:
         assert np.abs(basic(u, corotational=False)).max() > 1e-3
 
 
 def test_small_elongation_is_not_lost():
-    """chord - length without cancellation: 1e-14 of the length keeps its digits."""
+    """chord - length is computed without cancellation: an elongation of 1e-14 keeps its digits."""
     for elongation in (1e-14, 1e-10, -1e-12):
         v1, _, _, c, s, chord = deformations(0.0, elongation, 0.0, 0.0, LENGTH, True)
         assert v1 == pytest.approx(elongation, rel=1e-12)
@@ -96,7 +96,7 @@ def test_end_forces_are_work_conjugate(rng, corotational, size):
 @pytest.mark.parametrize("corotational", [True, False])
 @pytest.mark.parametrize("size", [0.01, 0.5])
 def test_tangent_is_the_derivative_of_the_forces(rng, corotational, size):
-    """Material and geometric part together, at forces of the size of the stiffness."""
+    """The sum of the material and the geometric part, at forces of the size of the stiffness."""
     for _ in range(20):
         u, q0 = displaced(rng, size), rng.normal(size=3) * 3.0
         _, stiffness = element(u, q0, corotational=corotational)
@@ -105,7 +105,7 @@ def test_tangent_is_the_derivative_of_the_forces(rng, corotational, size):
         np.testing.assert_allclose(stiffness, stiffness.T, rtol=0, atol=1e-12)
 
 
-def test_without_its_geometric_part_the_tangent_fails_the_same_comparison(rng):
+def test_a_missing_geometric_part_is_detected(rng):
     u, q0 = displaced(rng, 0.5), np.array([3.0, 1.0, -2.0])
     derivative = central(lambda w: element(w, q0)[0], u, 1e-5)
     transformation = np.array([element(u, row, np.zeros(6))[0] for row in np.eye(3)])
@@ -130,7 +130,7 @@ def test_both_variants_agree_for_small_displacements(rng):
 
 
 def test_fixed_base_takes_the_rows_of_the_free_end(rng):
-    """first = -3: only end J enters."""
+    """With first = -3 only end J contributes."""
     u = displaced(rng, 0.3)
     u[:3] = 0.0
     q0 = np.array([1.0, 2.0, -0.5])
@@ -144,9 +144,9 @@ def test_fixed_base_takes_the_rows_of_the_free_end(rng):
 
 
 def amplified_deflection(n_elements, corotational=True):
-    """Tip deflection over P h^3 / 3 EI of a very slender cantilever with k h = 1, and the closed form.
+    """Return the tip deflection over P h^3 / 3 EI of a very slender cantilever with k h = 1, and the closed form.
 
-    So slender that its strains stay below 1e-6, where concrete and steel are linear to 1e-6.
+    The cantilever is so slender that its strains stay below 1e-6, where concrete and steel are linear to 1e-6.
     """
     column = golden.column(
         golden.circle(),
@@ -168,7 +168,7 @@ def amplified_deflection(n_elements, corotational=True):
 
 
 def test_p_delta_amplification_converges_to_the_closed_form():
-    """Each element is a straight chord: second order in the number of elements."""
+    """Each element has a straight chord, so the convergence is of second order in the number of elements."""
     n = np.array([2, 4, 8, 16])
     deflections = [amplified_deflection(k) for k in n]
     errors = np.array([abs(value - exact) for value, exact in deflections])

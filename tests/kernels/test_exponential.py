@@ -1,4 +1,4 @@
-"""The matrix exponential beside closed forms and scipy's, and its bits on any number of BLAS threads."""
+"""The matrix exponential against closed forms and scipy, and equal bits for any number of BLAS threads."""
 
 import os
 import subprocess
@@ -33,7 +33,7 @@ def test_nilpotent_is_a_polynomial():
 
 
 @pytest.mark.parametrize("norm", [1e-3, 0.4, 3.0, 40.0])
-def test_beside_scipy(norm, rng):
+def test_agrees_with_scipy(norm, rng):
     a = rng.normal(size=(18, 18))
     a *= norm / np.abs(a).sum(axis=1).max()
     both = exponential(a), expm(a)
@@ -42,14 +42,14 @@ def test_beside_scipy(norm, rng):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
-def test_no_number_gives_nan_and_ends(bad):
+def test_entries_that_are_not_finite_give_nan(bad):
     a = np.eye(3)
     a[1, 2] = bad
     assert np.isnan(exponential(a)).all()
 
 
 def test_response_of_the_bridge_has_the_same_bits_on_any_number_of_blas_threads():
-    """Engines limit their workers' threads; scipy's expm failed here by 1e-15 of the state matrices."""
+    """Executors limit the threads of their workers. With scipy's expm the state matrices differed by 1e-15 here."""
     code = (
         "import hashlib, numpy as np; from fe_likelihoods import problems\n"
         "model = problems.isolated_bridge(step=1e-3).likelihood.model\n"

@@ -1,4 +1,4 @@
-"""The section against the reference histories, closed forms in the elastic range, and differences."""
+"""The section against reference histories, closed forms in the elastic range, and differences."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from fe_likelihoods.kernels import concrete04, reinforcing_steel
 
 from . import golden
 
-# Where round-off decides a clip of the steel (see test_reinforcing_steel).
+# Round-off decides here whether a slope of the steel is clipped (see test_reinforcing_steel).
 ROUGH = "section/nominal/rms40/large/P-522"
 
 
@@ -19,7 +19,7 @@ def histories(arrays):
 
 
 def deviation(column, history):
-    """Largest deviation of N and of M, each over the largest of its reference (N: at least the weight carried)."""
+    """Return the largest deviations of N and M over the largest of their reference (N: at least the weight)."""
     out = np.zeros((5, history.shape[1]))
     golden.section_history(history[0].copy(), history[1].copy(), column, out)
     n_scale = max(np.abs(history[2]).max(), golden.WEIGHT)
@@ -33,7 +33,7 @@ def test_reference_histories(reference):
     assert not {key: r for key, r in results.items() if not max(r) < limits[key]}
 
 
-def test_the_comparison_sees_a_tension_strength_one_percent_off():
+def test_a_tensile_strength_one_percent_off_is_detected():
     for _, column, history in histories(golden.load(golden.BUNDLED, "section")):
         column.sections.concrete[0, concrete04.FT] *= 1.01
         assert deviation(column, history)[1] > 1e-5
@@ -45,7 +45,7 @@ def column():
 
 
 def properties(column):
-    """EA, coupling and EI of the virgin section."""
+    """Return EA, the coupling term and EI of the virgin section."""
     s = column.sections
     modulus = np.where(np.arange(s.y.size) < s.core_count, *s.concrete[:, concrete04.EC])
     ea, y = modulus * s.area, s.y
@@ -60,7 +60,7 @@ def test_round_section_has_its_area_and_second_moment(column):
 
 
 def test_linear_range_is_closed_form(column):
-    """N = EA e0, M = EI kappa, for strains so small that the curvature of the laws is below 1e-9."""
+    """N = EA e0 and M = EI kappa, at strains so small that the laws are linear to 1e-9."""
     ea, _, ei = properties(column)
     for e0, kappa in ((1e-11, 0.0), (-1e-11, 0.0), (0.0, 1e-12), (3e-12, -1e-13)):
         n, moment, *tangent = golden.section_forces(e0, kappa, column)
@@ -76,7 +76,7 @@ def test_symmetric_section_does_not_couple(column):
         n, moment, _, coupling, _ = golden.section_forces(e0, 0.0, column)
         assert abs(moment) < 1e-13 * (abs(n) + 1.0) * 24.0
         assert abs(coupling) < 1e-13 * ea * 24.0
-    # control: one bar moved
+    # control: one bar is moved
     column.sections.bar_y[0] += 1.0
     assert abs(golden.section_forces(-1e-3, 0.0, column)[1]) > 1.0
 
@@ -91,9 +91,9 @@ def test_mirrored_curvature_gives_mirrored_moment(column, rng):
 
 @pytest.mark.parametrize("yielded", [False, True])
 def test_tangent_is_the_derivative(column, rng, yielded):
-    """At random memories, where no fiber changes its branch between the two neighbours.
+    """At random memories, where no fiber changes its branch between the two neighbouring states.
 
-    Beyond yield a bar may lie on a curve of R > 100, whose tangent is by its law the slope at the start: rare.
+    Beyond yield a bar is rarely on a curve with R > 100, whose tangent is by definition the slope at its start.
     """
     ea, _, ei = properties(column)
     scale = np.array([[ea, ea * 24.0], [ea * 24.0, ea * 24.0**2]])
@@ -124,7 +124,7 @@ def test_tangent_is_the_derivative(column, rng, yielded):
 
 
 def test_order_of_the_fibers_does_not_matter(column, rng):
-    """Sums may be reordered by the compiler: equal to round-off, memory included."""
+    """The compiler may reorder sums, so results are equal to round-off; the memory is equal exactly."""
     one, two = column.sections, golden.column(golden.circle())
     other = two.sections
     n = one.core_count
@@ -143,7 +143,7 @@ def test_order_of_the_fibers_does_not_matter(column, rng):
     np.testing.assert_array_equal(other.steel_memory[0], one.steel_memory[0][bars])
 
 
-def test_a_trial_leaves_no_trace(column, rng):
+def test_a_trial_changes_nothing(column, rng):
     sections = column.sections
     memory = (sections.concrete_memory, sections.steel_memory, sections.virgin)
     for e0, kappa in rng.normal(size=(20, 2)) * (1e-3, 1e-4):
@@ -156,7 +156,7 @@ def test_a_trial_leaves_no_trace(column, rng):
 
 
 def test_virgin_bars_equal_bars_with_memory(column, rng):
-    """The series below yield and the full law agree: the flag is a matter of speed only."""
+    """The series below yield and the full law agree, so the flag affects the speed only."""
     limit = column.sections.steel[reinforcing_steel.YIELD_STRAIN]
     other = golden.column(golden.circle())
     other.sections.virgin[0] = 0.0

@@ -1,8 +1,8 @@
-"""The isolated bridge three times: the library's, one for `solve_ivp` from the definition alone, and one in OpenSees.
+"""The isolated bridge against two independent implementations, one for `solve_ivp` and one in OpenSees.
 
-The record is white noise through the filter of a soil. The peers share the definition's numbers with each other and
-nothing with the library. Where the friction is elastic-plastic, the codes that go in steps find the moment of slip to
-within a step and err in first order, both alike: between them the difference is of second order.
+The record is filtered white noise. The two implementations share their nominal values with each other and no code with
+the library. With elastic-plastic friction, step-by-step programs locate the instant of slip only to within a step.
+Their error is of first order, and nearly the same in both, so that the difference between them is of second order.
 """
 
 import numpy as np
@@ -16,12 +16,12 @@ from tests.scipy_bridge import CHANNELS, Definition, peak_errors, solve
 
 DT = 0.005
 PARAMETERS = {"nominal": np.ones(10), "other": np.array([0.76, 0.6, 0.93, 1.13, 1.34, 1.03, 0.83, 0.76, 1.22, 1.49])}
-NO_LOOP = (0.0, 0.0, 0.0)  # the half loop of the rubber is left out beside OpenSees, which has none
+NO_LOOP = (0.0, 0.0, 0.0)  # OpenSees has no half loop of the rubber
 KINDS = ("Ub", "Fb", "drift", "shear", "acc_p", "Ud", "acc_d")
 
 
 def noise(seed, peak):
-    """Three seconds of Kanai and Tajimi's soil, 5 Hz, damped by .3, growing during half a second."""
+    """Return 3 s of noise through a Kanai-Tajimi filter (5 Hz, damping ratio 0.3), growing during half a second."""
     time = np.arange(601) * DT
     frequency, damping = 2.0 * np.pi * 5.0, 0.3
     soil = ([2.0 * damping * frequency, frequency**2], [1.0, 2.0 * damping * frequency, frequency**2])
@@ -42,7 +42,7 @@ def ours(theta, loop=True, **options):
 
 
 def by_kind(response, reference):
-    """Largest peak error among the channels of each kind."""
+    """Return the largest peak error among the channels of each kind."""
     errors = dict(zip(CHANNELS, peak_errors(response, reference).tolist(), strict=True))
     return {kind: max(value for channel, value in errors.items() if channel.startswith(kind)) for kind in KINDS}
 
@@ -59,7 +59,7 @@ def smooth():
 
 @pytest.fixture(scope="module")
 def slipping():
-    """The elastic-plastic law without half loop."""
+    """Reference with the elastic-plastic law and without half loop."""
     bridge = Definition(loop=NO_LOOP)
     return {
         name: solve(bridge.at(theta), GROUND, DT, friction="elastic-plastic").response
@@ -69,7 +69,7 @@ def slipping():
 
 @pytest.fixture(scope="module")
 def opensees():
-    """At steps of .5 and .25 ms."""
+    """Responses of OpenSees at steps of 0.5 and 0.25 ms."""
     require_opensees()
     bridge = Definition(loop=NO_LOOP)
     return {
@@ -79,7 +79,7 @@ def opensees():
     }
 
 
-# ---------------------------------------------------------------------- the peers by themselves
+# --- the two other implementations ---
 
 
 def test_bearings_slide_to_and_fro(smooth, slipping):
@@ -92,7 +92,7 @@ def test_bearings_slide_to_and_fro(smooth, slipping):
 
 @pytest.mark.parametrize("record", [0, 1])
 def test_reference_results(shared, record):
-    """The first four seconds of two synthetic records, by other solvers; these are kept in single precision."""
+    """Four seconds of two synthetic records, computed by other solvers and stored in single precision."""
     with np.load(shared / "golden" / "isolated_bridge" / "own_records.npz") as kept:
         ground, dt, reference = kept[f"ag{record}"][:801], float(kept[f"dt{record}"]), kept[f"Y{record}"][..., :401]
         assert tuple(kept["channels"]) == CHANNELS
@@ -115,7 +115,7 @@ def test_solvers_agree(smooth, method):
     assert peak_errors(response, smooth["nominal"][:, :301]).max() < 2e-6
 
 
-def test_relaxation_of_the_elastic_plastic_law_leaves_little(slipping):
+def test_relaxation_of_the_elastic_plastic_law_has_a_small_error(slipping):
     bridge = Definition(loop=NO_LOOP)
     error = {
         overshoot: peak_errors(
@@ -123,12 +123,12 @@ def test_relaxation_of_the_elastic_plastic_law_leaves_little(slipping):
         ).max()
         for overshoot in (1e-5, 1e-6)
     }
-    assert 8.0 < error[1e-5] / error[1e-6] < 12.0  # of first order: the default leaves a hundredth of the second
+    assert 8.0 < error[1e-5] / error[1e-6] < 12.0  # first order, so the default leaves a hundredth of the latter
     assert error[1e-6] < 1e-3
 
 
 def test_smooth_and_elastic_plastic_friction_differ(smooth):
-    """Control: what the comparisons of one law are worth."""
+    """Control: the comparisons distinguish the two laws."""
     response = solve(Definition(), GROUND, DT, friction="elastic-plastic").response
     errors = by_kind(response, smooth["nominal"])
     assert errors["Fb"] > 0.02 and errors["acc_p"] > 0.05
@@ -142,7 +142,7 @@ def test_half_loop_is_refused_in_opensees():
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_opensees_comes_to_the_elastic_plastic_solution(slipping, opensees, name):
+def test_opensees_converges_to_the_elastic_plastic_solution(slipping, opensees, name):
     errors = by_kind(opensees[name, 2.5e-4], slipping[name])
     bounds = dict(Ub=1e-4, Fb=3e-3, drift=5e-4, shear=7e-4, acc_p=8e-3, Ud=6e-5, acc_d=2e-3)
     assert not too_large(errors, **bounds)
@@ -150,15 +150,15 @@ def test_opensees_comes_to_the_elastic_plastic_solution(slipping, opensees, name
     assert 1.3 * peak_errors(opensees[name, 2.5e-4], slipping[name]).mean() < coarse
 
 
-# ---------------------------------------------------------------------- the library's beside them
+# --- the library compared with them ---
 
-SECOND_ORDER = (3.0, 6.0)  # by what halving the step divides an error
-# of the default step, .25 ms, about three times what was measured
+SECOND_ORDER = (3.0, 6.0)  # factor by which halving the step reduces an error
+# limits for the default step of 0.25 ms, about three times the measured errors
 SMOOTH = dict(Ub=4e-6, Fb=2e-4, drift=1.5e-5, shear=5e-5, acc_p=6e-4, Ud=2e-6, acc_d=1.5e-4)
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_smooth_law_beside_solve_ivp(smooth, name):
+def test_smooth_law_against_solve_ivp(smooth, name):
     theta = PARAMETERS[name]
     errors = by_kind(ours(theta), smooth[name])
     assert not too_large(errors, **SMOOTH)
@@ -166,21 +166,21 @@ def test_smooth_law_beside_solve_ivp(smooth, name):
     assert SECOND_ORDER[0] < coarse / peak_errors(ours(theta), smooth[name]).mean() < SECOND_ORDER[1]
 
 
-def test_p_delta_and_vertical_motion_beside_solve_ivp():
+def test_p_delta_and_vertical_motion_against_solve_ivp():
     reference = solve(Definition(), GROUND, DT, p_delta=True, vertical=VERTICAL).response
     response = ours(PARAMETERS["nominal"], p_delta=True, vertical=Record("up", DT, VERTICAL))
     assert not too_large(by_kind(response, reference), **SMOOTH)
 
 
-def test_elastic_plastic_law_with_half_loop_beside_solve_ivp():
+def test_elastic_plastic_law_with_half_loop_against_solve_ivp():
     reference = solve(Definition(), GROUND, DT, friction="elastic-plastic").response
     errors = by_kind(ours(PARAMETERS["nominal"], friction="elastic-plastic"), reference)
     assert not too_large(errors, Ub=1e-4, Fb=3e-3, drift=6e-4, shear=9e-4, acc_p=9e-3, Ud=6e-5, acc_d=3e-3)
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_elastic_plastic_law_beside_opensees(opensees, name):
-    """At the same step: the two make the same errors, and differ in second order."""
+def test_elastic_plastic_law_against_opensees(opensees, name):
+    """At equal steps both have nearly the same error of first order, and their difference is of second order."""
     theta = PARAMETERS[name]
     difference = {
         step: by_kind(ours(theta, loop=False, friction="elastic-plastic", step=step), opensees[name, step])
@@ -193,7 +193,7 @@ def test_elastic_plastic_law_beside_opensees(opensees, name):
 
 
 @pytest.mark.parametrize("place", range(10))
-def test_a_wrong_parameter_would_be_seen(smooth, place):
-    """Control: each of the ten parameters, one per cent off, is outside the bounds."""
+def test_a_wrong_parameter_is_detected(smooth, place):
+    """Control: an error of one per cent in any of the ten parameters exceeds the bounds."""
     errors = by_kind(ours(PARAMETERS["nominal"] + 0.01 * np.eye(10)[place]), smooth["nominal"])
     assert too_large(errors, **SMOOTH)

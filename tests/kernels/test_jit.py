@@ -1,4 +1,4 @@
-"""The compiled kernels against their own Python, and the cache that must never be stale."""
+"""Compiled kernels against pure Python, and the disk cache, which must never be stale."""
 
 import json
 import os
@@ -23,7 +23,7 @@ ROUND_OFF = 1e-13
 
 
 def python(code, *arguments, cwd=SOURCES.parents[1], **environment):
-    """Run `code` in a new interpreter that finds the package under test and these tests; its standard output."""
+    """Run `code` in a new interpreter that finds the package and these tests; return its standard output."""
     paths = [str(cwd), str(ROOT), os.environ.get("PYTHONPATH", "")]
     result = subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
@@ -49,7 +49,7 @@ def test_hash_names_the_folder_of_the_machine_code(tmp_path):
 
 @pytest.fixture
 def copied(tmp_path):
-    """A copy of the kernels as a package of its own, with a caller of `concrete04.envelope` in another file."""
+    """Copy of the kernels as a separate package, with a caller of `concrete04.commit` in another file."""
     folder = tmp_path / "copied" / "kernels"
     shutil.copytree(SOURCES, folder, ignore=shutil.ignore_patterns("__pycache__"))
     (folder / "caller.py").write_text(
@@ -60,7 +60,7 @@ def copied(tmp_path):
 
 
 def result_of(copied, cache):
-    """Hash of the copied sources, what the compiled caller returns, and the number of its disk cache hits."""
+    """Return the hash of the copied sources, the result of the compiled caller, and the number of its cache hits."""
     code = (
         "import json; from kernels import jit, caller; value = caller.call(2.0); "
         "print(json.dumps([jit.KERNEL_HASH, value, sum(caller.call.stats.cache_hits.values())]))"
@@ -69,7 +69,7 @@ def result_of(copied, cache):
 
 
 def test_an_edit_in_a_called_kernel_is_noticed(copied, tmp_path):
-    """numba alone would go on with the old code: the caller's own file has not changed."""
+    """numba alone would use the old code, because the file of the caller has not changed."""
     cache = tmp_path / "cache"
     first = result_of(copied, cache)
     assert first[1:] == [2.0, 0]
@@ -98,21 +98,21 @@ def test_any_change_of_the_sources_changes_the_hash(copied, change):
 
 
 def result_of_hash(copied):
-    """The hash, without importing numba's compiler for it."""
+    """Return the hash, without compiling anything."""
     return python("from kernels.jit import KERNEL_HASH; print(KERNEL_HASH)", cwd=copied.parent).strip()
 
 
-def test_a_cache_folder_that_cannot_be_written_is_passed_over(tmp_path):
-    """A file in the way: the next of the roots serves."""
+def test_a_cache_folder_that_cannot_be_written_is_skipped(tmp_path):
+    """Where a file is in the place of a folder, the next candidate is used."""
     blocked = tmp_path / "blocked"
     blocked.write_text("")
     home = tmp_path / "home"
-    code = "from fe_likelihoods.kernels import jit; print(jit._CACHE_FOLDER)"
+    code = "from fe_likelihoods.kernels import jit; print(jit.CACHE_FOLDER)"
     folder = python(code, FE_LIKELIHOODS_CACHE=str(blocked), XDG_CACHE_HOME=str(home)).strip()
     assert Path(folder).is_relative_to(home)
 
 
-def test_decorating_leaves_the_setting_of_others_alone():
+def test_decorating_restores_the_setting_of_numba():
     import numba
 
     before = numba.config.CACHE_DIR
@@ -133,26 +133,26 @@ with install_recorder("numba:compile") as compiled:
     bridge = problems.isolated_bridge(channels=6, **short)
     values = [posterior(posterior.sample_prior(1, 1)[0]) for posterior in (column, bridge)]
     events = len(compiled.buffer)
-    numba.njit(lambda x: x)(1.0)  # control: a compilation is seen
+    numba.njit(lambda x: x)(1.0)  # control: a compilation is recorded
     print(json.dumps([bool(np.isfinite(values).all()), events, len(compiled.buffer) - events]))
 """
 
 
 @golden.compiled_only
 def test_second_start_compiles_nothing():
-    """First likelihoods of both posteriors in a new interpreter, once the machine code is on disk."""
-    python(FIRST_EVALUATIONS)  # compiles what earlier tests have not
+    """First likelihoods of both posteriors in a new interpreter, when the machine code is on disk."""
+    python(FIRST_EVALUATIONS)  # compiles everything that is not on disk yet
     finite, events, control = json.loads(python(FIRST_EVALUATIONS))
     assert finite
     assert events == 0
     assert control > 0
 
 
-# --- compiled against pure Python ---
+# --- compiled kernels against pure Python ---
 
 
 def short_subset() -> dict[str, np.ndarray]:
-    """A few materials, one section, a pushover and a run, short enough for pure Python; cracked and yielding."""
+    """Return results of materials, a section, a pushover and a run that are short enough for pure Python."""
     rng = np.random.default_rng(7)
     out = {}
     for name, args in (("core", golden.CORE), ("r400", (-6.0, -0.0026, -0.05, 1958.8, 0.744, 0.00138, 0.1))):
@@ -193,7 +193,7 @@ def test_pure_python_gives_the_same_results(tmp_path):
         assert set(pure.files) == set(compiled)
         for name, values in compiled.items():
             scale = np.maximum(np.abs(values).max(axis=-1, keepdims=True), 1e-300)
-            # the iterations of the column stop at 1e-10 in, and carry round-off of the sums that far
+            # the iterations of the column stop at 1e-10 in and amplify round-off to that size
             limit = ROUND_OFF if name not in ("pushover", "run") else 1e-9
             np.testing.assert_allclose(pure[name] / scale, values / scale, rtol=0, atol=limit, err_msg=name)
     assert np.abs(compiled["run"][0]).max() > 1.0
@@ -201,8 +201,8 @@ def test_pure_python_gives_the_same_results(tmp_path):
 
 
 @golden.compiled_only
-def test_single_kernels_equal_their_own_python(rng):
-    """`.py_func` of the kernels that hold a formula; what they call stays compiled."""
+def test_single_kernels_equal_pure_python(rng):
+    """`.py_func` of the kernels with a formula; the kernels that they call stay compiled."""
     c = golden.concrete_constants(golden.CORE)
     for eps in rng.uniform(-0.018, 0.0015, 100):
         assert concrete04.envelope.py_func(eps, c) == pytest.approx(concrete04.envelope(eps, c), rel=ROUND_OFF)
@@ -241,8 +241,8 @@ def test_single_kernels_equal_their_own_python(rng):
 
 
 @golden.compiled_only
-def test_section_forces_equal_their_own_python(rng):
-    """The sums are reordered by the compiler."""
+def test_section_forces_equal_pure_python(rng):
+    """Equal to round-off, because the compiler reorders the sums."""
     column = golden.column(golden.circle())
     for e0, kappa in rng.normal(size=(30, 2)) * (5e-4, 5e-5):
         pure = fiber_section.forces.py_func(e0, kappa, 0, column.sections)
@@ -259,7 +259,7 @@ def pure_constants(module, args):
 
 
 def banded(rng, n, definite):
-    """Symmetric, half bandwidth five; diagonally heavy, of either sign where it need not be definite."""
+    """Return a symmetric, diagonally dominant matrix of half bandwidth five, definite or not."""
     a = np.triu(np.tril(rng.normal(size=(n, n)), 5), -5)
     signs = np.ones(n) if definite else rng.choice([-1.0, 1.0], n)
     return a + a.T + 20.0 * np.diag(signs)
@@ -276,7 +276,7 @@ def test_banded_solution_is_that_of_numpy(rng, n, definite):
 
 
 def test_singular_matrix_does_not_give_a_finite_answer():
-    """The iterations see it, and count the step as failed."""
+    """The caller recognises it as a failed iteration."""
     b = np.ones(3)
     linear_solve.solve_banded(np.zeros((3, 3)), b)
     assert not np.isfinite(b).any()

@@ -1,4 +1,4 @@
-"""Time stepping against the reference runs, closed forms of free vibration, its order, and the balance of energy."""
+"""Time integration against reference runs, closed forms of free vibration, its order, and the balance of energy."""
 
 import math
 
@@ -33,7 +33,7 @@ def run(
     velocity=0.0,
     weight=golden.WEIGHT,
 ):
-    """(status, retries, iterations) and the history; what the run does not reach stays nan."""
+    """Return (status, retries, iterations) and the history; samples that the run does not reach stay NaN."""
     ground = np.asarray(ground, dtype=float)
     n_elements = column.elements.state.shape[0]
     history = np.full((len(HISTORY_ROWS), (len(ground) - 1) // every + 1), np.nan)
@@ -70,7 +70,7 @@ def cases(arrays):
 
 
 def test_reference_runs(reference):
-    """Displacement, acceleration, vertical displacement; crack events amplify round-off in about half of the runs."""
+    """Displacement, acceleration and vertical displacement; cracks amplify round-off in about half of the runs."""
     results = {}
     for case, column, damping, ground, expected in cases(golden.load(reference, "dynamic")):
         (status, _, _), history = run(column, ground, **damping)
@@ -82,29 +82,29 @@ def test_reference_runs(reference):
     assert not {case: r for case, r in results.items() if not r < (1e-8 if case in smooth else 1e-3)}
 
 
-def test_the_comparison_sees_parameters_one_percent_off():
+def test_parameters_one_percent_off_are_detected():
     arrays = golden.load(golden.BUNDLED, "dynamic")
     for case, column, damping, ground, expected in cases(arrays):
         damping["a0"] *= 1.01
         assert rrmse(run(column, ground, **damping)[1][:3], expected).max() > (1e-4 if case == "prior8" else 1e-3)
     for case, column, damping, ground, expected in cases(arrays):
-        if case == "nominal_x4_sub1":  # the one that cracks
+        if case == "nominal_x4_sub1":  # this run cracks
             column.sections.concrete[:, concrete04.FT] *= 1.01
             assert rrmse(run(column, ground, **damping)[1][:3], expected).max() > 1e-3
 
 
-# --- free vibration of the elastic column: motions so small (strains of 1e-8) that the laws are linear to 1e-7 ---
+# --- free vibration of the elastic column, at strains of 1e-8, where the laws are linear to 1e-7 ---
 
 
 def frequency(column):
-    """Closed form of a cantilever with a mass at its top [1/s]."""
+    """Return the angular frequency of a cantilever with a mass at its top [1/s], in closed form."""
     return math.sqrt(3.0 * stiffness_of_section(column)[1] / (golden.MASS * golden.HEIGHT**3))
 
 
 def identified(displacement, dt):
-    """Frequency and damping ratio of the continuous system behind a free vibration stepped by average acceleration.
+    """Return frequency and damping ratio of the continuous system from a free vibration by average acceleration.
 
-    The samples obey u[n+2] - s u[n+1] + p u[n] = 0; its roots z give the eigenvalues (2/dt)(z - 1)/(z + 1).
+    The samples satisfy u[n+2] - s u[n+1] + p u[n] = 0; the roots z give the eigenvalues (2/dt)(z - 1)/(z + 1).
     """
     left = np.column_stack([displacement[1:-1], -displacement[:-2]])
     s, p = np.linalg.lstsq(left, displacement[2:], rcond=None)[0]
@@ -130,7 +130,7 @@ def free_vibration(column, dt, a0, a1, n_steps=1200):
 
 
 def test_undamped_free_vibration_is_the_rotation_of_average_acceleration():
-    """u = v0/omega sin(2 n atan(omega dt/2)) exactly: the period is longer by the known factor, nothing decays."""
+    """u = v0/omega sin(2 n atan(omega dt/2)): the period is longer by the known factor, the amplitude constant."""
     column = golden.column(golden.circle(), corotational=False, element_tolerance=1e-20)
     dt = 0.01
     omega, history = free_vibration(column, dt, 0.0, 0.0, 1000)
@@ -146,18 +146,18 @@ def test_frequency_and_damping_of_free_vibration(a0, a1, dt):
     """2 pi sqrt(m h^3 / 3 EI), and zeta = a0 / 2 omega + a1 omega / 2."""
     column = golden.column(golden.circle(), corotational=False, element_tolerance=1e-20)
     omega, history = free_vibration(column, dt, a0, a1)
-    # the start, with rotations not yet in step with the mass (they have none), is left out
+    # the start is left out, where the massless rotations are not yet in phase with the mass
     measured, damping = identified(history[0, 300:], dt)
     assert measured == pytest.approx(omega, rel=1e-6)
     assert damping == pytest.approx(a0 / (2 * omega) + a1 * omega / 2, abs=1e-6)
 
 
 def test_weight_lengthens_the_period():
-    """P-Delta: k - P/h to the first order, a few per cent; none with linear geometry."""
+    """P-delta reduces the stiffness by 6/5 P/h to first order; linear geometry has no such effect."""
     periods = {}
     for corotational in (True, False):
         column = golden.column(golden.circle(), corotational=corotational, element_tolerance=1e-24)
-        # the concrete under the weight has softened by some per cent, in both variants
+        # the weight softens the concrete by a few per cent in both variants
         _, history = run(column, np.zeros(2000), a0=0.0, a1=0.0, dt=0.01, velocity=1e-6, tolerance=1e-12)
         periods[corotational] = 2 * math.pi / identified(history[0, 1:], 0.01)[0]
     omega = 2 * math.pi / periods[False]
@@ -174,7 +174,7 @@ def pulse(dt, duration=1.6, length=0.6):
 
 
 def observed_orders(response, coarsest=0.02, levels=4):
-    """log2 of the ratio of successive errors at common instants, against a run eight times finer than the last."""
+    """Return log2 of the ratios of successive errors, against a run with an eighth of the smallest step."""
     reference = response(coarsest / 2 ** (levels + 2))[:: 2 ** (levels + 2)]
     errors = []
     for level in range(levels):
@@ -187,7 +187,7 @@ def observed_orders(response, coarsest=0.02, levels=4):
 @pytest.mark.parametrize("row", [0, 1])
 @pytest.mark.parametrize("scale", [1e-4, 10.0])
 def test_second_order(row, scale):
-    """Displacement and acceleration under a smooth pulse: linear, and at a tenth of gravity uncracked (not linear)."""
+    """Displacement and acceleration under a smooth pulse, in the linear and in the nonlinear uncracked range."""
 
     def response(dt):
         column = golden.column(golden.circle(), element_tolerance=1e-20)
@@ -199,8 +199,8 @@ def test_second_order(row, scale):
     assert np.all(np.abs(orders - 2.0) < 0.1)
 
 
-def test_the_order_test_sees_a_scheme_of_first_order():
-    """Backward Euler on the oscillator of the same frequency."""
+def test_a_scheme_of_first_order_is_detected():
+    """Backward Euler on an oscillator of the same frequency."""
     omega = frequency(golden.column(golden.circle()))
 
     def response(dt):
@@ -224,7 +224,7 @@ def test_the_order_test_sees_a_scheme_of_first_order():
 )
 @pytest.mark.parametrize("corotational", [True, False])
 def test_energy_balances(motion, scale, cracked, yielded, corotational):
-    """kinetic + damped + absorbed = input at every instant, elastic, cracked and yielding; damping never gives."""
+    """kinetic + damped + absorbed = input at every instant, for an elastic, a cracked and a yielding column."""
     column = golden.column(golden.circle(), corotational=corotational)
     (status, _, _), history = run(column, scale * motion)
     assert status == 0
@@ -236,7 +236,7 @@ def test_energy_balances(motion, scale, cracked, yielded, corotational):
     assert (tension > column.sections.concrete[0, concrete04.ECT]) == cracked
     assert (history[KINETIC] >= 0.0).all()
     assert history[DAMPED, -1] > 0.0
-    # control: the balance sees a term left out
+    # control: a missing term is detected
     assert np.abs(balance - history[DAMPED]).max() > 1e-3 * largest
 
 
@@ -250,8 +250,8 @@ def test_every_keeps_one_sample_in(column, motion, every):
     np.testing.assert_array_equal(kept, full[:, ::every])
 
 
-def test_same_result_again(column, motion):
-    """The run makes the column virgin first: a yielding run in between leaves no trace."""
+def test_repeated_run_gives_the_same_result(column, motion):
+    """The run makes the column virgin first, so a yielding run in between has no effect."""
     result, first = run(column, 2.0 * motion)
     run(column, 12.0 * motion)
     again_result, again = run(column, 2.0 * motion)
@@ -268,7 +268,7 @@ def test_first_sample_is_the_state_after_gravity(column):
 
 
 def test_absolute_acceleration_is_that_of_equilibrium(motion):
-    """Without damping: the mass times the absolute acceleration is the force of the column, step by step."""
+    """Without damping, mass times absolute acceleration is the force of the column at every step."""
     column = golden.column(golden.circle(), corotational=False, element_tolerance=1e-20)
     _, history = run(column, 1e-5 * motion, a0=0.0, a1=0.0, weight=0.0, tolerance=1e-13)
     expected = -(frequency(column) ** 2) * history[0]
@@ -276,7 +276,7 @@ def test_absolute_acceleration_is_that_of_equilibrium(motion):
 
 
 def test_retries_are_counted_and_agree_with_a_finer_run(motion):
-    """Four iterations are not enough for the steps in which the section cracks: they are retried, looser and halved."""
+    """Four iterations do not suffice for steps in which the section cracks; these steps are retried and halved."""
     ground = 6.0 * motion
     coarse = ground[::8]
     fine = np.interp(np.arange(8 * (len(coarse) - 1) + 1) / 8.0, np.arange(len(coarse)), coarse)
@@ -291,8 +291,8 @@ def test_retries_are_counted_and_agree_with_a_finer_run(motion):
     assert np.abs(balance).max() < 1e-6 * history[INPUT].max()
 
 
-def test_hopeless_step_ends_the_run_with_its_number(column, motion):
-    """Four iterations and no halving: the run ends where it cracks, and what came before stands."""
+def test_impossible_step_ends_the_run_with_its_number(column, motion):
+    """With four iterations and no halving the run ends where it cracks, and keeps the samples before."""
     (status, retries, _), history = run(column, 6.0 * motion, max_iterations=4, halvings=0)
     assert 1 < status < len(motion)
     assert retries > 0
@@ -303,7 +303,7 @@ def test_hopeless_step_ends_the_run_with_its_number(column, motion):
     np.testing.assert_array_equal(history[:, :status], shorter)
 
 
-def test_a_ground_motion_that_is_not_a_number_ends_the_run(column, motion):
+def test_nan_in_the_ground_motion_ends_the_run(column, motion):
     ground = motion[:100].copy()
     ground[50] = np.nan
     (status, _, _), history = run(column, ground)
@@ -311,7 +311,7 @@ def test_a_ground_motion_that_is_not_a_number_ends_the_run(column, motion):
     assert np.isfinite(history[:, :50]).all()
 
 
-def test_hopeless_gravity_is_reported(column, motion):
+def test_impossible_gravity_is_reported(column, motion):
     (status, _, _), history = run(column, motion[:10], weight=1e6, halvings=2)
     assert status == -1
     assert np.isnan(history).all()

@@ -1,4 +1,4 @@
-"""Reinforcing steel against the reference histories, its formulas, differences, and itself in the mirror."""
+"""Reinforcing steel against reference histories, its formulas, differences, and its mirror image."""
 
 import math
 
@@ -7,6 +7,7 @@ import pytest
 
 from fe_likelihoods.kernels import reinforcing_steel as steel
 from fe_likelihoods.kernels.jit import kernel
+from fe_likelihoods.kernels.menegotto_pinto import N_CURVE, RR
 from fe_likelihoods.kernels.reinforcing_steel import (
     N_STATE,
     backbone,
@@ -35,15 +36,15 @@ def constants(request):
 
 @pytest.fixture(params=["nominal", "other", "stiff"])
 def usual(request):
-    """Constants of steels whose hardening begins well after yield."""
+    """Constants of steels whose hardening begins well beyond yield."""
     return golden.steel_constants(MATERIALS[request.param])
 
 
 @kernel
 def compare_trial_and_update(strain, jitter, c, state, copy, scratch, before, out):
-    """Largest difference of the read-only trial and of `update` on a copy; out[1] = 1 when a trial changed the memory.
+    """Write the largest difference of a trial and of `update` on a copy to out[0], and 1 to out[1] if a trial wrote.
 
-    state, copy, scratch, before : (N_STATE,) zeros.
+    state, copy, scratch and before are zeros (N_STATE,).
     """
     steel.update(strain[0], state, c)
     steel.update(strain[1], state, c)
@@ -69,7 +70,7 @@ def follow(strain, c):
 
 
 def exact_backbone(x, c):
-    """The monotonic curve of specs/bridge_column.md, 3.2, at natural strains x >= 0 [stress and modulus]."""
+    """Return stress and modulus of the backbone of docs/theory/reinforcing_steel.rst at natural strains x >= 0."""
     end = c[steel.SHP] + 0.0002
     q = (c[steel.E0] - c[steel.EP]) * x / c[steel.F0]
     knee = x * ((c[steel.E0] - c[steel.EP]) * (1 + q**10) ** -0.1 + c[steel.EP])
@@ -94,13 +95,13 @@ def histories(arrays):
 
 
 def deviation(args, history, c=None):
-    """Largest deviation of stress / fy, and median deviation of tangent / Es."""
+    """Return the largest deviation of stress / fy and the median deviation of tangent / Es."""
     out = follow(history[0], golden.steel_constants(args) if c is None else c)
     return np.abs(out[0] - history[1]).max() / args[0], np.median(np.abs(out[1] - history[2])) / args[2]
 
 
 def test_reference_histories(reference):
-    """All but the few histories in which round-off decides on which side of a clip a curve falls."""
+    """Round-off decides in a few histories whether a slope is clipped; these may differ more."""
     results = {key: deviation(args, history) for key, args, history in histories(golden.load(reference, "materials"))}
     assert len(results) >= 3
     loose = {key: r for key, r in results.items() if not r[0] < golden.STRICT}
@@ -110,7 +111,7 @@ def test_reference_histories(reference):
 
 
 @pytest.mark.parametrize(("index", "name"), [(0, "fy"), (2, "Es")])
-def test_the_comparison_sees_a_constant_one_percent_off(index, name):
+def test_a_constant_one_percent_off_is_detected(index, name):
     for _, args, history in histories(golden.load(golden.BUNDLED, "materials")):
         changed = np.array(args)
         changed[index] *= 1.01
@@ -121,7 +122,7 @@ def test_backbone_is_the_formula(constants):
     c = constants
     x = np.linspace(0.0, 1.1 * c[steel.UP], 3001)
     out = np.array([backbone(value, c) for value in x]).T
-    # the hardening branch beyond the ultimate strain is its tangent there, as in the formula with w = 0
+    # beyond the ultimate strain the backbone is its tangent there, as in the formula with w = 0
     np.testing.assert_allclose(out, exact_backbone(x, c), rtol=1e-11)
 
 
@@ -132,7 +133,7 @@ def test_backbone_is_odd(constants, rng):
 
 
 def test_backbone_is_continuous(usual):
-    """Up to what the law itself leaves open: its smooth knee, and 1e-4 where the transition meets the hardening."""
+    """The law itself has small jumps: at its smooth knee, and of 1e-4 where the transition meets the hardening."""
     c = usual
     for x, limit in ((c[steel.A_SHIFT], 1e-6), (c[steel.SHP] + 0.0002, 1e-4), (c[steel.UP], 1e-12)):
         below, above = backbone(x * (1 - 1e-13), c)[0], backbone(x * (1 + 1e-13), c)[0]
@@ -145,16 +146,16 @@ def test_backbone_tangent_is_the_derivative_in_every_branch(usual, rng):
     for low, high in zip(edges[:-1], edges[1:], strict=True):
         step = 1e-4 * (high - low)
         for x in rng.uniform(low + 2 * step, high - 2 * step, 100) * rng.choice([-1, 1], 100):
-            # five points: an error of the fourth order in a step of 1e-4 of the branch
+            # five points give an error of fourth order in the step
             s = [backbone(x + k * step, c)[0] for k in (-2, -1, 1, 2)]
             difference = (s[0] - 8 * s[1] + 8 * s[2] - s[3]) / (12 * step)
             assert backbone(x, c)[1] == pytest.approx(difference, rel=1e-6, abs=1e-8 * c[steel.E0])
 
 
 def test_tangent_of_a_reversal_is_the_derivative(usual, rng):
-    """Along the Menegotto-Pinto curves, in engineering strain, wherever both neighbours lie on the same curve.
+    """Along the Menegotto-Pinto curves, in engineering strain, wherever both neighbours are on the same curve.
 
-    Curves of R > 100 are left out: there the law, as in OpenSees, gives the slope at the start for the tangent.
+    Curves with R > 100 are left out, because the law, as in OpenSees, returns the slope at the start as their tangent.
     """
     c = usual
     tested = 0
@@ -172,7 +173,7 @@ def test_tangent_of_a_reversal_is_the_derivative(usual, rng):
                 stresses.append(update(trial, copy, c))
                 branches.append(copy[steel.BRANCH])
             level = (int(branches[0]) + 1) // 2 - 2
-            if branches != [branches[0]] * 3 or level < 0 or copy[steel.CURVES + 9 * level + steel.RR] > 100.0:
+            if branches != [branches[0]] * 3 or level < 0 or copy[steel.CURVES + N_CURVE * level + RR] > 100.0:
                 continue
             difference = (stresses[2][0] - stresses[0][0]) / (2 * step)
             assert stresses[1][1] == pytest.approx(difference, rel=1e-4, abs=1e-5 * c[steel.E0])
@@ -182,7 +183,7 @@ def test_tangent_of_a_reversal_is_the_derivative(usual, rng):
 
 @pytest.mark.parametrize("multiplier", [0.2, 0.5, 1.0, 2.5])
 def test_series_below_yield_are_exact_to_round_off(multiplier):
-    """Against the backbone with log1p: the compiled backbone itself rounds 1 + eps."""
+    """The reference is the backbone with log1p, because the compiled backbone rounds 1 + eps."""
     args = (75.2, 102.0, multiplier * 28400.0, 1000.0, 0.011, 0.12)
     c = golden.steel_constants(args)
     limit = c[steel.VIRGIN_LIMIT]
@@ -198,15 +199,15 @@ def test_series_below_yield_are_exact_to_round_off(multiplier):
 
 
 def test_series_fail_beyond_their_limit():
-    """Control: at twice the limit the same comparison sees the truncation."""
+    """Control: at twice the limit the truncation is detected."""
     c = golden.steel_constants(golden.STEEL)
     eps = 2 * c[steel.VIRGIN_LIMIT]
     series = virgin_stress_tangent(eps, c[steel.E0], c[steel.EP], c[steel.F0])[0]
     assert abs(series / monotonic_stress_tangent(eps, c)[0] - 1) > 1e-6
 
 
-def test_virgin_steel_leaves_no_trace_below_yield(usual, rng):
-    """Any walk that stays below yield follows the backbone, both ways."""
+def test_steel_below_yield_follows_the_backbone(usual, rng):
+    """Any history that stays below yield follows the backbone in both directions."""
     c = usual
     limit = c[steel.YIELD_STRAIN] * (1 - 1e-9)
     for strain in golden.random_walks(rng, 30, 200, 0.5 * limit):
@@ -216,13 +217,13 @@ def test_virgin_steel_leaves_no_trace_below_yield(usual, rng):
             exact = monotonic_stress_tangent(eps, c)
             assert stress == pytest.approx(exact[0], rel=1e-12)
             assert tangent == pytest.approx(exact[1], rel=1e-12)
-    # and one committed strain beyond yield does leave one
+    # control: one committed strain beyond yield changes the path
     beyond = 2.0 * c[steel.YIELD_STRAIN]
     out = follow([0.0, beyond, 0.9 * beyond, 0.5 * beyond], c)
     assert abs(out[0, 3] / monotonic_stress_tangent(0.5 * beyond, c)[0] - 1) > 0.1
 
 
-def test_trial_equals_update_on_a_copy_and_leaves_no_trace(usual, rng):
+def test_trial_equals_update_on_a_copy_and_changes_nothing(usual, rng):
     worst = np.zeros(2)
     jitter = np.concatenate([[0.0], rng.normal(scale=1e-3, size=4)])
     for amplitude in (0.004, 0.01, 0.03):
@@ -242,28 +243,28 @@ def test_single_trial_from_python(usual):
 
 
 def mirrored_deviation(x, c):
-    """Largest sum of the natural stresses of a history of natural strain and of its mirror image, over fyp."""
+    """Return the largest sum of the natural stresses of a history and of its mirror image, over fyp."""
     one, other = follow(np.expm1(x), c), follow(np.expm1(-x), c)
     return np.abs(one[0] * np.exp(x) + other[0] * np.exp(-x)).max() / c[steel.FYP]
 
 
 @pytest.mark.parametrize("amplitude", [0.6, 3.0])
 def test_mirrored_cycles_give_mirrored_stress(usual, amplitude):
-    """Growing cycles: backbone and first returns, without ties, to round-off."""
+    """Growing cycles use the backbone and the first reversals only, and agree to round-off."""
     peaks = np.concatenate([[0.0], amplitude * usual[steel.SHP] * np.linspace(0.1, 1.0, 20) * (-1.0) ** np.arange(20)])
     x = np.interp(0.05 * np.arange(400), np.arange(21), peaks)
     assert mirrored_deviation(x, usual) < 1e-12
 
 
 def test_mirrored_walks_give_mirrored_stress(usual, rng):
-    """Nested reversals meet ties, where the last digit of ln(1 + eps) decides on a clip of a slope by 1/1000."""
+    """In nested reversals the last digit of ln(1 + eps) may decide whether a slope is clipped by 1/1000."""
     limit = 0.95 * usual[steel.SHP]
     walks = list(golden.random_walks(rng, 150, 300, 0.3 * limit))
     deviation = np.array([mirrored_deviation(np.clip(x, -limit, limit), usual) for x in walks])
     assert deviation.max() < 3e-3
     straight_runs = deviation[2::3]
     assert np.mean(straight_runs < 1e-11) > 0.6
-    # control: a steel of other strength in the mirror is seen
+    # control: another strength is detected
     other = golden.steel_constants((80.0, 102.0, 28400.0, 1000.0, 0.011, 0.12))
     difference = follow(np.expm1(walks[0]), usual)[0] - follow(np.expm1(walks[0]), other)[0]
     assert np.abs(difference).max() / usual[steel.FYP] > 1e-2
@@ -281,14 +282,14 @@ def test_large_random_walks_stay_finite(usual, seed):
 
 
 def test_impossible_strain_is_not_a_number(usual):
-    """ln(1 + eps) ends at eps = -1: the caller sees nan, counts it as failed, and never a plausible stress."""
+    """ln(1 + eps) ends at eps = -1; the result is NaN, which the caller counts as a failed iteration."""
     state, scratch = np.zeros(N_STATE), np.zeros(N_STATE)
     assert math.isnan(monotonic_stress_tangent(-0.96, usual)[0])
     assert math.isnan(stress_tangent(-0.96, state, usual, scratch)[0])
 
 
-# Constants, strains and the stresses of OpenSees 3.7.1, where the chord of a returning curve is steeper than the slope
-# of the reversal at its start: the curve is then a straight line.
+# Constants, strains and stresses of OpenSees 3.7.1, for returning curves whose chord is steeper than the slope at the
+# reversal. Such a curve is a straight line.
 STEEP_CHORDS = [
     (
         (75.2, 102.0, 5680.0, 1000.0, 0.0165, 0.12),
@@ -314,7 +315,7 @@ def test_chord_steeper_than_the_reversal(args, strain, stress):
 
 
 def test_large_random_walks_of_soft_steel_stay_finite(seed):
-    """Es at a fifth, hardening soon after yield: such chords are common there."""
+    """With a fifth of Es, hardening begins soon after yield, and such chords are common."""
     rng, c = np.random.default_rng(seed), golden.steel_constants(MATERIALS["soft"])
     for amplitude in (0.01, 0.03, 0.1):
         for strain in golden.random_walks(rng, 300, 200, amplitude):

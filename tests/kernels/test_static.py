@@ -10,7 +10,7 @@ from . import golden
 
 pytestmark = golden.compiled_only
 
-# Rows of a history, and where they stand in the reference results.
+# Rows of a history and their names in the reference results.
 ROWS = {
     "ux": "ux3",
     "uy": "uy3",
@@ -41,7 +41,7 @@ def cases(arrays):
 
 
 def deviation(history, reference, names):
-    """Largest deviation of each row over the largest of its reference."""
+    """Return the largest deviation of each row over the largest of its reference."""
     reference = reference[[names.index(name) for name in ROWS.values()]]
     return np.abs(history - reference).max(axis=1) / np.abs(reference).max(axis=1)
 
@@ -54,12 +54,12 @@ def test_reference_pushovers(reference):
         assert status[0] == 0
         results[key] = amplitude, deviation(history, expected, arrays["_meta"]["rows"]).max()
     assert results
-    # measured: 4e-12 and 5e-6; both codes stop their iterations at 1e-10 in
+    # measured: 4e-12 and 5e-6; both programs stop their iterations at 1e-10 in
     limits = {"small": 5e-11, "large": 2e-5}
     assert not {key: r for key, r in results.items() if not r[1] < limits[r[0]]}
 
 
-def test_the_comparison_sees_a_tension_strength_one_percent_off():
+def test_a_tensile_strength_one_percent_off_is_detected():
     arrays = golden.load(golden.BUNDLED, "pushover")
     for _, _, column, targets, expected in cases(arrays):
         column.sections.concrete[:, concrete04.FT] *= 1.01
@@ -84,8 +84,8 @@ def test_gravity_is_the_weight_on_every_section(column):
     assert GRAVITY_STEPS == 10
 
 
-def test_imposed_displacement_is_met_and_the_base_balances_it(column):
-    """M at the base = force x height of the top + weight x its drift: equilibrium in the deformed position."""
+def test_imposed_displacement_is_reached_and_the_base_balances_it(column):
+    """Equilibrium in the deformed position: M at the base = force x height of the top + weight x its drift."""
     targets = 2.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, 400)) * np.linspace(0.0, 1.0, 400)
     status, history = push(column, targets)
     assert status == (0, 0)
@@ -98,7 +98,7 @@ def test_imposed_displacement_is_met_and_the_base_balances_it(column):
 
 
 def test_every_closed_cycle_dissipates(column):
-    """The first most (it cracks the section), the next ones less and less."""
+    """The first cycle dissipates most, because it cracks the section; the next ones dissipate less and less."""
     cycle = 3.0 * np.sin(np.linspace(0.0, 2.0 * np.pi, 241))
     _, history = push(column, np.concatenate([cycle, cycle[1:], cycle[1:]]))
     work = np.diff(history[0]) * 0.5 * (history[3, 1:] + history[3, :-1])
@@ -106,7 +106,7 @@ def test_every_closed_cycle_dissipates(column):
     assert first > second > third > 0.0
 
 
-def test_same_result_again(column):
+def test_repeated_analysis_gives_the_same_result(column):
     """The analysis makes the column virgin first."""
     targets = np.linspace(0.0, 4.0, 200)
     _, first = push(column, targets)
@@ -115,7 +115,7 @@ def test_same_result_again(column):
 
 
 def test_large_steps_are_retried_and_reach_the_same_force():
-    """With four iterations a step of half an inch fails; halved, it follows the path of small steps."""
+    """With four iterations a step of half an inch fails; its halves follow the path of small steps."""
     fine = np.linspace(0.0, 3.0, 601)
     coarse = fine[::100]
     status, expected = push(golden.column(golden.circle()), fine)
@@ -126,7 +126,7 @@ def test_large_steps_are_retried_and_reach_the_same_force():
     np.testing.assert_allclose(history[3], expected[3, ::100], rtol=0, atol=2e-3 * np.abs(expected[3]).max())
 
 
-def test_hopeless_step_ends_the_run_with_its_number():
+def test_impossible_step_ends_the_run_with_its_number():
     targets = np.concatenate([np.linspace(0.0, 1.0, 50), [1.0e4], np.ones(5)])
     (status, _), history = push(golden.column(golden.circle()), targets, halvings=2)
     assert status == 51
@@ -136,7 +136,7 @@ def test_hopeless_step_ends_the_run_with_its_number():
     np.testing.assert_array_equal(history[:, :50], shorter)
 
 
-def test_hopeless_gravity_is_reported():
+def test_impossible_gravity_is_reported():
     """A weight far above the strength of the column."""
     status, history = push(golden.column(golden.circle()), np.zeros(3), halvings=2, gravity=golden.gravity(weight=1e6))
     assert status[0] == -1
