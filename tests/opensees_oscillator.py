@@ -40,9 +40,8 @@ class Oscillator:
         ops.mass(2, 1.0)
         ops.uniaxialMaterial("Elastic", 1, omega**2, 2.0 * damping * DAMPING * omega)
         ops.element("zeroLength", 1, 1, 2, "-mat", 1, "-dir", 1, "-doRayleigh", 0)
-        values = np.append(
-            self.acceleration, self.acceleration[-1]
-        ).tolist()  # one more value: round-off must not pass the end
+        # a path ends at its last point; one more value keeps round-off of the clock from passing the end
+        values = np.append(self.acceleration, self.acceleration[-1]).tolist()
         ops.timeSeries("Path", 1, "-dt", self.dt, "-values", *values)
         ops.pattern("UniformExcitation", 1, 1, "-accel", 1)
         ops.constraints("Plain")

@@ -86,7 +86,7 @@ class Solution(NamedTuple):
     evaluations: int
 
 
-# one structured array, because scipy passes it at every evaluation, and a tuple of arrays costs more than the evaluation
+# one structured array: scipy passes it at every evaluation, and passing a tuple of arrays takes longer than that
 _CONSTANTS = np.dtype(
     [(name, float) for name in ("dt", "overshoot", "k_uu", "k_up", "k_pp", "retardation", "deck")]
     + [(name, float) for name in ("mass", "rotary", "height", "centre", "rubber_length", "rubber_limit")]

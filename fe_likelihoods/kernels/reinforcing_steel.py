@@ -14,9 +14,9 @@ The backbone s_b(x) is odd in x. With z = |x|::
 
 Between reversals the path is a curve of Menegotto and Pinto (`menegotto_pinto`). A branch number selects the curve.
 Branches 1 and 2 are the backbones in tension and compression. Branches 3, 5, 7 ... are the curves of successively
-nested reversals of which the first goes down from tension; 4, 6, 8 ... are their mirror images. A branch b > 2 keeps its
-curve in the slot of level (b+1)//2. Only the rules of the odd branches are written out. An even branch is processed by the
-same rules with the signs of all strains and stresses changed.
+nested reversals of which the first goes down from tension; 4, 6, 8 ... are their mirror images. A branch b > 2 keeps
+its curve in the slot of level (b+1)//2. Only the rules of the odd branches are written out. An even branch is processed
+by the same rules with the signs of all strains and stresses changed.
 
 The law is that of the material ReinforcingSteel of OpenSees with its default options: no buckling, no fatigue, no
 isotropic hardening. ``docs/theory/reinforcing_steel.rst`` lists all rules.
