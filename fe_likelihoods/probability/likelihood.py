@@ -21,6 +21,7 @@ from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
 from ..simulation.memory_cache import MisfitMemory, distinct_keys
 from ..simulation.model import Model, SimulationFailed, misfit_batch, misfit_of_responses, simulate_batch, split_seconds
+from ..simulation.source_digest import simulation_fingerprint
 from .noise import GaussianNoise
 
 __all__ = ["FELikelihood", "TooManyFailures", "as_points"]
@@ -159,8 +160,8 @@ class FELikelihood:
         self.fast_parameters = tuple(range(self._n_structural, len(self.parameter_names)))
         self._memory = MisfitMemory(memory)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
-        self._key = None if cache is None else self.fingerprint
         self._model_fingerprint = None if cache is None else model.fingerprint
+        self._key = None if cache is None else f"{self.fingerprint} {simulation_fingerprint(model, self._statistic)}"
         self._chunk = 1
         self.simulations = 0
         self.cache_hits = 0
@@ -381,7 +382,7 @@ class FELikelihood:
                 )
             self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
             if batch is not None:
-                self.cache.store_responses(self._model_fingerprint, thetas, batch.response)
+                self.cache.store_responses(self.model, thetas, batch.response)
         return misfit
 
     def _record(self, theta: np.ndarray, reason: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 __all__ = ["read_rows", "write_rows"]
 
-SCHEMA = "fe_likelihoods.simulation.disk_cache"
+SCHEMA = "fe_likelihoods.cache"  # a name of the format: it stays when modules are moved
 SCHEMA_VERSION = 1
 KEY_BYTES = 16
 COLUMNS = {

@@ -1,10 +1,8 @@
 """A stored simulation: by which key it is found, and how it is known to be whole."""
 
-import functools
 import hashlib
 import struct
 import zlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,19 +15,9 @@ LONGEST_REASON = 2000
 NUMBERS = struct.Struct("<qd")
 
 
-@functools.cache
-def _sources() -> bytes:
-    """Digest of the sources of the models: their fingerprints tell arguments, not what the code does with them."""
-    digest = hashlib.blake2b(digest_size=KEY_BYTES)
-    for path in sorted((Path(__file__).parents[1] / "models").glob("*.py")):
-        digest.update(path.name.encode() + b"\0")
-        digest.update(path.read_bytes())
-    return digest.digest()
-
-
 def simulation_keys(fingerprint: str, thetas: np.ndarray) -> list[bytes]:
     """Digests of a fingerprint and each row of `thetas` (n, n_structural); -0.0 and 0.0 are one, by adding zero."""
-    start = hashlib.blake2b(_sources() + fingerprint.encode() + b"\0", digest_size=KEY_BYTES)
+    start = hashlib.blake2b(fingerprint.encode() + b"\0", digest_size=KEY_BYTES)
     keys = []
     for row in np.asarray(thetas, dtype="<f8") + 0.0:
         digest = start.copy()

@@ -26,6 +26,8 @@ from typing import Any
 
 import numpy as np
 
+from .source_digest import class_digest, source_digest
+
 __all__ = ["code_digest"]
 
 _LIBRARY = __name__.split(".")[0]
@@ -174,7 +176,8 @@ class _Digest:
     def _object(self, thing: Any) -> list[str | bytes]:
         fingerprint = getattr(thing, "fingerprint", None)
         if isinstance(fingerprint, str):
-            return ["fingerprint", fingerprint]
+            # a fingerprint describes values; what the methods of the library's classes do with them is in the sources
+            return ["fingerprint", fingerprint, class_digest(type(thing))]
         if isinstance(thing, enum.Enum):
             state = {thing.name: thing.value}
         elif is_dataclass(thing):
@@ -216,13 +219,15 @@ def _is_own(top: str) -> bool:
     return any(not {"site-packages", "dist-packages"} & set(PurePath(place).parts) for place in places)
 
 
-@functools.cache
 def _version(module: str) -> str:
-    """Version of a package; of this library and of a compiled module without version a digest; empty elsewhere."""
+    """What stands for the code of a module: of this library a digest of sources, otherwise the package's version."""
+    return source_digest(module) if module.split(".")[0] == _LIBRARY else _package_version(module)
+
+
+@functools.cache
+def _package_version(module: str) -> str:
+    """Version of a package, or of a compiled module without a version a digest of its file; otherwise empty."""
     top = module.split(".")[0]
-    if top == _LIBRARY:
-        sources = sorted(Path(__file__).parents[1].rglob("*.py"))
-        return blake2b(b"".join(source.read_bytes() for source in sources), digest_size=16).hexdigest()
     try:
         return importlib.metadata.version(top)
     except importlib.metadata.PackageNotFoundError:

@@ -26,6 +26,8 @@ import numpy as np
 
 from .cache_exchange import read_rows, write_rows
 from .cache_rows import COLUMNS, checksum, is_whole, packed, simulation_keys
+from .model import Model
+from .source_digest import simulation_fingerprint
 from .sqlite_file import CacheFile, is_damage
 
 __all__ = ["CacheInfo", "Remembered", "SimulationCache"]
@@ -255,19 +257,20 @@ class SimulationCache:
             ],
         )
 
-    def store_responses(self, fingerprint: str, thetas: np.ndarray, responses: np.ndarray) -> None:
+    def store_responses(self, model: Model, thetas: np.ndarray, responses: np.ndarray) -> None:
         """Keep full responses in single precision, in one transaction that also evicts.
 
         Parameters
         ----------
-        fingerprint : str
-            Of the model alone: responses do not depend on the measurements.
+        model : Model
+            The responses do not depend on the measurements.
         thetas : (n, n_structural) float
         responses : (n, n_channels, n_steps) float
             Those that are not finite, also in single precision, are left out.
         """
         rows = []
-        for key, response in zip(simulation_keys(fingerprint, thetas), responses, strict=True):
+        keys = simulation_keys(simulation_fingerprint(model), thetas)
+        for key, response in zip(keys, responses, strict=True):
             with np.errstate(over="ignore"):
                 single = np.asarray(response, dtype="<f4")
             if np.isfinite(single).all():
@@ -275,9 +278,9 @@ class SimulationCache:
                 rows.append((key, len(single), len(data), zlib.crc32(key + data), data))
         self._write(_STORE_RESPONSE, rows)
 
-    def response(self, fingerprint: str, theta: np.ndarray) -> np.ndarray | None:
-        """The response (n_channels, n_steps) kept for a model's fingerprint and parameters (n_structural,), or None."""
-        (key,) = simulation_keys(fingerprint, np.atleast_2d(np.asarray(theta, dtype=float)))
+    def response(self, model: Model, theta: np.ndarray) -> np.ndarray | None:
+        """The response (n_channels, n_steps) kept for a model and its parameters (n_structural,), or None."""
+        (key,) = simulation_keys(simulation_fingerprint(model), np.atleast_2d(np.asarray(theta, dtype=float)))
         query = "SELECT n_channels, crc, response FROM responses WHERE key = ?"
         with self._file.lock:
             found = self._try("read", lambda connection: connection.execute(query, (key,)).fetchall(), [])

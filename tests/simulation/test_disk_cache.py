@@ -22,7 +22,7 @@ from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal, Unifo
 from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation import cache_rows
+from fe_likelihoods.simulation import cache_rows, source_digest
 from fe_likelihoods.simulation.disk_cache import SimulationCache
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
 
@@ -194,22 +194,12 @@ def test_settings_of_the_integrator_are_part_of_the_key(path, change):
         assert (likelihood.simulations, likelihood.disk_hits) == (1, 0)
 
 
-def test_other_code_of_the_models_is_another_simulation(path, monkeypatch):
+def test_other_code_of_the_model_is_another_simulation(path, monkeypatch):
     oscillator(path).misfit([[1.1, 0.9]])
-    monkeypatch.setattr(cache_rows, "_sources", lambda: b"other code")
+    monkeypatch.setattr(source_digest, "source_digest", lambda *modules: "other code")
     changed = oscillator(path)
     changed.misfit([[1.1, 0.9]])
     assert (changed.simulations, changed.disk_hits) == (1, 0)
-
-
-def test_the_sources_of_the_models_are_what_the_key_depends_on(tmp_path, monkeypatch):
-    (tmp_path / "models").mkdir()
-    found = set()
-    for text in ("x = 1", "x = 2"):
-        (tmp_path / "models" / "any.py").write_text(text)
-        monkeypatch.setattr(cache_rows, "__file__", str(tmp_path / "cache_rows.py"))
-        found.add(cache_rows._sources.__wrapped__())
-    assert len(found) == 2
 
 
 def test_noise_prior_and_display_units_change_nothing(path):
@@ -564,7 +554,7 @@ def test_responses_are_kept_beside_the_sums(path, rng, model):
     again = SimulationCache(path)
     kept = 0
     for theta, failed in zip(thetas, np.isnan(likelihood.misfit(thetas)).any(axis=1), strict=True):
-        response = again.response(model.fingerprint, theta)
+        response = again.response(model, theta)
         if failed:
             assert response is None
         else:
@@ -572,8 +562,8 @@ def test_responses_are_kept_beside_the_sums(path, rng, model):
             assert response.dtype == np.float32
             np.testing.assert_array_equal(response, simulate_batch(model, theta[None]).response[0].astype("f4"))
     assert again.info().responses == kept > 0
-    assert again.response(model.fingerprint, thetas[0] + 1e-9) is None
-    assert again.response("another model", thetas[0]) is None
+    assert again.response(model, thetas[0] + 1e-9) is None
+    assert again.response(Line(9.0), thetas[0]) is None
 
 
 def test_responses_are_bounded(path, rng):
@@ -584,7 +574,7 @@ def test_responses_are_bounded(path, rng):
     likelihood.misfit(thetas[:14])
     likelihood.misfit(thetas[14:])
     assert (cache.info().responses, cache.info().response_bytes) == (10, 10 * bytes_each)
-    kept = [cache.response("line", theta) is not None for theta in thetas]
+    kept = [cache.response(Batched(), theta) is not None for theta in thetas]
     assert kept == [False] * 15 + [True] * 10
     assert cache.info().simulations == 25
 

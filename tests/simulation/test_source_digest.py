@@ -1,0 +1,134 @@
+"""A cache key depends on the source files that the response depends on, and on no others."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, FunctionModel, IsolatedBridge, LinearOscillator, RCColumn, Record, from_si
+from fe_likelihoods.probability.residuals import lag_one_sums
+from fe_likelihoods.simulation import source_digest
+from fe_likelihoods.simulation.cache_rows import simulation_keys
+from fe_likelihoods.simulation.code_digest import code_digest
+from fe_likelihoods.simulation.source_digest import imported_files, simulation_fingerprint
+
+CHANNELS = (Channel("a", "displacement", "m"),)
+RECORD = Record("pulse", 0.01, np.sin(np.arange(20) / 3))
+
+
+def respond(theta):
+    return from_si(theta[0] * np.ones((1, 5)), "cm")
+
+
+def late(theta):
+    from fe_likelihoods import to_si
+
+    return to_si(theta[0] * np.ones((1, 5)), "cm")
+
+
+class OwnColumn:
+    """A model of the user's own that uses one of the library."""
+
+    def __init__(self):
+        self.column = RCColumn.lhpost(RECORD)
+        self.fingerprint = "own " + self.column.fingerprint
+
+
+MODELS = {
+    "column": lambda: RCColumn.lhpost(RECORD),
+    "bridge": lambda: IsolatedBridge(RECORD),
+    "oscillator": lambda: LinearOscillator(RECORD),
+    "function": lambda: FunctionModel(respond, ("x",), CHANNELS, 0.1, 5),
+    "late": lambda: FunctionModel(late, ("x",), CHANNELS, 0.1, 5),
+    "own": OwnColumn,
+}
+
+
+@pytest.fixture
+def edit(tmp_path, monkeypatch):
+    """Append a comment to a file of a copy of the library, which is then the one that is read."""
+    copy = tmp_path / "fe_likelihoods"
+    shutil.copytree(source_digest.ROOT, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(source_digest, "ROOT", copy)
+    source_digest.source_digest.cache_clear()
+
+    def append(file):
+        assert (copy / file).is_file()
+        with (copy / file).open("a") as opened:
+            opened.write("\n# a comment\n")
+        source_digest.source_digest.cache_clear()
+
+    yield append
+    source_digest.source_digest.cache_clear()
+
+
+def keys(*models, statistic=None):
+    thetas = np.ones((1, 2))
+    return {name: simulation_keys(simulation_fingerprint(MODELS[name](), statistic), thetas)[0] for name in models}
+
+
+def changed(edit, file, *models, statistic=None):
+    """Models whose keys change with a file."""
+    before = keys(*models, statistic=statistic)
+    edit(file)
+    after = keys(*models, statistic=statistic)
+    return {name for name in models if before[name] != after[name]}
+
+
+@pytest.mark.parametrize("file", ["plots/histories.py", "plots/structures.py"])
+def test_a_plot_changes_no_key(edit, file):
+    assert changed(edit, file, *MODELS) == set()
+
+
+@pytest.mark.parametrize(
+    ("file", "expected"),
+    [
+        ("kernels/concrete04.py", {"column", "own", "late"}),  # imported by other kernels, not by the model
+        ("kernels/exponential.py", {"bridge", "own", "late"}),
+        ("models/rc_column.py", {"column", "own", "late"}),
+        ("models/circular_section.py", {"column", "own", "late"}),
+        ("models/linear_oscillator.py", {"oscillator", "own", "late"}),
+        ("models/isolated_bridge_parts.py", {"bridge", "own", "late"}),
+        ("models/function.py", {"function", "own", "late"}),
+        ("signals/sdof.py", set(MODELS)),
+        ("units.py", set(MODELS)),
+        ("simulation/model.py", set(MODELS)),
+        ("probability/priors.py", {"late"}),
+        ("simulation/disk_cache.py", {"late"}),
+    ],
+)
+def test_a_file_changes_the_keys_of_the_models_that_use_it(edit, file, expected):
+    """A late import from the façade and a class of the user may use more than can be seen: they depend on more."""
+    assert changed(edit, file, *MODELS) == expected
+
+
+def test_the_statistic_of_the_noise_is_part_of_the_key(edit):
+    assert changed(edit, "probability/residuals.py", "oscillator") == set()
+    assert changed(edit, "probability/residuals.py", "oscillator", statistic=lag_one_sums) == {"oscillator"}
+
+
+def test_a_model_that_a_function_uses_is_part_of_its_key(edit):
+    column = RCColumn.lhpost(RECORD)
+
+    def shifted(theta):
+        return column.simulate(theta) + 1.0
+
+    before = code_digest(shifted)
+    edit("models/isolated_bridge.py")
+    assert code_digest(shifted) == before
+    edit("models/rc_column.py")
+    assert code_digest(shifted) != before
+
+
+def test_imports_for_type_checkers_do_not_count(tmp_path, monkeypatch):
+    for name in ("a", "b", "c", "d", "e", "plots/p"):
+        path = tmp_path / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("x = 1\n")
+    (tmp_path / "a.py").write_text(
+        "from typing import TYPE_CHECKING\nimport numpy\nif TYPE_CHECKING:\n    from . import c\nelse:\n    from . import b\n"
+        "class A:\n    def f(self):\n        try:\n            import fe_likelihoods.d\n"
+        "        except ImportError:\n            from .e import x\n        from .plots import p\n"
+    )
+    monkeypatch.setattr(source_digest, "ROOT", tmp_path)
+    assert {path.stem for path in imported_files("fe_likelihoods.a")} == {"a", "b", "d", "e"}
