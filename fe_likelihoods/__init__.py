@@ -92,9 +92,11 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         Exceedance,
         exceedance,
     )
+    from .probability.failures import (
+        TooManyFailures,
+    )
     from .probability.likelihood import (
         FELikelihood,
-        TooManyFailures,
     )
     from .probability.marginal_noise import (
         MarginalNoise,
@@ -102,6 +104,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.noise import (
         AutoregressiveNoise,
         GaussianNoise,
+        Noise,
         SharedGaussianNoise,
     )
     from .probability.posterior import (
@@ -194,6 +197,7 @@ __all__ = [
     "MarginalNoise",
     "Measurements",
     "Model",
+    "Noise",
     "OpenSeesModel",
     "Patches",
     "Pier",
@@ -310,14 +314,13 @@ _EXPORTS = {
         "Exceedance",
         "exceedance",
     ),
-    "probability.likelihood": (
-        "FELikelihood",
-        "TooManyFailures",
-    ),
+    "probability.failures": ("TooManyFailures",),
+    "probability.likelihood": ("FELikelihood",),
     "probability.marginal_noise": ("MarginalNoise",),
     "probability.noise": (
         "AutoregressiveNoise",
         "GaussianNoise",
+        "Noise",
         "SharedGaussianNoise",
     ),
     "probability.posterior": ("Posterior",),

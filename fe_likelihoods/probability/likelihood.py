@@ -1,17 +1,16 @@
-"""The log-likelihood of a model's parameters and of the noise, given measurements.
+"""Log-likelihood of the parameters of a model and of the noise, given measurements.
 
-Parameters go to the model, its response to sums of squared residuals J, J and the noise's parameters to a number. (A
-noise may need some numbers more than J: its statistic of the residuals, see `fe_likelihoods.probability.noise`.) The middle of
-this chain, `FELikelihood.statistics`, is the only place where simulations are asked for: it decides which rows are run,
-counts them, records those that fail, and remembers what came out.
+The steps are: structural parameters to the response of the model, response to the sums of squared residuals J per
+channel, J and the parameters of the noise to the log-likelihood. (A noise may need more numbers than J, its statistic
+of the residuals, see `fe_likelihoods.probability.noise`.) `FELikelihood.statistics` is the only place where simulations
+are requested: it selects the rows to simulate, counts them, records failures and caches the results. The equations are
+on the page ``docs/theory/likelihood.rst``.
 """
 
 import hashlib
-import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,136 +18,97 @@ import numpy as np
 from ..signals.channels import Measurements
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
-from ..simulation.memory_cache import MisfitMemory, distinct_keys
-from ..simulation.model import Model, SimulationFailed, misfit_batch, misfit_of_responses, simulate_batch, split_seconds
+from ..simulation.memory_cache import MemoryCache, distinct_keys
+from ..simulation.model import (
+    Model,
+    SimulationFailed,
+    has_batch_method,
+    misfit_batch,
+    misfit_of_responses,
+    simulate_batch,
+)
 from ..simulation.source_digest import simulation_fingerprint
-from .noise import GaussianNoise
+from .failures import FailureLog
+from .inputs import as_points, check_noise_channels, match_measurements
+from .noise import GaussianNoise, Noise, noise_statistic
 
-__all__ = ["FELikelihood", "TooManyFailures", "as_points"]
+__all__ = ["FELikelihood"]
 
-logger = logging.getLogger(__name__)
-
-_RECORDED_FAILURES = 1000
-_RECORDED_REASONS = 100
-_OTHER_REASONS = "other reasons"
-_SECONDS_PER_CHUNK = 5.0  # of simulations, before they are stored
-_ROUNDS_PER_CHUNK = 8  # of each worker: those who wait for the last one idle for half a round in the mean
-_RESPONSE_VALUES = 2**23  # responses held at once where they are kept: 64 MiB
-_FEW_SIMULATIONS = 20
-
-
-class TooManyFailures(RuntimeError):
-    """More simulations failed than the stated share: what was simulated is kept, no more is."""
-
-
-def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
-    """One point or many, as an array.
-
-    Parameters
-    ----------
-    x : array_like (ndim,) or (n, ndim), or a mapping of every name to its value or its (n,) values
-        Mappings are what emcee passes with ``parameter_names=``, and nautilus with its own prior.
-    names : sequence of str
-        Names of the ndim parameters, in order.
-
-    Returns
-    -------
-    ndarray[ndim] or ndarray[n, ndim]
-
-    Raises
-    ------
-    ValueError
-        If the length or the names do not fit.
-    """
-    if isinstance(x, Mapping):
-        if set(x) != set(names):
-            raise ValueError(f"expected a value for each of {', '.join(names)}; got the names {', '.join(map(str, x))}")
-        x = np.stack([np.asarray(x[name], dtype=float) for name in names], axis=-1)
-    points = np.asarray(x, dtype=float)
-    if points.ndim not in (1, 2) or points.shape[-1] != len(names):
-        raise ValueError(
-            f"expected one value for each of the {len(names)} parameters {', '.join(names)}, in an array of shape "
-            f"({len(names)},) or (n, {len(names)}); got shape {points.shape}"
-        )
-    return points
+_SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
+_ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
+_RESPONSE_VALUES = 2**23  # responses held at once where they are cached: 64 MiB
 
 
 class FELikelihood:
-    """Log-likelihood of structural parameters and noise, given measurements.
+    """Log-likelihood of structural parameters and noise parameters, given measurements.
+
+    Calling the object is `log_likelihood`.
 
     Parameters
     ----------
     model : Model
-        Turns structural parameters into the response (see `fe_likelihoods.simulation.model`).
+        Computes the response from structural parameters (see `fe_likelihoods.simulation.model`).
     measurements : Measurements
-        The model's channels (matched by name, in any order) at the model's step and length.
-    noise : optional
-        A noise of `fe_likelihoods.probability.noise`, or anything with ``parameter_names`` and ``log_likelihood(misfit, n_steps,
-        parameters)``; by default `GaussianNoise` of the model's channels. One that needs more of the residuals than
-        their sums of squares has a ``statistic`` too (`fe_likelihoods.simulation.model.Statistic`).
-    pool : int, or an object with ``map(function, items)``, optional
-        Runs the simulations, as many at once as it has workers: a number of processes of this machine, a client of
-        dask.distributed, an executor or a pool (see `fe_likelihoods.simulation.executors`). Without it they run in this process:
-        the compiled models on threads, others one after the other. It does not travel when the likelihood is pickled.
-    memory : int
-        Number of simulations whose misfits are remembered (some 250 bytes each), so that none of them is run again,
-        those that failed included; 0 for none. What is remembered does not travel when the likelihood is pickled: every
-        process remembers what it simulated itself.
+        The model's channels (matched by name, in any order) at the model's time step and length.
+    noise : Noise, optional
+        A noise of `fe_likelihoods.probability.noise` or any object with that protocol; by default `GaussianNoise` of
+        the model's channels.
+    pool : int, or object with ``map(function, items)``, optional
+        Runs the simulations in parallel: a number of processes of this machine, a client of dask.distributed, an
+        executor or a pool (see `fe_likelihoods.simulation.executors`). Without it, simulations run in this process:
+        compiled models on threads, others one after the other. It is not pickled with the likelihood.
+    memory_rows : int
+        Number of simulations whose statistics are cached in memory (about 250 bytes each), failures included, so that
+        they are not simulated again; 0 for none. The contents are not pickled with the likelihood: every process caches
+        its own simulations.
     cache : SimulationCache or path, optional
-        Simulations on disk, asked after the memory: those of earlier runs and of other processes are not run again, and
-        a killed run loses no more than the last seconds. A batch is then simulated in chunks of some seconds, stored
-        one by one; through a pool whose number of workers cannot be told, in one piece.
+        Cache on disk, used after the one in memory: simulations of earlier runs and of other processes are not run
+        again, and a killed run loses only its last few seconds. A batch is then simulated in chunks of a few seconds
+        that are stored one by one; with a pool of unknown size, in one chunk.
     max_failure_share : float
-        Once more than this share of the simulations failed, of 20 or more, no more are run: asking for one raises
-        `TooManyFailures`. 1 for never.
+        Largest share of failed simulations, in [0, 1]. If more have failed, of 20 or more, the next request for a
+        simulation raises `TooManyFailures`.
 
     Attributes
     ----------
     parameter_names : tuple of str
-        The model's, then the noise's.
+        Names of the structural parameters, then of the noise parameters.
     fast_parameters : tuple of int
-        Indices of the parameters whose change costs no simulation: the noise's.
+        Indices of the parameters whose change needs no simulation: those of the noise.
     simulations : int
         Simulations run by this object in this process.
     cache_hits : int
-        Rows whose misfit was remembered instead.
+        Rows whose statistics were cached, in memory or on disk.
     disk_hits : int
-        How many of those rows came from the cache on disk.
-    failure_count : int
-        How many simulations failed, those that the cache on disk told included.
-    failures : list of dict
-        ``{"parameters": {name: value}, "reason": str}`` of the first thousand failures, and their duration, "seconds",
-        where it is known.
-    failure_reasons : dict of str to int
-        How often each reason occurred, whatever the duration.
+        Rows among them that came from the cache on disk.
     seconds : float
-        Wall time spent in simulations [s].
+        Wall time of the simulations [s].
 
     Raises
     ------
     ValueError
-        If channels, step or length of model and measurements or the noise's channels differ, parameter names repeat,
-        the pool is none, the model cannot be sent to its processes, or the file of the cache cannot be used.
+        If the channels, time step or length of model and measurements differ, or the channels of the noise, if
+        parameter names repeat, if the pool is not one or the model cannot be sent to its processes, or if the file of
+        the cache cannot be used.
     """
 
     def __init__(
         self,
         model: Model,
         measurements: Measurements,
-        noise: Any = None,
+        noise: Noise | None = None,
         pool: Any = None,
         *,
-        memory: int = 100_000,
+        memory_rows: int = 100_000,
         cache: SimulationCache | str | os.PathLike | None = None,
         max_failure_share: float = 1.0,
     ) -> None:
-        if not 0.0 <= max_failure_share <= 1.0:
-            raise ValueError(f"FELikelihood: max_failure_share must lie in [0, 1]; got {max_failure_share!r}")
+        self._failures = FailureLog(model.parameter_names, max_failure_share)
         self.model = model
-        self.measurements = _matched(model, measurements)
+        self.measurements = match_measurements(model, measurements)
         self.noise = GaussianNoise(model.channels) if noise is None else noise
-        _check_channels(model, self.noise)
-        self._statistic = getattr(self.noise, "statistic", None)
+        check_noise_channels(model, self.noise)
+        self._statistic = noise_statistic(self.noise)
         n_channels = self.measurements.n_channels
         self._width = n_channels if self._statistic is None else len(self._statistic(self.measurements.values))
         self.pool = as_executor(pool, model)
@@ -158,21 +118,22 @@ class FELikelihood:
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
         self._n_structural = len(model.parameter_names)
         self.fast_parameters = tuple(range(self._n_structural, len(self.parameter_names)))
-        self._memory = MisfitMemory(memory)
+        self._memory = MemoryCache(memory_rows)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._model_fingerprint = None if cache is None else model.fingerprint
-        self._key = None if cache is None else f"{self.fingerprint} {simulation_fingerprint(model, self._statistic)}"
+        self._key = None if cache is None else self.simulation_key
         self._chunk = 1
         self.simulations = 0
         self.cache_hits = 0
         self.disk_hits = 0
-        self.failure_count = 0
-        self.failures: list[dict] = []
-        self.failure_reasons: Counter[str] = Counter()
         self.seconds = 0.0
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"pool": None}
+
+    def __call__(self, x: Any) -> np.ndarray | float:
+        """Same as `log_likelihood`."""
+        return self.log_likelihood(x)
 
     @property
     def ndim(self) -> int:
@@ -180,12 +141,40 @@ class FELikelihood:
         return len(self.parameter_names)
 
     @property
+    def failure_count(self) -> int:
+        """Number of failed simulations, those known from the cache on disk included."""
+        return self._failures.count
+
+    @property
+    def failures(self) -> list[dict]:
+        """The first 1000 failures: ``{"parameters": {name: value}, "reason": str}``, with ``"seconds"`` if known."""
+        return self._failures.records
+
+    @property
+    def failure_reasons(self) -> Counter[str]:
+        """Number of failures per reason."""
+        return self._failures.reasons
+
+    @property
     def fingerprint(self) -> str:
-        """Digest of all that is kept of a simulation depends on: model, measurements, the noise's statistic."""
+        """Hex digest of everything the cached statistics depend on: model, measurements, statistic of the noise.
+
+        The source files of the library are not part of it; they are part of `simulation_key`.
+        """
         text = f"{self.model.fingerprint} {self.measurements.fingerprint}"
         if self._statistic is not None:
             text += f" {self._statistic.__module__}.{self._statistic.__qualname__}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+    @property
+    def simulation_key(self) -> str:
+        """Key under which a `SimulationCache` stores the statistics: `fingerprint` and digest of the source files."""
+        return f"{self.fingerprint} {simulation_fingerprint(self.model, self._statistic)}"
+
+    @property
+    def data_fingerprint(self) -> str:
+        """Hex digest of the measurements: equal for likelihoods of the same data."""
+        return self.measurements.fingerprint
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals: the first columns of `statistics`.
@@ -197,14 +186,15 @@ class FELikelihood:
 
         Returns
         -------
-        (n, n_channels) float : [SI unit of the channel, squared]; NaN where there is no usable simulation.
+        (n, n_channels) float
+            [SI unit of the channel, squared]; NaN where there is no usable simulation.
         """
         return self.statistics(thetas)[:, : self.measurements.n_channels]
 
     def statistics(self, thetas: np.ndarray) -> np.ndarray:
-        """What the noise needs of the residuals: for white noise their sums of squares.
+        """Statistics of the residuals that the noise needs: for white noise the sums of squares.
 
-        Equal rows are simulated once, remembered ones not again, and rows that are not finite not at all.
+        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped.
 
         Parameters
         ----------
@@ -213,7 +203,8 @@ class FELikelihood:
 
         Returns
         -------
-        (n, n_numbers) float : NaN where there is no usable simulation.
+        (n, n_numbers) float
+            NaN where there is no usable simulation.
         """
         thetas = as_points(thetas, self.model.parameter_names)
         thetas = thetas if thetas.ndim == 2 else thetas[None]
@@ -226,29 +217,30 @@ class FELikelihood:
         return result
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Measured less simulated response at one set of parameters: one simulation, neither counted nor kept.
+        """Measured minus simulated response at one point: one simulation, which is neither counted nor cached.
 
         Parameters
         ----------
         theta : (n_structural,) or (ndim,) float
-            Structural parameters; those of the noise may follow.
+            Structural parameters; the noise parameters may follow.
 
         Returns
         -------
-        (n_channels, n_steps) float : [SI], in the order of the model's channels.
+        (n_channels, n_steps) float
+            [SI], in the order of the model's channels.
 
         Raises
         ------
         ValueError
-            For another number of parameters.
+            For a wrong number of parameters.
         SimulationFailed
             If the simulation fails.
         """
         theta = np.asarray(theta, dtype=float)
         if theta.shape not in ((self._n_structural,), (self.ndim,)):
             raise ValueError(
-                f"residuals are those of one set of parameters, of shape ({self._n_structural},) or ({self.ndim},) "
-                f"with the noise's; got shape {theta.shape}"
+                f"expected one point, of shape ({self._n_structural},), or ({self.ndim},) with the noise parameters; "
+                f"got shape {theta.shape}"
             )
         response, (reason,) = simulate_batch(self.model, theta[None, : self._n_structural])
         if reason:
@@ -256,7 +248,7 @@ class FELikelihood:
         return self.measurements.values - response[0]
 
     def _statistics(self, thetas: np.ndarray) -> np.ndarray:
-        """Of finite rows. A single row that is remembered must not cost ten microseconds: few calls of numpy."""
+        """Statistics of finite rows; few calls of numpy, because a cached row has to cost less than 10 microseconds."""
         keys, distinct = distinct_keys(thetas)
         misfit, known = self._memory.look_up(keys, self._width)
         if all(known):
@@ -270,16 +262,18 @@ class FELikelihood:
         return misfit if len(keys) == len(thetas) else misfit[distinct]
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
-        """Log-likelihood of structural parameters followed by the noise's.
+        """Log-likelihood of structural parameters followed by noise parameters.
 
         Parameters
         ----------
-        x : array_like (ndim,) or (n, ndim), or named values (see `as_points`)
+        x : array_like (ndim,) or (n, ndim), or mapping
+            A mapping has a value, or n values, for every parameter name.
 
         Returns
         -------
-        float or (n,) float : -inf where a simulation fails, where the noise's parameters are impossible (nothing is
-        simulated there) and where x is not finite; never NaN.
+        float or (n,) float
+            -inf where a simulation fails, where the noise parameters are impossible (nothing is simulated there) and
+            where x is not finite; never NaN.
         """
         points = as_points(x, self.parameter_names)
         rows = np.atleast_2d(points)
@@ -287,7 +281,7 @@ class FELikelihood:
         n_steps = self.measurements.n_steps
         possible = np.isfinite(rows).all(axis=1)
         if self.fast_parameters:
-            # a perfect fit tells which noise parameters are possible at all, before anything is simulated
+            # statistics of zero (a perfect fit) show before any simulation which noise parameters are possible
             perfect = np.zeros((len(rows), self._width))
             possible &= ~np.isneginf(self.noise.log_likelihood(perfect, n_steps, noise))
         result = np.full(len(rows), -np.inf)
@@ -297,17 +291,20 @@ class FELikelihood:
             usable = values < np.inf  # neither NaN nor infinite
             simulated = np.isfinite(misfit).all(axis=1)
             for row in np.flatnonzero(simulated & ~usable):
-                self._record(thetas[possible][row], f"the log-likelihood of the noise is {values[row]}")
+                self._failures.add(thetas[possible][row], f"the log-likelihood of the noise is {values[row]}")
             result[possible] = np.where(simulated & usable, values, -np.inf)
         return result if points.ndim == 2 else float(result[0])
 
-    def with_noise(self, noise: Any) -> "FELikelihood":
-        """The same with another noise: model, measurements, pool, cache and bounds stay; counts and memory are new."""
+    def with_noise(self, noise: Noise) -> "FELikelihood":
+        """The same likelihood with another noise.
+
+        Model, measurements, pool, cache on disk and limits are kept; counts and the cache in memory start empty.
+        """
         other = FELikelihood(
             self.model,
             self.measurements,
             noise,
-            memory=self._memory.rows,
+            memory_rows=self._memory.rows,
             cache=self.cache,
             max_failure_share=self.max_failure_share,
         )
@@ -315,7 +312,7 @@ class FELikelihood:
         return other
 
     def _obtain(self, keys: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-        """Statistics of rows that are not in memory, and which of them came from disk; the others are simulated."""
+        """Statistics of rows that are not in memory, simulated or from disk, and which of them came from disk."""
         thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), -1).copy()
         shape = len(keys), self._width
         misfit, on_disk = np.full(shape, np.nan), np.zeros(len(keys), dtype=bool)
@@ -323,43 +320,37 @@ class FELikelihood:
             misfit, reasons, on_disk = self.cache.look_up(self._key, thetas, shape[1], self.measurements.n_steps)
             for row in np.flatnonzero(on_disk):
                 if reasons[row]:
-                    self._record(thetas[row], reasons[row])
+                    self._failures.add(thetas[row], reasons[row])
             self._memory.store([keys[row] for row in np.flatnonzero(on_disk)], misfit[on_disk])
         left = np.flatnonzero(~on_disk)
-        least, most = self._chunk_limits(len(left)) if len(left) else (0, 0)
+        smallest, largest = self._chunk_limits(len(left)) if len(left) else (0, 0)
         while len(left):
-            size = max(least, min(most, self._chunk))
+            size = max(smallest, min(largest, self._chunk))
             rows, left = left[:size], left[size:]
             start = time.perf_counter()
             misfit[rows] = self._simulate(thetas[rows])
-            # not at once: the first ones may have failed in no time
+            # the size grows by steps: the first simulations may be failures that took no time
             self._chunk = min(4 * size, 1 + int(_SECONDS_PER_CHUNK * len(rows) / (time.perf_counter() - start)))
             self._memory.store([keys[row] for row in rows], misfit[rows])
         return misfit, on_disk
 
     def _chunk_limits(self, n: int) -> tuple[int, int]:
-        """How many of n simulations are run before they are stored, at least (all workers are busy) and at most."""
+        """Smallest (all workers are busy) and largest number of simulations, of n, between two writes to disk."""
         if self.cache is None:
             return n, n
-        most = max(1, _RESPONSE_VALUES // self.measurements.values.size) if self.cache.responses else n
+        largest = max(1, _RESPONSE_VALUES // self.measurements.values.size) if self.cache.responses else n
         if self.pool is not None:
             workers = self.pool.n_workers or n
-        elif hasattr(self.model, "misfit_batch") or hasattr(self.model, "simulate_batch"):
+        elif has_batch_method(self.model):
             workers = os.cpu_count() or 1
         else:
-            return 1, most
-        return min(_ROUNDS_PER_CHUNK * workers, most), most
+            return 1, largest
+        return min(_ROUNDS_PER_CHUNK * workers, largest), largest
 
     def _simulate(self, thetas: np.ndarray) -> np.ndarray:
-        # asked before and not after a batch, so that what was simulated is remembered
-        known = self.simulations + self.disk_hits
-        if known >= _FEW_SIMULATIONS and self.failure_count > self.max_failure_share * known:
-            (reason, count), *_ = self.failure_reasons.most_common(1)
-            raise TooManyFailures(
-                f"{self.failure_count} of {known} simulations failed, {count} because of {reason!r}, where "
-                f"a share of {self.max_failure_share:g} is allowed: see failures and report(). Mend the model, "
-                "narrow the prior, or allow for more with max_failure_share"
-            )
+        """Statistics of new simulations, which are counted, recorded if they fail, and stored on disk."""
+        # checked before a batch and not after it, so that finished simulations are stored
+        self._failures.check(self.simulations + self.disk_hits)
         start = time.perf_counter()
         measured = self.measurements.values
         batch = None
@@ -373,72 +364,14 @@ class FELikelihood:
         self.simulations += len(thetas)
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
-                self._record(theta, reason)
+                self._failures.add(theta, reason)
         if self.cache is not None:
             if self.model.fingerprint != self._model_fingerprint:
                 raise ValueError(
-                    "the model has changed since the likelihood was made (its fingerprint is another one), and its "
-                    "simulations cannot be kept with the old ones: make a new likelihood"
+                    "the model has changed since the likelihood was made (its fingerprint differs), so its simulations "
+                    "cannot be stored with the earlier ones; make a new likelihood"
                 )
             self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
             if batch is not None:
                 self.cache.store_responses(self.model, thetas, batch.response)
         return misfit
-
-    def _record(self, theta: np.ndarray, reason: str) -> None:
-        parameters = dict(zip(self.model.parameter_names, theta.tolist(), strict=True))
-        reason, seconds = split_seconds(reason)
-        if not self.failure_count:
-            logger.warning(
-                "a simulation failed and counts as impossible: %s at %s; further ones are only counted, see report()",
-                reason,
-                parameters,
-            )
-        self.failure_count += 1
-        if len(self.failures) < _RECORDED_FAILURES:
-            self.failures.append({"parameters": parameters, "reason": reason})
-            if seconds is not None:
-                self.failures[-1]["seconds"] = seconds
-        known = reason in self.failure_reasons or len(self.failure_reasons) < _RECORDED_REASONS
-        self.failure_reasons[reason if known else _OTHER_REASONS] += 1
-
-
-def _check_channels(model: Model, noise: Any) -> None:
-    """ValueError where a noise is of other channels than the model's."""
-    ours, theirs = (
-        [c.name for c in channels] for channels in (model.channels, getattr(noise, "channels", model.channels))
-    )
-    if ours != theirs:
-        raise ValueError(
-            f"the noise is of the channels {', '.join(theirs)}, the model's are {', '.join(ours)}: make the noise with "
-            "model.channels"
-        )
-
-
-def _matched(model: Model, measurements: Measurements) -> Measurements:
-    """The measurements in the order of the model's channels, or ValueError with advice where the two do not fit."""
-    expected = [channel.name for channel in model.channels]
-    got = [channel.name for channel in measurements.channels]
-    if sorted(expected) != sorted(got):
-        raise ValueError(
-            f"the model's channels are {', '.join(expected)}, the measurements' are {', '.join(got)}; "
-            "choose the common ones with Measurements.select(names) and in the model"
-        )
-    matched = measurements if expected == got else measurements.select(expected)
-    for ours, theirs in zip(model.channels, matched.channels, strict=True):
-        words = [channel.quantity.split()[:-1] for channel in (ours, theirs)]
-        if ours.dimension != theirs.dimension or (all(words) and words[0] != words[1]):
-            raise ValueError(
-                f"channel {ours.name!r} is {ours.quantity!r} in the model and {theirs.quantity!r} in the measurements"
-            )
-    if abs(matched.dt - model.dt) > 1e-9 * model.dt:
-        raise ValueError(
-            f"the model's response has a step of {model.dt} s, the measurements have {matched.dt} s; make them equal "
-            "with Record.resample(dt) on the excitation or Measurements.decimate(factor)"
-        )
-    if matched.n_steps != model.n_steps:
-        raise ValueError(
-            f"the model's response has {model.n_steps} samples, the measurements have {matched.n_steps}; make them "
-            "equal with Record.trim(start, stop) and Measurements.trim(start, stop)"
-        )
-    return matched

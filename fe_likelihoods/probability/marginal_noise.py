@@ -1,15 +1,16 @@
 """White noise with its standard deviations integrated out: a likelihood of the structural parameters alone.
 
-Given the sum of squared residuals J of n samples, what is left of the noise is one integral per standard deviation, ::
+Given the sum of squared residuals J of n samples, the likelihood is one integral per standard deviation::
 
     L(J) = integral of (2 pi)^(-n/2) sigma^-n exp(-J / (2 sigma^2)) p(sigma) d sigma
 
-under its prior p. A sampler then has that many dimensions fewer to search, at the same evidence and the same posterior
-of the structural parameters, and the standard deviations are drawn afterwards, given these.
+under its prior p. A sampler then searches fewer dimensions, with the same evidence and the same posterior of the
+structural parameters. The standard deviations are drawn afterwards, given the structural parameters.
 
-In t = log sigma the integrand is a hump, of width 1 / sqrt(2 n) where the likelihood decides. It is found (a grid that
-closes in on the maximum), bounded (bisection for where it has fallen by exp(-36)), and integrated between these bounds
-by Gauss and Legendre's rule, which a prior with bounds of its own does not disturb.
+In t = log sigma the integrand has one maximum, with a width of 1 / sqrt(2 n) where the likelihood dominates. The
+maximum is found by a grid that is refined around it, the limits by bisection for a decrease by the factor exp(-36), and
+the integral between them by Gauss-Legendre quadrature, which also holds for a prior with bounds of its own. The
+equations are on the page ``docs/theory/likelihood.rst``.
 """
 
 import math
@@ -25,23 +26,23 @@ from .priors import Distribution, Prior, RandomState, Uniform
 __all__ = ["MarginalNoise"]
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
-_FALL = 36.0  # of the logarithm, beyond which nothing is left in double precision
+_FALL = 36.0  # decrease of the logarithm at which the integrand is negligible in double precision
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 _GRID = np.linspace(0.0, 1.0, 17)
-_MOST_ROUNDS = 40
-_CELLS = 512  # of the distribution function that is inverted for draws
+_MAX_ITERATIONS = 40
+_CELLS = 512  # intervals of the distribution function that is inverted for draws
 
 
 @dataclass(frozen=True)
 class MarginalNoise:
-    """A white noise without parameters: those of another one, integrated out under their priors.
+    """White noise without parameters: those of another noise are integrated out under their priors.
 
     Parameters
     ----------
     noise : GaussianNoise or SharedGaussianNoise
-        Effective samples are allowed, a known sensor is not.
+        Effective samples are allowed, known sensor noise is not.
     priors : mapping of str to Distribution
-        Of exactly the noise's parameters.
+        Priors of exactly the noise's parameters.
 
     Raises
     ------
@@ -50,17 +51,17 @@ class MarginalNoise:
 
     Notes
     -----
-    To eight digits of the likelihood for a hundred samples and more, six for ten, where there is one hump. There is one
-    for half-normal, uniform and lognormal priors (the integrand is then log-concave in log sigma). There can be two
-    where few effective samples contradict an informative `TruncatedNormal` prior by many of its standard deviations:
-    the smaller one is then left out.
+    If the integrand has one maximum, the likelihood is accurate to eight digits for a hundred samples or more and to
+    six digits for ten. It has one maximum for half-normal, uniform and lognormal priors, for which it is log-concave
+    in log sigma. It can have two if few effective samples contradict an informative `TruncatedNormal` prior by many of
+    its standard deviations; the lower one is then left out.
 
     Examples
     --------
     >>> noise = MarginalNoise(GaussianNoise(model.channels), {"sigma_top": HalfNormal(0.1)})
     >>> posterior = Posterior(FELikelihood(model, measurements, noise), prior_of_structural_parameters)
 
-    or `fe_likelihoods.probability.posterior.Posterior.marginal` of a posterior with all parameters.
+    `fe_likelihoods.probability.posterior.Posterior.marginal` does this for a posterior with all parameters.
     """
 
     noise: GaussianNoise | SharedGaussianNoise
@@ -70,7 +71,7 @@ class MarginalNoise:
         if not isinstance(noise, GaussianNoise | SharedGaussianNoise) or noise.sensor is not None:
             raise ValueError(
                 "MarginalNoise integrates out the standard deviations of white noise, GaussianNoise or "
-                f"SharedGaussianNoise, without a known sensor; got {noise!r}: keep the parameters of this one"
+                f"SharedGaussianNoise, without sensor noise; got {noise!r}: keep the parameters of this one"
             )
         object.__setattr__(self, "noise", noise)
         ordered = Prior(priors).reorder(noise.parameter_names)
@@ -78,12 +79,12 @@ class MarginalNoise:
 
     @property
     def channels(self) -> tuple:
-        """Those of the noise."""
+        """Channels of the noise."""
         return self.noise.channels
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """None."""
+        """No parameters."""
         return ()
 
     def log_likelihood(self, misfit: np.ndarray, n_steps: int, parameters: Any = None) -> np.ndarray:
@@ -92,16 +93,18 @@ class MarginalNoise:
         Parameters
         ----------
         misfit : (n, n_channels) float
-            Sums over the samples of squared residuals [SI unit of the channel, squared]; NaN where the simulation
+            Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
             failed.
         n_steps : int
-            Number of samples in each channel.
-        parameters : ignored; there are none.
+            Number of samples per channel.
+        parameters : optional
+            Ignored; the noise has no parameters.
 
         Returns
         -------
-        (n,) float : -inf where the misfit is NaN or infinite, +inf where it is zero and so may be sigma (the integral
-            does not exist), never NaN.
+        (n,) float
+            -inf where the misfit is NaN or infinite; +inf where it is zero and the prior allows sigma = 0 (the integral
+            diverges); never NaN.
         """
         misfit = np.asarray(misfit, dtype=float)
         total = np.full(len(misfit), -np.inf)
@@ -113,17 +116,21 @@ class MarginalNoise:
         return total
 
     def draw(self, misfit: np.ndarray, n_steps: int, rng: RandomState = None) -> np.ndarray:
-        """Standard deviations given the misfit: one draw for each row of their conditional posterior.
+        """Draws of the standard deviations from their conditional posterior, given the misfit, one per row.
 
         Parameters
         ----------
-        misfit : (n, n_channels) float — as for `log_likelihood`, finite and positive.
+        misfit : (n, n_channels) float
+            As for `log_likelihood`; finite and positive.
         n_steps : int
-        rng : seed, generator, or None for NumPy's global stream
+            Number of samples per channel.
+        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+            A seed, a generator, or None for NumPy's global stream.
 
         Returns
         -------
-        (n, n_noise) float : parameters of `noise`.
+        (n, n_noise) float
+            Parameters of `noise`.
 
         Raises
         ------
@@ -134,8 +141,8 @@ class MarginalNoise:
         good = (np.isfinite(misfit) & (misfit > 0.0)).all(axis=1)
         if not good.all():
             raise ValueError(
-                f"the noise can be drawn where the misfit is finite and positive; in {(~good).sum()} of {len(good)} "
-                "rows it is not, the simulation failed there or fits without an error"
+                f"the noise can only be drawn where the misfit is finite and positive; in "
+                f"{(~good).sum()} of {len(good)} rows it is not, because the simulation failed or fits exactly: leave these rows out"
             )
         squares, counts, _ = self._sums(misfit, n_steps)
         uniform = Uniform(0.0, 1.0).rvs(squares.shape, rng)
@@ -143,7 +150,7 @@ class MarginalNoise:
         return np.stack(columns, axis=1)
 
     def _sums(self, misfit: np.ndarray, n_steps: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """Sums of squares (n, n_noise) and numbers of samples (n_noise,) for each sigma, and a constant."""
+        """Sums of squares (n, n_noise) and numbers of samples (n_noise,) per sigma, and a constant of the logarithm."""
         counts = np.full(misfit.shape[1], float(n_steps))
         if self.noise.effective_samples is not None:
             counts = np.minimum(counts, self.noise.effective_samples)
@@ -154,8 +161,8 @@ class MarginalNoise:
         return (misfit / scales**2).sum(axis=1, keepdims=True), counts.sum(keepdims=True), -counts @ np.log(scales)
 
 
-class _Hump(NamedTuple):
-    """Where the integrand over t = log sigma is, for each of n rows: maximum, and the bounds of what is left of it."""
+class _Peak(NamedTuple):
+    """Peak of the integrand over t = log sigma, for n rows: its position and the limits of integration, all (n, 1)."""
 
     top: np.ndarray
     low: np.ndarray
@@ -163,19 +170,19 @@ class _Hump(NamedTuple):
 
 
 def _log_integrand(t: np.ndarray, fit: np.ndarray, count: float, prior: Distribution) -> np.ndarray:
-    """Of t = log sigma (n, k); `fit` (n, 1) is log sqrt(J / n), where the likelihood is largest."""
+    """Logarithm of the integrand at t = log sigma (n, k); `fit` (n, 1) is the likelihood's maximum, log sqrt(J / n)."""
     with np.errstate(over="ignore", invalid="ignore"):
         likelihood = -count * (_HALF_LOG_TWO_PI + t + 0.5 * np.exp(2.0 * (fit - t)))
     return likelihood + prior.logpdf(np.exp(t)) + t
 
 
-def _find(fit: np.ndarray, count: float, prior: Distribution) -> _Hump:
-    """The hump for every row of `fit` (n, 1)."""
+def _find(fit: np.ndarray, count: float, prior: Distribution) -> _Peak:
+    """Peak of the integrand for every row of `fit` (n, 1)."""
     least, most = _logarithms(prior)
     middle, far = np.log(prior.ppf(np.array([0.5, 1.0 - 1e-15])))
-    # between the maxima of likelihood and prior: closing in on it, until its neighbours are almost as high
+    # the maximum is between those of likelihood and prior; refine until the neighbours on the grid are almost as high
     low, high = np.clip(np.minimum(fit, middle - 5.0), least, most), np.clip(np.maximum(fit, far), least, most)
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         t = low + (high - low) * _GRID
         values = _log_integrand(t, fit, count, prior)
         best = np.argmax(values, axis=1)[:, None]
@@ -187,23 +194,23 @@ def _find(fit: np.ndarray, count: float, prior: Distribution) -> _Hump:
         if (highest - np.minimum(left, right)).max() < 1.0:
             break
     floor = highest - _FALL
-    # three below the maximum the exponent of the likelihood is four hundred times what it was
+    # at three below the maximum the exponent of the likelihood is 400 times as large
     below = np.maximum(np.minimum(top, fit) - 3.0, least)
     above = np.minimum(top + (far - middle) + 3.0, most)
     bounds = []
     for inside, outside in ((top, below), (top, above)):
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(_MAX_ITERATIONS):
             half = 0.5 * (inside + outside)
             fallen = _log_integrand(half, fit, count, prior) < floor
             inside, outside = np.where(fallen, inside, half), np.where(fallen, half, outside)
             if (np.abs(outside - inside) <= 0.1 * np.abs(outside - top)).all():
                 break
         bounds.append(outside)
-    return _Hump(top, *bounds)
+    return _Peak(top, *bounds)
 
 
 def _logarithms(prior: Distribution) -> tuple[float, float]:
-    """Logarithms of the prior's bounds, where sigma is positive; nudged inwards, so that exp(log) stays inside."""
+    """Logarithms of the prior's bounds for positive sigma, moved inwards so that exp(log) is within the bounds."""
     least, most = prior.bounds
     tiny = np.finfo(float).tiny
     return math.log(max(least, tiny)) + 1e-14, math.log(min(most, 1.0 / tiny)) - 1e-14
@@ -218,19 +225,19 @@ def _integral(squares: np.ndarray, count: float, prior: Distribution) -> np.ndar
     fit = np.maximum(fit[exists], math.log(np.finfo(float).tiny))
     if not exists.any():
         return result
-    hump = _find(fit, count, prior)
-    half = 0.5 * (hump.high - hump.low)
-    values = _log_integrand(hump.low + half * (1.0 + _NODES), fit, count, prior)
+    peak = _find(fit, count, prior)
+    half = 0.5 * (peak.high - peak.low)
+    values = _log_integrand(peak.low + half * (1.0 + _NODES), fit, count, prior)
     largest = values.max(axis=1)
     result[exists] = largest + np.log((half * np.exp(values - largest[:, None])) @ _WEIGHTS)
     return result
 
 
 def _draws(squares: np.ndarray, count: float, prior: Distribution, uniform: np.ndarray) -> np.ndarray:
-    """Standard deviations for sums of squares (n,), by inversion of their distribution function at uniform numbers."""
+    """Standard deviations for sums of squares (n,): the inverse of their distribution function at uniform numbers."""
     fit = 0.5 * np.log(squares / count)[:, None]
-    hump = _find(fit, count, prior)
-    t = hump.low + (hump.high - hump.low) * np.linspace(0.0, 1.0, _CELLS + 1)
+    peak = _find(fit, count, prior)
+    t = peak.low + (peak.high - peak.low) * np.linspace(0.0, 1.0, _CELLS + 1)
     values = _log_integrand(t, fit, count, prior)
     density = np.exp(values - values.max(axis=1, keepdims=True))
     cumulative = np.cumsum(0.5 * (density[:, 1:] + density[:, :-1]), axis=1)
@@ -238,4 +245,4 @@ def _draws(squares: np.ndarray, count: float, prior: Distribution, uniform: np.n
     cell = np.minimum((cumulative < wanted).sum(axis=1, keepdims=True), _CELLS - 1)
     before = np.where(cell > 0, np.take_along_axis(cumulative, np.maximum(cell - 1, 0), axis=1), 0.0)
     share = (wanted - before) / (np.take_along_axis(cumulative, cell, axis=1) - before)
-    return np.exp(hump.low + (hump.high - hump.low) * (cell + share) / _CELLS)[:, 0]
+    return np.exp(peak.low + (peak.high - peak.low) * (cell + share) / _CELLS)[:, 0]

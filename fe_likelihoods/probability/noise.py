@@ -1,68 +1,129 @@
-"""What separates a measured response from a simulated one, as a probability.
+"""Probability models of the error, the difference between a measured and a simulated response.
 
-The measurement is the simulated response plus an error. For an error that is Gaussian and independent from channel to
-channel, a few numbers per channel are all that the likelihood needs of the residuals (a sufficient statistic): for
-white noise their sum of squares J, for an autoregressive error two numbers more. So a noise takes these numbers, not
-the response, and a change of its own parameters costs no simulation.
+The errors are Gaussian and independent between channels. The likelihood then needs only a few sums of the residuals
+per channel (sufficient statistics): for white noise the sum of squares J, for an autoregressive error two more. A noise
+takes these sums instead of the response, so a change of its own parameters needs no simulation. Equations and sources
+are on the page ``docs/theory/noise.rst``.
 
-Which one to take::
+Which noise to take:
 
-    GaussianNoise(channels)                          errors independent from sample to sample: synthetic data
-    AutoregressiveNoise(channels)                    errors that last: an unknown lag-one correlation per channel
-    GaussianNoise(channels, effective_samples=n_eff) the same concern, at no further parameter: n_eff from residuals
-    SharedGaussianNoise.of(measurements)             one sigma for all channels
-    ...Noise(channels, sensor={"top": 0.02})         known sensor noise beside the unknown model error
+========================================================  ==============================================================
+``GaussianNoise(channels)``                               Independent errors: synthetic data, thinned measurements.
+``AutoregressiveNoise(channels)``                         Correlated errors, with an unknown lag-one correlation per
+                                                          channel.
+``GaussianNoise(channels, effective_samples=n_eff)``      Correlated errors without more parameters; `n_eff` is
+                                                          estimated from residuals.
+``SharedGaussianNoise.of(measurements)``                  One unknown standard deviation for all channels.
+``...Noise(channels, sensor={"top": 0.02})``              Known sensor noise in addition to the unknown model error.
+========================================================  ==============================================================
 
-Real measurements differ from a model by more than a sensor's noise, and by errors that last longer than a sample.
-White noise counts n of them as n independent witnesses, and its posterior is too sharp. `fe_likelihoods.probability.residuals` has
-the checks and the effective number of samples.
+Real measurements differ from a model by more than the noise of a sensor, and the differences are correlated in time.
+White noise counts the n samples of a channel as n independent observations, which makes the posterior too narrow. The
+module `fe_likelihoods.probability.residuals` has checks of this assumption and estimates the effective number of
+samples.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
 from .residuals import lag_one_sums
 
-__all__ = ["AutoregressiveNoise", "GaussianNoise", "SharedGaussianNoise"]
+__all__ = [
+    "AutoregressiveNoise",
+    "GaussianNoise",
+    "Noise",
+    "SharedGaussianNoise",
+    "noise_channels",
+    "noise_statistic",
+    "sampled_noise",
+]
 
+Statistic = Callable[[np.ndarray], np.ndarray]
 PerChannel = Mapping[str, float] | Sequence[float] | None
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
+class Noise(Protocol):
+    """What a likelihood needs of a noise.
+
+    Two members are required, `parameter_names` and `log_likelihood`. A noise may also have:
+
+    * ``channels``, the measured channels in the order of the statistics; checked against those of the model.
+    * ``statistic``, a function of a module that takes the residuals (n_channels, n_steps) and returns the numbers
+      (n_numbers,) which `log_likelihood` needs, the sums of squares (n_channels,) first. Without it these are all.
+    * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
+      errors (n, n_channels) [SI]; needed for predictions with noise.
+    * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
+      predictions with autoregressive noise.
+    """
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters of the noise."""
+
+    def log_likelihood(self, statistics: np.ndarray, n_steps: int, parameters: np.ndarray) -> np.ndarray:
+        """Log-likelihood (n,) of statistics (n, n_numbers) of the residuals at parameters (n, n_noise).
+
+        The value is -inf where a parameter is impossible, also for statistics of zero.
+        """
+
+
+def noise_channels(noise: Noise, default: Sequence[Channel]) -> tuple[Channel, ...]:
+    """Channels of a noise; `default` where the noise does not specify them."""
+    return tuple(getattr(noise, "channels", default))
+
+
+def noise_statistic(noise: Noise) -> Statistic | None:
+    """Statistic of the residuals that a noise needs, None for the sums of squares."""
+    return getattr(noise, "statistic", None)
+
+
+def sampled_noise(noise: Noise) -> Noise:
+    """Noise whose parameters are in a complete sample: for a `MarginalNoise` the one that was integrated out."""
+    return getattr(noise, "noise", noise)
+
+
 @dataclass(frozen=True)
 class GaussianNoise:
-    """Independent white Gaussian noise, one unknown standard deviation per channel.
+    r"""Independent white Gaussian noise with one unknown standard deviation per channel.
 
     Parameters
     ----------
     channels : sequence of Channel
         The measured channels, in the order of the sums of squared residuals.
-    sensor : mapping of channel names to float, or one for each channel, optional
-        Known standard deviations of the sensors [SI unit of the channel], zero where a name is left out. The parameters
-        are then the standard deviations of the model's error, zero allowed: sigma_total^2 = sensor^2 + sigma^2.
-    effective_samples : mapping of channel names to float, or one for each channel, optional
-        How many independent samples a channel is worth, as `fe_likelihoods.probability.residuals.effective_samples` estimates it;
-        no more than there are, and all of them where a name is left out.
+    sensor : mapping of channel names to float, or sequence of float, optional
+        Known standard deviations of the sensors [SI unit of the channel], one per channel; zero for names that are left
+        out. The parameters are then the standard deviations of the model error, and may be zero:
+        sigma_total^2 = sensor^2 + sigma^2.
+    effective_samples : mapping of channel names to float, or sequence of float, optional
+        Number of independent samples that each channel is worth, as estimated by
+        `fe_likelihoods.probability.residuals.effective_samples`; the number of samples where it is smaller or the name
+        is left out.
 
     Raises
     ------
     ValueError
-        For no channel, an unknown one, a negative sensor noise, a number of samples that is not positive.
+        For no channel, an unknown channel, a negative sensor noise, or a number of samples that is not positive.
 
     Notes
     -----
-    Equations (2) and (3) of Ramancha et al., Bayesian nonlinear finite element model updating of a full-scale
-    bridge-column using sequential Monte Carlo: with n samples in channel c and the residuals' sum of squares J_c, ::
+    With n samples in channel c and the sum of squared residuals J_c, the log-likelihood is [1]_, eqs. (2) and (3)::
 
         log L = sum_c [ -n/2 log(2 pi) - n log(sigma_c) - J_c / (2 sigma_c^2) ]
 
-    With effective samples, the term of channel c is multiplied by n_eff / n. This is what thinning to n_eff samples
-    does, but no sample is thrown away. It is no density of the measurements any more: evidences can be compared among
-    models of the same n_eff only.
+    With effective samples, the term of channel c is multiplied by n_eff / n. This has the effect of thinning to n_eff
+    samples without discarding any. The result is not a density of the measurements: only evidences of models with the
+    same n_eff can be compared.
+
+    References
+    ----------
+    .. [1] M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd (2022), "Bayesian nonlinear finite
+       element model updating of a full-scale bridge-column using sequential Monte Carlo".
     """
 
     channels: tuple[Channel, ...]
@@ -76,9 +137,9 @@ class GaussianNoise:
         _set_effective(self, effective_samples)
 
     def __repr__(self) -> str:
-        # display units change nothing, so they do not enter
+        # display units change no value, so they are left out
         named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
-        return f"GaussianNoise({', '.join(named + _options(self))})"
+        return f"GaussianNoise({', '.join(named + _options(self.sensor, self.effective_samples))})"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -91,52 +152,63 @@ class GaussianNoise:
         Parameters
         ----------
         misfit : (n, n_channels) float
-            Sums over the samples of squared residuals [SI unit of the channel, squared]; NaN where the simulation
+            Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
             failed.
         n_steps : int
-            Number of samples in each channel.
+            Number of samples per channel.
         sigma : (n, n_channels) float
-            Standard deviations of the noise [SI unit of the channel], of the model's error where the sensor's is known.
+            Standard deviations of the noise [SI unit of the channel]; of the model error where sensor noise is given.
 
         Returns
         -------
-        (n,) float : -inf where a sigma is impossible (not positive; negative, where the sensor's noise is known) or
-            the misfit is NaN or infinite, never NaN.
+        (n,) float
+            -inf where a sigma is impossible (zero or negative; with sensor noise only negative) and where the misfit is
+            NaN or infinite; never NaN.
         """
         return _log_likelihood(misfit, n_steps, self.standard_deviations(sigma), self.effective_samples)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of every channel's error [SI], sensor included, (n, n_channels), from the noise's
-        parameters (n, n_channels); NaN for a negative one."""
+        """Standard deviation of the errors of every channel, sensor noise included.
+
+        Parameters
+        ----------
+        parameters : (n, n_channels) float
+            Parameters of the noise.
+
+        Returns
+        -------
+        (n, n_channels) float
+            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
+        """
         return _total(np.asarray(parameters, dtype=float), self.sensor)
 
 
 @dataclass(frozen=True)
 class SharedGaussianNoise:
-    """Independent white Gaussian noise, one unknown standard deviation for all channels, each in units of its scale.
+    """Independent white Gaussian noise with one unknown standard deviation for all channels, in units of their scales.
 
     Channels of different dimensions can only share a dimensionless sigma: the standard deviation of channel c is
-    sigma times its scale. `of` takes the root mean square of the measured channel, so that sigma is the share of noise.
+    sigma times the scale of the channel. With `of`, the scale is the root mean square of the measured channel, and
+    sigma is the ratio of noise to signal.
 
     Parameters
     ----------
     channels : sequence of Channel
         The measured channels, in the order of the sums of squared residuals.
     scales : sequence of float
-        One for each channel [SI unit of the channel], positive.
+        One positive scale per channel [SI unit of the channel].
     sensor, effective_samples : optional
-        As in `GaussianNoise`.
+        As for `GaussianNoise`.
 
     Raises
     ------
     ValueError
-        If there is not one positive scale for each channel; and as `GaussianNoise`.
+        If there is not one positive scale per channel, and as `GaussianNoise`.
 
     Notes
     -----
-    specs/isolated_bridge.md, section 5: the isolated bridge's paper has "the same sigma for all the measured response
-    time histories". The likelihood is that of the measurements themselves, not of the scaled ones: the logarithms of
-    the scales are in it, so that evidences of different noises can be compared.
+    The likelihood is that of the measurements, not of the scaled measurements: it contains the logarithms of the
+    scales, so evidences of different noises can be compared.
     """
 
     channels: tuple[Channel, ...]
@@ -156,26 +228,33 @@ class SharedGaussianNoise:
         channels = tuple(channels)
         if not channels or len(self.scales) != len(channels):
             raise ValueError(
-                f"SharedGaussianNoise expects one scale for each channel; got {len(channels)} channels and "
+                f"SharedGaussianNoise expects one scale per channel; got {len(channels)} channels and "
                 f"{len(self.scales)} scales"
             )
         for channel, scale in zip(channels, self.scales, strict=True):
             if not (math.isfinite(scale) and scale > 0.0):
                 raise ValueError(
-                    f"SharedGaussianNoise expects positive scales; got {scale} for channel {channel.name!r}: leave a "
-                    "channel that measured nothing out of the measurements, or give its scale"
+                    f"SharedGaussianNoise expects positive scales; got {scale} for channel {channel.name!r}: remove a "
+                    "channel without signal from the measurements, or give its scale"
                 )
         _set_channels(self, channels, sensor)
         _set_effective(self, effective_samples)
 
     @classmethod
     def of(cls, measurements: Measurements, **options: PerChannel) -> "SharedGaussianNoise":
-        """With the root mean squares of the measured channels as scales; `options` are sensor, effective_samples."""
+        """Noise with the root mean squares of the measured channels as scales.
+
+        Parameters
+        ----------
+        measurements : Measurements
+        **options
+            `sensor` and `effective_samples`, as for the class.
+        """
         return cls(measurements.channels, np.sqrt(np.mean(np.square(measurements.values), axis=1)), **options)
 
     def __repr__(self) -> str:
         named = [f"{c.name}: {c.quantity} / {scale!r}" for c, scale in zip(self.channels, self.scales, strict=True)]
-        return f"SharedGaussianNoise({', '.join(named + _options(self))})"
+        return f"SharedGaussianNoise({', '.join(named + _options(self.sensor, self.effective_samples))})"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -183,8 +262,18 @@ class SharedGaussianNoise:
         return ("sigma",)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of every channel's error [SI], sensor included, (n, n_channels), from the noise's
-        parameter (n, 1); NaN for a negative one."""
+        """Standard deviation of the errors of every channel, sensor noise included.
+
+        Parameters
+        ----------
+        parameters : (n, 1) float
+            Shared standard deviation, in units of the scales.
+
+        Returns
+        -------
+        (n, n_channels) float
+            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
+        """
         return _total(np.asarray(parameters, dtype=float) * np.array(self.scales), self.sensor)
 
     def log_likelihood(self, misfit: np.ndarray, n_steps: int, sigma: np.ndarray) -> np.ndarray:
@@ -193,32 +282,35 @@ class SharedGaussianNoise:
         Parameters
         ----------
         misfit : (n, n_channels) float
-            Sums over the samples of squared residuals [SI unit of the channel, squared]; NaN where the simulation
+            Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
             failed.
         n_steps : int
-            Number of samples in each channel.
+            Number of samples per channel.
         sigma : (n, 1) float
             Shared standard deviation, in units of the scales.
 
         Returns
         -------
-        (n,) float : -inf where sigma is impossible (see `GaussianNoise.log_likelihood`) or the misfit is NaN or
-            infinite, never NaN.
+        (n,) float
+            -inf where sigma is impossible (see `GaussianNoise.log_likelihood`) and where the misfit is NaN or infinite;
+            never NaN.
         """
         return _log_likelihood(misfit, n_steps, self.standard_deviations(sigma), self.effective_samples)
 
 
 @dataclass(frozen=True)
 class AutoregressiveNoise:
-    """Stationary Gaussian error of each channel that lasts: AR(1), standard deviation and lag-one correlation unknown.
+    """Stationary first-order autoregressive Gaussian noise, with unknown standard deviation and lag-one correlation.
+
+    Both parameters are unknown for each channel.
 
     Parameters
     ----------
     channels : sequence of Channel
         The measured channels, in the order of the sums of squared residuals.
-    sensor : optional
-        Known standard deviations of the sensors, as in `GaussianNoise`: a floor under that of the whole error, whose
-        lag-one correlation is the parameter (not that of the model's part alone).
+    sensor : mapping of channel names to float, or sequence of float, optional
+        Known standard deviations of the sensors, as for `GaussianNoise`. They are a lower bound of the standard
+        deviation of the whole error. The lag-one correlation is that of the whole error, not of the model error alone.
 
     Raises
     ------
@@ -228,18 +320,22 @@ class AutoregressiveNoise:
     Notes
     -----
     With e_1 ~ N(0, sigma^2) and e_t = rho e_{t-1} + sqrt(1 - rho^2) sigma z_t, the errors of n samples are normal with
-    the covariance sigma^2 rho^|i-j|, and their exact likelihood is (Hamilton, Time Series Analysis, 1994, section 5.2,
-    there with the variance of z) ::
+    covariance sigma^2 rho^|i-j|. Their exact likelihood is ([1]_, section 5.2, there with the variance of z)::
 
         log L = -n/2 log(2 pi) - n log(sigma) - (n-1)/2 log(1 - rho^2) - Q / (2 sigma^2 (1 - rho^2))
         Q     = (1 - rho)^2 J + rho D + rho (1 - rho) E
 
-    of the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2 (`residuals.lag_one_sums`). At rho = 0
-    this is white noise. Q is written with differences, not with products r_t r_{t-1}, whose sum would cancel against J
-    for rho near one. A mean over a channel is then worth n (1 - rho) / (1 + rho) independent samples.
+    with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2 (`residuals.lag_one_sums`). For rho = 0
+    this is white noise. Q is written with differences instead of the products r_t r_{t-1}, because for rho near one
+    their sum would cancel against J. The mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
 
-    Errors of a smooth model are smoother than any AR(1) when sampled finely: rho goes to one and the likelihood is that
-    of differences. Decimate the measurements (`Measurements.decimate`) to a step at which rho is well below one.
+    Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one and the
+    likelihood becomes that of the differences. Decimate the measurements (`Measurements.decimate`) to a step at which
+    rho is well below one.
+
+    References
+    ----------
+    .. [1] J. D. Hamilton (1994), "Time Series Analysis", Princeton University Press.
     """
 
     channels: tuple[Channel, ...]
@@ -250,17 +346,17 @@ class AutoregressiveNoise:
 
     def __repr__(self) -> str:
         named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
-        return f"AutoregressiveNoise({', '.join(named + _options(self))})"
+        return f"AutoregressiveNoise({', '.join(named + _options(self.sensor))})"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``sigma_<channel>`` of all channels [SI], then ``rho_<channel>`` of all [-], between -1 and 1."""
+        """``sigma_<channel>`` of all channels [SI], then ``rho_<channel>`` of all channels [-], between -1 and 1."""
         names = [channel.name for channel in self.channels]
         return tuple(f"sigma_{name}" for name in names) + tuple(f"rho_{name}" for name in names)
 
     @property
-    def statistic(self) -> Callable[[np.ndarray], np.ndarray]:
-        """What is needed of the residuals: `residuals.lag_one_sums`, three numbers per channel."""
+    def statistic(self) -> Statistic:
+        """Statistic of the residuals: `residuals.lag_one_sums`, three numbers per channel."""
         return lag_one_sums
 
     def log_likelihood(self, statistics: np.ndarray, n_steps: int, parameters: np.ndarray) -> np.ndarray:
@@ -272,14 +368,15 @@ class AutoregressiveNoise:
             J of all channels, then D, then E (see Notes of the class) [SI unit of the channel, squared]; NaN where the
             simulation failed.
         n_steps : int
-            Number of samples in each channel.
+            Number of samples per channel.
         parameters : (n, 2 n_channels) float
-            Standard deviations of all channels' errors [SI], then their lag-one correlations.
+            Standard deviations of the errors of all channels [SI], then their lag-one correlations.
 
         Returns
         -------
-        (n,) float : -inf where a sigma is impossible (see `GaussianNoise.log_likelihood`), a rho not between -1 and 1,
-            or a statistic NaN or infinite, never NaN.
+        (n,) float
+            -inf where a sigma is impossible (see `GaussianNoise.log_likelihood`), where a rho is not between -1 and 1,
+            and where a statistic is NaN or infinite; never NaN.
         """
         statistics = np.asarray(statistics, dtype=float)
         n_channels = len(self.channels)
@@ -296,16 +393,27 @@ class AutoregressiveNoise:
         return np.where(possible, terms, -np.inf).sum(axis=-1)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of every channel's error [SI], sensor included, (n, n_channels), from the noise's
-        parameters (n, 2 n_channels); NaN for a negative one."""
+        """Standard deviation of the errors of every channel, sensor noise included.
+
+        Parameters
+        ----------
+        parameters : (n, 2 n_channels) float
+            Parameters of the noise.
+
+        Returns
+        -------
+        (n, n_channels) float
+            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
+        """
         return _total(np.asarray(parameters, dtype=float)[..., : len(self.channels)], self.sensor)
 
     def lag_one_correlations(self, parameters: np.ndarray) -> np.ndarray:
-        """Correlation of successive errors of every channel [-], (n, n_channels), from the noise's parameters."""
+        """Correlation of successive errors of every channel [-], (n, n_channels), from parameters (n, 2 n_channels)."""
         return np.asarray(parameters, dtype=float)[..., len(self.channels) :]
 
 
-def _set_channels(noise: object, channels: Sequence[Channel], sensor: PerChannel) -> None:
+def _set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) -> None:
+    """Set and check the fields `channels` and `sensor` of a frozen noise."""
     object.__setattr__(noise, "channels", tuple(channels))
     if not noise.channels:
         raise ValueError(f"{type(noise).__name__} expects at least one channel; got none")
@@ -317,7 +425,8 @@ def _set_channels(noise: object, channels: Sequence[Channel], sensor: PerChannel
     object.__setattr__(noise, "sensor", values)
 
 
-def _set_effective(noise: object, effective_samples: PerChannel) -> None:
+def _set_effective(noise: Any, effective_samples: PerChannel) -> None:
+    """Set and check the field `effective_samples` of a frozen noise."""
     values = _per_channel(noise, "effective_samples", effective_samples, math.inf)
     if values is not None and not all(value > 0.0 for value in values):
         raise ValueError(
@@ -326,8 +435,8 @@ def _set_effective(noise: object, effective_samples: PerChannel) -> None:
     object.__setattr__(noise, "effective_samples", values)
 
 
-def _per_channel(noise: object, what: str, given: PerChannel, default: float) -> tuple[float, ...] | None:
-    """One number for each channel, or None where none is given."""
+def _per_channel(noise: Any, what: str, given: PerChannel, default: float) -> tuple[float, ...] | None:
+    """One number per channel, or None if none are given."""
     if given is None:
         return None
     names = [channel.name for channel in noise.channels]
@@ -335,7 +444,8 @@ def _per_channel(noise: object, what: str, given: PerChannel, default: float) ->
         unknown = set(given) - set(names)
         if unknown:
             raise ValueError(
-                f"{type(noise).__name__}: {what} names no channel with {sorted(unknown)}; they are {', '.join(names)}"
+                f"{type(noise).__name__}: {what} has the unknown channels {sorted(unknown)}; the channels are "
+                f"{', '.join(names)}"
             )
         given = [given.get(name, default) for name in names]
     values = tuple(float(value) for value in np.ravel(given))
@@ -346,14 +456,14 @@ def _per_channel(noise: object, what: str, given: PerChannel, default: float) ->
     return values
 
 
-def _options(noise: object) -> list[str]:
-    """The options that are not the default, for the `repr`: a noise without them has the digest that it always had."""
-    options = {name: getattr(noise, name, None) for name in ("sensor", "effective_samples")}
+def _options(sensor: tuple[float, ...] | None, effective_samples: tuple[float, ...] | None = None) -> list[str]:
+    """Options that differ from the default, for the `repr`, which fingerprints are made of."""
+    options = {"sensor": sensor, "effective_samples": effective_samples}
     return [f"{name}={value!r}" for name, value in options.items() if value is not None]
 
 
 def _total(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.ndarray:
-    """Standard deviations of model and sensor together; NaN for a negative sigma."""
+    """Standard deviations of model error and sensor noise together; NaN for a negative sigma."""
     if sensor is None:
         return sigma
     with np.errstate(invalid="ignore"):
@@ -363,10 +473,10 @@ def _total(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.ndarray:
 def _log_likelihood(
     misfit: np.ndarray, n_steps: int, sigma: np.ndarray, effective: tuple[float, ...] | None
 ) -> np.ndarray:
-    """Of independent Gaussian residuals with standard deviations `sigma` (n, n_channels)."""
+    """Log-likelihood (n,) of independent Gaussian residuals with standard deviations `sigma` (n, n_channels)."""
     misfit = np.asarray(misfit, dtype=float)
     with np.errstate(all="ignore"):
-        # the ratio is squared, not sigma: a tiny sigma squared would be zero, and zero misfit then 0 / 0
+        # the ratio is squared instead of sigma: the square of a tiny sigma would be zero, and 0 / 0 for zero misfit
         ratio = np.sqrt(misfit) / sigma
         terms = -n_steps * (_HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * ratio * ratio
     if effective is not None:

@@ -1,9 +1,9 @@
-"""The posterior: prior times likelihood, as one object that any Bayesian client can call.
+"""Posterior density: prior times likelihood, as one object that any Bayesian client can call.
 
-There is no common interface among samplers, but one object answers them all: a density of an array (one point or
-many), its two factors apart, a map from the unit cube, draws of the prior, and the names of the parameters. Two
-promises make it safe to hand to them: a value is a finite number or -inf, whatever happens in a simulation, and
-nothing is simulated where the prior is zero.
+Samplers have no common interface, but one object serves them all: a log-density of one or many points, its two factors,
+a transform from the unit cube, draws of the prior, and the names of the parameters. Two properties hold for all
+clients: a value is a finite number or -inf, also if a simulation fails, and nothing is simulated where the prior
+density is zero.
 """
 
 import hashlib
@@ -15,41 +15,42 @@ from typing import Any
 
 import numpy as np
 
-from .likelihood import FELikelihood, as_points
+from .inputs import as_points
+from .likelihood import FELikelihood
 from .marginal_noise import MarginalNoise
 from .priors import Distribution, Prior, RandomState
 
 __all__ = ["Posterior"]
 
-_ALMOST_INFINITE = 1e100  # less likely than anything, and far from overflow when differences of it are squared
+_ALMOST_INFINITE = 1e100  # below any log-likelihood, and far from overflow when differences of it are squared
 
 
 def _description(thing: Any) -> str:
-    """The ``repr`` of something, complete and the same in every process, or ValueError."""
+    """The complete ``repr`` of an object, the same in every process; ValueError if it contains an address."""
     with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
         text = repr(thing)
     if re.search(r"\bat 0x[0-9a-fA-F]+", text):
         raise ValueError(
-            f"a fingerprint needs a repr that says what {type(thing).__qualname__} is, not where it lies: make it a "
-            f"frozen dataclass or give it a __repr__ of all its values; got {text}"
+            f"a fingerprint needs a repr that shows all values of {type(thing).__qualname__} instead of its address; "
+            f"make it a frozen dataclass or give it a __repr__; got {text}"
         )
     return text
 
 
 class Posterior:
-    """Posterior density of structural parameters and noise.
+    """Posterior density of structural parameters and noise parameters.
 
-    Every density takes a point (ndim,) and returns a float, or n points (n, ndim) and returns (n,). Named values are
-    understood as well (see `fe_likelihoods.probability.likelihood.as_points`). Calling the object is `log_prob`.
+    Every density takes one point (ndim,) and returns a float, or n points (n, ndim) and returns (n,). Mappings of
+    parameter names to values are accepted as well. Calling the object is `log_prob`.
 
     Parameters
     ----------
     likelihood : FELikelihood
-    prior : Prior, or a mapping of names to distributions
-        Of exactly the likelihood's parameters, in any order.
+    prior : Prior, or mapping of parameter names to distributions
+        It must have exactly the likelihood's parameters, in any order.
     coarse : Posterior, optional
-        A cheaper posterior of the same parameters (of the first part of a record, say), for samplers that climb on it
-        first: ``SMCSampler(..., coarse_log_prob_fn=posterior.coarse)``.
+        A cheaper posterior of the same parameters (for example of the first part of a record), for samplers that anneal
+        on it first: ``SMCSampler(..., coarse_log_prob_fn=posterior.coarse)``.
 
     Raises
     ------
@@ -60,7 +61,7 @@ class Posterior:
     --------
     >>> posterior = Posterior(FELikelihood(model, measurements), prior)
     >>> sampler = emcee.EnsembleSampler(32, posterior.ndim, posterior, vectorize=True)
-    >>> sampler.run_mcmc(posterior.sample_prior(32), 1000)
+    >>> sampler.run_mcmc(posterior.sample_start(32), 1000)
     """
 
     def __init__(
@@ -86,30 +87,35 @@ class Posterior:
 
     @property
     def parameter_names(self) -> list[str]:
-        """Structural parameters first, then the noise's: a list, as emcee, arviz and corner want it."""
+        """Structural parameters first, then those of the noise; a list, as emcee, arviz and corner expect."""
         return list(self.prior.names)
 
     @property
     def fast_parameters(self) -> tuple[int, ...]:
-        """Indices of the parameters whose change costs no simulation."""
+        """Indices of the parameters whose change needs no simulation."""
         return self.likelihood.fast_parameters
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest (BLAKE2b, 128 bits) of all that the density depends on: likelihood, noise and prior.
+        """Hex digest (BLAKE2b, 128 bits) of everything the density depends on: likelihood, noise and prior.
 
-        It is the same in another process. The coarse posterior does not enter.
+        It is the same in every process. The coarse posterior is not part of it.
 
         Raises
         ------
         ValueError
-            If the noise or a distribution is of a class whose ``repr`` does not say what it is.
+            If the ``repr`` of the noise or of a distribution does not show its values.
         """
         noise = self.likelihood.noise
         parts = [self.likelihood.fingerprint, type(noise).__qualname__, *noise.parameter_names, _description(noise)]
         for name, distribution in self.prior.distributions.items():
             parts += [name, type(distribution).__qualname__, _description(distribution)]
         return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()
+
+    @property
+    def data_fingerprint(self) -> str:
+        """Hex digest of the measurements: evidences of posteriors with the same digest can be compared."""
+        return self.likelihood.data_fingerprint
 
     def __call__(self, x: Any) -> np.ndarray | float:
         """Same as `log_prob`."""
@@ -126,39 +132,61 @@ class Posterior:
         return self.prior.logpdf(as_points(x, self.prior.names))
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
-        """Log-likelihood: -inf also outside the prior's support, where nothing is simulated."""
+        """Log-likelihood; -inf outside the support of the prior, where nothing is simulated."""
         points, _, log_likelihood = self._evaluate(x)
         return log_likelihood if points.ndim == 2 else float(log_likelihood[0])
 
     def finite_log_likelihood(self, x: Any) -> np.ndarray | float:
-        """`log_likelihood` with -1e100 for -inf: for clients that refuse infinities, or leave such points out.
+        """`log_likelihood` with -1e100 instead of -inf, for clients that reject infinite values.
 
-        ultranest stops at an infinite value; bilby and pocomc draw such a point of the prior again, so that their
-        evidence is too large by the share of the prior in which simulations fail.
+        ultranest stops at an infinite value. bilby and pocomc replace such a point by another draw of the prior, which
+        makes their evidence too large by the share of the prior in which simulations fail.
         """
         return np.maximum(self.log_likelihood(x), -_ALMOST_INFINITE)[()]
 
     def negative_log_prob(self, x: Any) -> np.ndarray | float:
-        """Minus `log_prob` with 1e100 for inf, for minimisers, whose differences of two infinities are NaN."""
+        """Minus `log_prob`, with 1e100 instead of inf, for minimisers: differences of infinities would be NaN."""
         return np.minimum(-self.log_prob(x), _ALMOST_INFINITE)[()]
 
     def prior_transform(self, u: np.ndarray) -> np.ndarray:
-        """From the unit cube to the parameters, (ndim,) or (n, ndim), as nested samplers ask."""
+        """Map from the unit cube to the parameters, (ndim,) or (n, ndim), for nested samplers."""
         return self.prior.transform(u)
 
     def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
-        """Draws of the prior, (n, ndim); `rng` is a seed, a generator, or None for NumPy's global stream."""
+        """Draws of the prior.
+
+        Parameters
+        ----------
+        n : int
+        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+            A seed, a generator, or None for NumPy's global stream.
+
+        Returns
+        -------
+        (n, ndim) float
+        """
         return self.prior.rvs(n, rng)
 
     def sample_start(self, n: int, rng: RandomState = None) -> np.ndarray:
-        """Draws of the prior where the posterior is not zero, (n, ndim): where walkers can start.
+        """Draws of the prior at which the posterior density is not zero: starting points of walkers.
 
-        Several clients refuse a start of probability zero, which a draw of the prior is where its simulation fails.
+        Several clients reject a start of zero density. A draw of the prior has zero posterior density if its simulation
+        fails.
+
+        Parameters
+        ----------
+        n : int
+        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+            As for `sample_prior`.
+
+        Returns
+        -------
+        (n, ndim) float
 
         Raises
         ------
         ValueError
-            If hardly any simulation succeeds: fewer than n of 100 n, or of 1000 where these are more.
+            If fewer than n simulations succeed among the largest of 100 n and 1000 draws.
         """
         rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
         found = np.empty((0, self.ndim))
@@ -168,21 +196,22 @@ class Posterior:
             if len(found) >= n:
                 return found[:n]
         raise ValueError(
-            f"sample_start: the posterior is zero at nearly all draws of the prior ({len(found)} points found of {n} "
-            "asked for); report() has the reasons: mend the model or narrow the prior"
+            f"sample_start: the posterior density is zero at nearly all draws of the prior ({len(found)} points found "
+            f"of {n}); report() has the reasons: correct the model or narrow the prior"
         )
 
     def marginal(self) -> "Posterior":
         """The same posterior with the standard deviations of its white noise integrated out.
 
-        It has the structural parameters alone, at the same evidence, and a coarse posterior of its own if this one has
-        one. `draw_noise` gives the standard deviations back. An evaluation costs some microseconds more, and some
-        hundred for a single row; what it saves are the simulations of samplers that search fewer dimensions.
+        Its parameters are the structural ones, its evidence is the same, and its coarse posterior is the marginal one
+        of this posterior's. `draw_noise` draws the standard deviations afterwards. A sampler has fewer dimensions to
+        search, which saves simulations; the quadrature costs a few microseconds per row, and about 100 for a single
+        row.
 
         Raises
         ------
         ValueError
-            If the noise is not white, has a known sensor, or is integrated out already.
+            If the noise is not white, has sensor noise, or is integrated out already.
         """
         names, noise = self.parameter_names, self.likelihood.noise
         n_structural = len(self.likelihood.model.parameter_names)
@@ -195,32 +224,35 @@ class Posterior:
         )
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
-        """Samples of all parameters from samples of the structural ones, where the noise is integrated out.
+        """Complete samples of all parameters from samples of the structural ones, for a `marginal` posterior.
 
-        One draw of the standard deviations for each sample, given its misfit; those that are remembered, in memory or
-        in the cache, are not simulated again.
+        The standard deviations are drawn once per sample from their conditional posterior, given its misfit. Cached
+        samples are not simulated again.
 
         Parameters
         ----------
-        x : (n, ndim) float, or named values — samples of this posterior.
-        rng : seed, generator or None — as in `sample_prior`.
+        x : (n, ndim) float, or mapping
+            Samples of this posterior.
+        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+            As for `sample_prior`.
 
         Returns
         -------
-        dict of str to (n,) float : structural parameters, then the noise's; `fe_likelihoods.prediction.propagation.propagate` takes
-            it as samples.
+        dict of str to (n,) float
+            Structural parameters, then those of the noise; accepted as samples by
+            `fe_likelihoods.prediction.propagation.propagate`.
 
         Raises
         ------
         ValueError
-            If the noise has not been integrated out (its parameters are in the samples), or a simulation fails or fits
-            without an error.
+            If the noise is not integrated out (its parameters are in the samples), or if a simulation fails or fits
+            exactly.
         """
         noise = self.likelihood.noise
         if not isinstance(noise, MarginalNoise):
             raise ValueError(
-                f"the noise's parameters {', '.join(noise.parameter_names)} are in the samples of this posterior; they "
-                "are drawn where they have been integrated out, see marginal()"
+                f"the noise parameters {', '.join(noise.parameter_names)} are in the samples of this posterior; "
+                "draw_noise is for posteriors from which they are integrated out, see marginal()"
             )
         points = np.atleast_2d(as_points(x, self.prior.names))
         misfit = self.likelihood.misfit(points)
@@ -229,15 +261,15 @@ class Posterior:
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 
     def report(self) -> dict:
-        """What was simulated so far, by this object in this process.
+        """Summary of the simulations that this object has requested in this process.
 
         Returns
         -------
         dict
-            ``simulations``, ``cache_hits`` (rows whose misfit was remembered instead), ``disk_hits`` (how many of them
-            came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, and ``"seconds"`` where
-            known, the first thousand), ``failure_count``, ``failure_reasons`` (count of each), ``seconds`` (wall time
-            in simulations).
+            ``simulations``, ``cache_hits`` (rows whose statistics were cached), ``disk_hits`` (rows among them that
+            came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where
+            known; the first 1000), ``failure_count``, ``failure_reasons`` (count per reason), ``seconds`` (wall time of
+            the simulations).
         """
         return {
             "simulations": self.likelihood.simulations,
@@ -250,7 +282,7 @@ class Posterior:
         }
 
     def _evaluate(self, x: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points as given, and the log-prior (n,) and log-likelihood (n,) of their rows."""
+        """Points in the given shape, and log-prior (n,) and log-likelihood (n,) of their rows."""
         points = as_points(x, self.prior.names)
         log_prior = np.atleast_1d(self.prior.logpdf(points))
         log_likelihood = np.full(len(log_prior), -np.inf)

@@ -1,13 +1,14 @@
 """Prior densities: normalised, in closed form, finite or -inf everywhere.
 
-A distribution is a frozen dataclass that gives three things: the logarithm of its density inside its support, its
-quantile function, and its bounds. Everything else follows: the density is -inf outside the bounds and at NaN, and
-draws are quantiles of uniform numbers, so the unit cube of nested samplers and `rvs` are the same map.
+A distribution is a frozen dataclass with the logarithm of its density inside its support, its quantile function, and
+its bounds. The base class derives the rest: the density is zero outside the bounds and at NaN, and draws are quantiles
+of uniform numbers, so `rvs` and the unit cube of nested samplers use the same map.
 
-`Prior` joins independent distributions under the names of the parameters. It has the attributes that clients ask of a
-prior object (``logpdf``, ``rvs``, ``bounds``, ``dim``) and ``transform`` from the unit cube. Normalising constants are
-computed once, when a distribution is made: the frozen distributions of `scipy.stats` are equal to these to round-off
-and cost tens of times more a call, which is felt where the simulation is cheap.
+`Prior` joins independent distributions under the names of the parameters. It has the attributes that clients expect of
+a prior (``logpdf``, ``rvs``, ``bounds``, ``dim``) and ``transform`` from the unit cube. Normalising constants are
+computed once, when a distribution is made. The frozen distributions of `scipy.stats` agree with these to round-off but
+take tens of times longer per call, which matters where the simulation is cheap. The densities are on the page
+``docs/theory/likelihood.rst``.
 """
 
 import math
@@ -28,7 +29,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 def _uniform_numbers(size: int | tuple[int, ...], random_state: RandomState) -> np.ndarray:
     """Numbers in [0, 1) from a seed, a generator, or NumPy's global stream."""
     if random_state is None:
-        # as scipy.stats does: clients that are seeded through np.random.seed (pocomc, zeus, emcee) stay reproducible
+        # as in scipy.stats: clients that are seeded with np.random.seed (pocomc, zeus, emcee) stay reproducible
         return np.random.random(size)  # noqa: NPY002
     if isinstance(random_state, int | np.integer):
         random_state = np.random.default_rng(random_state)
@@ -36,6 +37,7 @@ def _uniform_numbers(size: int | tuple[int, ...], random_state: RandomState) -> 
 
 
 def _unit_interval(u: np.ndarray) -> np.ndarray:
+    """Probabilities as an array; ValueError for one outside [0, 1]."""
     u = np.asarray(u, dtype=float)
     if not ((u >= 0.0) & (u <= 1.0)).all():
         raise ValueError(f"quantiles are defined for probabilities in [0, 1]; got {u[~((u >= 0.0) & (u <= 1.0))][:3]}")
@@ -43,9 +45,9 @@ def _unit_interval(u: np.ndarray) -> np.ndarray:
 
 
 class Distribution(ABC):
-    """A univariate distribution of one parameter, in the parameter's own unit.
+    """Univariate distribution of one parameter, in the unit of the parameter.
 
-    A new one is a frozen dataclass with `bounds`, `moments`, `_log_density` and `_quantile`.
+    A subclass is a frozen dataclass with `bounds`, `moments`, `_log_density` and `_quantile`.
     """
 
     @property
@@ -56,11 +58,11 @@ class Distribution(ABC):
     @property
     @abstractmethod
     def moments(self) -> tuple[float, float]:
-        """Mean and standard deviation of the distribution itself (as truncated, where it is truncated)."""
+        """Mean and standard deviation of the distribution (after truncation, where it is truncated)."""
 
     @abstractmethod
     def _log_density(self, x: np.ndarray) -> np.ndarray:
-        """Logarithm of the density inside the bounds; anything outside them."""
+        """Logarithm of the density inside the bounds; the value outside them is not used."""
 
     @abstractmethod
     def _quantile(self, u: np.ndarray) -> np.ndarray:
@@ -71,11 +73,13 @@ class Distribution(ABC):
 
         Parameters
         ----------
-        x : array_like, any shape
+        x : array_like
+            Any shape.
 
         Returns
         -------
-        ndarray of the same shape, or float : -inf outside the bounds and at NaN, never NaN.
+        ndarray of the same shape, or float
+            -inf outside the bounds and at NaN; never NaN.
         """
         x = np.asarray(x, dtype=float)
         low, high = self.bounds
@@ -83,7 +87,17 @@ class Distribution(ABC):
             return np.where((x >= low) & (x <= high), self._log_density(x), -np.inf)[()]
 
     def ppf(self, u: np.ndarray | float) -> np.ndarray | float:
-        """Quantile function: probabilities in [0, 1] to values within the bounds, shape kept.
+        """Quantile function.
+
+        Parameters
+        ----------
+        u : array_like
+            Probabilities in [0, 1], any shape.
+
+        Returns
+        -------
+        ndarray of the same shape, or float
+            Values within the bounds.
 
         Raises
         ------
@@ -96,19 +110,28 @@ class Distribution(ABC):
             return np.clip(self._quantile(u), low, high)[()]
 
     def isf(self, q: np.ndarray | float) -> np.ndarray | float:
-        """Inverse of the survival function, ``ppf(1 - q)``: what a `nautilus.Prior` asks of a distribution."""
+        """Inverse survival function, ``ppf(1 - q)``, which `nautilus.Prior` expects of a distribution."""
         return self.ppf(1.0 - np.asarray(q, dtype=float))
 
     def rvs(self, size: int | tuple[int, ...] = 1, rng: RandomState = None) -> np.ndarray:
-        """Independent draws of shape `size`.
+        """Independent draws.
 
-        `rng` is a seed, a NumPy ``Generator`` or ``RandomState``, or None for NumPy's global stream.
+        Parameters
+        ----------
+        size : int or tuple of int
+            Shape of the result.
+        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+            A seed, a generator, or None for NumPy's global stream.
+
+        Returns
+        -------
+        ndarray of shape `size`
         """
         return np.asarray(self.ppf(_uniform_numbers(size, rng)))
 
 
 def _set_finite(distribution: Distribution, **values: float) -> None:
-    """Store finite floats in the fields of a frozen dataclass."""
+    """Set fields of a frozen dataclass to finite floats; ValueError for others."""
     for name, value in values.items():
         value = float(value)
         if not math.isfinite(value):
@@ -117,7 +140,7 @@ def _set_finite(distribution: Distribution, **values: float) -> None:
 
 
 def _set_positive(distribution: Distribution, **values: float) -> None:
-    """Store finite floats greater than zero in the fields of a frozen dataclass."""
+    """Set fields of a frozen dataclass to finite floats greater than zero; ValueError for others."""
     _set_finite(distribution, **values)
     for name in values:
         if getattr(distribution, name) <= 0.0:
@@ -125,11 +148,11 @@ def _set_positive(distribution: Distribution, **values: float) -> None:
 
 
 def _standard_truncated_normal(a: float, b: float) -> tuple[float, float, float]:
-    """Mass of a standard normal on [a, b]; mean and variance of the normal truncated there."""
-    from scipy.special import erf, ndtr  # scipy starts slowly, and whoever only evaluates densities needs none of it
+    """Probability of [a, b] under a standard normal, and mean and variance of the normal truncated to it."""
+    from scipy.special import erf, ndtr  # slow to import, and not needed for densities of other distributions
 
     if (b - a) * max(abs(a), abs(b), 1.0) < 1.0:
-        # differences of tail probabilities cancel on a narrow interval; the density is smooth there, so integrate it
+        # differences of tail probabilities cancel on a narrow interval; the smooth density is integrated instead
         half = 0.5 * (b - a)
         weights = _WEIGHTS * np.exp(-0.5 * (0.5 * (a + b) + half * _NODES) ** 2)
         total = weights.sum()
@@ -159,19 +182,20 @@ class TruncatedNormal(Distribution):
     Parameters
     ----------
     mean, sd : float
-        Of the normal before truncation (sd > 0), in the unit of the parameter.
+        Mean and standard deviation (sd > 0) of the normal before truncation, in the unit of the parameter.
     lower, upper : float
-        Bounds, lower < upper, infinite allowed; by default positive values only.
+        Bounds, lower < upper; may be infinite. The default is positive values only.
 
     Raises
     ------
     ValueError
-        Also when the bounds leave less probability than a float can hold (some 37 sd from the mean).
+        For impossible values, and if the probability within the bounds is below the smallest float (bounds about 37 sd
+        from the mean).
 
     Notes
     -----
-    Quantiles are computed from the nearer tail, so both tails are resolved; their error is a few units of round-off
-    of max(abs(mean), sd).
+    Quantiles are computed from the nearer tail, which resolves both tails; their error is a few units of round-off of
+    max(abs(mean), sd).
     """
 
     mean: float
@@ -191,8 +215,8 @@ class TruncatedNormal(Distribution):
         mass = _standard_truncated_normal(*self._standard_bounds)[0]
         if not mass >= np.finfo(float).tiny:
             raise ValueError(
-                f"TruncatedNormal: a normal of mean {self.mean} and sd {self.sd} has no probability that a float can "
-                f"hold in [{self.lower}, {self.upper}]; move the mean towards the bounds or raise the sd"
+                f"TruncatedNormal: the probability of [{self.lower}, {self.upper}] under a normal of mean {self.mean} "
+                f"and sd {self.sd} is smaller than a float can hold; move the mean towards the bounds or raise the sd"
             )
         object.__setattr__(self, "_mass", float(mass))
         object.__setattr__(self, "_log_constant", -math.log(self.sd) - _HALF_LOG_TWO_PI - math.log(mass))
@@ -225,14 +249,14 @@ class TruncatedNormal(Distribution):
 
 @dataclass(frozen=True)
 class HalfNormal(Distribution):
-    """Absolute value of a normal of mean zero: the usual prior of a noise's standard deviation.
+    """Distribution of the absolute value of a normal with mean zero: a usual prior of standard deviations of noise.
 
-    With another lower bound, write ``TruncatedNormal(0.0, sd, lower=...)``.
+    For another lower bound use ``TruncatedNormal(0.0, sd, lower=...)``.
 
     Parameters
     ----------
     sd : float
-        Standard deviation of the normal before folding (> 0), in the unit of the parameter.
+        Standard deviation (> 0) of the normal before taking the absolute value, in the unit of the parameter.
     """
 
     sd: float
@@ -262,7 +286,13 @@ class HalfNormal(Distribution):
 
 @dataclass(frozen=True)
 class Uniform(Distribution):
-    """Constant density on [low, high], both finite and included."""
+    """Constant density on [low, high].
+
+    Parameters
+    ----------
+    low, high : float
+        Finite bounds, low < high, both included, in the unit of the parameter.
+    """
 
     low: float
     high: float
@@ -293,15 +323,14 @@ class Uniform(Distribution):
 class LogNormal(Distribution):
     """Distribution of a positive parameter whose logarithm is normal.
 
-    Given by its median, which carries the unit of the parameter, rather than by the mean of the logarithm, which has
-    none.
+    It is defined by its median, which has the unit of the parameter, instead of the mean of the logarithm.
 
     Parameters
     ----------
     median : float
         Median (> 0), in the unit of the parameter: the exponential of the mean of its logarithm.
     log_sd : float
-        Standard deviation of the natural logarithm (> 0); near the coefficient of variation when it is small.
+        Standard deviation of the natural logarithm (> 0); if small, about the coefficient of variation.
     """
 
     median: float
@@ -323,7 +352,7 @@ class LogNormal(Distribution):
     def _log_density(self, x: np.ndarray) -> np.ndarray:
         log_median = math.log(self.median)
         log_ratio = np.log(x) - log_median
-        # one product instead of a difference of two infinities at x = 0
+        # a product, because a sum would be a difference of two infinities at x = 0
         return (
             -log_ratio * (0.5 * log_ratio / self.log_sd**2 + 1.0)
             - math.log(self.log_sd)
@@ -343,15 +372,23 @@ class Prior:
     Parameters
     ----------
     distributions : mapping of str to Distribution
-        In the order of the parameters.
+        Parameter names and their distributions, in the order of the parameters.
 
     Attributes
     ----------
     names : tuple of str
+        Names of the parameters.
     dim : int
+        Number of parameters.
     bounds : ndarray[dim, 2]
         Lower and upper bound of every parameter.
     distributions : dict of str to Distribution
+        As given.
+
+    Raises
+    ------
+    ValueError
+        If `distributions` is not such a mapping, or empty.
 
     Examples
     --------
@@ -368,7 +405,7 @@ class Prior:
             )
         for name, distribution in distributions.items():
             if not isinstance(distribution, Distribution):
-                raise ValueError(f"Prior: {name!r} must be a Distribution of this module; got {distribution!r}")
+                raise ValueError(f"Prior: {name!r} must be a Distribution of fe_likelihoods; got {distribution!r}")
         self.distributions = dict(distributions)
         self.names = tuple(distributions)
         self.dim = len(self.names)
@@ -395,7 +432,8 @@ class Prior:
 
         Returns
         -------
-        float or ndarray[n] : -inf outside the bounds and where a value is NaN, never NaN.
+        float or ndarray[n]
+            -inf outside the bounds and where a value is NaN; never NaN.
         """
         x = self._checked(x, "x")
         inside = ((x >= self.bounds[:, 0]) & (x <= self.bounds[:, 1])).all(axis=-1)
@@ -405,7 +443,7 @@ class Prior:
         return log_density if x.ndim == 2 else float(log_density)
 
     def transform(self, u: np.ndarray) -> np.ndarray:
-        """From the unit cube to the parameters, for nested samplers.
+        """Map from the unit cube to the parameters, for nested samplers.
 
         Parameters
         ----------
@@ -421,18 +459,23 @@ class Prior:
         return np.stack(columns, axis=-1)
 
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
-        """Independent draws: ndarray[size, dim].
+        """Independent draws.
 
         Parameters
         ----------
         size : int
+            Number of draws.
         random_state : int, numpy.random.Generator, numpy.random.RandomState or None
             A seed, a generator, or None for NumPy's global stream (``np.random.seed``).
+
+        Returns
+        -------
+        ndarray[size, dim]
         """
         return self.transform(_uniform_numbers((size, self.dim), random_state))
 
     def reorder(self, names: Iterable[str]) -> "Prior":
-        """The same prior with its parameters in the order of `names`, which must be the same set."""
+        """The same prior with its parameters in the order of `names`; ValueError if the names are not the same."""
         names = tuple(names)
         if sorted(names) != sorted(self.names):
             raise ValueError(

@@ -1,14 +1,16 @@
-"""What the residuals say about the noise: are they white, and how many independent samples are they worth.
+"""Checks of residuals: are they white, and how many independent samples are they worth?
 
-A residual is measured less simulated, at parameters that fit. White noise takes the n samples of a channel as
-independent. Residuals of real measurements are not: the error of a model lasts longer than a sample and looks alike
-from one cycle to the next. `residual_checks` says how far they are from white, `effective_samples` what they are worth
-to `fe_likelihoods.probability.noise.GaussianNoise`, and `innovations` whether one lag of correlation explains them
-(`fe_likelihoods.probability.noise.AutoregressiveNoise`)::
+A residual is the measured minus the simulated response at parameters that fit. White noise treats the n samples of a
+channel as independent. Residuals of real measurements are not, because the error of a model changes slowly and repeats
+from cycle to cycle. `residual_checks` measures how far they are from white noise, `effective_samples` gives the number
+of independent samples for `fe_likelihoods.probability.noise.GaussianNoise`, and `innovations` shows whether
+`fe_likelihoods.probability.noise.AutoregressiveNoise` explains them::
 
     residuals = posterior.likelihood.residuals(best)
     residual_checks(residuals)
     noise = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
+
+The equations are on the page ``docs/theory/noise.rst``.
 """
 
 from collections.abc import Sequence
@@ -31,17 +33,25 @@ __all__ = [
     "residual_checks",
 ]
 
-_WINDOW = 5.0  # of the sums over lags, in correlation times
+_WINDOW = 5.0  # length of the sums over lags, in correlation times
 
 
 class ResidualChecks(NamedTuple):
-    """Of the residuals of each channel, all (n_channels,).
+    """Checks of the residuals of each channel; all arrays are (n_channels,).
 
-    mean, standard_deviation : [SI unit of the channel]
-    lag_one : correlation of successive residuals, near zero for white ones
-    n_effective : independent samples that they are worth (`effective_samples`)
-    white : probability of a lag-one correlation at least so far from zero if they were white
-    normal : probability of a skewness and a kurtosis at least so far from the normal's if they were normal
+    Attributes
+    ----------
+    mean, standard_deviation : ndarray
+        [SI unit of the channel].
+    lag_one : ndarray
+        Correlation of successive residuals [-], near zero for white noise.
+    n_effective : ndarray
+        Number of independent samples (`effective_samples`).
+    white : ndarray
+        Probability that white noise has a lag-one correlation at least as far from zero.
+    normal : ndarray
+        Probability that normal residuals have a skewness and kurtosis at least as far from those of the normal
+        distribution.
     """
 
     mean: np.ndarray
@@ -53,16 +63,18 @@ class ResidualChecks(NamedTuple):
 
 
 def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
-    """Statistic of residuals for an AR(1) error: J, D and E of `fe_likelihoods.probability.noise.AutoregressiveNoise`.
+    """Statistics of an AR(1) error: J, D and E of `fe_likelihoods.probability.noise.AutoregressiveNoise`.
 
     Parameters
     ----------
-    residuals : (n_channels, n_steps) float, [SI]
+    residuals : (n_channels, n_steps) float
+        [SI unit of the channel].
 
     Returns
     -------
-    (3 n_channels,) float : sums of squares of all channels, then those of successive differences, then the squares of
-        first and last residual together [SI unit of the channel, squared].
+    (3 n_channels,) float
+        Sums of squares of all channels, then sums of squared differences of successive residuals, then the square of
+        the first plus the square of the last residual [SI unit of the channel, squared].
     """
     squares = np.square(residuals).sum(axis=-1)
     differences = np.square(np.diff(residuals, axis=-1)).sum(axis=-1)
@@ -74,20 +86,22 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    residuals : (n_channels, n_steps) float — any unit.
+    residuals : (n_channels, n_steps) float
+        Any unit.
 
     Returns
     -------
-    (n_channels, n_steps) float : sum_t r_t r_{t+k} / sum_t r_t^2, one at lag zero.
+    (n_channels, n_steps) float
+        sum_t r_t r_{t+k} / sum_t r_t^2; one at lag zero.
 
     Raises
     ------
     ValueError
-        If the residuals are not of this shape, have fewer than two samples, are not finite, or zero in a channel.
+        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel.
     """
     residuals = _checked(residuals)
     n = residuals.shape[1]
-    size = 2 ** (2 * n - 1).bit_length()  # room for all lags, without wrapping round
+    size = 2 ** (2 * n - 1).bit_length()  # zero padding, so that no lag wraps around
     spectrum = np.fft.rfft(residuals / np.abs(residuals).max(axis=1, keepdims=True), size, axis=1)
     products = np.fft.irfft(spectrum * spectrum.conj(), size, axis=1)[:, :n]
     return products / products[:, :1]
@@ -99,11 +113,12 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     residuals : (n_channels, n_steps) float
-        Measured less simulated, at parameters that fit; any unit.
+        Measured minus simulated response at parameters that fit; any unit.
 
     Returns
     -------
-    (n_channels,) float : between one and n_steps.
+    (n_channels,) float
+        Between one and n_steps.
 
     Raises
     ------
@@ -112,22 +127,30 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
 
     Notes
     -----
-    With the autocorrelation rho_k of the errors ::
+    With the autocorrelation rho_k of the errors::
 
         n_eff = n / (1 + 2 sum_k rho_k^2)
 
-    This is the number for sigma (the variance of a mean square: Bayley & Hammersley, The "effective" number of
-    independent observations in an autocorrelated time series, Supplement to the Journal of the Royal Statistical
-    Society 8, 1946, 184-197), and for a parameter whose sensitivity has the spectrum of the errors: in general one
-    rho_k is the autocorrelation of the sensitivity (compare Bretherton et al., The effective number of spatial degrees
-    of freedom of a time-varying field, Journal of Climate 12, 1999, 1990-2009). So intervals of a parameter whose
-    sensitivity is quicker than the errors come out too wide, of a slower one (an offset) too narrow;
-    `fe_likelihoods.probability.noise.AutoregressiveNoise` tells parameters apart, a single number cannot. For AR(1) errors it is
-    n (1 - rho^2) / (1 + rho^2). The autocorrelation time of a mean, which samplers report, would not do: for residuals
-    that oscillate, as those of structures do, it falls below one.
+    This is the number for the variance of a mean square, that is for sigma [1]_. It also holds for a parameter whose
+    sensitivity has the same spectrum as the errors; in general, one factor rho_k is the autocorrelation of the
+    sensitivity (compare [2]_). Intervals are therefore too wide for a parameter whose sensitivity varies faster than
+    the errors, and too narrow for one whose sensitivity varies more slowly, such as an offset.
+    `fe_likelihoods.probability.noise.AutoregressiveNoise` makes this distinction, a single number cannot. For AR(1)
+    errors the number is n (1 - rho^2) / (1 + rho^2).
 
-    The sum ends at the first lag of five times the sum of rho_k^2 (Sokal's window), lest it be a sum of errors of
-    estimation.
+    The integrated autocorrelation time of a mean, which samplers report, is not suitable: it is less than one for
+    oscillating residuals, which are typical of structures.
+
+    The sum ends at the first lag of at least five correlation times 1 + 2 sum_k rho_k^2 (Sokal's window), because later
+    terms are dominated by estimation errors.
+
+    References
+    ----------
+    .. [1] G. V. Bayley, J. M. Hammersley (1946), "The 'effective' number of independent observations in an
+       autocorrelated time series", Supplement to the Journal of the Royal Statistical Society 8, 184-197,
+       doi:10.2307/2983560.
+    .. [2] C. S. Bretherton et al. (1999), "The effective number of spatial degrees of freedom of a time-varying field",
+       Journal of Climate 12, 1990-2009.
     """
     correlation = autocorrelation(residuals)
     n = correlation.shape[1]
@@ -138,21 +161,24 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
 
 
 def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
-    """What is new in each residual if they are AR(1): white, and of the same standard deviation, if they are.
+    """Innovations of an AR(1) process: white, with the standard deviation of the residuals, if they are AR(1).
 
     Parameters
     ----------
-    residuals : (n_channels, n_steps) float, [SI]
-    lag_one : (n_channels,) float — correlations of successive residuals, between -1 and 1.
+    residuals : (n_channels, n_steps) float
+        [SI unit of the channel].
+    lag_one : (n_channels,) float
+        Correlations of successive residuals, between -1 and 1.
 
     Returns
     -------
-    (n_channels, n_steps - 1) float : (r_t - rho r_{t-1}) / sqrt(1 - rho^2), [SI].
+    (n_channels, n_steps - 1) float
+        (r_t - rho r_{t-1}) / sqrt(1 - rho^2) [SI unit of the channel].
 
     Raises
     ------
     ValueError
-        As `autocorrelation`; also for another number of correlations, or one that is not between -1 and 1.
+        As `autocorrelation`; also for a wrong number of correlations, or one that is not between -1 and 1.
     """
     residuals = _checked(residuals)
     rho = np.asarray(lag_one, dtype=float)
@@ -164,12 +190,12 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
 
 
 def residual_checks(residuals: np.ndarray) -> ResidualChecks:
-    """Whether residuals are what a Gaussian white noise would leave.
+    """Compare residuals with Gaussian white noise.
 
     Parameters
     ----------
     residuals : (n_channels, n_steps) float
-        Measured less simulated, at parameters that fit [SI].
+        Measured minus simulated response at parameters that fit [SI unit of the channel].
 
     Returns
     -------
@@ -182,12 +208,17 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
 
     Notes
     -----
-    The lag-one correlation of n white residuals is normal with a standard deviation of 1 / sqrt(n). The test of
-    normality is that of Jarque and Bera, with the effective number of samples in the place of n: independence is
-    another question, and takes none of its significance. Probabilities below a hundredth are worth a look at
+    The lag-one correlation of n white residuals is approximately normal with standard deviation 1 / sqrt(n). Normality
+    is tested with the statistic of Jarque and Bera [1]_, with the effective number of samples instead of n, so that
+    correlation alone does not make the test significant. If a probability is below 0.01, look at
     `plot_residuals`.
+
+    References
+    ----------
+    .. [1] C. M. Jarque, A. K. Bera (1987), "A test for normality of observations and regression residuals",
+       International Statistical Review 55, 163-172, doi:10.2307/1403192.
     """
-    from scipy import stats  # where used: half a second, and whoever has a noise imports this module
+    from scipy import stats  # takes 0.5 s to import, and every noise imports this module
 
     residuals = _checked(residuals)
     n_effective = effective_samples(residuals)
@@ -238,12 +269,13 @@ def _checked(residuals: np.ndarray) -> np.ndarray:
     residuals = np.asarray(residuals, dtype=float)
     if residuals.ndim != 2 or residuals.shape[1] < 2:
         raise ValueError(
-            f"expected residuals of shape (n_channels, n_steps), of two samples or more; got {residuals.shape}"
+            f"expected residuals of shape (n_channels, n_steps) with two samples or more; got {residuals.shape}"
         )
     if not np.isfinite(residuals).all():
-        raise ValueError("residuals must be finite; they are not: is this a simulation that failed?")
+        raise ValueError("residuals must be finite; these are not, perhaps because a simulation failed")
     if not residuals.any(axis=1).all():
         raise ValueError(
-            f"residuals of channels {np.flatnonzero(~residuals.any(axis=1)).tolist()} are all zero: nothing can be said"
+            f"the residuals of channels {np.flatnonzero(~residuals.any(axis=1)).tolist()} are all zero and have no "
+            "correlation; leave these channels out"
         )
     return residuals

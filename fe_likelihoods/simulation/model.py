@@ -27,6 +27,7 @@ __all__ = [
     "SimulationBatch",
     "SimulationFailed",
     "Statistic",
+    "has_batch_method",
     "misfit_batch",
     "misfit_of_responses",
     "simulate_batch",
@@ -115,6 +116,11 @@ class Model(Protocol):
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (n_channels, n_steps) [SI] at the parameters (n_parameters,); raises `SimulationFailed`."""
+
+
+def has_batch_method(model: Model) -> bool:
+    """Whether a model has a batch method of its own."""
+    return hasattr(model, "misfit_batch") or hasattr(model, "simulate_batch")
 
 
 def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:

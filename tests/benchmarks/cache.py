@@ -41,7 +41,7 @@ def cache(repeats: int) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cache.sqlite"
         likelihood = bridge_column(cache=path).likelihood
-        n_steps, key = likelihood.measurements.n_steps, likelihood.fingerprint
+        n_steps, key = likelihood.measurements.n_steps, likelihood.simulation_key
         misfit = rng.uniform(size=(STORED, 2))
 
         def store(batch: np.ndarray) -> None:

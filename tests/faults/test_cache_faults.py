@@ -227,7 +227,7 @@ def test_two_programs_on_one_cache(path, thetas, expected):
     """Both are right, and together they leave every simulation behind; the third one runs none."""
 
     def run(order):
-        likelihood = likelihood_of(path, memory=0)
+        likelihood = likelihood_of(path, memory_rows=0)
         for start in range(0, len(thetas), 10):
             rows = order[start : start + 10]
             np.testing.assert_array_equal(likelihood.misfit(thetas[rows]), expected[rows])

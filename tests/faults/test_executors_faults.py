@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.probability.likelihood import TooManyFailures
+from fe_likelihoods.probability.failures import TooManyFailures
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -238,7 +238,7 @@ def test_stated_share_of_failures_stops_the_run_and_keeps_what_there_is(kind, tm
     if kind == "smc":
         backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
         sampler = SMCSampler(200, posterior.ndim, posterior, vectorize=True, seed=seed, backend=backend)
-        with pytest.raises(RuntimeError, match=r"TooManyFailures: \d+ of \d+ simulations failed.*share of 0.25"):
+        with pytest.raises(RuntimeError, match=r"TooManyFailures: \d+ of \d+ simulations failed.*allowed is 0.25"):
             sampler.run_mcmc(None, 2)
         assert sampler.evaluations >= 200
     else:
@@ -262,7 +262,7 @@ def test_share_that_is_allowed_does_not_stop_it(seed):
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_share_must_be_one(share):
-    with pytest.raises(ValueError, match="max_failure_share must lie in"):
+    with pytest.raises(ValueError, match="max_failure_share must be in"):
         third(max_failure_share=share)
 
 

@@ -239,7 +239,7 @@ def oscillator(kind=Posterior, memory=100_000):
         "sigma_acceleration": HalfNormal(0.5),
         "sigma_displacement": HalfNormal(0.01),
     }
-    return kind(FELikelihood(model, Measurements(model.channels, model.dt, values), memory=memory), prior)
+    return kind(FELikelihood(model, Measurements(model.channels, model.dt, values), memory_rows=memory), prior)
 
 
 @pytest.mark.parametrize("mode", ["recycling", "moves", "tmcmc"])

@@ -206,7 +206,7 @@ def test_the_noise_is_drawn_afterwards_without_a_simulation(full, rng):
 
 def test_cache_pool_and_coarse_posterior_come_along(full, tmp_path):
     model, measurements = full.likelihood.model, full.likelihood.measurements
-    likelihood = FELikelihood(model, measurements, cache=tmp_path / "sums.sqlite", max_failure_share=0.5, memory=7)
+    likelihood = FELikelihood(model, measurements, cache=tmp_path / "sums.sqlite", max_failure_share=0.5, memory_rows=7)
     posterior = Posterior(likelihood, full.prior, coarse=full)
     posterior.log_prob([1.0, 1.0, 0.5, 0.01])
     marginal = posterior.marginal()

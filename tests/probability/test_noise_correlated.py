@@ -134,7 +134,7 @@ def test_effective_samples_weigh_the_channels(rng):
 @pytest.mark.parametrize("kind", [GaussianNoise, AutoregressiveNoise])
 def test_sensors_that_cannot_be_are_refused(kind):
     for sensor, message in (
-        ({"bottom": 1.0}, "names no channel with .*bottom.*they are top, drift"),
+        ({"bottom": 1.0}, "unknown channels .*bottom.*the channels are top, drift"),
         ([1.0], "one number for each of top, drift; got 1"),
         ([1.0, -1.0], "zero or more"),
         ([1.0, math.nan], "zero or more"),
@@ -237,7 +237,7 @@ def test_the_cache_tells_statistics_apart(tmp_path, rng, responses):
 
 
 def test_a_noise_of_other_channels_is_refused(rng):
-    with pytest.raises(ValueError, match="noise is of the channels drift, top, the model's are top, drift"):
+    with pytest.raises(ValueError, match="noise's channels are drift, top, the model's are top, drift"):
         FELikelihood(Line(), measured_by(Line(), rng), GaussianNoise(CHANNELS[::-1]))
 
 
@@ -246,7 +246,7 @@ def test_residuals_of_a_likelihood(rng):
     expected = likelihood.measurements.values - Line().simulate(np.array([0.2, 0.1]))
     np.testing.assert_array_equal(likelihood.residuals([0.2, 0.1]), expected)
     np.testing.assert_array_equal(likelihood.residuals([0.2, 0.1, 1.0, 1.0]), expected)
-    with pytest.raises(ValueError, match=r"shape \(2,\) or \(4,\)"):
+    with pytest.raises(ValueError, match=r"shape \(2,\), or \(4,\) with the noise"):
         likelihood.residuals([0.2])
     with pytest.raises(SimulationFailed, match="too steep"):
         likelihood.residuals([0.0, 2.0])

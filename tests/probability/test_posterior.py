@@ -14,6 +14,7 @@ from scipy import optimize, stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import SharedGaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import HalfNormal, LogNormal, Prior, TruncatedNormal, Uniform
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -273,6 +274,26 @@ def test_fingerprint_knows_model_and_measurements(oscillator, measurements):
     model = LinearOscillator(oscillator.record, 0.7)
     fingerprints = {FELikelihood(oscillator, other).fingerprint, FELikelihood(model, measurements).fingerprint}
     assert len(fingerprints | {likelihood.fingerprint}) == 3
+
+
+def test_data_fingerprint_knows_the_measurements_only(oscillator, measurements, prior):
+    likelihood = FELikelihood(oscillator, measurements)
+    model = LinearOscillator(oscillator.record, 0.7)
+    turned = measurements.select(["displacement", "acceleration"])
+    noise = SharedGaussianNoise.of(measurements)
+    same = [FELikelihood(model, measurements), FELikelihood(oscillator, turned), likelihood.with_noise(noise)]
+    other = Measurements(measurements.channels, measurements.dt, measurements.values * 1.01)
+    assert {one.data_fingerprint for one in same} == {likelihood.data_fingerprint}
+    assert Posterior(likelihood, prior).data_fingerprint == likelihood.data_fingerprint
+    assert Posterior(likelihood, prior).marginal().data_fingerprint == likelihood.data_fingerprint
+    assert FELikelihood(oscillator, other).data_fingerprint != likelihood.data_fingerprint
+
+
+def test_a_likelihood_is_callable(oscillator, measurements):
+    likelihood = FELikelihood(oscillator, measurements)
+    x = np.array([[1.1, 0.7, 0.06, 0.0012], [1.0, 0.7, -0.06, 0.0012]])
+    np.testing.assert_array_equal(likelihood(x), likelihood.log_likelihood(x))
+    assert likelihood(x[0]) == likelihood.log_likelihood(x[0])
 
 
 # failures ------------------------------------------------------------------------------------------------------------

@@ -121,7 +121,7 @@ def test_duplicates_and_zeros_of_both_signs(path):
 
 
 def test_without_memory_the_disk_answers(path, thetas):
-    likelihood = likelihood_of(Line(), path, memory=0)
+    likelihood = likelihood_of(Line(), path, memory_rows=0)
     for _ in range(3):
         likelihood.misfit(thetas)
     assert (likelihood.simulations, likelihood.disk_hits) == (300, 600)
@@ -274,7 +274,7 @@ def test_the_oldest_are_evicted(path, rng):
     assert (len(likelihood.model.sizes), cache.evictions) == (1, 0)
     likelihood.misfit(thetas[8:14])
     assert (cache.info().simulations, cache.evictions) == (10, 4)
-    known = SimulationCache(path).look_up(likelihood.fingerprint, thetas, 2, 8).known
+    known = SimulationCache(path).look_up(likelihood.simulation_key, thetas, 2, 8).known
     assert np.flatnonzero(known).tolist() == list(range(4, 14))
     likelihood.misfit(thetas)  # a batch larger than the bound
     assert (cache.info().simulations, cache.evictions) == (10, 15)
@@ -317,7 +317,7 @@ def test_export_and_import(tmp_path, path, thetas):
     FELikelihood(wide, Measurements(wide.channels, 0.02, np.ones((2, 50))), cache=path).misfit([[1.0, 1.0]])
     assert SimulationCache(path).export_hdf5(tmp_path / "out.h5") == 301
     other = SimulationCache(tmp_path / "other.sqlite")
-    other.store(likelihood_of(Line()).fingerprint, thetas[:1], 8, np.ones((1, 2)), [""], 1.0)
+    other.store(likelihood_of(Line()).simulation_key, thetas[:1], 8, np.ones((1, 2)), [""], 1.0)
     assert other.import_hdf5(tmp_path / "out.h5") == 301
     likelihood = likelihood_of(Line(), other)
     misfit = likelihood.misfit(thetas)
@@ -499,7 +499,7 @@ def test_forks_while_threads_write(path, rng):
 
 
 def test_threads_share_a_cache(path, rng):
-    likelihood = likelihood_of(Line(), path, memory=50)
+    likelihood = likelihood_of(Line(), path, memory_rows=50)
     thetas = rng.normal(size=(60, 2)) * [1.0, 0.3]
     expected = likelihood_of(Line()).misfit(thetas)
     batches = [np.arange(start, start + 20) % 60 for start in range(0, 400, 7)]
@@ -513,7 +513,7 @@ def test_threads_share_a_cache(path, rng):
 def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     monkeypatch.chdir(tmp_path)
     cache = SimulationCache("relative.sqlite", max_rows=1000, retry_failures=True)
-    likelihood = likelihood_of(Line(), cache, memory=0)
+    likelihood = likelihood_of(Line(), cache, memory_rows=0)
     likelihood.misfit(thetas)
     data = pickle.dumps(likelihood)
     assert len(data) < 4000

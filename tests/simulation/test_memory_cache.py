@@ -18,7 +18,7 @@ from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import Distribution, HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.memory_cache import MisfitMemory
+from fe_likelihoods.simulation.memory_cache import MemoryCache
 from fe_likelihoods.simulation.model import SimulationFailed
 
 
@@ -62,7 +62,7 @@ def test_a_change_of_the_noise_costs_no_simulation(rng):
     x[:, 2:] *= rng.uniform(0.5, 2.0, size=(20, 2))
     again = likelihood.log_likelihood(x)
     assert (likelihood.simulations, likelihood.cache_hits, len(model.runs)) == (20, 20, 20)
-    np.testing.assert_array_equal(again, likelihood_of(Line(), memory=0).log_likelihood(x))
+    np.testing.assert_array_equal(again, likelihood_of(Line(), memory_rows=0).log_likelihood(x))
     x[3, 0] = np.nextafter(x[3, 0], 9.0)
     likelihood.log_likelihood(x)
     assert (likelihood.simulations, likelihood.cache_hits) == (21, 39)
@@ -96,7 +96,7 @@ def test_failures_are_remembered_and_recorded_once():
 
 def test_the_memory_is_bounded(rng):
     model = Line()
-    likelihood = likelihood_of(model, memory=10)
+    likelihood = likelihood_of(model, memory_rows=10)
     thetas = points(rng, 15)[:, :2]
     likelihood.misfit(thetas)  # a batch larger than the memory
     likelihood.misfit(thetas[5:])
@@ -111,7 +111,7 @@ def test_the_memory_is_bounded(rng):
 
 def test_without_memory():
     model = Line()
-    likelihood = likelihood_of(model, memory=0)
+    likelihood = likelihood_of(model, memory_rows=0)
     for _ in range(2):
         likelihood.misfit([[0.0, 0.5], [0.0, 0.5]])
     assert len(model.runs) == likelihood.simulations == 2
@@ -120,12 +120,12 @@ def test_without_memory():
 
 @pytest.mark.parametrize("rows", [-1, 2.5, None, True])
 def test_impossible_memories(rows):
-    with pytest.raises(ValueError, match="memory is the number of simulations"):
-        likelihood_of(Line(), memory=rows)
+    with pytest.raises(ValueError, match="memory_rows must be the number of simulations"):
+        likelihood_of(Line(), memory_rows=rows)
 
 
 def test_memory_does_not_travel(rng):
-    likelihood = likelihood_of(Line(), memory=500)
+    likelihood = likelihood_of(Line(), memory_rows=500)
     x = points(rng, 200)
     small = len(pickle.dumps(likelihood))
     values = likelihood.log_likelihood(x)
@@ -139,7 +139,7 @@ def test_memory_does_not_travel(rng):
 
 
 def test_threads_share_a_memory(rng):
-    likelihood = likelihood_of(Line(), memory=50)
+    likelihood = likelihood_of(Line(), memory_rows=50)
     x = points(rng, 60)
     expected = likelihood_of(Line()).log_likelihood(x)
     batches = [np.arange(start, start + 20) % 60 for start in range(0, 400, 7)]
@@ -152,7 +152,7 @@ def test_threads_share_a_memory(rng):
 
 
 def test_the_memory_alone():
-    memory = MisfitMemory(2)
+    memory = MemoryCache(2)
     misfit, known = memory.look_up([], 3)
     assert misfit.shape == (0, 3)
     assert known == []
@@ -226,7 +226,7 @@ def test_fingerprint_changes_with_what_the_density_depends_on():
 
 
 def test_fingerprint_of_a_noise_that_does_not_say_what_it_is():
-    with pytest.raises(ValueError, match="repr that says what NamelessNoise is"):
+    with pytest.raises(ValueError, match="repr that shows all values of NamelessNoise"):
         _ = oscillator_posterior(noise=NamelessNoise(np.ones(2))).fingerprint
 
 
@@ -243,13 +243,13 @@ def test_fingerprint_of_a_distribution_that_does_not_say_what_it_is():
 
     posterior = oscillator_posterior()
     posterior = Posterior(posterior.likelihood, {**posterior.prior.distributions, "damping": Vague()})
-    with pytest.raises(ValueError, match="repr that says what .*Vague is"):
+    with pytest.raises(ValueError, match="repr that shows all values of .*Vague"):
         _ = posterior.fingerprint
 
 
 def test_fingerprint_is_the_same_in_another_process():
     root = Path(__file__).resolve().parents[2]
-    code = "from test_memory import oscillator_posterior; print(oscillator_posterior().fingerprint)"
+    code = "from test_memory_cache import oscillator_posterior; print(oscillator_posterior().fingerprint)"
     found = set()
     for hash_seed in ("1", "2"):
         environment = {

@@ -126,7 +126,8 @@ def test_imports_for_type_checkers_do_not_count(tmp_path, monkeypatch):
         path.parent.mkdir(exist_ok=True)
         path.write_text("x = 1\n")
     (tmp_path / "a.py").write_text(
-        "from typing import TYPE_CHECKING\nimport numpy\nif TYPE_CHECKING:\n    from . import c\nelse:\n    from . import b\n"
+        "from typing import TYPE_CHECKING\nimport numpy\n"
+        "if TYPE_CHECKING:\n    from . import c\nelse:\n    from . import b\n"
         "class A:\n    def f(self):\n        try:\n            import fe_likelihoods.d\n"
         "        except ImportError:\n            from .e import x\n        from .plots import p\n"
     )

@@ -1,0 +1,87 @@
+"""Record of the simulations that failed."""
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..simulation.model import split_seconds
+
+__all__ = ["FailureLog", "TooManyFailures"]
+
+logger = logging.getLogger(__name__)
+
+_MAX_RECORDS = 1000
+_MAX_REASONS = 100
+_OTHER_REASONS = "other reasons"
+_MIN_SIMULATIONS = 20  # before the share of failures is checked
+
+
+class TooManyFailures(RuntimeError):
+    """More simulations failed than allowed. Finished simulations are kept, and no further ones are run."""
+
+
+class FailureLog:
+    """Failed simulations of one likelihood: their number, their reasons, and the parameters of the first thousand.
+
+    Parameters
+    ----------
+    parameter_names : sequence of str
+        Names of the structural parameters.
+    max_share : float
+        Largest share of failed simulations that `check` accepts, in [0, 1].
+
+    Attributes
+    ----------
+    count : int
+        Number of failures.
+    records : list of dict
+        ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures, with ``"seconds"`` where the
+        duration is known.
+    reasons : collections.Counter
+        Number of failures per reason; reasons beyond the first 100 are counted together.
+
+    Raises
+    ------
+    ValueError
+        If `max_share` is outside [0, 1].
+    """
+
+    def __init__(self, parameter_names: Sequence[str], max_share: float) -> None:
+        if not 0.0 <= max_share <= 1.0:
+            raise ValueError(f"FELikelihood: max_failure_share must be in [0, 1]; got {max_share!r}")
+        self.max_share = max_share
+        self.count = 0
+        self.records: list[dict] = []
+        self.reasons: Counter[str] = Counter()
+        self._names = tuple(parameter_names)
+
+    def add(self, theta: np.ndarray, reason: str) -> None:
+        """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
+        parameters = dict(zip(self._names, theta.tolist(), strict=True))
+        reason, seconds = split_seconds(reason)
+        if not self.count:
+            logger.warning(
+                "A simulation failed (%s) at %s; its log-likelihood is -inf. Further failures are counted without a "
+                "message, see report()",
+                reason,
+                parameters,
+            )
+        self.count += 1
+        if len(self.records) < _MAX_RECORDS:
+            self.records.append({"parameters": parameters, "reason": reason})
+            if seconds is not None:
+                self.records[-1]["seconds"] = seconds
+        known = reason in self.reasons or len(self.reasons) < _MAX_REASONS
+        self.reasons[reason if known else _OTHER_REASONS] += 1
+
+    def check(self, n_simulations: int) -> None:
+        """Raise `TooManyFailures` if too large a share of `n_simulations` simulations (20 or more) failed."""
+        if n_simulations >= _MIN_SIMULATIONS and self.count > self.max_share * n_simulations:
+            (reason, count), *_ = self.reasons.most_common(1)
+            raise TooManyFailures(
+                f"{self.count} of {n_simulations} simulations failed, {count} of them with the reason {reason!r}; the "
+                f"largest share allowed is {self.max_share:g}. See failures and report(); then correct the model, "
+                "narrow the prior or raise max_failure_share"
+            )

@@ -1,0 +1,91 @@
+"""Checks of what a likelihood is made of and called with."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..signals.channels import Measurements
+from ..simulation.model import Model
+from .noise import Noise, noise_channels
+
+__all__ = ["as_points", "check_noise_channels", "match_measurements"]
+
+
+def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
+    """One point or several points as an array.
+
+    Parameters
+    ----------
+    x : array_like (ndim,) or (n, ndim), or mapping
+        A mapping has a value, or n values, for every name. emcee passes mappings with ``parameter_names=``, nautilus
+        with its own prior.
+    names : sequence of str
+        Names of the ndim parameters, in order.
+
+    Returns
+    -------
+    ndarray[ndim] or ndarray[n, ndim]
+
+    Raises
+    ------
+    ValueError
+        If the number of values or the names are wrong.
+    """
+    if isinstance(x, Mapping):
+        if set(x) != set(names):
+            raise ValueError(f"expected a value for each of {', '.join(names)}; got the names {', '.join(map(str, x))}")
+        x = np.stack([np.asarray(x[name], dtype=float) for name in names], axis=-1)
+    points = np.asarray(x, dtype=float)
+    if points.ndim not in (1, 2) or points.shape[-1] != len(names):
+        raise ValueError(
+            f"expected one value for each of the {len(names)} parameters {', '.join(names)}, in an array of shape "
+            f"({len(names)},) or (n, {len(names)}); got shape {points.shape}"
+        )
+    return points
+
+
+def check_noise_channels(model: Model, noise: Noise) -> None:
+    """Raise ValueError if the channels of a noise are not those of the model."""
+    expected = [channel.name for channel in model.channels]
+    got = [channel.name for channel in noise_channels(noise, model.channels)]
+    if expected != got:
+        raise ValueError(
+            f"the noise's channels are {', '.join(got)}, the model's are {', '.join(expected)}; make the noise with "
+            "model.channels"
+        )
+
+
+def match_measurements(model: Model, measurements: Measurements) -> Measurements:
+    """Measurements in the order of the model's channels.
+
+    Raises
+    ------
+    ValueError
+        If channels, quantities, time step or number of samples of model and measurements differ.
+    """
+    expected = [channel.name for channel in model.channels]
+    got = [channel.name for channel in measurements.channels]
+    if sorted(expected) != sorted(got):
+        raise ValueError(
+            f"the model's channels are {', '.join(expected)}, the measurements' are {', '.join(got)}; "
+            "select the common ones with Measurements.select(names) and in the model"
+        )
+    matched = measurements if expected == got else measurements.select(expected)
+    for ours, theirs in zip(model.channels, matched.channels, strict=True):
+        words = [channel.quantity.split()[:-1] for channel in (ours, theirs)]
+        if ours.dimension != theirs.dimension or (all(words) and words[0] != words[1]):
+            raise ValueError(
+                f"channel {ours.name!r} is {ours.quantity!r} in the model and {theirs.quantity!r} in the measurements"
+            )
+    if abs(matched.dt - model.dt) > 1e-9 * model.dt:
+        raise ValueError(
+            f"the time step of the model's response is {model.dt} s, that of the measurements {matched.dt} s; make "
+            "them equal with Record.resample(dt) on the excitation or Measurements.decimate(factor)"
+        )
+    if matched.n_steps != model.n_steps:
+        raise ValueError(
+            f"the model's response has {model.n_steps} samples, the measurements have {matched.n_steps}; make them "
+            "equal with Record.trim(start, stop) and Measurements.trim(start, stop)"
+        )
+    return matched
