@@ -23,7 +23,7 @@ import numpy as np
 from ..signals.channels import Channel
 from ..simulation.code_digest import code_digest
 from ..simulation.model import SimulationFailed
-from ..simulation.processes import RunFailed, Started, TemporaryFolder, ending, last_lines
+from ..simulation.processes import ManagedProcess, RunFailed, TemporaryFolder, describe_exit, last_lines
 from .external import ExternalModel
 from .validation import positive_float
 
@@ -207,7 +207,7 @@ class ExecutableModel(ExternalModel):
         """Run the program in the folder ``run`` of `place`; raise RunFailed unless it succeeds."""
         start = time.monotonic()
         with open(place / "stdout.txt", "wb") as stdout, open(place / "stderr.txt", "w+b") as stderr:
-            program = Started(
+            program = ManagedProcess(
                 [self.command[0], *arguments],
                 cwd=place / "run",
                 stdin=subprocess.DEVNULL,
@@ -230,7 +230,7 @@ class ExecutableModel(ExternalModel):
                 raise
             exit_code = program.kill(everywhere=False)
             if exit_code:
-                reasons = filter(None, [ending(exit_code, "the program"), last_lines(stderr, 3)])
+                reasons = filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)])
                 raise RunFailed(": ".join(reasons), time.monotonic() - start)
             if _size(place) > self.max_output:
                 raise RunFailed(f"the program wrote more than {self.max_output} bytes", time.monotonic() - start)

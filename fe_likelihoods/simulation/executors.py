@@ -1,19 +1,19 @@
-"""One map over any pool: how simulations are spread over processes and machines.
+"""Executors: a common ``map`` over any pool, which runs simulations in other processes or on other machines.
 
 The rule for ``pool=``:
 
 * None: in this process.
-* a whole number: that many processes of a `LocalPool`.
-* an object with ``gather``, a client of dask.distributed: ``gather(map(function, groups of items, pure=False))``.
-* anything else with ``map``: ``list(pool.map(function, items))``, which covers the executors of concurrent.futures,
+* a whole number: a `LocalPool` of that many processes.
+* an object with ``gather``, that is a client of dask.distributed: ``gather(map(function, groups of items, pure=False))``.
+* any other object with ``map``: ``list(pool.map(function, items))``. This covers the executors of concurrent.futures,
   loky and mpi4py.futures and the pools of multiprocessing and schwimmbad.
 
-The function that is mapped holds the model and the measurements and may be large, an item is a few parameters. The
-function crosses into each worker process once: over the worker's own pipe in a `LocalPool`, through a temporary file
-in other pools of the same machine, and beside the item where a worker says that it knows neither the function nor the
-file. After that a task is a digest and the parameters.
+The mapped function contains the model and the measurements and may be large; an item is a few parameters. The function
+is sent to each worker process once: through the worker's own pipe in a `LocalPool`, through a temporary file in other
+pools on the same machine, and together with the items where a worker reports that it has neither the function nor the
+file. Later tasks consist of a digest of the function and the parameters.
 
-What comes back does not depend on the pool, to the last bit.
+Results do not depend on the pool, to the last bit.
 """
 
 import logging
@@ -31,63 +31,65 @@ from typing import Any, NamedTuple
 from .local_pool import LocalPool, Outcome
 from .processes import PickledFunction, TemporaryFolder
 
-__all__ = ["DaskEngine", "LocalPool", "PoolEngine", "as_executor"]
+__all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 
 logger = logging.getLogger(__name__)
 
-_KNOWN_FUNCTIONS = 8
-_DIED = "the worker process died each time that dask tried"
+_MAX_LOADED_FUNCTIONS = 8
+_DIED = "the worker process died in every attempt of dask"
 
 
-def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskEngine | PoolEngine | None":
-    """What maps functions over a pool, by the rule above.
+def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | PoolExecutor | None":
+    """Executor for a pool, by the rule above.
 
     Parameters
     ----------
     pool : None, int, or a pool
-    model : optional
-        Looked at before anything runs: it must be picklable if the workers are other processes.
+    model : Model, optional
+        Checked before anything runs: it must be picklable if the workers are other processes.
 
     Returns
     -------
-    None for None, else an object whose ``map(function, items)`` returns a list. The functions must return an
-    `Outcome`: an item that brings down every process that tries it gets one as well, where the pool survives that.
+    LocalPool, DaskExecutor, PoolExecutor or None
+        None for None, otherwise an object whose ``map(function, items)`` returns a list. The functions must return an
+        `Outcome`; an item that kills every process that runs it gets one as well, if the pool survives.
 
     Raises
     ------
     ValueError
         If `pool` is none of these, or the model cannot be sent to its processes.
     """
-    if pool is None or isinstance(pool, LocalPool | PoolEngine):
-        engine = pool
+    if pool is None or isinstance(pool, LocalPool | PoolExecutor):
+        executor = pool
     elif hasattr(pool, "gather") and hasattr(pool, "map"):
-        engine = DaskEngine(pool)
+        executor = DaskExecutor(pool)
     elif hasattr(pool, "map"):
-        engine = PoolEngine(pool)
+        executor = PoolExecutor(pool)
     else:
-        engine = LocalPool(pool)
-    if engine is not None and engine.other_processes:
-        _check_picklable(model, engine)
-    return engine
+        executor = LocalPool(pool)
+    if executor is not None and executor.other_processes:
+        _check_picklable(model, executor)
+    return executor
 
 
-def _check_picklable(model: Any, engine: Any) -> None:
+def _check_picklable(model: Any, executor: Any) -> None:
+    """Raise ValueError, with the name of the attribute to blame, if a model cannot be sent to other processes."""
     try:
-        shipment = PickledFunction.of(model)
-        if isinstance(engine, LocalPool):
-            shipment.script()
+        pickled = PickledFunction.of(model)
+        if isinstance(executor, LocalPool):
+            pickled.script()
     except ValueError as error:
         name, value = _culprit(model)
         raise ValueError(
-            f"with this pool the model {type(model).__name__} must go to other processes, which its attribute {name} = "
-            f"{value!r} prevents. {error}"
+            f"with this pool the model {type(model).__name__} must be sent to other processes, which its attribute "
+            f"{name} = {value!r} prevents. {error}"
             if name
-            else f"with this pool the model must go to other processes. {error}"
+            else f"with this pool the model must be sent to other processes. {error}"
         ) from error
 
 
 def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
-    """Name and value of the innermost attribute that cannot be pickled."""
+    """Name and value of the innermost attribute of an object that cannot be pickled."""
     try:
         state = thing.__getstate__()
     except Exception:
@@ -103,20 +105,27 @@ def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
 
 
 class _Missing(NamedTuple):
-    """Answer of a worker that does not have the function."""
+    """Reply of a worker that does not have the function."""
 
 
 class _Unusable(NamedTuple):
-    """Answer of a worker that has the function and cannot load it, and why."""
+    """Reply of a worker that has the function but cannot load it, with the reason."""
 
     reason: str
 
 
-class _Shipped:
-    """A function that is left behind when it is pickled: its digest goes instead.
+class _FunctionReference:
+    """A function that is pickled as a reference: its digest and the path of a file with the pickled function.
 
-    Called in this process it is the function itself. In another one it takes the function from those known there,
-    from the file, or from its own payload, which it carries only if told to.
+    Called in this process, it calls the function. In another process it becomes a `_LoadedFunction`.
+
+    Parameters
+    ----------
+    function : callable
+    folder : Path
+        Temporary folder for the file.
+    carried : bool
+        Whether the pickled function itself is part of the reference, for workers that cannot read the file.
     """
 
     def __init__(self, function: Callable, folder: Path, carried: bool = False) -> None:
@@ -128,24 +137,24 @@ class _Shipped:
         return self._function(item)
 
     def __reduce__(self) -> tuple:
-        with self._lock:  # pools pickle in threads of their own, often once for every item
+        with self._lock:  # pools pickle in threads of their own, often once per item
             if self._parts is None:
-                shipment = PickledFunction.of(self._function)
-                path = self._folder / shipment.key.hex()
+                pickled = PickledFunction.of(self._function)
+                path = self._folder / pickled.key.hex()
                 if not self._carried and not path.exists():
                     part = path.with_suffix(f".{threading.get_ident()}")
-                    part.write_bytes(shipment.payload)
+                    part.write_bytes(pickled.payload)
                     part.replace(path)
-                self._parts = shipment.key, str(path), shipment.payload if self._carried else b""
-        return _Arrived, self._parts
+                self._parts = pickled.key, str(path), pickled.payload if self._carried else b""
+        return _LoadedFunction, self._parts
 
 
 _functions: OrderedDict[bytes, Callable] = OrderedDict()
 _loading = threading.Lock()
 
 
-class _Arrived:
-    """What a `_Shipped` function is in a worker process."""
+class _LoadedFunction:
+    """A `_FunctionReference` in a worker process, which loads the function once and keeps the most recent ones."""
 
     def __init__(self, key: bytes, path: str, payload: bytes) -> None:
         self._parts = key, path, payload
@@ -168,17 +177,17 @@ class _Arrived:
                     return _Unusable(f"{type(error).__name__}: {error}")
                 _functions[key] = function
             _functions.move_to_end(key)
-            while len(_functions) > _KNOWN_FUNCTIONS:
+            while len(_functions) > _MAX_LOADED_FUNCTIONS:
                 _functions.popitem(last=False)
         return function(item)
 
 
-class PoolEngine:
-    """Map over any object with ``map(function, items)``.
+class PoolExecutor:
+    """Executor for any object with ``map(function, items)``.
 
     Parameters
     ----------
-    pool : the object
+    pool : object
     """
 
     def __init__(self, pool: Any) -> None:
@@ -187,33 +196,33 @@ class PoolEngine:
 
     @property
     def other_processes(self) -> bool:
-        """Whether the pool is known to send its work to other processes."""
+        """Whether the pool is known to run its work in other processes."""
         return isinstance(self.pool, Executor | Pool) and not isinstance(self.pool, ThreadPoolExecutor | ThreadPool)
 
     @property
     def n_workers(self) -> int | None:
-        """How many items run at once, where the pool tells; None where it does not."""
+        """Number of items that run at once; None if the pool does not say."""
         sizes = (getattr(self.pool, name, None) for name in ("n_workers", "_max_workers", "_processes", "size"))
         return next((size for size in sizes if isinstance(size, int) and size > 0), None)
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
-        """Outcomes for every item, in their order; RuntimeError where the workers cannot load the function."""
+        """Outcomes of a function for every item, in their order; RuntimeError if a worker cannot load the function."""
         items = list(items)
         if self._folder is None:
             self._folder = TemporaryFolder()
-        outcomes = self._map(_Shipped(function, self._folder.path), items)
+        outcomes = self._map(_FunctionReference(function, self._folder.path), items)
         missing = [index for index, outcome in enumerate(outcomes) if isinstance(outcome, _Missing)]
         if missing:
             carried = self._map(
-                _Shipped(function, self._folder.path, carried=True), [items[index] for index in missing]
+                _FunctionReference(function, self._folder.path, carried=True), [items[index] for index in missing]
             )
             for index, outcome in zip(missing, carried, strict=True):
                 outcomes[index] = outcome
         for outcome in outcomes:
             if isinstance(outcome, _Unusable):
                 raise RuntimeError(
-                    f"a worker cannot load the model: {outcome.reason}. Its classes and functions must be in modules "
-                    "that can be imported there"
+                    f"a worker cannot load the model: {outcome.reason}. Define its classes and functions in modules that "
+                    "the workers can import"
                 )
         return outcomes
 
@@ -221,14 +230,14 @@ class PoolEngine:
         return list(self.pool.map(function, items))
 
 
-class DaskEngine(PoolEngine):
-    """Map over the cluster of a ``dask.distributed.Client``, the engine beyond one machine.
+class DaskExecutor(PoolExecutor):
+    """Executor for the cluster of a ``dask.distributed.Client``, for work on several machines.
 
-    A task costs dask about 2 ms of all processors, so short runs travel in groups: large ones first and single runs
-    last, so that the workers end together, and none longer than a second by what the runs before took, so that little
-    is done again where a worker dies. dask tries a group again whose worker died, and gives up after some times
-    (``distributed.scheduler.allowed-failures``); its items are then tried each by itself, and one that kills its worker
-    again gets ``(None, reason)``.
+    A task costs dask about 2 ms of all processors, so short simulations are sent in groups. The groups are large at
+    first and single items at last, so that the workers finish together. No group takes longer than about a second, by
+    the duration of earlier simulations, so that little is repeated if a worker dies. dask retries a group whose worker
+    died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). The items of the group are
+    then run one by one, and an item that kills its worker again gets ``(None, reason)``.
 
     Parameters
     ----------
@@ -239,16 +248,19 @@ class DaskEngine(PoolEngine):
 
     def __init__(self, pool: Any) -> None:
         super().__init__(pool)
-        self._seconds: float | None = None  # of one item, by the last map
+        self._seconds: float | None = None  # mean duration of an item in the last map
 
     @property
     def n_workers(self) -> int | None:
-        """Threads of all workers of the cluster at this moment."""
+        """Number of threads of all workers that the cluster has at present."""
         return sum(self.pool.nthreads().values()) or None
 
     def _map(self, function: Callable, items: list) -> list:
         if not (n_workers := self.n_workers):
-            logger.warning("the dask cluster has no worker: %d runs wait for one", len(items))
+            logger.warning(
+                "The dask cluster has no worker; %d simulations wait for one. Start workers or scale the cluster",
+                len(items),
+            )
         largest = 1 if self._seconds is None else int(1.0 / max(self._seconds, 1e-3))
         groups = _groups(items, n_workers or 1, largest)
         answers = self._answers(function, groups)
@@ -265,10 +277,10 @@ class DaskEngine(PoolEngine):
         return outcomes
 
     def _answers(self, function: Callable, groups: list[list]) -> "list[_Answer | None]":
-        """The answer for each group; None where every worker that tried it died."""
+        """Answer for each group; None where every worker that ran it died."""
         if not groups:
             return []
-        futures = self.pool.map(partial(_one_after_the_other, function), groups, pure=False)
+        futures = self.pool.map(partial(_run_group, function), groups, pure=False)
         try:
             return self.pool.gather(futures)
         except Exception as error:
@@ -277,12 +289,13 @@ class DaskEngine(PoolEngine):
         try:
             return [self._answer(future) for future in futures]
         finally:
-            for future in futures:  # or dask would run again what a dead worker had kept of them
+            for future in futures:  # otherwise dask repeats the groups whose results were on a dead worker
                 future.release()
 
     @staticmethod
     def _answer(future: Any) -> "_Answer | None":
-        error = future.exception()  # waits for it
+        """Result of a future; None if its worker died."""
+        error = future.exception()  # waits for the future
         if error is None:
             return future.result()
         if type(error).__name__ != "KilledWorker":
@@ -291,28 +304,30 @@ class DaskEngine(PoolEngine):
 
 
 class _Answer(NamedTuple):
+    """Outcomes of a group of items, and their total duration [s]."""
+
     outcomes: list
     seconds: float
 
 
-def _one_after_the_other(function: Callable, items: list) -> _Answer:
-    """Runs in the worker."""
-    _settle()
+def _run_group(function: Callable, items: list) -> _Answer:
+    """Run the items of a group one after the other; called in the worker."""
+    _wait_for_nanny()
     start = time.perf_counter()
     return _Answer([function(item) for item in items], time.perf_counter() - start)
 
 
 @cache
-def _settle() -> None:
-    """Wait, once in a process: dask's nanny starts no other worker if it hears of the death of one before its start.
+def _wait_for_nanny() -> None:
+    """Wait once per process, because dask's nanny does not replace a worker that dies before its start is reported.
 
-    Where a deadly item is tried on every new worker at once, none would be left in the end, and all would wait.
+    An item that kills every new worker at once would otherwise leave a cluster without workers, and the run would hang.
     """
     time.sleep(0.5)
 
 
 def _groups(items: list, n_workers: int, largest: int) -> list[list]:
-    """`items` in groups, each half of a worker's share of what is left, at least one and at most `largest`."""
+    """Groups of items: each is half of a worker's share of the remaining items, at least one and at most `largest`."""
     groups, start = [], 0
     while start < len(items):
         size = min(max(1, (len(items) - start) // (2 * n_workers)), max(1, largest))

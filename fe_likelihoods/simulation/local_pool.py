@@ -1,8 +1,8 @@
-"""A pool of processes of this machine.
+"""Pool of processes of this machine that survives the death of its workers.
 
-The standard library's pools hang for ever when a worker dies, or end with it, and cannot say which item it was that
-killed it. Here each worker has a pipe of its own, so that it is known what every process was doing when it died: that
-item alone is tried again, and is given up after the third time.
+When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Here each worker
+has a pipe of its own, so it is known which item every process was running. Only that item is run again, and it is given
+up after the third time.
 """
 
 import os
@@ -16,21 +16,22 @@ from .processes import PickledFunction, RunFailed, Worker
 
 __all__ = ["LocalPool", "Outcome"]
 
-TRIES = 3
+MAX_ATTEMPTS = 3
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
-"""Result and an empty reason, or None and the reason of a failure: what functions return that are mapped."""
+"""Result and an empty reason, or None and the reason of a failure; mapped functions return this."""
 
 
 class LocalPool:
-    """Processes of this machine that survive what is run in them.
+    """Pool of processes of this machine.
 
-    They start with the first `map`, and end with `close`, with this object or with this process, even if that is
-    killed. A process that dies is replaced and its item tried again, the other items are not touched. Linear algebra
-    and numba use one thread in each, unless the environment (OMP_NUM_THREADS and the like) says otherwise.
+    The processes start with the first `map`. They end with `close`, when this object is garbage-collected, or when this
+    process exits, even if it is killed. A process that dies is replaced and its item run again; the other items are not
+    affected. Linear algebra and numba use one thread per process, unless environment variables such as
+    OMP_NUM_THREADS say otherwise.
 
-    It can be shared: by several likelihoods, and as ``pool=`` of samplers.
+    A pool can be shared by several likelihoods, and can be the ``pool=`` of samplers.
 
     Parameters
     ----------
@@ -40,7 +41,7 @@ class LocalPool:
     Raises
     ------
     ValueError
-        If the number is not a positive whole number.
+        If `workers` is not a positive whole number.
     """
 
     other_processes = True
@@ -73,33 +74,33 @@ class LocalPool:
 
     @property
     def n_workers(self) -> int:
-        """How many items run at once."""
+        """Number of items that run at once."""
         return self.workers
 
     def close(self) -> None:
-        """End the processes; the next `map` would start others."""
+        """End the processes; another `map` starts new ones."""
         with self._lock:
             while self._free:
                 self._free.pop().kill()
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """Results of `function` for every item, in their order.
+        """Results of a function for every item, in their order.
 
         An item whose process died three times gets the `Outcome` ``(None, reason)``.
 
         Raises
         ------
         ValueError
-            If the function or an item cannot be sent to the processes, or not be loaded there.
+            If the function or an item cannot be sent to the processes, or the function cannot be loaded there.
         RuntimeError
-            If processes die, three times, before they were given an item.
+            If three processes die before they are given an item.
         Exception
-            The first that `function` raises; nothing further is started then.
+            The first exception that `function` raises; no further items are started.
         """
-        shipment, items = PickledFunction.of(function), list(items)
+        pickled, items = PickledFunction.of(function), list(items)
         results: list[Any] = [None] * len(items)
         waiting, deaths = deque(range(len(items))), Counter()
-        running: dict[Worker, int | None] = {}  # item of each worker, None while it loads the function
+        running: dict[Worker, int | None] = {}  # index of each worker's item, None while it loads the function
         with self._lock:
             try:
                 while waiting or running:
@@ -108,10 +109,10 @@ class LocalPool:
                     ):
                         worker = self._take()
                         running[worker] = None
-                        if worker.key == shipment.key:
+                        if worker.key == pickled.key:
                             self._next(worker, running, waiting, items)
                         else:
-                            worker.load(shipment)
+                            worker.load(pickled)
                     wait([worker.connection for worker in running], timeout=1.0)
                     for worker, index in list(running.items()):
                         try:
@@ -136,7 +137,7 @@ class LocalPool:
         return results
 
     def _take(self) -> Worker:
-        """A process that waits, or a new one."""
+        """An idle process, or a new one."""
         while self._free:
             worker = self._free.pop()
             if worker.alive:
@@ -144,7 +145,7 @@ class LocalPool:
         return Worker(self._environment)
 
     def _next(self, worker: Worker, running: dict, waiting: deque, items: list) -> None:
-        """Give a worker that has loaded the function its next item, or let it rest."""
+        """Send the next item to a worker that has loaded the function, or make it idle."""
         if waiting:
             running[worker] = index = waiting.popleft()
             worker.submit(items[index])
@@ -154,11 +155,12 @@ class LocalPool:
 
     @staticmethod
     def _died(index: int | None, reason: str, deaths: Counter, waiting: deque, results: list) -> None:
+        """Count the death of a worker: put its item first in the queue, or give it up."""
         deaths[index] += 1
         if index is None:
-            if deaths[index] == TRIES:
-                raise RuntimeError(f"{reason} while it was loading the model; what it wrote to stderr tells more")
-        elif deaths[index] == TRIES:
+            if deaths[index] == MAX_ATTEMPTS:
+                raise RuntimeError(f"{reason} while loading the model; see its output on stderr")
+        elif deaths[index] == MAX_ATTEMPTS:
             results[index] = None, reason
         else:
             waiting.appendleft(index)

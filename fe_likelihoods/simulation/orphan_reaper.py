@@ -1,16 +1,16 @@
-"""No process, and no temporary folder, outlives those who need it.
+"""Kills processes and removes temporary folders whose owner has died.
 
-A process that is killed by -9 cannot clean up, and what it had started goes on for ever. So every process that starts
-others keeps one minder beside it: a small interpreter that runs this file, is told each process group that is started
-and each that has ended, and kills what is left when its pipe closes, whatever the reason. With temporary folders it is
-the same. A thread inside the workers could do so only as long as their simulation lets other threads run, which
-compiled code often does not.
+A process that is killed with SIGKILL cannot clean up, and the processes it had started would run on. Therefore every
+process that starts others keeps one reaper: a small interpreter that runs this file. The reaper receives a message for
+each process group that is started or has ended. When its pipe closes, for whatever reason, it kills the groups that are
+left. Temporary folders are handled in the same way. A thread inside the workers would not be enough, because it runs
+only while the simulation lets other threads run, which compiled code often does not.
 
-What a group has started is found by two marks: its process group, which children inherit, and a variable of the
-environment with a random name, which also those inherit that open a session of their own (a program that puts itself
-into the background). The second needs ``/proc``; on other systems such programs are not found.
+The descendants of a process are found by two marks: its process group, which children inherit, and an environment
+variable with a random name, which is also inherited by children in a session of their own (such as a program that moves
+to the background). The second mark needs ``/proc``; on other systems such programs are not found.
 
-This file imports the standard library only, so that it can be run alone and starts in no time.
+This file imports the standard library only, so that it can be run alone and starts quickly.
 """
 
 import json
@@ -25,12 +25,12 @@ __all__ = ["kill_tree", "main"]
 
 
 def kill_tree(group: int, mark: str) -> None:
-    """Kill a process group and all processes whose environment has the variable `mark`, this process excepted.
+    """Kill a process group and all other processes whose environment has a variable, except the calling process.
 
     Parameters
     ----------
     group : int
-        Process group, whose leader must not have been waited for (its number could be another's by now).
+        Process group. Its leader must not have been waited for, because its id could have been reused.
     mark : str
         Name of the variable; empty for the group alone.
     """
@@ -39,7 +39,7 @@ def kill_tree(group: int, mark: str) -> None:
     if not mark or not os.path.isdir("/proc/self"):
         return
     wanted = mark.encode() + b"="
-    for _ in range(100):  # one of them may start another while the list is read, and dying takes a moment
+    for _ in range(100):  # a process may start another while the list is read, and dying takes a moment
         found = False
         for name in filter(str.isdigit, os.listdir("/proc")):
             if int(name) == os.getpid():
@@ -47,7 +47,7 @@ def kill_tree(group: int, mark: str) -> None:
             with suppress(OSError):
                 with open(f"/proc/{name}/environ", "rb") as file:
                     environment = file.read()
-                # the environment of what is dead is empty
+                # the environment of a dead process is empty
                 if environment.startswith(wanted) or b"\0" + wanted in environment:
                     os.kill(int(name), signal.SIGKILL)
                     found = True
@@ -57,9 +57,10 @@ def kill_tree(group: int, mark: str) -> None:
 
 
 def main() -> None:
-    """Read lines of JSON until the pipe closes, then kill and remove what is left.
+    """Read messages until the pipe closes, then kill the groups and remove the folders that are left.
 
-    ``["group", number, mark]`` and ``["folder", path]`` say what there is, ``["gone", number or path]`` what is not.
+    A message is a line of JSON: ``["group", id, mark]`` or ``["folder", path]`` for a new one, ``["gone", id or path]``
+    for one that has ended.
     """
     groups: dict[int, str] = {}
     folders: set[str] = set()

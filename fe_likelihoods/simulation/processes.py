@@ -1,11 +1,11 @@
-"""Processes for simulations, which may hang, crash or eat their memory.
+"""Processes for simulations, which may hang, crash or use too much memory.
 
-A `Started` process is killed with all that it has started, and does not outlive the one that started it (see
-`fe_likelihoods.simulation.orphan_reaper`). A `Worker` is such a process, an interpreter that is sent a function once and then one item
-after the other.
+A `ManagedProcess` is killed together with everything it has started, and does not outlive the process that started it
+(see `fe_likelihoods.simulation.orphan_reaper`). A `Worker` is a managed Python interpreter that is sent a function once
+and then items one by one.
 
-Workers are started by `subprocess`, not by `multiprocessing`: they have to work inside the workers of any pool, many
-of which may not have children there. Linux and macOS.
+Workers are started with `subprocess`, not with `multiprocessing`, because they must also work inside the workers of any
+pool, many of which may not start `multiprocessing` processes. Linux and macOS.
 """
 
 import json
@@ -32,13 +32,13 @@ from typing import Any, NamedTuple
 from . import orphan_reaper
 
 __all__ = [
-    "Reply",
-    "RunFailed",
+    "ManagedProcess",
     "PickledFunction",
-    "Started",
+    "RunFailed",
     "TemporaryFolder",
     "Worker",
-    "ending",
+    "WorkerReply",
+    "describe_exit",
     "last_lines",
     "serve",
 ]
@@ -48,12 +48,20 @@ _BOOT = (
     "from fe_likelihoods.simulation.processes import serve; serve(int(sys.argv[2]), int(sys.argv[3]))"
 )
 _MARK = "FE_LIKELIHOODS_RUN_"
-_SCRIPTS = ("__main__", "__mp_main__")  # where a script is itself, and where it was read again in a worker
-_reading = False
+_SCRIPTS = ("__main__", "__mp_main__")  # names of the user's script as it runs, and as a worker imports it
+_importing_script = False
 
 
 class RunFailed(RuntimeError):
-    """A run in a process of its own did not end well, for a reason in words (attributes `reason` and `seconds`)."""
+    """A run in another process failed.
+
+    Attributes
+    ----------
+    reason : str
+        Why it failed, in words.
+    seconds : float or None
+        Duration of the run [s], if known.
+    """
 
     def __init__(self, reason: str, seconds: float | None = None) -> None:
         super().__init__(reason, seconds)
@@ -61,19 +69,20 @@ class RunFailed(RuntimeError):
         self.seconds = seconds
 
 
-class _Minder:
-    """The minder of this process."""
+class _Reaper:
+    """The orphan reaper of this process, started when it is first needed."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._process: subprocess.Popen | None = None
         self._owner = 0
 
-    def tell(self, *message: Any) -> None:
+    def send(self, *message: Any) -> None:
+        """Send a message of `orphan_reaper.main`."""
         with self._lock:
             if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
                 command = [sys.executable, "-I", "-S", orphan_reaper.__file__]
-                # without the marks: whoever kills this process by its mark must leave its minder to do its work
+                # without the marks: killing this process by its mark must not kill its reaper, which then cleans up
                 variables = {name: value for name, value in os.environ.items() if not name.startswith(_MARK)}
                 self._process = subprocess.Popen(
                     command,
@@ -88,30 +97,33 @@ class _Minder:
                 self._process.stdin.write(json.dumps(message).encode() + b"\n")
 
 
-_MINDER = _Minder()
+_REAPER = _Reaper()
 
 
-class Started:
-    """A process in a session of its own, that is killed with all that it started: by `kill`, with this object, with us.
+class ManagedProcess:
+    """A process in its own session, with everything it starts.
+
+    It is killed with its descendants by `kill`, when this object is garbage-collected, or when this process exits.
 
     Parameters
     ----------
     command : list of str
-        No shell is involved.
+        Program and arguments; no shell is used.
     environment : mapping, optional
-        Variables added to this process's own.
-    options : of `subprocess.Popen`
+        Environment variables in addition to those of this process.
+    **options
+        Passed to `subprocess.Popen`.
     """
 
     def __init__(self, command: list[str], environment: Mapping[str, str] | None = None, **options: Any) -> None:
         self.mark = f"{_MARK}{uuid.uuid4().hex}"
         variables = os.environ | dict(environment or {}) | {self.mark: "1"}
         self.process = subprocess.Popen(command, env=variables, start_new_session=True, **options)
-        _MINDER.tell("group", self.process.pid, self.mark)
+        _REAPER.send("group", self.process.pid, self.mark)
         self._kill = weakref.finalize(self, _kill, self.process, self.mark, os.getpid())
 
     def ended(self) -> bool:
-        """Whether the process has ended by itself; it is not waited for, so that its number stays its own."""
+        """Whether the process has exited; it is not waited for, so that its process id is not reused."""
         if self.process.returncode is not None:
             return True
         if not hasattr(os, "waitid"):  # macOS before Python 3.13
@@ -121,9 +133,17 @@ class Started:
         return True
 
     def kill(self, everywhere: bool = True) -> int:
-        """Kill what is left of it and of what it started, also outside its process group if `everywhere` is true.
+        """Kill the process and its descendants.
 
-        The exit code as in `subprocess`.
+        Parameters
+        ----------
+        everywhere : bool
+            Whether descendants outside its process group are killed as well.
+
+        Returns
+        -------
+        int
+            Exit code, as in `subprocess`.
         """
         if not everywhere and self._kill.detach():
             _kill(self.process, "", os.getpid())
@@ -132,16 +152,20 @@ class Started:
 
 
 def _kill(process: subprocess.Popen, mark: str, owner: int) -> None:
-    if owner != os.getpid():  # a copy of this object in a forked process
+    """Kill a process with its descendants, unless the calling process has only a forked copy of its object."""
+    if owner != os.getpid():
         return
     if process.returncode is None or not hasattr(os, "waitid"):
         orphan_reaper.kill_tree(process.pid, mark)
         process.wait()
-    _MINDER.tell("gone", process.pid)
+    _REAPER.send("gone", process.pid)
 
 
 class TemporaryFolder:
-    """A temporary folder, removed at the end of a with statement, with this object, or after this process was killed.
+    """Temporary folder.
+
+    It is removed at the end of a with statement, when this object is garbage-collected, or after this process was
+    killed.
 
     Attributes
     ----------
@@ -150,7 +174,7 @@ class TemporaryFolder:
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="fe_likelihoods_"))
-        _MINDER.tell("folder", str(self.path))
+        _REAPER.send("folder", str(self.path))
         self._remove = weakref.finalize(self, _remove, str(self.path), os.getpid())
 
     def __enter__(self) -> Path:
@@ -163,73 +187,88 @@ class TemporaryFolder:
 def _remove(folder: str, owner: int) -> None:
     if owner == os.getpid():
         shutil.rmtree(folder, ignore_errors=True)
-        _MINDER.tell("gone", folder)
+        _REAPER.send("gone", folder)
 
 
-def ending(exit_code: int, who: str) -> str:
-    """How a process ended, in words, such as "the worker process died (signal 11)"."""
+def describe_exit(exit_code: int, who: str) -> str:
+    """Description of an exit code, such as "the worker process died (signal 11)"."""
     return f"{who} died (signal {-exit_code})" if exit_code < 0 else f"{who} ended with exit code {exit_code}"
 
 
 class PickledFunction(NamedTuple):
-    """A function on its way to workers: the pickled function, `payload`, and its digest, `key`."""
+    """A function as it is sent to workers.
+
+    Attributes
+    ----------
+    payload : bytes
+        The pickled function.
+    key : bytes
+        Digest of the payload.
+    """
 
     payload: bytes
     key: bytes
 
     @classmethod
     def of(cls, function: Any) -> "PickledFunction":
-        """Pickle a function; ValueError where that is not possible."""
+        """Pickle a function; ValueError if that is impossible."""
         try:
             payload = pickle.dumps(function, protocol=5)
         except Exception as error:
             raise ValueError(
                 f"{repr(function)[:200]} cannot be sent to another process: {type(error).__name__}: {error}. Define "
-                "functions and classes at the top level of a module, and keep open files, locks and connections out "
-                "of them"
+                "functions and classes at the top level of a module, without open files, locks and connections"
             ) from error
         return cls(payload, blake2b(payload, digest_size=16).digest())
 
     def script(self) -> str | None:
-        """The script in which parts of the function are defined, None if there are none; ValueError for a notebook."""
+        """Path of the user's script if parts of the function are defined there, else None; ValueError for a notebook."""
         if not any(name.encode() in self.payload for name in _SCRIPTS):
             return None
         if all(argument not in _SCRIPTS for _, argument, _ in pickletools.genops(self.payload)):
             return None
-        _refuse_while_reading()
+        _refuse_while_importing_script()
         path = getattr(sys.modules["__main__"], "__file__", None)
         if path is None or not Path(path).is_file():
             raise ValueError(
-                "what is defined in a notebook or at a prompt cannot be loaded in another process: put the function or "
-                "class into a file and import it"
+                "a function or class that is defined in a notebook or at a prompt cannot be loaded in another process: "
+                "put it into a file and import it"
             )
         return str(Path(path).resolve())
 
 
-class Reply(NamedTuple):
-    """What a worker answers: kind is "loaded", "unusable" (value: why), "done" or "raised" (value: the exception)."""
+class WorkerReply(NamedTuple):
+    """Reply of a worker.
+
+    Attributes
+    ----------
+    kind : {"loaded", "unusable", "done", "raised"}
+    value : object
+        None, the reason, the result, or the exception.
+    """
 
     kind: str
     value: Any
 
 
 class Worker:
-    """A process that runs a function for one item at a time.
+    """Process that runs a function for one item at a time.
 
-    Send a `PickledFunction`, receive "loaded"; send an item, receive "done" or "raised". Only one of them at a time.
+    Send a `PickledFunction` with `load` and receive "loaded" or "unusable"; send an item with `submit` and receive
+    "done" or "raised". Only one message may be unanswered.
 
     Parameters
     ----------
     environment : mapping, optional
-        Variables added to this process's own.
+        Environment variables in addition to those of this process.
     memory_limit : int
-        The most address space of the process [bytes], beyond which allocations in it fail; 0 for no limit.
+        Limit of the address space of the process [bytes], beyond which its allocations fail; 0 for no limit.
     output : open file, optional
-        Takes what is written to standard output and error; by default it goes where ours goes.
+        Receives standard output and standard error, which are otherwise those of this process.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
-        _refuse_while_reading()
+        _refuse_while_importing_script()
         self.connection, theirs = Pipe()
         with theirs:
             command = [
@@ -240,7 +279,7 @@ class Worker:
                 str(theirs.fileno()),
                 str(memory_limit),
             ]
-            self._started = Started(
+            self._process = ManagedProcess(
                 command,
                 environment,
                 pass_fds=(theirs.fileno(),),
@@ -253,18 +292,18 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
-        return self._started.process.pid
+        """Process id."""
+        return self._process.process.pid
 
     @property
     def alive(self) -> bool:
-        """Whether the process is there and belongs to this one."""
-        return self._owner == os.getpid() and not self._started.ended()
+        """Whether the process runs and is a child of this process (not of the one this was forked from)."""
+        return self._owner == os.getpid() and not self._process.ended()
 
-    def load(self, shipment: PickledFunction) -> None:
-        """Send the function that items are for; ValueError if it is defined where no other process can load it."""
-        self._send(("load", shipment.payload, shipment.script()))
-        self.key = shipment.key
+    def load(self, function: PickledFunction) -> None:
+        """Send the function to call; ValueError if it is defined where no other process can load it."""
+        self._send(("load", function.payload, function.script()))
+        self.key = function.key
 
     def submit(self, item: Any) -> None:
         """Send an item."""
@@ -272,42 +311,50 @@ class Worker:
 
     def _send(self, message: tuple) -> None:
         data = pickle.dumps(message, protocol=5)
-        with suppress(OSError):  # that it has died is found out by whoever waits for the answer
+        with suppress(OSError):  # `receive` reports that the process has died
             self.connection.send_bytes(data)
 
-    def receive(self) -> Reply | None:
-        """The answer, None if there is none yet; RunFailed if the process has died."""
+    def receive(self) -> WorkerReply | None:
+        """The reply, or None if there is none yet; RunFailed if the process has died."""
         try:
             if self.connection.poll():
-                return Reply(*pickle.loads(self.connection.recv_bytes()))
-            # a program that it has left behind may hold the connection open: look at the process itself
-            if not self._started.ended() or self.connection.poll():
+                return WorkerReply(*pickle.loads(self.connection.recv_bytes()))
+            # a program that the process started may hold the connection open: check the process itself
+            if not self._process.ended() or self.connection.poll():
                 return None
         except (EOFError, OSError):
             self.wait_briefly()
-        raise RunFailed(ending(self.kill(), "the worker process"))
+        raise RunFailed(describe_exit(self.kill(), "the worker process"))
 
     def wait_briefly(self) -> None:
-        """Give a process that has closed its connection the time to end by itself, so that its exit code is its own."""
+        """Wait for a process that has closed its connection to exit by itself, to get its own exit code."""
         give_up = time.monotonic() + 5.0
-        while not self._started.ended() and time.monotonic() < give_up:
+        while not self._process.ended() and time.monotonic() < give_up:
             time.sleep(0.001)
 
     def kill(self) -> int:
-        """End the process and all that it has started; its exit code."""
-        exit_code = self._started.kill()
+        """Kill the process and everything it has started; returns its exit code."""
+        exit_code = self._process.kill()
         self.connection.close()
         return exit_code
 
 
 def serve(fileno: int, memory_limit: int) -> None:
-    """What a worker process does: answer until the connection closes."""
+    """Main loop of a worker process: answer messages until the connection closes.
+
+    Parameters
+    ----------
+    fileno : int
+        File descriptor of the connection.
+    memory_limit : int
+        As for `Worker`.
+    """
     os.set_inheritable(fileno, False)
     if memory_limit:
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (memory_limit, memory_limit))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ours to end, not the terminal's
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
     function: Callable = _nothing
     with Connection(fileno) as connection:
         while True:
@@ -321,7 +368,7 @@ def serve(fileno: int, memory_limit: int) -> None:
             if kind == "load":
                 try:
                     if rest[0] is not None:
-                        _read_script(rest[0])
+                        _import_script(rest[0])
                     function = pickle.loads(content)
                     answer = _packed("loaded", None)
                 except Exception as error:
@@ -335,38 +382,41 @@ def serve(fileno: int, memory_limit: int) -> None:
 
 
 def _nothing(item: Any) -> None:
+    """The function of a worker before it is sent one."""
     raise RuntimeError("no function was sent")
 
 
-def _refuse_while_reading() -> None:
-    if _reading:
+def _refuse_while_importing_script() -> None:
+    """Raise RuntimeError if this process is a worker that imports the user's script."""
+    if _importing_script:
         raise RuntimeError(
-            "a worker process reads this script again to find what is defined in it, and must not start workers of its "
-            'own then: put what the script does under if __name__ == "__main__":'
+            "a worker process imports this script to find the functions and classes that are defined in it, and must "
+            'not start workers meanwhile: put the code that runs under if __name__ == "__main__":'
         )
 
 
-def _read_script(path: str) -> None:
-    """Make what is defined in the script that the other process runs known here under the same name."""
+def _import_script(path: str) -> None:
+    """Import the script that the parent runs, so that functions and classes defined in it can be unpickled."""
     import runpy
     import types
 
-    global _reading
-    _reading = True
+    global _importing_script
+    _importing_script = True
     try:
         module = types.ModuleType("__main__")
         module.__file__ = path
         module.__dict__.update(runpy.run_path(path, run_name="__mp_main__"))
         sys.modules["__main__"] = sys.modules["__mp_main__"] = module
     finally:
-        _reading = False
+        _importing_script = False
 
 
 def _packed(kind: str, value: Any) -> bytes:
+    """Pickled reply; a value that cannot be pickled becomes a RuntimeError with its message."""
     try:
         data = pickle.dumps((kind, value), protocol=5)
         if kind == "raised":
-            pickle.loads(data)  # exceptions with arguments of their own are often written and not read
+            pickle.loads(data)  # exceptions with constructors of their own can often be pickled but not unpickled
         return data
     except Exception as error:
         shown = value if kind == "raised" else error
@@ -374,7 +424,7 @@ def _packed(kind: str, value: Any) -> bytes:
 
 
 def last_lines(file: Any, most: int) -> str:
-    """The last lines of an open file that are not empty, at most 300 characters."""
+    """The last non-empty lines of an open file, at most `most` lines and 300 characters."""
     size = os.fstat(file.fileno()).st_size
     data = os.pread(file.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
     lines = [line.strip() for line in data.splitlines() if line.strip()]

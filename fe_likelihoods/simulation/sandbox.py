@@ -1,4 +1,4 @@
-"""A function that runs in a process of its own, within limits, and is called as if it ran here."""
+"""A function that runs in another process, with limits of time, memory and output."""
 
 import math
 import os
@@ -8,30 +8,30 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from .processes import PickledFunction, Reply, RunFailed, Worker, last_lines
+from .processes import PickledFunction, RunFailed, Worker, WorkerReply, last_lines
 
 __all__ = ["Sandbox"]
 
-_START_LIMIT = 120.0
-_LOOK = 0.1
+_START_LIMIT = 120.0  # [s] for starting a process and loading the function
+_POLL_INTERVAL = 0.1  # [s] between checks of the amount of output
 
 
 class Sandbox:
-    """A function that runs in a process of its own.
+    """Callable that runs a function in another process.
 
-    The process stays for the next call, and is replaced after one that did not end by itself. Threads that call at the
-    same time have a process each. What the function prints is not shown.
+    The process is kept for later calls, and replaced after a call that did not end by itself. Concurrent calls of
+    several threads use one process each. What the function prints is not shown.
 
     Parameters
     ----------
-    function : callable of one argument
-        It, its argument and its result must be picklable.
+    function : callable
+        Takes one argument. The function, its argument and its result must be picklable.
     time_limit : float, optional
-        The longest that a call may take [s], without the start of the process.
+        Largest duration of a call [s], without the start of the process.
     memory_limit : int
-        See `Worker`; 0 for no limit.
+        Limit of the address space of the process [bytes]; 0 for no limit.
     max_output : int
-        The most that one call may print [bytes].
+        Largest amount of output of one call [bytes].
 
     Raises
     ------
@@ -46,22 +46,22 @@ class Sandbox:
         self._function = function
         self._time_limit = math.inf if time_limit is None else time_limit
         self._memory_limit, self._max_output = memory_limit, max_output
-        self._shipment = PickledFunction.of(function)
-        self._shipment.script()  # refused here, not in the first call
+        self._pickled = PickledFunction.of(function)
+        self._pickled.script()  # raises here what would be raised in the first call
         self._free: list[tuple[Worker, Any]] = []
 
     def __reduce__(self) -> tuple:
         return type(self), self._settings
 
     def __call__(self, item: Any) -> Any:
-        """Result for one item.
+        """Result of the function for one item.
 
         Raises
         ------
         RunFailed
             If the process died, or was killed because it took too long or printed too much.
         Exception
-            What the function raises.
+            Any exception that the function raises.
         """
         worker, output = self._take()
         start = time.monotonic()
@@ -82,12 +82,12 @@ class Sandbox:
         return reply.value
 
     def close(self) -> None:
-        """End the processes that wait for calls."""
+        """End the idle processes."""
         while self._free:
             self._free.pop()[0].kill()
 
     def _take(self) -> tuple[Worker, Any]:
-        """A process that waits, or a new one."""
+        """An idle process that has loaded the function, or a new one, and the file with its output."""
         with suppress(IndexError):
             while True:
                 worker, output = self._free.pop()
@@ -96,21 +96,22 @@ class Sandbox:
         output = tempfile.TemporaryFile()
         worker = Worker(memory_limit=self._memory_limit, output=output)
         try:
-            worker.load(self._shipment)
+            worker.load(self._pickled)
             reply = self._wait(worker, output, _START_LIMIT)
         except BaseException:
             worker.kill()
             raise
         if reply.kind != "loaded":
             worker.kill()
-            raise ValueError(f"{self._function!r} cannot be loaded in a process of its own: {reply.value}")
+            raise ValueError(f"{self._function!r} cannot be loaded in another process: {reply.value}")
         return worker, output
 
-    def _wait(self, worker: Worker, output: Any, limit: float) -> Reply:
+    def _wait(self, worker: Worker, output: Any, limit: float) -> WorkerReply:
+        """Reply of a worker; RunFailed if it dies or exceeds a limit."""
         stop = time.monotonic() + limit
         while (left := stop - time.monotonic()) > 0.0:
             with suppress(OSError):
-                worker.connection.poll(min(left, _LOOK))
+                worker.connection.poll(min(left, _POLL_INTERVAL))
             try:
                 reply = worker.receive()
             except RunFailed as error:

@@ -1,4 +1,4 @@
-"""A batch of simulations on threads: compiled kernels hold no lock, and each run has its own memory."""
+"""Batches of simulations on threads: compiled kernels release the GIL, and each simulation has its own memory."""
 
 from __future__ import annotations
 
@@ -17,19 +17,23 @@ __all__ = ["map_threads"]
 def map_threads(
     run: Callable[[np.ndarray], np.ndarray], thetas: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, list[str]]:
-    """Results of many runs, on numba's number of threads.
+    """Results of many simulations, on as many threads as numba uses.
 
     Parameters
     ----------
     run : callable
-        Turns one row of `thetas` into an array of `shape`, or raises `SimulationFailed`.
+        Takes one row of `thetas` and returns an array of `shape`, or raises `SimulationFailed`.
     thetas : (n, n_parameters) float
+        Parameter sets.
     shape : tuple of int
+        Shape of one result.
 
     Returns
     -------
-    (n, *shape) float : NaN where a run failed.
-    list of str : reasons, empty where a run succeeded.
+    out : (n, *shape) float
+        NaN where a simulation failed.
+    reasons : list of str
+        Reasons of failures; empty where a simulation succeeded.
     """
     out = np.full((len(thetas), *shape), np.nan)
     reasons = [""] * len(thetas)
@@ -48,7 +52,7 @@ def map_threads(
     with ThreadPoolExecutor(n_threads) as threads:
         try:
             list(threads.map(one, range(len(thetas))))
-        except BaseException:  # Ctrl-C: do not wait for what has not begun
+        except BaseException:  # Ctrl-C: cancel the simulations that have not begun
             threads.shutdown(wait=False, cancel_futures=True)
             raise
     return out, reasons

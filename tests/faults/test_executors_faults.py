@@ -27,7 +27,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: ca
 
 def needs(module):
     missing = importlib.util.find_spec(module) is None
-    return pytest.mark.skipif(missing, reason=f"NO {module.upper()}: install it to test this engine")
+    return pytest.mark.skipif(missing, reason=f"NO {module.upper()}: install it to test this pool")
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +37,7 @@ def nothing_is_left():
     yield
     gc.collect()  # samplers and their states hold each other
     if Path("/proc").is_dir():
-        # the minder stays with this process, and the resource tracker of multiprocessing
+        # the orphan reaper stays with this process, and the resource tracker of multiprocessing
         left = [
             pid
             for pid in set(descendants(os.getpid())) - before
@@ -145,7 +145,7 @@ def test_dask_tries_again_and_gives_up_on_the_deadly_item_alone(tmp_path):
         np.testing.assert_array_equal(values[:3], expected)
         assert np.isneginf(values[3])
         assert np.isfinite(values[4:]).all()
-        assert posterior.report()["failure_reasons"] == {"the worker process died each time that dask tried": 1}
+        assert posterior.report()["failure_reasons"] == {"the worker process died in every attempt of dask": 1}
         # short runs travel in groups once their time is known: the one that kills is still told from its neighbours
         many = np.column_stack([theta(bad.FINE, 40), np.full(40, 0.5)])
         expected = posterior_of(Treacherous(), top=20.0)(many)
@@ -183,12 +183,12 @@ PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask"
 
 
 @needs_proc
-@pytest.mark.parametrize("engine", PARENTS)
-def test_nothing_outlives_a_parent_that_is_killed(engine, tmp_path, tmp_path_factory):
-    # a minder beside each process that starts others; the program and its child, which are two more
-    expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 4, "dask": WORKERS}.get(engine, 1 + WORKERS)
-    at_once = 1 if engine == "isolated" else WORKERS
-    command = [sys.executable, "-m", "tests.faults.pooled_run", engine, str(tmp_path)]
+@pytest.mark.parametrize("pool", PARENTS)
+def test_nothing_outlives_a_parent_that_is_killed(pool, tmp_path, tmp_path_factory):
+    # an orphan reaper for each process that starts others; the program and its child, which are two more
+    expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 4, "dask": WORKERS}.get(pool, 1 + WORKERS)
+    at_once = 1 if pool == "isolated" else WORKERS
+    command = [sys.executable, "-m", "tests.faults.pooled_run", pool, str(tmp_path)]
     place = tmp_path_factory.mktemp("place")
     environment = os.environ | {"TMPDIR": str(place)}
     with subprocess.Popen(

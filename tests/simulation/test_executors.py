@@ -1,4 +1,4 @@
-"""The rule for ``pool=``: every engine gives the same bits, the model travels once, bad input is refused early."""
+"""The rule for ``pool=``: every executor gives the same bits, the model travels once, bad input is refused early."""
 
 import multiprocessing
 import os
@@ -19,7 +19,7 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import executors
-from fe_likelihoods.simulation.executors import DaskEngine, LocalPool, PoolEngine, as_executor
+from fe_likelihoods.simulation.executors import DaskExecutor, LocalPool, PoolExecutor, as_executor
 from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
 from tests.faults import treacherous
 from tests.faults.treacherous import Absent, Large, Treacherous, Unpicklable, posterior_of
@@ -77,12 +77,12 @@ def test_same_bits_on_every_engine(make, oscillator, thetas, rng):
     expected = misfit_batch(oscillator, thetas, measured)
     assert [bool(reason) for reason in expected.reasons] == [row == 5 for row in range(23)]
     pool = make()
-    engine = as_executor(pool, oscillator)
+    executor = as_executor(pool, oscillator)
     for n in (23, 3, 1):
-        result = misfit_batch(oscillator, thetas[:n], measured, engine)
+        result = misfit_batch(oscillator, thetas[:n], measured, executor)
         np.testing.assert_array_equal(result.misfit, expected.misfit[:n])
         assert result.reasons == expected.reasons[:n]
-    responses = simulate_batch(oscillator, thetas, engine)
+    responses = simulate_batch(oscillator, thetas, executor)
     np.testing.assert_array_equal(responses.response, simulate_batch(oscillator, thetas).response)
     for end in ("terminate", "shutdown", "close"):
         if hasattr(pool, end):
@@ -99,8 +99,8 @@ def test_kind_of_engine():
         assert as_executor(as_executor(pool)) is pool
     assert as_executor(None) is None
     assert as_executor(3).workers == as_executor(np.int64(3)).workers == 3
-    assert type(as_executor(Client())) is DaskEngine
-    assert type(as_executor(Recorder())) is PoolEngine
+    assert type(as_executor(Client())) is DaskExecutor
+    assert type(as_executor(Recorder())) is PoolExecutor
 
 
 def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
@@ -127,12 +127,12 @@ def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
 
     monkeypatch.setattr(executors, "_settle", lambda: None)
     client = Client()
-    engine = as_executor(client)
+    executor = as_executor(client)
     items = list(range(64))
     for _ in range(2):
-        assert engine.map(lambda item: (item, ""), items) == [(item, "") for item in items]
-    assert engine.map(slow, items[:3]) == [(item, "") for item in items[:3]]
-    assert engine.map(slow, items[:12]) == [(item, "") for item in items[:12]]
+        assert executor.map(lambda item: (item, ""), items) == [(item, "") for item in items]
+    assert executor.map(slow, items[:3]) == [(item, "") for item in items[:3]]
+    assert executor.map(slow, items[:12]) == [(item, "") for item in items[:12]]
     assert client.tasks[0] == [1] * 64  # nothing is known yet
     assert client.tasks[1][0] == 16 and client.tasks[1][-1] == 1 and sum(client.tasks[1]) == 64
     assert len(client.tasks[1]) < 20
@@ -164,12 +164,12 @@ def _absent_file(path):
 def test_bytes_sent_with_each_item(forget, monkeypatch):
     model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
     recorder = Recorder()
-    engine = as_executor(recorder)
+    executor = as_executor(recorder)
     treacherous.LOADED.clear()
     if forget:  # as on another machine: there is no such folder, so the model travels beside the items
         monkeypatch.setattr(executors.Path, "read_bytes", _absent_file)
     for _ in range(2):
-        batch = simulate_batch(model, thetas, engine)
+        batch = simulate_batch(model, thetas, executor)
         assert batch.reasons == [""] * 20
     assert len(treacherous.LOADED) == 1
     large = [size for size in recorder.bytes if size > 2**20]
@@ -179,20 +179,20 @@ def test_bytes_sent_with_each_item(forget, monkeypatch):
 
 
 def test_few_functions_are_kept_in_a_worker():
-    engine = as_executor(Recorder())
+    executor = as_executor(Recorder())
     for ballast in range(20):
         model = Treacherous()
         model.ballast = ballast
-        simulate_batch(model, np.array([[0.1, 0.2]]), engine)
+        simulate_batch(model, np.array([[0.1, 0.2]]), executor)
     assert len(executors._functions) == executors._KNOWN_FUNCTIONS
 
 
 def test_temporary_files_go_with_the_engine():
-    engine = as_executor(Recorder())
-    simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), engine)
-    folder = engine._folder.path
+    executor = as_executor(Recorder())
+    simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), executor)
+    folder = executor._folder.path
     assert [file.stat().st_size > 0 for file in folder.iterdir()] == [True]
-    del engine
+    del executor
     assert not folder.exists()
 
 
