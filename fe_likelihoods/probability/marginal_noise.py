@@ -141,8 +141,8 @@ class MarginalNoise:
         good = (np.isfinite(misfit) & (misfit > 0.0)).all(axis=1)
         if not good.all():
             raise ValueError(
-                f"the noise can only be drawn where the misfit is finite and positive; in "
-                f"{(~good).sum()} of {len(good)} rows it is not, because the simulation failed or fits exactly: leave these rows out"
+                f"the noise can only be drawn where the misfit is finite and positive; in {(~good).sum()} of "
+                f"{len(good)} rows it is not, because the simulation failed or fits exactly: leave these rows out"
             )
         squares, counts, _ = self._sums(misfit, n_steps)
         uniform = Uniform(0.0, 1.0).rvs(squares.shape, rng)

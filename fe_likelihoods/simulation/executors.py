@@ -4,7 +4,7 @@ The rule for ``pool=``:
 
 * None: in this process.
 * a whole number: a `LocalPool` of that many processes.
-* an object with ``gather``, that is a client of dask.distributed: ``gather(map(function, groups of items, pure=False))``.
+* an object with ``gather`` (a client of dask.distributed): ``gather(map(function, groups of items, pure=False))``.
 * any other object with ``map``: ``list(pool.map(function, items))``. This covers the executors of concurrent.futures,
   loky and mpi4py.futures and the pools of multiprocessing and schwimmbad.
 
@@ -35,7 +35,7 @@ __all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 
 logger = logging.getLogger(__name__)
 
-_MAX_LOADED_FUNCTIONS = 8
+MAX_LOADED_FUNCTIONS = 8
 _DIED = "the worker process died in every attempt of dask"
 
 
@@ -149,7 +149,7 @@ class _FunctionReference:
         return _LoadedFunction, self._parts
 
 
-_functions: OrderedDict[bytes, Callable] = OrderedDict()
+loaded_functions: OrderedDict[bytes, Callable] = OrderedDict()
 _loading = threading.Lock()
 
 
@@ -165,7 +165,7 @@ class _LoadedFunction:
     def __call__(self, item: Any) -> Any:
         key, path, payload = self._parts
         with _loading:
-            function = _functions.get(key)
+            function = loaded_functions.get(key)
             if function is None:
                 try:
                     payload = payload or Path(path).read_bytes()
@@ -175,10 +175,10 @@ class _LoadedFunction:
                     function = pickle.loads(payload)
                 except Exception as error:
                     return _Unusable(f"{type(error).__name__}: {error}")
-                _functions[key] = function
-            _functions.move_to_end(key)
-            while len(_functions) > _MAX_LOADED_FUNCTIONS:
-                _functions.popitem(last=False)
+                loaded_functions[key] = function
+            loaded_functions.move_to_end(key)
+            while len(loaded_functions) > MAX_LOADED_FUNCTIONS:
+                loaded_functions.popitem(last=False)
         return function(item)
 
 
@@ -221,8 +221,8 @@ class PoolExecutor:
         for outcome in outcomes:
             if isinstance(outcome, _Unusable):
                 raise RuntimeError(
-                    f"a worker cannot load the model: {outcome.reason}. Define its classes and functions in modules that "
-                    "the workers can import"
+                    f"a worker cannot load the model: {outcome.reason}. Define its classes and functions in modules "
+                    "that the workers can import"
                 )
         return outcomes
 
@@ -312,13 +312,13 @@ class _Answer(NamedTuple):
 
 def _run_group(function: Callable, items: list) -> _Answer:
     """Run the items of a group one after the other; called in the worker."""
-    _wait_for_nanny()
+    wait_for_nanny()
     start = time.perf_counter()
     return _Answer([function(item) for item in items], time.perf_counter() - start)
 
 
 @cache
-def _wait_for_nanny() -> None:
+def wait_for_nanny() -> None:
     """Wait once per process, because dask's nanny does not replace a worker that dies before its start is reported.
 
     An item that kills every new worker at once would otherwise leave a cluster without workers, and the run would hang.

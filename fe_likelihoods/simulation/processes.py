@@ -222,7 +222,7 @@ class PickledFunction(NamedTuple):
         return cls(payload, blake2b(payload, digest_size=16).digest())
 
     def script(self) -> str | None:
-        """Path of the user's script if parts of the function are defined there, else None; ValueError for a notebook."""
+        """Path of the user's script if the function uses definitions in it, else None; ValueError for a notebook."""
         if not any(name.encode() in self.payload for name in _SCRIPTS):
             return None
         if all(argument not in _SCRIPTS for _, argument, _ in pickletools.genops(self.payload)):

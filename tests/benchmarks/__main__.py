@@ -4,7 +4,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from . import bridge, cache, column, cost, engines, growth, job, peers, samplers, startup, storage
+from . import bridge, cache, column, cost, executors, growth, job, peers, samplers, startup, storage
 from .comparison import compare
 from .rows import as_table, machine, write_json
 
@@ -18,7 +18,7 @@ BENCHMARKS = {
     "growth": growth.growth,
     "cache": cache.cache,
     "storage": storage.storage,
-    "engines": engines.engines,
+    "executors": executors.executors,
     "samplers": samplers.rows,
     "peers": peers.rows,
     "memory": job.memory,

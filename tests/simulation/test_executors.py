@@ -36,7 +36,7 @@ class Recorder:
     def map(self, function, items):
         for item in items:
             if self.forget:
-                executors._functions.clear()
+                executors.loaded_functions.clear()
             task = pickle.dumps((function, item))
             self.bytes.append(len(task))
             function, item = pickle.loads(task)
@@ -45,7 +45,7 @@ class Recorder:
 
 @pytest.fixture(autouse=True)
 def nothing_known():
-    executors._functions.clear()
+    executors.loaded_functions.clear()
 
 
 @pytest.fixture
@@ -125,7 +125,7 @@ def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
         time.sleep(0.35)
         return item, ""
 
-    monkeypatch.setattr(executors, "_settle", lambda: None)
+    monkeypatch.setattr(executors, "wait_for_nanny", lambda: None)
     client = Client()
     executor = as_executor(client)
     items = list(range(64))
@@ -184,7 +184,7 @@ def test_few_functions_are_kept_in_a_worker():
         model = Treacherous()
         model.ballast = ballast
         simulate_batch(model, np.array([[0.1, 0.2]]), executor)
-    assert len(executors._functions) == executors._KNOWN_FUNCTIONS
+    assert len(executors.loaded_functions) == executors.MAX_LOADED_FUNCTIONS
 
 
 def test_temporary_files_go_with_the_engine():
@@ -200,7 +200,9 @@ def test_temporary_files_go_with_the_engine():
     "make", [lambda: 2, lambda: ProcessPoolExecutor(1), lambda: LocalPool(1)], ids=["2", "executor", "pool"]
 )
 def test_model_that_cannot_be_pickled_is_refused_with_the_attribute(make):
-    with pytest.raises(ValueError, match=r"Unpicklable must go to other processes, which its attribute solver\.lock ="):
+    with pytest.raises(
+        ValueError, match=r"Unpicklable must be sent to other processes, which its attribute solver\.lock ="
+    ):
         posterior_of(Unpicklable(), pool=make())
 
 
@@ -288,7 +290,7 @@ def main():
         ('if __name__ == "__main__":\n    main()\n', "True True"),
         (
             "main()\n",
-            'must not start workers of its own then: put what the script does under if __name__ == "__main__"',
+            'must not start workers meanwhile: put the code that runs under if __name__ == "__main__"',
         ),
     ],
     ids=["guarded", "not guarded"],
@@ -306,7 +308,8 @@ def test_models_of_a_notebook_are_refused():
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
     assert (
-        "ValueError: with this pool the model must go to other processes. what is defined in a notebook" in run.stderr
+        "ValueError: with this pool the model must be sent to other processes. a function or class that is defined in a notebook"
+        in run.stderr
     )
 
 

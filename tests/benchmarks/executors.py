@@ -1,7 +1,7 @@
-"""What the engines behind ``pool=`` cost a run, and what they do when a worker or the parent is killed.
+"""Overhead of the executors of ``pool=`` per simulation, and their behaviour when a worker or the parent is killed.
 
-The model costs next to nothing, so what is measured is the way there and back. Each case has a process of its own,
-``python -m tests.benchmarks.engines WHAT ENGINE REPEATS``, which is killed if it hangs.
+The model takes almost no time, so the result is the overhead of sending and receiving. Each case runs in a separate
+process, ``python -m tests.benchmarks.executors WHAT POOL REPEATS``, which is killed if it hangs.
 """
 
 import importlib.util
@@ -20,13 +20,13 @@ from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation.executors import as_executor
 from fe_likelihoods.simulation.model import simulate_batch
-from fe_likelihoods.simulation.processes import Started
+from fe_likelihoods.simulation.processes import ManagedProcess
 from tests.faults.pooled_run import NAMES, POOLS, WORKERS, at_work
 from tests.faults.treacherous import CHANNELS, DT, KILLED, N_STEPS, DiesOnce, Treacherous, descendants, gone, line
 
 from .rows import Row
 
-__all__ = ["engines"]
+__all__ = ["executors"]
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = {"dask": "distributed", "mpi": "mpi4py", "loky": "joblib"}
@@ -34,27 +34,35 @@ ITEMS, LIMIT = 1000, 60.0
 THREADS = 64
 
 
-def engines(repeats: int) -> list[Row]:
-    """One row for each engine and question."""
+def executors(repeats: int) -> list[Row]:
+    """One row per pool and question."""
     rows = []
     for name in POOLS:
         if name in MODULES and importlib.util.find_spec(MODULES[name]) is None:
-            rows.append(Row("engine", name, None, "", f"not installed: {MODULES[name]}"))
+            rows.append(Row("executor", name, None, "", f"not installed: {MODULES[name]}"))
             continue
         answer = _answer("overhead", name, repeats)
         case = f"{name}, {WORKERS} workers"
-        rows.append(Row("engine: overhead a run", case, answer.get("microseconds"), "us", answer.get("told", "")))
+        rows.append(
+            Row("executor: overhead per simulation", case, answer.get("microseconds"), "us", answer.get("told", ""))
+        )
         answer = _answer("death", name, repeats)
-        rows.append(Row("engine: a worker is killed by -9", case, answer.get("seconds"), "s", answer["told"]))
-        rows.append(Row("engine: the parent is killed by -9", case, *_left_over(name)))
+        rows.append(Row("executor: a worker is killed (SIGKILL)", case, answer.get("seconds"), "s", answer["told"]))
+        rows.append(Row("executor: the parent is killed (SIGKILL)", case, *_left_over(name)))
     for name in ("isolated function", "program"):
         answer = _answer("overhead", name, repeats)
-        rows.append(Row("engine: overhead a run", f"{name}, no pool", answer.get("microseconds"), "us"))
+        rows.append(Row("executor: overhead per simulation", f"{name}, no pool", answer.get("microseconds"), "us"))
     if importlib.util.find_spec("distributed"):
         answer = _answer("cluster", "dask", repeats)
         case = f"dask, {THREADS} sleeping threads in {WORKERS} processes"
         rows.append(
-            Row("engine: overhead of a run of 1 s", case, answer.get("microseconds"), "us", answer.get("told", ""))
+            Row(
+                "executor: overhead of a simulation of 1 s",
+                case,
+                answer.get("microseconds"),
+                "us",
+                answer.get("told", ""),
+            )
         )
     return rows
 
@@ -72,10 +80,10 @@ ENVIRONMENT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": 
 
 
 def _answer(what: str, name: str, repeats: int) -> dict:
-    """What the process of one case prints last, or how it ended otherwise."""
+    """The last line of JSON that the process of one case prints, or how the process ended."""
     with tempfile.TemporaryFile("w+") as output:
-        command = _command("tests.benchmarks.engines", name, what, name, repeats)
-        process = Started(command, ENVIRONMENT, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+        command = _command("tests.benchmarks.executors", name, what, name, repeats)
+        process = ManagedProcess(command, ENVIRONMENT, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
         stop = time.monotonic() + LIMIT
         while not process.ended() and time.monotonic() < stop:
             time.sleep(0.05)
@@ -89,10 +97,10 @@ def _answer(what: str, name: str, repeats: int) -> dict:
 
 
 def _left_over(name: str) -> tuple[float | None, str, str]:
-    """Processes that are there ten seconds after the one that made the pool was killed."""
+    """Number of processes left ten seconds after the process with the pool was killed."""
     with tempfile.TemporaryDirectory() as folder:
         command = _command("tests.faults.pooled_run", name, name, folder)
-        parent = Started(command, ENVIRONMENT, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        parent = ManagedProcess(command, ENVIRONMENT, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             stop = time.monotonic() + LIMIT
             while len(at_work(Path(folder))) < WORKERS:
@@ -120,13 +128,13 @@ def _thetas() -> np.ndarray:
     return np.random.default_rng(0).uniform(0.0, 1.0, size=(ITEMS, 2))
 
 
-def _seconds(model, thetas: np.ndarray, engine, repeats: int) -> float:
-    """Median wall time a run, with workers that are there and know the model."""
-    simulate_batch(model, thetas[:50], engine)
+def _seconds(model, thetas: np.ndarray, executor, repeats: int) -> float:
+    """Median wall time per simulation, with workers that have started and loaded the model."""
+    simulate_batch(model, thetas[:50], executor)
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
-        batch = simulate_batch(model, thetas, engine)
+        batch = simulate_batch(model, thetas, executor)
         times.append((time.perf_counter() - start) / len(thetas))
         if any(batch.reasons):
             raise RuntimeError(f"a run failed: {next(filter(None, batch.reasons))}")
@@ -164,11 +172,11 @@ def _cluster() -> dict:
     from distributed import Client, LocalCluster
 
     cluster = LocalCluster(n_workers=WORKERS, threads_per_worker=THREADS // WORKERS, dashboard_address=None)
-    engine = as_executor(Client(cluster))
+    executor = as_executor(Client(cluster))
     thetas = _thetas()[: 4 * THREADS]
-    simulate_batch(Sleeper(), thetas[:THREADS], engine)
+    simulate_batch(Sleeper(), thetas[:THREADS], executor)
     start = time.perf_counter()
-    batch = simulate_batch(Sleeper(), thetas, engine)
+    batch = simulate_batch(Sleeper(), thetas, executor)
     seconds = time.perf_counter() - start
     if any(batch.reasons):
         return {"told": f"a run failed: {next(filter(None, batch.reasons))}"}
@@ -181,12 +189,12 @@ def _death(name: str) -> dict:
     """Two of twenty items kill their worker, the first time that they are tried."""
     thetas = _thetas()[:20]
     thetas[[4, 11], 0] += KILLED
-    engine = as_executor(POOLS[name]())
-    simulate_batch(Treacherous(), _thetas()[:10], engine)
+    executor = as_executor(POOLS[name]())
+    simulate_batch(Treacherous(), _thetas()[:10], executor)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         try:
-            batch = simulate_batch(DiesOnce(Path(folder)), thetas, engine)
+            batch = simulate_batch(DiesOnce(Path(folder)), thetas, executor)
         except Exception as error:
             return {"seconds": time.perf_counter() - start, "told": f"error: {type(error).__name__}"}
         seconds = time.perf_counter() - start
