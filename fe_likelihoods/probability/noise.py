@@ -122,8 +122,9 @@ class GaussianNoise:
 
     References
     ----------
-    .. [1] M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd (2022), "Bayesian nonlinear finite
-       element model updating of a full-scale bridge-column using sequential Monte Carlo".
+    .. [1] M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd, "Bayesian nonlinear finite element model
+       updating of a full-scale bridge-column using sequential Monte Carlo", in "Model Validation and Uncertainty
+       Quantification, Volume 3", Springer.
     """
 
     channels: tuple[Channel, ...]

@@ -1,7 +1,8 @@
-"""Simulations of a cache as an HDF5 file: to keep them beside a publication, or to take them to another machine.
+"""Export of the simulations of a cache to an HDF5 file, to archive them with a publication or to copy them.
 
-One data set a quantity, one entry a simulation, each with its CRC-32. The sums of squared residuals of all
-simulations stand behind one another in ``misfit``, ``n_channels`` of them each; reasons of failures likewise, as UTF-8.
+The file has one data set per quantity with one entry per simulation, and a CRC-32 per data set. The sums of squared
+residuals of all simulations are concatenated in ``misfit``, with ``n_channels`` numbers each, and the reasons of
+failures, as UTF-8, in ``reason``.
 """
 
 import os
@@ -30,9 +31,19 @@ Row = tuple[bytes, bytes, int, bytes, float]
 
 
 def write_rows(path: str | os.PathLike, pages: Iterable[list[Row]]) -> int:
-    """Write lists of (key, misfit, n_steps, reason, seconds), misfits and reasons as bytes; returns how many.
+    """Write rows to an HDF5 file. An existing file is replaced atomically, so it is never incomplete.
 
-    A file of that name is replaced at once, and never left half written.
+    Parameters
+    ----------
+    path : path
+        The HDF5 file.
+    pages : iterable of list of tuple
+        Rows (key, misfit, n_steps, reason, seconds), with misfit and reason as bytes.
+
+    Returns
+    -------
+    int
+        Number of rows.
 
     Raises
     ------
@@ -41,11 +52,11 @@ def write_rows(path: str | os.PathLike, pages: Iterable[list[Row]]) -> int:
     OSError
         If the file cannot be written.
     """
-    import h5py  # takes longer to start than the whole cache
+    import h5py  # takes longer to import than the rest of the cache
 
     path = Path(path)
     if not path.parent.is_dir():
-        raise ValueError(f"cannot write {path}: there is no folder {path.parent}; make it first")
+        raise ValueError(f"cannot write {path}: there is no folder {path.parent}; create it first")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     count, checksums = 0, dict.fromkeys(COLUMNS, 0)
     try:
@@ -72,12 +83,22 @@ def write_rows(path: str | os.PathLike, pages: Iterable[list[Row]]) -> int:
 
 
 def read_rows(path: str | os.PathLike) -> list[Row]:
-    """Rows that `write_rows` wrote.
+    """Rows of a file that `write_rows` wrote.
+
+    Parameters
+    ----------
+    path : path
+        The HDF5 file.
+
+    Returns
+    -------
+    list of tuple
+        As in `write_rows`.
 
     Raises
     ------
     ValueError
-        If the file is not there, is something else, of another version, or damaged.
+        If the file does not exist, is not such a file, has another version, or is damaged.
     """
     import h5py
 
@@ -87,14 +108,14 @@ def read_rows(path: str | os.PathLike) -> list[Row]:
             if schema != SCHEMA or version != SCHEMA_VERSION:
                 raise ValueError(
                     f"{path}: expected schema {SCHEMA!r} version {SCHEMA_VERSION}, got {schema!r} version {version}; "
-                    "give a file that SimulationCache.export_hdf5 wrote"
+                    "expected a file that SimulationCache.export_hdf5 wrote"
                 )
             columns = {name: np.asarray(file[name][()], dtype=kind) for name, kind in COLUMNS.items()}
             whole = all(zlib.crc32(values.tobytes()) == file[name].attrs["crc32"] for name, values in columns.items())
     except (OSError, KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{path}: not a complete export of a cache ({error}); make it or fetch it again") from error
+        raise ValueError(f"{path}: not a complete export of a cache ({error}); export or copy it again") from error
     if not whole:
-        raise ValueError(f"{path}: the contents do not match their checksums; make it or fetch it again")
+        raise ValueError(f"{path}: the contents do not match their checksums; export or copy it again")
     keys, misfits, reasons = (columns[name].tobytes() for name in ("key", "misfit", "reason"))
     ends = [8 * np.cumsum(columns["n_channels"]), np.cumsum(columns["reason_bytes"])]
     starts = [ends[0] - 8 * columns["n_channels"], ends[1] - columns["reason_bytes"]]
@@ -111,6 +132,7 @@ def read_rows(path: str | os.PathLike) -> list[Row]:
 
 
 def _columns(page: list[Row]) -> dict[str, np.ndarray]:
+    """Values of the data sets for a list of rows."""
     keys, misfits, n_steps, reasons, seconds = zip(*page, strict=True) if page else ((),) * 5
     columns = {
         "key": np.frombuffer(b"".join(keys), dtype="u1"),

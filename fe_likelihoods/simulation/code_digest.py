@@ -1,10 +1,11 @@
-"""What a Python function computes, as a digest that is the same in every process.
+"""Digest of what a Python function computes, the same in every process.
 
-A result that is kept belongs to the code that made it. The digest goes through all that a function uses: its bytecode
-and constants, its defaults, the values it closes over, the global names it mentions, what it imports as it runs, and in
-the same way the functions and classes that it calls, in its own package and in any file that is not installed (beside
-it, say). Of the standard library and of installed packages the name and the version enter, of this library its sources.
-What cannot be told apart by its value (an open file, a handle of compiled code) is refused, and the user asked for a
+A stored result belongs to the code that made it. The digest covers everything a function uses: its bytecode and
+constants, its defaults, the values it closes over, the global names it uses, the modules it imports when it runs, and
+recursively the functions and classes that it calls, in its own package and in any file that is not installed (such as a
+file in the same folder). The standard library and installed packages are represented by name and version, modules of
+this library by their source files (see `fe_likelihoods.simulation.source_digest`). For objects that cannot be
+identified by their value (an open file, a handle of compiled code) a ValueError is raised, and the user is asked for a
 version.
 """
 
@@ -34,21 +35,27 @@ _LIBRARY = __name__.split(".")[0]
 
 
 def code_digest(function: Callable) -> str:
-    """Hex digest of a function and of all that it uses.
+    """Digest of a function and of everything it uses.
 
     Parameters
     ----------
     function : callable
 
+    Returns
+    -------
+    str
+        Hexadecimal, 128 bits.
+
     Raises
     ------
     ValueError
-        If it uses something of which no stable digest can be made; the message says what.
+        If it uses an object that has no stable digest; the message names it.
     """
     return _Digest(_package(function)).of(function).hex()
 
 
 def _package(thing: Any) -> str:
+    """Top-level package in which a function or the class of a callable object is defined."""
     while isinstance(thing, functools.partial):
         thing = thing.func
     module = getattr(thing, "__module__", None) or type(thing).__module__
@@ -56,12 +63,21 @@ def _package(thing: Any) -> str:
 
 
 class _Digest:
+    """Digests of objects, relative to the package of one function.
+
+    Parameters
+    ----------
+    package : str
+        Package whose functions and classes are covered by their code instead of a version.
+    """
+
     def __init__(self, package: str) -> None:
         self.package = package
-        self.open: dict[int, int] = {}  # what is being digested, and how deep: where it is met again, a circle closes
-        self.done: dict[int, tuple[bytes, Any]] = {}  # with the thing, so that its id is not used again
+        self.open: dict[int, int] = {}  # ids of the objects in progress and their depths, to detect cycles
+        self.done: dict[int, tuple[bytes, Any]] = {}  # with the object, so that its id is not reused
 
     def of(self, thing: Any) -> bytes:
+        """Digest of an object."""
         key = id(thing)
         if key in self.done:
             return self.done[key][0]
@@ -84,6 +100,7 @@ class _Digest:
         return digest.digest()
 
     def _parts(self, thing: Any) -> list[str | bytes]:
+        """Parts of which the digest of an object is made, by its type."""
         kind = type(thing)
         if thing is None or kind in (bool, int, float, complex, str, bytes, type(Ellipsis)):
             return [kind.__name__, repr(thing)]
@@ -93,7 +110,7 @@ class _Digest:
         if kind in (tuple, list):
             return [kind.__name__, *map(self.of, thing)]
         if kind in (set, frozenset):
-            # each by itself, so that the order does not matter
+            # a separate digest for each item, so that the order does not matter
             return [kind.__name__, *sorted(_Digest(self.package).of(item) for item in thing)]
         if isinstance(thing, dict | types.MappingProxyType):
             return ["dict", *(self.of(part) for item in thing.items() for part in item)]
@@ -134,16 +151,16 @@ class _Digest:
         names = sorted(set(_names(function.__code__)))
         for name in names:
             if name in function.__globals__:
-                parts += self._told(name, function.__globals__[name], names, function)
+                parts += self._named(name, function.__globals__[name], names, function)
         for name in sorted(set(_imports(function))):
             if self._known_by_version(name):
                 parts += [name, _version(name)]
             else:
-                parts += self._told(name, importlib.import_module(name), names, function)
+                parts += self._named(name, importlib.import_module(name), names, function)
         return parts
 
-    def _told(self, name: str, value: Any, names: list[str], function: types.FunctionType) -> list[str | bytes]:
-        """Digest of a name that a function uses, and of what it may use of it behind a dot, if it is a module."""
+    def _named(self, name: str, value: Any, names: list[str], function: types.FunctionType) -> list[str | bytes]:
+        """Digest of the value of a name in a function, and of the attributes that it uses if the value is a module."""
         try:
             parts = [name, self.of(value)]
         except ValueError as error:
@@ -152,7 +169,7 @@ class _Digest:
             members = [member for member in names if member in vars(value) and vars(value)[member] is not value]
             for member in members:
                 inner = [other for other in names if other != member]
-                parts += self._told(member, vars(value)[member], inner, function)
+                parts += self._named(member, vars(value)[member], inner, function)
         return parts
 
     def _code(self, code: types.CodeType) -> list[str | bytes]:
@@ -176,7 +193,7 @@ class _Digest:
     def _object(self, thing: Any) -> list[str | bytes]:
         fingerprint = getattr(thing, "fingerprint", None)
         if isinstance(fingerprint, str):
-            # a fingerprint describes values; what the methods of the library's classes do with them is in the sources
+            # a fingerprint describes values; the source files determine what the class does with them
             return ["fingerprint", fingerprint, class_digest(type(thing))]
         if isinstance(thing, enum.Enum):
             state = {thing.name: thing.value}
@@ -199,14 +216,14 @@ class _Digest:
         return ["object", self.of(type(thing)), *(self.of(part) for item in state.items() for part in item)]
 
     def _known_by_version(self, module: str) -> bool:
-        """Whether a module is told by name and version: neither the function's package nor a file of the user's own."""
+        """Whether a module is represented by a version: neither in the function's package nor a file of the user."""
         top = module.split(".")[0]
         return top != self.package and (top == _LIBRARY or not _is_own(top))
 
 
 @functools.cache
 def _is_own(top: str) -> bool:
-    """Whether a module is a file neither installed nor of the standard library: it changes without a version."""
+    """Whether a module is neither installed nor in the standard library, so that it changes without a version."""
     if top in sys.stdlib_module_names:
         return False
     module = sys.modules.get(top)
@@ -220,13 +237,13 @@ def _is_own(top: str) -> bool:
 
 
 def _version(module: str) -> str:
-    """What stands for the code of a module: of this library a digest of sources, otherwise the package's version."""
+    """Digest of the source files for a module of this library, otherwise the version of the package."""
     return source_digest(module) if module.split(".")[0] == _LIBRARY else _package_version(module)
 
 
 @functools.cache
 def _package_version(module: str) -> str:
-    """Version of a package, or of a compiled module without a version a digest of its file; otherwise empty."""
+    """Version of a package; for a compiled module without a version a digest of its file; otherwise empty."""
     top = module.split(".")[0]
     try:
         return importlib.metadata.version(top)
@@ -239,7 +256,7 @@ def _package_version(module: str) -> str:
 
 
 def _imports(function: types.FunctionType) -> Iterator[str]:
-    """Full names of the modules that a function imports as it runs."""
+    """Full names of the modules that a function imports when it runs."""
     codes = [function.__code__]
     while codes:
         code = codes.pop()
@@ -252,18 +269,20 @@ def _imports(function: types.FunctionType) -> Iterator[str]:
                 try:
                     yield importlib.util.resolve_name(name, package)
                 except ImportError:
-                    raise ValueError(f"{function.__qualname__} imports {name}, but stands in no package") from None
+                    raise ValueError(f"{function.__qualname__} imports {name}, but is not in a package") from None
             before.append(step.argval)
 
 
 def _contents(cell: types.CellType) -> Any:
+    """Value of a closure variable, None if it is not set yet."""
     try:
         return cell.cell_contents
-    except ValueError:  # not yet filled
+    except ValueError:
         return None
 
 
 def _names(code: types.CodeType) -> Iterator[str]:
+    """Names of globals and attributes in a code object and the functions defined in it."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):

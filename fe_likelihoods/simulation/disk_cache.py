@@ -1,16 +1,16 @@
-"""Simulations on disk, so that none is ever repeated or lost: not by another run, sampler, process or program.
+"""Cache of simulations on disk, shared by runs, samplers, processes and programs.
 
-What is kept of a simulation are the sums of squared residuals, one number a channel. They do not depend on the noise
-nor on the prior, so one simulation serves every noise level, every rung of a ladder and every sampler. Its key is a
-digest of all that the sums do depend on: fingerprint of model, record and measurements, sources of the models, and the
-structural parameters bit for bit. Whatever changes has another key; nothing has to be declared invalid. What is not
-asked for any more is evicted in the end, the oldest first.
+The sums of squared residuals of a simulation are stored, one number per channel. They depend neither on the noise nor
+on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
+simulation is a digest of everything its sums depend on: fingerprints of model, record and measurements, the source
+files of the model, and the structural parameters to the last bit. After any change the key is another one, so stored
+results never have to be invalidated. Results that are no longer used are evicted in the end, oldest first.
 
-Promise no more than exact hits: they come from changes of the noise alone, resumed runs, repeated runs, duplicates,
-and comparisons from the same start.
+Hits are exact. They occur when only the noise parameters change, in resumed and repeated runs, for duplicates, and when
+samplers are compared from the same start.
 
-A run never fails because of its cache. A row that does not match its checksum is simulated again, a damaged file is set
-aside, and while nothing can be written the rows wait in memory.
+A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
+aside, and while the file cannot be written, rows wait in memory.
 """
 
 import logging
@@ -25,18 +25,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .cache_exchange import read_rows, write_rows
-from .cache_rows import COLUMNS, checksum, is_whole, packed, simulation_keys
+from .cache_rows import COLUMNS, checksum, is_undamaged, pack_row, simulation_keys
 from .model import Model
 from .source_digest import simulation_fingerprint
 from .sqlite_file import CacheFile, is_damage
 
-__all__ = ["CacheInfo", "Remembered", "SimulationCache"]
+__all__ = ["CacheInfo", "CachedRows", "SimulationCache"]
 
 logger = logging.getLogger(__name__)
 
-PER_QUERY = 500  # keys asked for by one SELECT
-RETRY_SECONDS = 60.0  # after a write that failed
-MOST_WAITING = 100_000  # rows kept for when writing works again
+KEYS_PER_QUERY = 500  # keys in one SELECT
+RETRY_SECONDS = 60.0  # wait after a failed access to the file
+MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 
 _STORE = (
     "INSERT INTO simulations (key, misfit, n_steps, reason, seconds, crc) VALUES (?, ?, ?, ?, ?, ?) "
@@ -48,14 +48,17 @@ _STORE_RESPONSE = (
 )
 
 
-class Remembered(NamedTuple):
-    """What a cache knows of n simulations.
+class CachedRows(NamedTuple):
+    """Result of looking up n simulations.
 
     Attributes
     ----------
-    misfit : (n, n_channels) float — NaN where the simulation failed, and where nothing is known
-    reasons : n strings, empty where the simulation succeeded or nothing is known
+    misfit : (n, n_channels) float
+        Sums of squared residuals [SI unit of the channel, squared]; NaN where the simulation failed or is not stored.
+    reasons : list of n str
+        Reasons of failures; empty where the simulation succeeded or is not stored.
     known : (n,) bool
+        Whether the simulation is stored.
     """
 
     misfit: np.ndarray
@@ -66,12 +69,20 @@ class Remembered(NamedTuple):
 class CacheInfo(NamedTuple):
     """State of a cache.
 
-    path : where it is
-    simulations, failures : how many are kept, and how many of them had failed
-    responses, response_bytes : how many full responses are kept, and their size
-    seconds : wall time that was spent on what is kept [s]
-    file_bytes : size of the file, without the log of what was written last
-    hits, misses, evictions, damaged : rows, by this object in this process
+    Attributes
+    ----------
+    path : Path
+        The file.
+    simulations, failures : int
+        Number of stored simulations, and of failed ones among them.
+    responses, response_bytes : int
+        Number of stored responses, and their size [bytes].
+    seconds : float
+        Wall time of the stored simulations [s].
+    file_bytes : int
+        Size of the file without its write-ahead log [bytes].
+    hits, misses, evictions, damaged : int
+        Rows found, not found, evicted and found damaged by this object in this process.
     """
 
     path: Path
@@ -88,45 +99,45 @@ class CacheInfo(NamedTuple):
 
 
 class SimulationCache:
-    """Sums of squared residuals of simulations, in one SQLite file.
+    """Cache of the sums of squared residuals of simulations, in one SQLite file.
 
-    Any number of threads, processes and programs may use a file at once, each process through a connection of its own.
-    The object may be forked and pickled: another process opens the file by its path. The file must lie on a disk of the
-    machine, not on a network file system, where SQLite's shared memory does not work; on a cluster let the parent own
-    the cache (``FELikelihood(..., pool=...)``), its workers return sums.
+    Any number of threads, processes and programs may use a file at the same time, each process through its own
+    connection. The object may be forked and pickled: another process opens the file by its path. The file must be on a
+    local disk, because SQLite's shared memory does not work on network file systems. On a cluster let the parent
+    process own the cache (``FELikelihood(..., pool=...)``); its workers return sums.
 
-    What is stored survives the death of the process, by ``kill -9`` too; a power failure may take the last seconds.
+    Stored rows survive the death of the process, also by ``kill -9``; a power failure may lose the last seconds.
 
     Parameters
     ----------
     path : path
-        The file; made if it is not there. One that may only be read is read from, with a warning.
+        The file; created if it does not exist. A read-only file is used for reading, with a warning.
     max_rows : int
-        The most simulations that are kept, of some 120 bytes each; whoever writes evicts the oldest beyond this bound.
+        Largest number of stored simulations, of about 120 bytes each. Every write evicts the oldest beyond it.
     retry_failures : bool
-        Run simulations that had failed again: after a change of something that no fingerprint tells (an external
-        program, memory, a time limit).
+        Run failed simulations again, after a change that no fingerprint contains (an external program, memory, a time
+        limit).
     responses : bool
-        Keep full responses too, in single precision, for predictive work.
+        Store full responses as well, in single precision, for predictions.
     max_response_bytes : int
-        The most bytes of responses that are kept; the oldest are evicted.
+        Largest size of the stored responses [bytes]; the oldest are evicted.
     timeout : float
         How long to wait for another writer [s].
 
     Attributes
     ----------
     hits, misses : int
-        Rows that were known, or not, by this object in this process.
+        Rows found and not found by this object in this process.
     evictions : int
         Rows evicted by this object.
     damaged : int
-        Rows found to be damaged, and deleted.
+        Rows that were damaged and deleted.
 
     Raises
     ------
     ValueError
-        If a bound is not positive, the path is a folder or lies in none, the file may not be read or made, belongs to
-        another program, or has another layout than this release writes. Such a file is left as it is.
+        If a bound is not positive, or if the path is a folder or in no existing folder, or if the file cannot be read
+        or created, belongs to another program, or has the layout of another release. Such a file is not changed.
 
     Examples
     --------
@@ -152,9 +163,10 @@ class SimulationCache:
         self._set_up(path, int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes), timeout)
         self._file.check()
         if not self._file.writable:
-            self._warn_that_it_is_only_read()
+            self._warn_read_only()
 
     def _set_up(self, path, max_rows, retry_failures, responses, max_response_bytes, timeout) -> None:
+        """Set all attributes without opening the file."""
         self._file = CacheFile(path, timeout)
         self.max_rows = max_rows
         self.retry_failures = retry_failures
@@ -162,8 +174,8 @@ class SimulationCache:
         self.max_response_bytes = max_response_bytes
         self.hits = self.misses = self.evictions = self.damaged = 0
         self._waiting: list[tuple] = []
-        self._only_read = False  # and has been said to be
-        self._pauses: dict[str, float] = {}  # until when what failed is not tried again
+        self._warned_read_only = False
+        self._pauses: dict[str, float] = {}  # time before which an action that failed is not tried again
 
     def __getstate__(self) -> tuple:
         return (
@@ -176,31 +188,31 @@ class SimulationCache:
         )
 
     def __setstate__(self, state: tuple) -> None:
-        self._set_up(*state)  # the file is opened when it is needed, and may be out of reach: a run goes on without
+        self._set_up(*state)  # opens the file when it is needed; a run continues without it if that fails
 
     def __repr__(self) -> str:
         return f"SimulationCache({str(self.path)!r})"
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """Path of the file."""
         return self._file.path
 
-    def look_up(self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int) -> Remembered:
-        """What is known of simulations; one question for the whole batch.
+    def look_up(self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int) -> CachedRows:
+        """Look up simulations, with few queries for the whole batch.
 
         Parameters
         ----------
         fingerprint : str
-            Of model and measurements.
+            Everything but the parameters that the sums depend on, such as `FELikelihood.simulation_key`.
         thetas : (n, n_structural) float
             Structural parameters.
         n_channels, n_steps : int
-            Of the measurements.
+            Shape of the measurements; rows of another shape count as damaged.
 
         Returns
         -------
-        Remembered
+        CachedRows
         """
         keys = simulation_keys(fingerprint, thetas)
         misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
@@ -208,7 +220,7 @@ class SimulationCache:
             found, bad = {}, []
             for row in self._try("read", lambda connection: self._select(connection, keys), []):
                 key, sums, steps, reason = row[:4]
-                if not is_whole(*row) or len(sums) != 8 * n_channels or steps != n_steps:
+                if not is_undamaged(*row) or len(sums) != 8 * n_channels or steps != n_steps:
                     bad.append(key)
                 elif not (reason and self.retry_failures):
                     found[key] = sums, reason
@@ -221,7 +233,7 @@ class SimulationCache:
             self.hits += int(known.sum())
             self.misses += int((~known).sum())
             self._drop("simulations", bad)
-        return Remembered(misfit, reasons, known)
+        return CachedRows(misfit, reasons, known)
 
     def store(
         self,
@@ -232,41 +244,43 @@ class SimulationCache:
         reasons: Sequence[str],
         seconds: float,
     ) -> None:
-        """Keep simulations, failures too, in one transaction that also evicts.
+        """Store simulations, failed ones included, in one transaction that also evicts.
 
         Parameters
         ----------
         fingerprint : str
-            Of model and measurements.
+            As for `look_up`.
         thetas : (n, n_structural) float
+            Structural parameters.
         n_steps : int
             Number of samples of the measurements.
         misfit : (n, n_channels) float
-            Sums of squared residuals.
-        reasons : n strings
-            Why simulations failed; empty where they did not.
+            Sums of squared residuals [SI unit of the channel, squared].
+        reasons : sequence of n str
+            Reasons of failures; empty where the simulation succeeded.
         seconds : float
-            Wall time of all of them [s].
+            Wall time of all simulations together [s].
         """
         keys = simulation_keys(fingerprint, thetas)
         self._write(
             _STORE,
             [
-                packed(key, sums, n_steps, reason, seconds / len(keys))
+                pack_row(key, sums, n_steps, reason, seconds / len(keys))
                 for key, sums, reason in zip(keys, misfit, reasons, strict=True)
             ],
         )
 
     def store_responses(self, model: Model, thetas: np.ndarray, responses: np.ndarray) -> None:
-        """Keep full responses in single precision, in one transaction that also evicts.
+        """Store full responses in single precision, in one transaction that also evicts.
 
         Parameters
         ----------
         model : Model
             The responses do not depend on the measurements.
         thetas : (n, n_structural) float
+            Structural parameters.
         responses : (n, n_channels, n_steps) float
-            Those that are not finite, also in single precision, are left out.
+            [SI]. Responses that are not finite, also in single precision, are not stored.
         """
         rows = []
         keys = simulation_keys(simulation_fingerprint(model), thetas)
@@ -279,7 +293,19 @@ class SimulationCache:
         self._write(_STORE_RESPONSE, rows)
 
     def response(self, model: Model, theta: np.ndarray) -> np.ndarray | None:
-        """The response (n_channels, n_steps) kept for a model and its parameters (n_structural,), or None."""
+        """Stored response of a model.
+
+        Parameters
+        ----------
+        model : Model
+        theta : (n_structural,) float
+            Structural parameters.
+
+        Returns
+        -------
+        (n_channels, n_steps) float32 or None
+            [SI]; None if it is not stored.
+        """
         (key,) = simulation_keys(simulation_fingerprint(model), np.atleast_2d(np.asarray(theta, dtype=float)))
         query = "SELECT n_channels, crc, response FROM responses WHERE key = ?"
         with self._file.lock:
@@ -291,7 +317,7 @@ class SimulationCache:
         return None
 
     def info(self) -> CacheInfo:
-        """What is kept, and what this object did so far."""
+        """State of the cache, and counts of this object."""
 
         def ask(connection: sqlite3.Connection) -> tuple:
             ((n, failures, seconds),) = connection.execute(
@@ -306,7 +332,7 @@ class SimulationCache:
             return CacheInfo(self.path, *counted, size, self.hits, self.misses, self.evictions, self.damaged)
 
     def clear(self) -> None:
-        """Forget everything, for all who use the file; what likelihoods remember in memory stays.
+        """Delete all rows, for all users of the file; the caches in memory of likelihoods are not affected.
 
         Raises
         ------
@@ -314,24 +340,30 @@ class SimulationCache:
             If the file cannot be written.
         """
 
-        def forget(connection: sqlite3.Connection) -> None:
+        def delete(connection: sqlite3.Connection) -> None:
             connection.execute("BEGIN IMMEDIATE")
             connection.execute("DELETE FROM simulations")
             connection.execute("DELETE FROM responses")
             connection.execute("COMMIT")
 
         with self._file.lock:
-            self._insist(forget)
+            self._insist(delete)
             self._waiting.clear()
-            # gives the space back to the disk; not worth an error while others are reading
+            # returns the space to the disk; may fail while others read
             self._try("vacuumed", lambda connection: connection.execute("VACUUM"), None)
 
     def export_hdf5(self, path: str | os.PathLike) -> int:
-        """Write all simulations to an HDF5 file, replaced at once; responses stay.
+        """Write all simulations, without responses, to an HDF5 file; an existing file is replaced atomically.
+
+        Parameters
+        ----------
+        path : path
+            The HDF5 file.
 
         Returns
         -------
-        int : how many
+        int
+            Number of simulations.
 
         Raises
         ------
@@ -341,20 +373,26 @@ class SimulationCache:
             If either file cannot be used.
         """
         if Path(path).resolve() == self.path:
-            raise ValueError(f"{path} is the cache itself: export it to another file")
+            raise ValueError(f"{path} is the cache itself; export to another file")
         return write_rows(path, self._pages())
 
     def import_hdf5(self, path: str | os.PathLike) -> int:
-        """Take in what `export_hdf5` wrote; simulations that are known stay as they are.
+        """Add the simulations of a file that `export_hdf5` wrote; simulations that are already stored are not changed.
+
+        Parameters
+        ----------
+        path : path
+            The HDF5 file.
 
         Returns
         -------
-        int : how many rows the file has
+        int
+            Number of simulations in the file.
 
         Raises
         ------
         ValueError
-            If it is not such a file, or damaged.
+            If it is not such a file, or is damaged.
         OSError
             If either file cannot be used.
         """
@@ -363,7 +401,7 @@ class SimulationCache:
         return len(rows)
 
     def close(self) -> None:
-        """Store what waits, if that can be done, and close this process's connection; the next use opens one."""
+        """Store waiting rows, if possible, and close the connection of this process; the next use opens a new one."""
         with self._file.lock:
             self._pauses.clear()
             if self._waiting:
@@ -371,7 +409,7 @@ class SimulationCache:
             self._file.close()
 
     def _pages(self) -> Iterator[list[tuple]]:
-        """All whole rows, without their checksums, oldest first."""
+        """All undamaged rows, without their checksums, oldest first."""
         last = 0
         while True:
             query = f"SELECT id, {COLUMNS} FROM simulations WHERE id > ? ORDER BY id LIMIT 10000"
@@ -379,13 +417,13 @@ class SimulationCache:
             if not page:
                 return
             last = page[-1][0]
-            yield [row[1:-1] for row in page if is_whole(*row[1:])]
+            yield [row[1:-1] for row in page if is_undamaged(*row[1:])]
 
     @staticmethod
     def _select(connection: sqlite3.Connection, keys: list[bytes]) -> list[tuple]:
         found = []
-        for start in range(0, len(keys), PER_QUERY):
-            part = keys[start : start + PER_QUERY]
+        for start in range(0, len(keys), KEYS_PER_QUERY):
+            part = keys[start : start + KEYS_PER_QUERY]
             marks = ",".join("?" * len(part))
             found += connection.execute(f"SELECT {COLUMNS} FROM simulations WHERE key IN ({marks})", part).fetchall()
         return found
@@ -410,33 +448,33 @@ class SimulationCache:
     def _write(self, statement: str, rows: list[tuple]) -> None:
         with self._file.lock:
             if not self._file.writable:
-                self._warn_that_it_is_only_read()
+                self._warn_read_only()
                 return
-            if statement is _STORE:  # responses are no loss
-                rows = self._waiting = (self._waiting + rows)[-MOST_WAITING:]
+            if statement is _STORE:  # responses can be computed again and do not wait
+                rows = self._waiting = (self._waiting + rows)[-MAX_WAITING_ROWS:]
             if self._try("written", lambda connection: self._insert(connection, statement, rows) or True, False):
                 if statement is _STORE:
                     self._waiting = []
 
-    def _warn_that_it_is_only_read(self) -> None:
-        if not self._only_read:
-            logger.warning("%s may only be read: what is simulated now is not stored", self.path)
-        self._only_read = True
+    def _warn_read_only(self) -> None:
+        if not self._warned_read_only:
+            logger.warning("%s is read-only: new simulations are not stored. Change its permissions or path", self.path)
+        self._warned_read_only = True
 
     def _drop(self, table: str, keys: list[bytes]) -> None:
         """Delete rows that do not match their checksum."""
         if not keys:
             return
         if not self.damaged:
-            logger.warning("%s has damaged rows: they count as missing, see SimulationCache.damaged", self.path)
+            logger.warning("%s has damaged rows; they are simulated again, see SimulationCache.damaged", self.path)
         self.damaged += len(keys)
         if not self._file.writable:
             return
         delete = f"DELETE FROM {table} WHERE key = ?"
-        self._try("mended", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
+        self._try("repaired", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
 
     def _try(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
-        """Result of an action on the connection; whatever goes wrong is a warning, and not tried again for a while."""
+        """Result of an action on the connection; after an error `otherwise`, with a warning, and a pause of this action."""
         with self._file.lock:
             if time.monotonic() < self._pauses.get(what, -np.inf):
                 return otherwise
@@ -445,8 +483,8 @@ class SimulationCache:
                     result = action(self._file.connection())
                     self._pauses.pop(what, None)
                     return result
-                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # damage may ask for any size
-                    self._file.close()  # and with it a transaction
+                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # a damaged size may be huge
+                    self._file.close()  # also ends a transaction
                     failure = error
                 except BaseException:
                     self._file.close()
@@ -460,7 +498,7 @@ class SimulationCache:
                     break
             if what not in self._pauses:
                 logger.warning(
-                    "%s cannot be %s (%s): the run goes on without, and tries again every %g s",
+                    "%s cannot be %s (%s); the run continues without it and tries again after %g s",
                     self.path,
                     what,
                     failure,
@@ -470,7 +508,7 @@ class SimulationCache:
             return otherwise
 
     def _insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
-        """Result of what the user asked for by name: whatever goes wrong is an error."""
+        """Result of an action that the user has called explicitly; errors are raised."""
         with self._file.lock:
             try:
                 return action(self._file.connection())

@@ -1,13 +1,12 @@
-"""What a structural model is, and how a batch of its simulations is run.
+"""Protocol of a structural model, and functions that run a batch of its simulations.
 
-A model is any object with named parameters, named channels and a method `simulate` that turns one set of parameters
-into one response. It says that a simulation cannot be done by raising `SimulationFailed`. Nothing has to be inherited.
+A model is any object with named parameters, named channels and a method `simulate` that computes the response for one
+parameter set. It raises `SimulationFailed` if a simulation is impossible. No base class is needed.
 
-Samplers ask for many parameter sets at once. `simulate_batch` and `misfit_batch` answer with the model's own batch
-methods where it has them (compiled kernels that share work or threads), else set by set; through a pool, if there is
-one, always set by set. They never raise for a simulation that goes wrong: whatever happens to one set of parameters (an
-exception, a response that is not finite or has a wrong shape) becomes a reason in words beside a row of NaN, and leaves
-the other rows alone.
+Samplers request many parameter sets at once. `simulate_batch` and `misfit_batch` use the model's own batch methods if
+it has them (compiled kernels that share work or threads), otherwise they run the sets one by one; with a pool they
+always run them one by one. A failing simulation never raises here: an exception, or a response that is not finite or
+has a wrong shape, becomes a reason in words and a row of NaN, and does not affect other rows.
 """
 
 import logging
@@ -37,18 +36,27 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 Statistic = Callable[[np.ndarray], np.ndarray]
-"""Residuals (n_channels, n_steps) to numbers (n_numbers,), the first n_channels of them the sums of squares.
+"""Function of residuals (n_channels, n_steps) that returns (n_numbers,), the sums of squares (n_channels,) first.
 
-A function of a module, so that it can be sent to workers.
+It must be defined at the top level of a module, so that it can be sent to workers.
 """
 
-_RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is wanted: 64 MiB
+_RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is needed: 64 MiB
 
 
 class SimulationFailed(RuntimeError):
-    """A simulation that could not be done, for a reason in words (attribute `reason`).
+    """A simulation that failed.
 
-    A reason may end in how long it took, " after 12.3 s": this is told apart (see `split_seconds`).
+    Parameters
+    ----------
+    reason : str
+        Why it failed, in words. It may end with the duration of the run, as in "crashed after 12.3 s" (see
+        `split_seconds`).
+
+    Attributes
+    ----------
+    reason : str
+        As given.
     """
 
     def __init__(self, reason: str) -> None:
@@ -57,7 +65,7 @@ class SimulationFailed(RuntimeError):
 
 
 def split_seconds(reason: str) -> tuple[str, float | None]:
-    """A reason without its duration at the end, " after 12.3 s", and the duration [s], None where there is none."""
+    """Split a reason such as "crashed after 12.3 s" into the reason proper and the duration [s], None if not given."""
     found = re.fullmatch(r"(.+) after ([0-9.]+(?:e[-+]?[0-9]+)?) s", reason, re.DOTALL)
     return (found[1], float(found[2])) if found else (reason, None)
 
@@ -65,8 +73,12 @@ def split_seconds(reason: str) -> tuple[str, float | None]:
 class SimulationBatch(NamedTuple):
     """Responses of a batch of parameter sets.
 
-    response : (n, n_channels, n_steps) float, SI; rows of failures are NaN
-    reasons : n strings, empty where the simulation succeeded
+    Attributes
+    ----------
+    response : (n, n_channels, n_steps) float
+        [SI]; NaN where the simulation failed.
+    reasons : list of n str
+        Reasons of failures; empty where the simulation succeeded.
     """
 
     response: np.ndarray
@@ -76,10 +88,13 @@ class SimulationBatch(NamedTuple):
 class MisfitBatch(NamedTuple):
     """Misfits of a batch of parameter sets.
 
-    misfit : (n, n_channels) float, sums of squared residuals [SI unit of the channel, squared]; NaN in failed rows.
-        Where another statistic of the residuals was asked for, (n, n_numbers)
-
-    reasons : n strings, empty where the simulation succeeded
+    Attributes
+    ----------
+    misfit : (n, n_channels) float
+        Sums of squared residuals [SI unit of the channel, squared], or (n, n_numbers) for another statistic of the
+        residuals; NaN where the simulation failed.
+    reasons : list of n str
+        Reasons of failures; empty where the simulation succeeded.
     """
 
     misfit: np.ndarray
@@ -89,9 +104,9 @@ class MisfitBatch(NamedTuple):
 class Model(Protocol):
     """What a likelihood needs of a model.
 
-    It may also have ``simulate_batch(thetas) -> SimulationBatch`` and
-    ``misfit_batch(thetas, measured) -> MisfitBatch``, which must give for each row what `simulate` gives; and
-    ``with_record(record)``, the same model under another excitation, for predictions.
+    A model may also have ``simulate_batch(thetas) -> SimulationBatch`` and
+    ``misfit_batch(thetas, measured) -> MisfitBatch``, whose rows must be the results of `simulate`, and
+    ``with_record(record)``, which returns the same model under another excitation, for predictions.
     """
 
     @property
@@ -100,7 +115,7 @@ class Model(Protocol):
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """What the rows of the response are."""
+        """Channels of the response, one per row."""
 
     @property
     def dt(self) -> float:
@@ -112,10 +127,10 @@ class Model(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """Text that changes with anything that changes a response."""
+        """Text that differs between models with different responses."""
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
-        """Response (n_channels, n_steps) [SI] at the parameters (n_parameters,); raises `SimulationFailed`."""
+        """Response (n_channels, n_steps) [SI] for parameters (n_parameters,); may raise `SimulationFailed`."""
 
 
 def has_batch_method(model: Model) -> bool:
@@ -124,14 +139,15 @@ def has_batch_method(model: Model) -> bool:
 
 
 def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
-    """Responses at many parameter sets.
+    """Responses for many parameter sets.
 
     Parameters
     ----------
     model : Model
     thetas : (n, n_parameters) float
+        Parameter sets.
     pool : object with ``map(function, items)``, optional
-        Runs the simulations one by one, also where the model has a batch method (which stays in this process); the
+        Runs the simulations one by one, even if the model has a batch method (which would run in this process). The
         results do not depend on it.
 
     Returns
@@ -150,19 +166,19 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
 def misfit_batch(
     model: Model, thetas: np.ndarray, measured: np.ndarray, pool: Any = None, statistic: Statistic | None = None
 ) -> MisfitBatch:
-    """Sums of squared residuals, or another statistic of them, at many parameter sets; no response is kept.
+    """Sums of squared residuals, or another statistic of them, for many parameter sets; responses are not kept.
 
     Parameters
     ----------
     model : Model
     thetas : (n, n_parameters) float
+        Parameter sets.
     measured : (n_channels, n_steps) float
         Measured response [SI].
     pool : object with ``map(function, items)``, optional
-        Runs the simulations one by one, also where the model has a batch method (which stays in this process); the
-        results do not depend on it.
+        As for `simulate_batch`.
     statistic : Statistic, optional
-        What is taken of the residuals instead; a model's own ``misfit_batch`` cannot give it and is passed by.
+        Statistic of the residuals instead of the sums of squares; the model's own ``misfit_batch`` is then not used.
 
     Returns
     -------
@@ -185,7 +201,21 @@ def misfit_batch(
 def misfit_of_responses(
     model: Model, batch: SimulationBatch, measured: np.ndarray, statistic: Statistic | None = None
 ) -> MisfitBatch:
-    """Sums of squared residuals, or another statistic, of responses against `measured` (n_channels, n_steps)."""
+    """Sums of squared residuals, or another statistic of them, for given responses.
+
+    Parameters
+    ----------
+    model : Model
+    batch : SimulationBatch
+    measured : (n_channels, n_steps) float
+        Measured response [SI].
+    statistic : Statistic, optional
+        As for `misfit_batch`.
+
+    Returns
+    -------
+    MisfitBatch
+    """
     reduce = _sums_of_squares if statistic is None else statistic
     rows = [_reduced(response, measured, reduce) for response in batch.response]
     misfit = np.reshape(rows, (len(rows), len(reduce(measured))))
@@ -199,13 +229,14 @@ def _sums_of_squares(residuals: np.ndarray) -> np.ndarray:
 
 
 def _reduced(response: np.ndarray, measured: np.ndarray, reduce: Statistic) -> np.ndarray:
-    # contiguous rows: the order of summation, hence the last bit, must not depend on who made the array
+    # contiguous rows, because the order of summation, and so the last bit, must not depend on the array's layout
     residuals = np.ascontiguousarray(response - measured)
     with np.errstate(over="ignore", invalid="ignore"):
         return reduce(residuals)
 
 
 def _misfit_from_responses(model: Model, thetas: np.ndarray, measured: np.ndarray, reduce: Statistic) -> MisfitBatch:
+    """Statistics from the model's own ``simulate_batch``, in parts of bounded memory."""
     misfits, reasons = [], []
     rows = max(1, _RESPONSE_VALUES // measured.size)
     for start in range(0, len(thetas), rows):
@@ -216,6 +247,7 @@ def _misfit_from_responses(model: Model, thetas: np.ndarray, measured: np.ndarra
 
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
+    """Response of one simulation; `SimulationFailed` if it has a wrong shape."""
     response = np.asarray(model.simulate(theta.copy()), dtype=float)
     expected = (len(model.channels), model.n_steps)
     if response.shape != expected:
@@ -229,7 +261,7 @@ def _misfit(measured: np.ndarray, reduce: Statistic, model: Model, theta: np.nda
 
 def _not_finite(model: Model, values: np.ndarray) -> str:
     """Reason why one row of responses or misfits is not usable, or an empty string."""
-    for channel, value in zip(cycle(model.channels), values, strict=False):  # several numbers a channel go round
+    for channel, value in zip(cycle(model.channels), values, strict=False):  # a statistic repeats the channels
         if not np.isfinite(value).all():
             what = "response" if value.ndim else "misfit"
             return f"the {what} of channel {channel.name!r} is not finite"
@@ -239,12 +271,12 @@ def _not_finite(model: Model, values: np.ndarray) -> str:
 def _attempt(
     run: Callable[[Model, np.ndarray], np.ndarray], model: Model, theta: np.ndarray
 ) -> tuple[np.ndarray | None, str]:
-    """One simulation: its result and an empty reason, or None and the reason. Runs in the worker."""
+    """Run one simulation; returns its result and an empty reason, or None and the reason. Called in the worker."""
     try:
         result = run(model, theta)
     except SimulationFailed as error:
         return None, error.reason
-    except Exception as error:  # a black box may raise anything; KeyboardInterrupt is no Exception and passes
+    except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
         return None, f"{type(error).__name__}: {error}"
     reason = _not_finite(model, result)
     return (None, reason) if reason else (result, "")
@@ -253,7 +285,7 @@ def _attempt(
 def _run_each(
     run: Callable[[Model, np.ndarray], np.ndarray], model: Model, thetas: np.ndarray, shape: tuple[int, ...], pool: Any
 ) -> tuple[np.ndarray, list[str]]:
-    """Simulate set by set, in this process or in the pool's workers."""
+    """Run simulations one by one, in this process or in the pool's workers."""
     attempt = partial(_attempt, run, model)
     outcomes = list(map(attempt, thetas) if pool is None else pool.map(attempt, list(thetas)))
     values = np.full((len(thetas), *shape), np.nan)
@@ -266,7 +298,7 @@ def _run_each(
 def _run_whole(
     model: Model, method: Callable[[], tuple], shape: tuple[int, ...]
 ) -> tuple[np.ndarray, list[str]] | None:
-    """Results of a model's own batch method, or None if it broke as a whole and the sets must be run one by one."""
+    """Results of a model's own batch method, or None if it failed as a whole and the sets must be run one by one."""
     try:
         values, reasons = method()
         values, reasons = np.array(values, dtype=float), [str(reason) for reason in reasons]
@@ -274,9 +306,9 @@ def _run_whole(
             raise ValueError(
                 f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"
             )
-    except Exception as error:  # one bad set must not take the others with it
+    except Exception as error:  # one bad parameter set must not make the others fail
         logger.warning(
-            "a batch method of %s broke, its sets are run one by one: %s: %s",
+            "A batch method of %s failed; its parameter sets are run one by one: %s: %s",
             type(model).__name__,
             type(error).__name__,
             error,

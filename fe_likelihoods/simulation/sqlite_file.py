@@ -1,12 +1,12 @@
-"""The SQLite file of the simulation cache: how it is made, known again, shared, and set aside when damaged.
+"""SQLite file of the simulation cache: how it is created, recognised, shared, and moved aside when damaged.
 
-The file is in WAL mode: readers never wait, writers take turns, and whoever is killed in the middle of a transaction
-leaves the file as it was before it. It says by its application id that it is ours and by its user version which layout
-it has; a file that says otherwise is somebody else's and is never written to.
+The file is in write-ahead-log (WAL) mode: readers never wait, writers take turns, and a process that is killed during a
+transaction leaves the file as it was before it. The application id of the file identifies it as a cache, its user
+version is the version of the layout. A file with another id or version is never written to.
 
-SQLite must not be taken through a fork. So every process has a connection of its own, opened when it is first needed,
-and those of a process are closed before it forks. WAL needs shared memory among all who use a file: keep it on a disk
-of the machine, not on a network file system.
+SQLite connections must not be used after a fork. Therefore every process has its own connection, opened when it is
+first needed, and the connections of a process are closed before it forks. WAL mode needs memory shared by all users of
+a file, so the file must be on a local disk, not on a network file system.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from pathlib import Path
 try:
     from fcntl import LOCK_EX, LOCK_NB
     from fcntl import flock as lock_file
-except ImportError:  # no such locks on this system: two programs must not find the same damage at once
+except ImportError:  # without such locks two programs must not find the same damage at the same time
     lock_file = None
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
@@ -32,14 +32,14 @@ logger = logging.getLogger(__name__)
 APPLICATION_ID = 0x46454C43  # "FELC"
 SCHEMA_VERSION = 1
 LAYOUT = (
-    # the id tells the age, the unique key finds the row
+    # the id orders rows by age
     "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, misfit BLOB NOT NULL, "
     "n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, crc INTEGER NOT NULL)",
     "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, n_channels INTEGER NOT NULL, "
     "size INTEGER NOT NULL, crc INTEGER NOT NULL, response BLOB NOT NULL)",
-    "CREATE INDEX response_sizes ON responses (size)",  # their sum without reading the responses
+    "CREATE INDEX response_sizes ON responses (size)",  # for their sum without reading the responses
 )
-CHECK_SECONDS = 2.0  # for looking through the file when it is opened; rows have checksums of their own
+CHECK_SECONDS = 2.0  # limit of the integrity check on opening; rows have checksums of their own
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
@@ -72,44 +72,45 @@ if hasattr(os, "register_at_fork"):
 
 
 def _code(error: Exception) -> int:
+    """Primary result code of an SQLite error, 0 for other errors."""
     return (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
 
 
 def is_damage(error: Exception) -> bool:
-    """Whether an error says that the file itself is broken."""
-    if isinstance(error, UnicodeDecodeError):  # SQLite's message quotes what it has found there
+    """Whether an error means that the file itself is damaged."""
+    if isinstance(error, UnicodeDecodeError):  # SQLite's message quotes damaged contents
         return True
     return _code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 class _Damaged(sqlite3.DatabaseError):
-    """What we find broken ourselves."""
+    """Damage that SQLite does not detect."""
 
     sqlite_errorcode = sqlite3.SQLITE_CORRUPT
 
 
 class CacheFile:
-    """One file, and this process's connection to it; whoever uses the connection holds `lock`.
+    """A file and the connection of this process to it. Hold `lock` while using the connection.
 
     Parameters
     ----------
     path : path
-        The file; it is made if it is not there.
+        The file; created if it does not exist.
     timeout : float
         How long to wait for another writer [s].
 
     Attributes
     ----------
     path : Path
-        Absolute, without links.
-    lock : RLock
-        Of this process's threads.
+        Absolute path without symbolic links.
+    lock : threading.RLock
+        Lock of the threads of this process.
     writable : bool
-        False for a file that can only be read.
+        False for a read-only file.
     """
 
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
-        self.path = Path(path).resolve()  # SQLite keeps the log beside the file that a link leads to
+        self.path = Path(path).resolve()  # SQLite keeps the log next to the target of a link
         self.timeout = float(timeout)
         self.lock = threading.RLock()
         self.writable = True
@@ -123,67 +124,68 @@ class CacheFile:
             self._connection.close()
 
     def check(self) -> None:
-        """Open the file and look through it, before anything costly is done.
+        """Open the file and check its integrity, before any costly work.
 
-        A damaged file is set aside with a warning, and a new one begun.
+        A damaged file is moved aside with a warning, and a new one is created.
 
         Raises
         ------
         ValueError
-            If the path is a folder or lies in none, the file cannot be read or made, belongs to another program, or
-            has another layout than this release writes.
+            If the path is a folder or in no existing folder, or if the file cannot be read or created, belongs to
+            another program, or has the layout of another release.
         """
         folder = self.path.parent
         if self.path.is_dir():
-            raise ValueError(f"{self.path} is a folder; a cache is a file: give a name in it, such as 'cache.sqlite'")
+            raise ValueError(f"{self.path} is a folder; give the path of a file, such as 'cache.sqlite' in it")
         if not folder.is_dir():
-            raise ValueError(f"{self.path} cannot be made: there is no folder {folder}; make it first")
+            raise ValueError(f"{self.path} cannot be created: there is no folder {folder}; create it first")
         if not self.path.exists() and not os.access(folder, os.W_OK | os.X_OK):
-            raise ValueError(f"{self.path} cannot be made: nothing may be written to {folder}; give another path")
+            raise ValueError(f"{self.path} cannot be created: {folder} is not writable; give another path")
         try:
             open(self.path, "rb").close()
         except PermissionError:
             raise ValueError(
-                f"{self.path} may not be read by this user; change its permissions or give another path"
+                f"{self.path} is not readable for this user; change its permissions or give another path"
             ) from None
-        except OSError:  # not there, or SQLite says better what is wrong
+        except OSError:  # it does not exist, or SQLite will give a better message
             pass
         with self.lock:
             try:
-                self._look_through(self.connection())
+                self._check_integrity(self.connection())
             except (sqlite3.Error, UnicodeDecodeError) as error:
                 self.close()
                 if not is_damage(error):
                     raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
                 if self._starts_with(HDF5_SIGNATURE):
                     raise ValueError(
-                        f"{self.path} is an HDF5 file, not a cache: give another path; what SimulationCache."
-                        "export_hdf5 wrote comes in with import_hdf5"
+                        f"{self.path} is an HDF5 file, not a cache; give another path, and read a file that "
+                        "SimulationCache.export_hdf5 wrote with import_hdf5"
                     ) from None
                 self._replace(error)
 
     def _replace(self, error: Exception) -> None:
+        """Move a damaged file aside and create a new one."""
         try:
             self.set_aside(str(error))
             self.connection()
         except (OSError, sqlite3.Error) as failure:
             raise ValueError(
-                f"{self.path} is damaged ({error}) and could not be set aside ({failure}): remove it, or give another "
+                f"{self.path} is damaged ({error}) and cannot be moved aside ({failure}); remove it, or give another "
                 "path"
             ) from failure
 
     def connection(self) -> sqlite3.Connection:
-        """This process's connection; opened now if there is none.
+        """Connection of this process, opened if there is none.
 
         Raises
         ------
         ValueError
-            If the file is another program's or of another layout.
+            If the file belongs to another program or has another layout.
         sqlite3.Error
             If it cannot be opened.
         """
         if self._connection is None:
-            with self._alone():
+            with self._exclusive():
                 self._inode = self._inode_now()
                 self.writable = self._inode is None or (
                     os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK | os.X_OK)
@@ -193,35 +195,36 @@ class CacheFile:
         return self._connection
 
     def close(self) -> None:
-        """Close this process's connection; the next use opens one again."""
+        """Close the connection of this process; the next use opens a new one."""
         with self.lock:
             if self._connection is not None:
                 self._connection.close()
                 self._connection = None
 
     def set_aside(self, why: str) -> None:
-        """Rename a damaged file to ``<name>.damaged-<n>``, with a warning, unless another process has done so.
+        """Rename a damaged file to ``<name>.damaged-<n>`` with a warning, unless another process has already done so.
 
         Raises
         ------
         OSError
             If it cannot be renamed.
         """
-        with self.lock, self._alone():
+        with self.lock, self._exclusive():
             self.close()
             if self._inode is None or self._inode_now() != self._inode:
                 return
             n = 1
             while (aside := self.path.with_name(f"{self.path.name}.damaged-{n}")).exists():
                 n += 1
-            # the log first: beside a new file it would be taken for that one's
+            # the log first, because SQLite would use it for a new file of the same name
             for suffix in ("-wal", "-shm", ""):
                 part = self.path.with_name(self.path.name + suffix)
                 if part.exists():
                     os.rename(part, aside.with_name(aside.name + suffix))
-            logger.warning("%s is damaged (%s): set aside as %s, a new cache is begun", self.path, why, aside.name)
+            logger.warning("%s is damaged (%s): set aside as %s, and a new cache created", self.path, why, aside.name)
 
     def _inode_now(self) -> tuple[int, int] | None:
+        """Device and inode of the file, None if it does not exist."""
         try:
             status = self.path.stat()
         except FileNotFoundError:
@@ -229,18 +232,18 @@ class CacheFile:
         return status.st_dev, status.st_ino
 
     @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
-        """No other process opens the file, or sets it aside, meanwhile: by a lock on the folder.
+    def _exclusive(self) -> Iterator[None]:
+        """Lock on the folder, which prevents other processes from opening the file or moving it aside meanwhile.
 
-        SQLite finds the log by its name: who opened a damaged file while it is renamed would write into the log of the
-        new one. A lock on the file itself would not do: to close a file takes all of SQLite's own locks from it.
+        SQLite finds the log by its name. A process that opened a damaged file while it is renamed would write to the
+        log of the new file. The file itself cannot be locked instead, because closing it releases SQLite's own locks.
         """
         if lock_file is None:
             yield
             return
         try:
             folder = os.open(self.path.parent, os.O_RDONLY)
-        except OSError:  # a folder that may be used, not listed
+        except OSError:  # a folder with search permission only
             yield
             return
         try:
@@ -249,7 +252,7 @@ class CacheFile:
                 try:
                     lock_file(folder, LOCK_EX | LOCK_NB)
                     break
-                except OSError as error:  # a file system without such locks is no reason to stop
+                except OSError as error:  # continue without a lock if the file system has none
                     if not isinstance(error, BlockingIOError) or time.monotonic() > give_up:
                         break
                 time.sleep(0.002)
@@ -261,9 +264,9 @@ class CacheFile:
         connection = self._connect("mode=rwc")
         try:
             if self._is_empty(connection):
-                self._make(connection)
+                self._create(connection)
             self._identify(connection)
-            self._patiently(connection, "PRAGMA journal_mode = WAL")
+            self._execute_with_retry(connection, "PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
         except BaseException:
             connection.close()
@@ -271,7 +274,7 @@ class CacheFile:
         return connection
 
     def _open_to_read(self) -> sqlite3.Connection:
-        """Without leave to write there may be no room for the shared memory: then the file is taken as unchanging."""
+        """Connection to a read-only file, opened as immutable if SQLite cannot create its shared memory."""
         for options in ("mode=ro", "mode=ro&immutable=1"):
             connection = self._connect(options)
             try:
@@ -300,9 +303,9 @@ class CacheFile:
         ((tables,),) = connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
         return identity == 0 and tables == 0
 
-    def _make(self, connection: sqlite3.Connection) -> None:
-        """All of the layout or nothing, by one process."""
-        self._patiently(connection, "BEGIN IMMEDIATE")
+    def _create(self, connection: sqlite3.Connection) -> None:
+        """Create the tables in one transaction, unless another process has created them."""
+        self._execute_with_retry(connection, "BEGIN IMMEDIATE")
         if self._is_empty(connection):
             for statement in LAYOUT:
                 connection.execute(statement)
@@ -310,8 +313,8 @@ class CacheFile:
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         connection.execute("COMMIT")
 
-    def _patiently(self, connection: sqlite3.Connection, statement: str) -> None:
-        """Execute what SQLite does not wait for by itself while another process is at the same."""
+    def _execute_with_retry(self, connection: sqlite3.Connection, statement: str) -> None:
+        """Execute a statement for which SQLite itself does not wait while another process holds a lock."""
         give_up = time.monotonic() + self.timeout
         while True:
             try:
@@ -323,25 +326,26 @@ class CacheFile:
             time.sleep(0.005)
 
     def _identify(self, connection: sqlite3.Connection) -> None:
+        """ValueError for a file of another program or release; `_Damaged` for other tables than expected."""
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
         ((version,),) = connection.execute("PRAGMA user_version").fetchall()
         layout = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall())
         if identity != APPLICATION_ID:
             raise ValueError(
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
-                f"{APPLICATION_ID:#x}; tables and indices {', '.join(sorted(layout)) or 'none'}): give another path"
+                f"{APPLICATION_ID:#x}; tables and indices {', '.join(sorted(layout)) or 'none'}); give another path"
             )
         if version != SCHEMA_VERSION:
             raise ValueError(
-                f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}: give "
+                f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}; give "
                 "another path, or remove the file"
             )
         if sorted(layout.values()) != sorted(LAYOUT):
-            raise _Damaged("its tables are not those that were made")
+            raise _Damaged("its tables are not those of a cache")
 
     @staticmethod
-    def _look_through(connection: sqlite3.Connection) -> None:
-        """SQLite's own check, as far as it comes in a short time."""
+    def _check_integrity(connection: sqlite3.Connection) -> None:
+        """SQLite's own integrity check, as far as it gets in `CHECK_SECONDS`."""
         stop = time.monotonic() + CHECK_SECONDS
         connection.set_progress_handler(lambda: time.monotonic() > stop, 100_000)
         try:
@@ -356,8 +360,9 @@ class CacheFile:
             raise _Damaged(answer)
 
     def _starts_with(self, signature: bytes) -> bool:
+        """Whether the file starts with these bytes."""
         try:
             with open(self.path, "rb") as file:
                 return file.read(len(signature)) == signature
-        except FileNotFoundError:  # another process has set it aside meanwhile
+        except FileNotFoundError:  # another process has moved it aside
             return False

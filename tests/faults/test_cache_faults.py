@@ -582,7 +582,7 @@ def test_a_file_that_may_only_be_read(open_folder, thetas, expected, caplog, fol
         for _ in range(2):
             np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
         assert (likelihood.simulations, likelihood.disk_hits) == (100, 300)
-        assert warnings_of(caplog, "may only be read") == 1
+        assert warnings_of(caplog, "is read-only") == 1
         assert warnings_of(caplog, "cannot be") == 0
         with pytest.raises(OSError, match="cannot be used"):
             likelihood.cache.clear()
@@ -608,7 +608,7 @@ def test_a_folder_that_becomes_read_only_during_the_run(open_folder, thetas, exp
             likelihood.misfit(thetas[start : start + 50])
         np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
         assert likelihood.simulations == 400
-        assert warnings_of(caplog, "may only be read") == 1
+        assert warnings_of(caplog, "is read-only") == 1
 
     def forbid():
         ready.wait(30)
@@ -633,9 +633,9 @@ def test_places_where_nothing_may_be_done(open_folder):
     closed.chmod(0o555)
 
     def run():
-        with pytest.raises(ValueError, match="nothing may be written to"):
+        with pytest.raises(ValueError, match="is not writable"):
             SimulationCache(closed / "cache.sqlite")
-        with pytest.raises(ValueError, match="may not be read by this user"):
+        with pytest.raises(ValueError, match="is not readable for this user"):
             SimulationCache(secret)
 
     as_somebody(run)
