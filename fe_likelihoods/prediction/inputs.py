@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..probability.likelihood import FELikelihood, as_points
+from ..probability.inputs import as_points
+from ..probability.likelihood import FELikelihood
+from ..probability.noise import sampled_noise
 from ..signals.records import Record
 from ..simulation.executors import as_executor
 from ..simulation.memory_cache import distinct_keys
@@ -98,8 +100,7 @@ def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
     likelihood = getattr(posterior_or_model, "likelihood", posterior_or_model)
     if hasattr(likelihood, "measurements") and hasattr(likelihood, "model"):
         executor = getattr(likelihood, "pool", None) if pool is None else as_executor(pool, likelihood.model)
-        noise = getattr(likelihood.noise, "noise", likelihood.noise)
-        return PredictionSource(likelihood.model, noise, likelihood, executor)
+        return PredictionSource(likelihood.model, sampled_noise(likelihood.noise), likelihood, executor)
     if not (hasattr(posterior_or_model, "simulate") and hasattr(posterior_or_model, "parameter_names")):
         raise ValueError(
             f"expected a Posterior, an FELikelihood or a model with simulate(theta); got {posterior_or_model!r}"

@@ -474,7 +474,7 @@ class SimulationCache:
         self._try("repaired", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
 
     def _try(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
-        """Result of an action on the connection; after an error `otherwise`, with a warning, and a pause of this action."""
+        """Result of an action on the connection; after an error a warning, `otherwise`, and a pause of this action."""
         with self._file.lock:
             if time.monotonic() < self._pauses.get(what, -np.inf):
                 return otherwise

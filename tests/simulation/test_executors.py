@@ -72,7 +72,7 @@ def pools():
 
 
 @pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in pools()])
-def test_same_bits_on_every_engine(make, oscillator, thetas, rng):
+def test_same_bits_on_every_executor(make, oscillator, thetas, rng):
     measured = rng.normal(size=(2, 300))
     expected = misfit_batch(oscillator, thetas, measured)
     assert [bool(reason) for reason in expected.reasons] == [row == 5 for row in range(23)]
@@ -90,7 +90,7 @@ def test_same_bits_on_every_engine(make, oscillator, thetas, rng):
             break
 
 
-def test_kind_of_engine():
+def test_kind_of_executor():
     class Client(Recorder):
         def gather(self, futures): ...
 
@@ -187,7 +187,7 @@ def test_few_functions_are_kept_in_a_worker():
     assert len(executors.loaded_functions) == executors.MAX_LOADED_FUNCTIONS
 
 
-def test_temporary_files_go_with_the_engine():
+def test_temporary_files_go_with_the_executor():
     executor = as_executor(Recorder())
     simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), executor)
     folder = executor._folder.path
