@@ -21,7 +21,7 @@ RECORD = Record("beats", 0.05, np.sin(np.arange(120) / 3) * np.cos(np.arange(120
 
 
 class Slow(LinearOscillator):
-    """Takes its time for every simulation, and counts them."""
+    """A model whose simulations take a given time and are counted."""
 
     seconds = 0.0
     runs = 0
@@ -33,7 +33,7 @@ class Slow(LinearOscillator):
 
 
 def make(cache, seconds=0.0):
-    """The sampler and its posterior."""
+    """Sampler and posterior of the run."""
     model = Slow(RECORD)
     model.seconds = seconds
     measured = LinearOscillator(RECORD).simulate(np.array([1.1, 0.8]))

@@ -1,6 +1,6 @@
 """A run over processes that a test can kill: ``python -m tests.faults.pooled_run CASE FOLDER``.
 
-Each process that is at work leaves a file with its number in FOLDER. What the simulations do would take an hour.
+Each process that runs a simulation writes a file named by its process id in FOLDER. The simulations take an hour.
 """
 
 import multiprocessing
@@ -31,7 +31,7 @@ WORKERS = 2
 
 
 def at_work(folder: Path) -> set[int]:
-    """The processes that have told so."""
+    """Ids of the processes that run a simulation."""
     return {int(path.name) for path in folder.iterdir()}
 
 
@@ -71,7 +71,7 @@ POOLS = {
     "dask": _dask,
     "mpi": _mpi,
 }
-# model, pool, and how it hangs
+# model, pool, and way of hanging
 CASES = {name: (Treacherous, pool, HANGS) for name, pool in POOLS.items()} | {
     "deaf": (Treacherous, POOLS["local"], HANGS_HARD),
     "nested": (_isolated, POOLS["local"], HANGS_HARD),

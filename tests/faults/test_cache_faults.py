@@ -1,4 +1,4 @@
-"""Whatever happens to the cache or to those who use it: never a wrong value, never a broken run, nothing lost."""
+"""Faults of the cache and of processes that use it: no wrong value, no broken run, no lost simulation."""
 
 import logging
 import multiprocessing
@@ -47,7 +47,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def thetas(rng):
-    """Some of them fail: the stiffness must be positive."""
+    """Points, some of which fail because their stiffness is negative."""
     return np.column_stack([rng.uniform(-0.1, 2.0, size=400), rng.uniform(0.5, 2.0, size=400)])
 
 
@@ -70,7 +70,7 @@ def sums_of(thetas):
 
 
 def at_once(function, arguments):
-    """Exit codes of one process for each of the arguments, all let go at the same moment."""
+    """Exit codes of processes, one per argument, that are started at the same moment."""
     barrier = FORK.Barrier(len(arguments))
 
     def start(*args):
@@ -110,7 +110,7 @@ def write_until_killed(path, kill, max_rows, pipe):
 
 @pytest.mark.parametrize(("kills", "max_rows"), [(30, 1_000_000), (10, 1_000)])
 def test_killed_while_writing(path, rng, kills, max_rows):
-    """Kills by -9, each at a moment of chance: what was acknowledged is there, batches are whole, or gone."""
+    """SIGKILL at random moments: acknowledged batches are stored, others are complete or absent."""
     acknowledged = []
     for kill in range(kills):
         receiver, sender = FORK.Pipe(duplex=False)
@@ -136,7 +136,7 @@ def test_killed_while_writing(path, rng, kills, max_rows):
         np.testing.assert_array_equal(found.misfit[found.known], sums_of(thetas)[found.known])
         known += found.known.tolist()
         expected += len(thetas)
-    # the one batch that a killed process may have stored, and not yet told about
+    # the batch that a killed process may have stored without acknowledging it
     for kill in range(kills):
         thetas = batch_of(kill, 1 + max((n for k, n in acknowledged if k == kill), default=-1))
         share = cache.look_up(FINGERPRINT, thetas, 2, 8).known.mean()
@@ -149,7 +149,7 @@ def test_killed_while_writing(path, rng, kills, max_rows):
         assert all(known)
 
 
-def test_a_killed_writer_does_not_keep_others_waiting(path):
+def test_a_killed_writer_does_not_block_others(path):
     cache = SimulationCache(path, timeout=20.0)
     receiver, sender = FORK.Pipe(duplex=False)
 
@@ -173,7 +173,7 @@ def test_a_killed_writer_does_not_keep_others_waiting(path):
 @pytest.mark.parametrize(
     "share", [pytest.param(0.1, marks=pytest.mark.slow), 0.5, pytest.param(0.9, marks=pytest.mark.slow)]
 )
-def test_a_killed_run_reaches_its_place_without_a_simulation(path, tmp_path, share):
+def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
     whole, reference = cached_run.make(tmp_path / "whole.sqlite")
     whole.run_mcmc(None, cached_run.STEPS)
     distinct = reference.likelihood.cache.info().simulations
@@ -207,7 +207,7 @@ def test_a_killed_run_reaches_its_place_without_a_simulation(path, tmp_path, sha
 # several at once ------------------------------------------------------------------------------------------------------
 
 
-def test_programs_that_begin_a_cache_at_once(tmp_path):
+def test_programs_that_create_a_cache_at_the_same_moment(tmp_path):
     for attempt in range(5):
         path = tmp_path / f"{attempt}.sqlite"
 
@@ -224,7 +224,7 @@ def test_programs_that_begin_a_cache_at_once(tmp_path):
 
 
 def test_two_programs_on_one_cache(path, thetas, expected):
-    """Both are right, and together they leave every simulation behind; the third one runs none."""
+    """Both get the right values and together store every simulation, so a third one runs none."""
 
     def run(order):
         likelihood = likelihood_of(path, memory_rows=0)
@@ -240,7 +240,7 @@ def test_two_programs_on_one_cache(path, thetas, expected):
     assert third.cache.info().simulations == len(thetas)
 
 
-def test_another_program_that_keeps_the_file_locked(path, thetas, expected, caplog, monkeypatch):
+def test_another_program_that_holds_a_lock_on_the_file(path, thetas, expected, caplog, monkeypatch):
     cache = SimulationCache(path, timeout=0.05)
     blocker = sqlite3.connect(path, isolation_level=None)
     blocker.execute("BEGIN IMMEDIATE")
@@ -249,7 +249,7 @@ def test_another_program_that_keeps_the_file_locked(path, thetas, expected, capl
     assert warnings_of(caplog, "cannot be written") == 1
     blocker.execute("ROLLBACK")
     blocker.close()
-    cache.close()  # stores what waits
+    cache.close()  # stores the waiting rows
     assert cache.info().simulations == 200
 
 
@@ -257,7 +257,7 @@ def test_another_program_that_keeps_the_file_locked(path, thetas, expected, capl
 
 
 def warnings_of(caplog, text):
-    """How many warnings say so, those of failed simulations apart."""
+    """Number of warnings with this text."""
     return sum(text in record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING)
 
 
@@ -314,7 +314,7 @@ def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, b
 def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog, damage):
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas[:50]), expected[:50])
-    likelihood.cache.close()  # as before a fork
+    likelihood.cache.close()  # as it happens before a fork
     damage(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
     assert warnings_of(caplog, "set aside as") == 1
@@ -326,7 +326,7 @@ def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog,
 @pytest.mark.parametrize("attempts", [10, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("how", ["bytes", "page", "cut"])
 def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, how, attempts):
-    """At places of chance, also while the file is open."""
+    """Damage at random places, also while the file is open."""
     data = filled.read_bytes()
     served = 0
     for attempt in range(attempts):
@@ -336,7 +336,7 @@ def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, h
         if attempt % 2:
             likelihood.cache.close()
         damaged = bytearray(data)
-        place = int(rng.integers(100, len(data)))  # the first hundred bytes say whose file it is
+        place = int(rng.integers(100, len(data)))  # the first 100 bytes identify the file
         if how == "bytes":
             for where in rng.integers(100, len(data), size=20):
                 damaged[where] ^= 1 << rng.integers(8)
@@ -407,7 +407,7 @@ def test_a_damaged_response_is_missing(path, thetas):
 
 
 def test_programs_that_find_a_damaged_file_at_once(filled):
-    """It is set aside once, and the new one is everybody's."""
+    """It is set aside once, and all use the new one."""
     no_database(filled)
     data = filled.read_bytes()
 
@@ -438,8 +438,8 @@ def test_a_damaged_file_that_another_program_sets_aside_at_that_moment(filled, m
 
 
 def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
-    """The log goes with the damaged file."""
-    keep = sqlite3.connect(filled)  # so that the log is there
+    """The log is renamed together with the damaged file."""
+    keep = sqlite3.connect(filled)  # an open connection keeps the log
     keep.execute("SELECT count(*) FROM simulations").fetchall()
     cache = SimulationCache(filled)
     cache.store(FINGERPRINT, thetas, 20, sums_of(thetas), [""] * len(thetas), 1.0)
@@ -451,8 +451,8 @@ def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
     keep.close()
 
 
-def test_who_has_the_damaged_file_open_leaves_the_new_one_alone(filled, thetas):
-    """SQLite removes the log when the last one closes, by its name: it must not be the new file's."""
+def test_a_connection_to_the_damaged_file_does_not_affect_the_new_one(filled, thetas):
+    """SQLite removes the log by its name when the last connection closes; it must not remove that of the new file."""
     first, second = SimulationCache(filled), SimulationCache(filled)
     second.look_up(FINGERPRINT, thetas, 2, 8)
     first._file.set_aside("for a test")
@@ -474,14 +474,14 @@ def test_who_has_the_damaged_file_open_leaves_the_new_one_alone(filled, thetas):
 
 @pytest.fixture
 def full(monkeypatch):
-    """A switch: SQLite itself refuses to let the file grow."""
+    """A context in which SQLite refuses to let the file grow."""
     switch = {"full": True}
     normal = CacheFile._open
 
     def limited(self):
         connection = normal(self)
         if switch["full"]:
-            connection.execute("PRAGMA max_page_count = 1")  # not below the size it has
+            connection.execute("PRAGMA max_page_count = 1")  # limits the file to its present size
         return connection
 
     monkeypatch.setattr(CacheFile, "_open", limited)
@@ -498,11 +498,11 @@ def test_a_full_disk_does_not_stop_the_run(path, thetas, expected, caplog, full,
     assert likelihood.simulations == 300
     stored = likelihood.cache.info().simulations
     assert stored < 300
-    # somebody makes room: what waited in memory is stored with what comes next
+    # space becomes available: the waiting rows are stored with the next ones
     full["full"] = False
     likelihood.cache._file.close()
     likelihood.misfit(thetas[300:310])
-    assert likelihood.cache.info().simulations == stored  # not tried again so soon
+    assert likelihood.cache.info().simulations == stored  # writing is not tried again before the pause ends
     monkeypatch.setattr(cache_module, "RETRY_SECONDS", 0.0)
     likelihood.cache._pauses["written"] = time.monotonic()
     likelihood.misfit(thetas[310:320])
@@ -536,7 +536,7 @@ def test_a_really_full_disk(thetas, expected, caplog):
 
 @pytest.fixture
 def open_folder():
-    """A folder that another user can enter: pytest's own are closed."""
+    """A folder that another user can enter, unlike those of pytest."""
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
         yield Path(folder)
@@ -544,7 +544,7 @@ def open_folder():
 
 
 def as_somebody(function):
-    """Run it where permissions bind: root may do everything, so as another user then; whatever it raises is raised."""
+    """Run a function as a user to whom permissions apply (root ignores them), and raise its exceptions."""
     receiver, sender = FORK.Pipe(duplex=False)
 
     def run():
@@ -568,11 +568,11 @@ def as_somebody(function):
 
 
 @pytest.mark.parametrize("folder_mode", [0o555, 0o777])
-def test_a_file_that_may_only_be_read(open_folder, thetas, expected, caplog, folder_mode):
+def test_a_read_only_file(open_folder, thetas, expected, caplog, folder_mode):
     path = open_folder / "cache.sqlite"
     likelihood = likelihood_of(path)
     likelihood.misfit(thetas[:300])
-    likelihood.cache.close()  # nothing is left in the log
+    likelihood.cache.close()  # the log is empty
     path.chmod(0o444)
     open_folder.chmod(folder_mode)
     before = sorted(open_folder.iterdir()), path.read_bytes()
@@ -601,7 +601,7 @@ def test_a_folder_that_becomes_read_only_during_the_run(open_folder, thetas, exp
     def run():
         likelihood = likelihood_of(path)
         np.testing.assert_array_equal(likelihood.misfit(thetas[:200]), expected[:200])
-        likelihood.cache.close()  # as before a fork
+        likelihood.cache.close()  # as it happens before a fork
         ready.set()
         assert go.wait(30)
         for start in range(200, 400, 50):
@@ -624,7 +624,7 @@ def test_a_folder_that_becomes_read_only_during_the_run(open_folder, thetas, exp
         thread.join()
 
 
-def test_places_where_nothing_may_be_done(open_folder):
+def test_paths_without_permission_are_refused(open_folder):
     closed = open_folder / "closed"
     closed.mkdir()
     secret = open_folder / "secret.sqlite"
@@ -686,7 +686,7 @@ def hdf5_file(path):
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_other_files_are_refused_and_left_alone(path, make, message):
+def test_other_files_are_refused_and_not_changed(path, make, message):
     make(path)
     before = path.read_bytes() if path.is_file() else None
     for _ in range(2):
@@ -696,18 +696,18 @@ def test_other_files_are_refused_and_left_alone(path, make, message):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_folder_that_is_not_there(tmp_path):
+def test_a_folder_that_does_not_exist(tmp_path):
     with pytest.raises(ValueError, match="no folder"):
         SimulationCache(tmp_path / "nowhere" / "cache.sqlite")
 
 
 @pytest.mark.parametrize("path", [17, None, b"cache.sqlite", ["cache.sqlite"]])
-def test_what_is_no_path(path):
+def test_values_that_are_not_paths(path):
     with pytest.raises(ValueError, match="expected the path of a file"):
         SimulationCache(path)
 
 
-def test_names_that_mean_something_in_an_address(tmp_path, thetas, expected):
+def test_file_names_with_special_characters_of_uris(tmp_path, thetas, expected):
     path = tmp_path / "a b?mode=memory#c%20d\N{GREEK SMALL LETTER THETA}.sqlite"
     likelihood_of(path).misfit(thetas)
     assert path.exists()
@@ -739,8 +739,8 @@ def test_an_empty_file_becomes_a_cache(path):
     connection.close()
 
 
-def test_a_file_out_of_reach_after_unpickling(path, thetas, expected, caplog):
-    """A worker elsewhere goes on without."""
+def test_a_file_that_is_not_accessible_after_unpickling(path, thetas, expected, caplog):
+    """A worker on another machine continues without the file."""
     likelihood = likelihood_of(path)
     data = pickle.dumps(likelihood)
     likelihood.cache.close()

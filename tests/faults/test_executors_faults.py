@@ -1,4 +1,4 @@
-"""Workers that die, parents that die, models that fail: nothing hangs, nothing is lost, nothing is left over."""
+"""Workers that die, parents that die, models that fail: no run hangs, no result is lost, no process is left over."""
 
 import gc
 import importlib.util
@@ -35,7 +35,7 @@ def nothing_is_left():
     """No process that a test started outlives it."""
     before = set(descendants(os.getpid())) if Path("/proc").is_dir() else set()
     yield
-    gc.collect()  # samplers and their states hold each other
+    gc.collect()  # samplers and their states refer to each other
     if Path("/proc").is_dir():
         # the orphan reaper stays with this process, and the resource tracker of multiprocessing
         left = [
@@ -61,7 +61,7 @@ def theta(what, n=1):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_deadly_item_is_a_failure_of_its_own_and_not_of_its_neighbours(workers):
+def test_an_item_that_kills_its_worker_fails_alone(workers):
     thetas = np.concatenate([theta(bad.FINE, 8), theta(bad.CRASHES), theta(bad.FINE, 8), theta(bad.LEAVES)])
     with LocalPool(workers) as pool:
         batch = simulate_batch(Treacherous(), thetas, pool)
@@ -73,7 +73,7 @@ def test_deadly_item_is_a_failure_of_its_own_and_not_of_its_neighbours(workers):
             "the worker process ended with exit code 3",
         ]
         assert [batch.reasons[row] for row in fine] == [""] * 16
-        again = simulate_batch(Treacherous(), thetas[fine], pool)  # and the pool goes on
+        again = simulate_batch(Treacherous(), thetas[fine], pool)  # the pool still works
         np.testing.assert_array_equal(again.response, batch.response[fine])
 
 
@@ -87,7 +87,7 @@ def test_items_of_killed_workers_are_run_again(tmp_path):
 
 
 @needs_proc
-def test_worker_killed_while_it_waits_is_replaced():
+def test_idle_worker_that_is_killed_is_replaced():
     with LocalPool(1) as pool:
         expected = simulate_batch(Treacherous(), theta(bad.FINE, 3), pool)
         (pid,) = [
@@ -117,7 +117,7 @@ class _Interrupt(Exception):
 
 
 def _interrupt():
-    raise KeyboardInterrupt  # when the parent reads the answer of a worker
+    raise KeyboardInterrupt  # when the parent reads the reply of a worker
 
 
 def _interrupts(item):
@@ -126,7 +126,7 @@ def _interrupts(item):
 
 @needs("dask")
 @needs("distributed")
-def test_dask_tries_again_and_gives_up_on_the_deadly_item_alone(tmp_path):
+def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_path):
     import dask
     from dask.distributed import Client, LocalCluster
 
@@ -146,7 +146,7 @@ def test_dask_tries_again_and_gives_up_on_the_deadly_item_alone(tmp_path):
         assert np.isneginf(values[3])
         assert np.isfinite(values[4:]).all()
         assert posterior.report()["failure_reasons"] == {"the worker process died in every attempt of dask": 1}
-        # short runs travel in groups once their time is known: the one that kills is still told from its neighbours
+        # short runs are sent in groups once their duration is known; the item that kills its worker is still identified
         many = np.column_stack([theta(bad.FINE, 40), np.full(40, 0.5)])
         expected = posterior_of(Treacherous(), top=20.0)(many)
         np.testing.assert_array_equal(posterior(many), expected)
@@ -160,7 +160,7 @@ def test_dask_tries_again_and_gives_up_on_the_deadly_item_alone(tmp_path):
 
 @needs("mpi4py")
 def test_mpi_gives_the_same_bits():
-    """mpi4py.futures, two workers of their own ranks."""
+    """mpi4py.futures with two workers."""
     code = (
         "from mpi4py.futures import MPICommExecutor; from fe_likelihoods.simulation.executors import as_executor;"
         "from fe_likelihoods.simulation.model import simulate_batch;"
@@ -174,7 +174,7 @@ def test_mpi_gives_the_same_bits():
     command = [mpiexec if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", "3", sys.executable, "-c", code]
     environment = os.environ | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
-    assert run.stdout.split() == ["True", "{1.0}"], run.stderr  # and the model was loaded once in each rank
+    assert run.stdout.split() == ["True", "{1.0}"], run.stderr  # the model is loaded once per rank
 
 
 # parents that die ---------------------------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask"
 @needs_proc
 @pytest.mark.parametrize("pool", PARENTS)
 def test_nothing_outlives_a_parent_that_is_killed(pool, tmp_path, tmp_path_factory):
-    # an orphan reaper for each process that starts others; the program and its child, which are two more
+    # one orphan reaper per process that starts others; two more for the program and its child
     expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 4, "dask": WORKERS}.get(pool, 1 + WORKERS)
     at_once = 1 if pool == "isolated" else WORKERS
     command = [sys.executable, "-m", "tests.faults.pooled_run", pool, str(tmp_path)]
@@ -216,7 +216,7 @@ def third(**options):
 
 
 @pytest.mark.parametrize("pool", [None, 2])
-def test_sampler_lives_with_nan_in_a_third_of_the_prior(pool, seed):
+def test_sampler_with_nan_in_a_third_of_the_prior(pool, seed):
     posterior = third(pool=pool)
     sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=seed)
     sampler.run_mcmc(None, 2)
@@ -226,14 +226,14 @@ def test_sampler_lives_with_nan_in_a_third_of_the_prior(pool, seed):
     reasons = report["failure_reasons"]
     assert reasons.pop("ValueError: too stiff", 0) < reasons.pop("the response of channel 'a' is not finite")
     assert reasons == {}
-    # those drawn from the prior alone fail to a third, the rest less
+    # a third of the draws of the prior fail, fewer of the later points
     assert 0 < report["failure_count"] < 0.5 * report["simulations"]
 
 
-@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning:emcee")  # it subtracts -inf from -inf
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning:emcee")  # emcee subtracts -inf from -inf
 @pytest.mark.parametrize("kind", ["smc", "emcee"])
-def test_stated_share_of_failures_stops_the_run_and_keeps_what_there_is(kind, tmp_path, seed):
-    """0.25 is allowed and a third of the prior fails: the run stops, by an error that says so."""
+def test_too_many_failures_stop_the_run_and_keep_finished_simulations(kind, tmp_path, seed):
+    """A third of the prior fails where 0.25 is allowed: the run stops with an error."""
     posterior = third(max_failure_share=0.25)
     if kind == "smc":
         backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
@@ -249,11 +249,11 @@ def test_stated_share_of_failures_stops_the_run_and_keeps_what_there_is(kind, tm
     assert report["simulations"] >= 200
     assert report["failure_count"] == len(report["failures"]) > 0.25 * report["simulations"]
     known = posterior.sample_prior(200, seed)
-    if kind == "emcee":  # what was simulated is remembered, so it can still be asked for
+    if kind == "emcee":  # cached points can still be evaluated
         assert np.isfinite(posterior(known)).sum() == 200 - report["failure_count"]
 
 
-def test_share_that_is_allowed_does_not_stop_it(seed):
+def test_allowed_share_of_failures_does_not_stop_the_run(seed):
     posterior = third(max_failure_share=0.5)
     for _ in range(3):
         posterior(posterior.sample_prior(60, seed))
@@ -261,13 +261,13 @@ def test_share_that_is_allowed_does_not_stop_it(seed):
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_share_must_be_one(share):
+def test_invalid_share_is_refused(share):
     with pytest.raises(ValueError, match="max_failure_share must be in"):
         third(max_failure_share=share)
 
 
-def test_sampler_over_a_deadly_isolated_model(seed):
-    """Some of the prior crashes, some hangs: the run ends, and the report knows both."""
+def test_sampler_with_a_sandboxed_model_that_crashes_and_hangs(seed):
+    """Parts of the prior crash or hang: the run ends, and the report has both reasons."""
     posterior = posterior_of(FunctionModel(bad.deadly, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.3))
     sampler = SMCSampler(
         20, posterior.ndim, posterior, vectorize=True, seed=seed, check_draws=0, ess_ratio=0.2, max_moves=2

@@ -1,4 +1,4 @@
-"""Models that do to their process what real ones do, where their first parameter tells them to."""
+"""Models that fail like real ones: the first parameter selects how they harm their process."""
 
 import ctypes
 import os
@@ -20,7 +20,7 @@ FINE, RAISES, REFUSES, NOT_FINITE, SHAPE, HANGS, HANGS_HARD, CRASHES, KILLED, LE
 
 
 def line(theta: np.ndarray) -> np.ndarray:
-    """What it should do: (1, 20)."""
+    """The correct response, (1, 20)."""
     return (theta[0] + theta[1] * TIME)[None]
 
 
@@ -36,7 +36,7 @@ def treacherous(theta: np.ndarray) -> np.ndarray:
     if what == HANGS:
         time.sleep(3600)
     if what == HANGS_HARD:
-        ctypes.PyDLL(None).sleep(3600)  # in compiled code that lets no other thread run
+        ctypes.PyDLL(None).sleep(3600)  # in compiled code that holds the GIL
     if what == CRASHES:
         ctypes.string_at(0)
     if what == KILLED:
@@ -50,7 +50,7 @@ def treacherous(theta: np.ndarray) -> np.ndarray:
 
 
 class Treacherous:
-    """The same, as a model without any protection of its own."""
+    """The same function as a model, without protection."""
 
     parameter_names = ("offset", "slope")
     channels = CHANNELS
@@ -63,7 +63,7 @@ class Treacherous:
 
 
 class Announced(Treacherous):
-    """A model that tells where it is at work."""
+    """A model that writes a file named by the process in which it runs."""
 
     def __init__(self, folder: Path, model) -> None:
         self.folder, self.model = folder, model
@@ -74,7 +74,7 @@ class Announced(Treacherous):
 
 
 class DiesOnce(Treacherous):
-    """Kills its process the first time that it gets to a file that is not there, and makes the file."""
+    """Kills its process at the first call for each parameter set, which it marks by a file."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -88,7 +88,7 @@ class DiesOnce(Treacherous):
 
 
 class Large(Treacherous):
-    """A model of a megabyte, that knows how often it was unpickled in this process and what it is asked for."""
+    """A model of 1 MB that counts how often it was unpickled in this process."""
 
     def __init__(self):
         self.ballast = np.random.default_rng(1).bytes(2**20)
@@ -110,7 +110,7 @@ class Unpicklable(Treacherous):
 
 
 class Absent(Treacherous):
-    """Can be pickled here and not be loaded elsewhere."""
+    """Can be pickled here but not loaded in another process."""
 
     def __reduce__(self):
         return _absent, (os.getpid(),)
@@ -123,18 +123,18 @@ def _absent(home):
 
 
 def speaks(theta: np.ndarray) -> np.ndarray:
-    """Ends its process with some words."""
+    """Ends its process after writing to stderr."""
     os.write(2, b"solver 7.1\nout of licences\n\n")
     os._exit(1)
 
 
 def eats(theta: np.ndarray) -> np.ndarray:
-    """Asks for more memory than there is."""
+    """Allocates more memory than there is."""
     return np.ones((1, 10**11))
 
 
 def third(theta: np.ndarray) -> np.ndarray:
-    """NaN in a third of the prior, an exception in a little of it."""
+    """NaN in a third of the prior and an exception in a small part of it."""
     if theta[0] > 0.98:
         raise ValueError("too stiff")
     return line(theta) * (np.nan if theta[0] < 1.0 / 3.0 else 1.0)
@@ -151,7 +151,9 @@ def deadly(theta: np.ndarray) -> np.ndarray:
 
 def posterior_of(model, top: float = 1.0, **options):
     """Posterior of a model of two parameters, whose offset is between 0 and `top`."""
-    from fe_likelihoods.probability.likelihood import FELikelihood  # the workers need none of this, and start faster
+    from fe_likelihoods.probability.likelihood import (
+        FELikelihood,
+    )  # not needed by workers, which start faster without it
     from fe_likelihoods.probability.posterior import Posterior
     from fe_likelihoods.probability.priors import HalfNormal, Uniform
 
@@ -162,7 +164,7 @@ def posterior_of(model, top: float = 1.0, **options):
 
 
 def descendants(pid: int) -> list[int]:
-    """Processes that this one started, and those they started, from /proc."""
+    """Process ids of all descendants of a process, from /proc."""
     parents = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -181,7 +183,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def gone(pids, seconds: float = 20.0) -> bool:
-    """Whether all of these processes end within the time."""
+    """Whether all of these processes end within a time."""
     stop = time.monotonic() + seconds
     while any(_runs(pid) for pid in pids):
         if time.monotonic() > stop:

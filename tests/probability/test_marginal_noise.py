@@ -1,4 +1,4 @@
-"""Standard deviations integrated out: the integral against other methods, the same posterior with less to search."""
+"""Standard deviations integrated out: the integral by other methods, and the same posterior in fewer dimensions."""
 
 import math
 import pickle
@@ -32,7 +32,7 @@ PRIORS = {
 
 
 def by_quadrature(squares, n, prior):
-    """Logarithm of the integral over sigma, by scipy's adaptive rule in pieces about the maximum."""
+    """Logarithm of the integral over sigma, by scipy's adaptive quadrature in intervals around the maximum."""
 
     def log_integrand(t):
         sigma = np.exp(t)
@@ -58,11 +58,11 @@ def by_quadrature(squares, n, prior):
 
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
 def test_equals_an_adaptive_quadrature(prior):
-    """From perfect fits to hopeless ones, beyond the prior's bounds too, all rows at once."""
+    """From very good to very bad fits, also beyond the bounds of the prior, in one call."""
     for n, tolerance in ((10, 1e-6), (100, 1e-8), (5000, 1e-7)):
         rms = np.array([1e-3, 0.049, 0.3, 1.0, 20.0])
         if n == 10 and prior == PRIORS["informative"]:
-            rms = rms[2:]  # two humps, see the Notes of MarginalNoise
+            rms = rms[2:]  # two maxima, see the Notes of MarginalNoise
         got = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": prior}).log_likelihood(n * rms[:, None] ** 2, n)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", integrate.IntegrationWarning)
@@ -71,7 +71,7 @@ def test_equals_an_adaptive_quadrature(prior):
 
 
 def test_equals_the_closed_form_of_a_flat_prior():
-    """Of sigma^-n exp(-J / (2 sigma^2)) over all sigma: 1/2 (J / 2)^(-(n-1)/2) Gamma((n-1)/2)."""
+    """The integral of sigma^-n exp(-J / (2 sigma^2)) over all sigma is 1/2 (J / 2)^(-(n-1)/2) Gamma((n-1)/2)."""
     n, squares = 60, np.array([[2.0], [0.5]])
     got = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.0, 100.0)}).log_likelihood(squares, n)
     half = 0.5 * (n - 1)
@@ -96,7 +96,7 @@ def test_channels_are_a_sum_and_a_shared_sigma_is_one_integral(rng):
         np.testing.assert_allclose(one.log_likelihood(misfit, 80), expected, rtol=1e-6)
 
 
-def test_impossible_values_and_perfect_fits():
+def test_impossible_values_and_exact_fits():
     noise = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": HalfNormal(1.0)})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -117,13 +117,13 @@ def test_a_row_does_not_depend_on_the_others_but_for_round_off(rng):
 
 
 def test_draws_have_the_conditional_distribution(rng):
-    """Of sigma given J, at a flat prior: J / sigma^2 is chi-squared of n - 1 degrees of freedom."""
+    """For a flat prior, J / sigma^2 given J is chi-squared with n - 1 degrees of freedom."""
     n, n_draws = 12, 5000
     noise = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.0, 1e3)})
     sigma = noise.draw(np.full((n_draws, 1), 3.0), n, rng)
     assert sigma.shape == (n_draws, 1)
     assert stats.kstest(3.0 / sigma[:, 0] ** 2, stats.chi2(n - 1).cdf).pvalue > 1e-4
-    assert stats.kstest(3.0 / sigma[:, 0] ** 2, stats.chi2(n).cdf).pvalue < 1e-4  # control
+    assert stats.kstest(3.0 / sigma[:, 0] ** 2, stats.chi2(n).cdf).pvalue < 1e-4  # control: the test can fail
     bounded = MarginalNoise(GaussianNoise([TOP]), {"sigma_top": Uniform(0.1, 0.4)}).draw(np.full((500, 1), 3.0), n, rng)
     assert ((bounded > 0.1) & (bounded < 0.4)).all()
     for misfit in (0.0, math.nan):
@@ -134,7 +134,7 @@ def test_draws_have_the_conditional_distribution(rng):
 @pytest.mark.parametrize(
     "noise", [AutoregressiveNoise([TOP]), GaussianNoise([TOP], sensor=[0.1]), "white"], ids=["AR", "sensor", "name"]
 )
-def test_what_cannot_be_integrated_out_is_refused(noise):
+def test_noises_that_cannot_be_integrated_out_are_refused(noise):
     with pytest.raises(ValueError, match="keep the parameters of this one"):
         MarginalNoise(noise, {"sigma_top": HalfNormal(1.0)})
 
@@ -162,7 +162,7 @@ def full(rng):
 
 
 def test_the_posterior_is_the_full_one_summed_over_the_noise(full):
-    """At each structural point, hence the same posterior and the same evidence."""
+    """The densities agree at each structural point, hence posterior and evidence agree."""
     marginal = full.marginal()
     assert marginal.parameter_names == ["stiffness", "damping"] and marginal.fast_parameters == ()
     thetas = np.array([[1.15, 0.8], [1.1, 1.0], [0.7, 0.5]])
@@ -171,7 +171,7 @@ def test_the_posterior_is_the_full_one_summed_over_the_noise(full):
     for theta, scale in zip(thetas, rms, strict=True):
         grid = scale * np.exp(np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2))
         values = full.log_prob(np.hstack([np.tile(theta, (len(grid), 1)), grid])) + np.log(grid).sum(axis=1)
-        # the trapezoidal rule converges exponentially for a hump that it holds whole
+        # the trapezoidal rule converges exponentially for a peak within its limits
         expected = special.logsumexp(values) + 2.0 * math.log(t[1] - t[0])
         assert marginal.log_prob(theta) == pytest.approx(expected, abs=1e-8)
     assert np.isneginf(marginal.log_prob([-1.0, 1.0])) and np.isneginf(marginal.log_prob([1.0, 100.0]))
@@ -204,7 +204,7 @@ def test_the_noise_is_drawn_afterwards_without_a_simulation(full, rng):
         full.draw_noise(samples)
 
 
-def test_cache_pool_and_coarse_posterior_come_along(full, tmp_path):
+def test_cache_pool_and_coarse_posterior_are_kept(full, tmp_path):
     model, measurements = full.likelihood.model, full.likelihood.measurements
     likelihood = FELikelihood(model, measurements, cache=tmp_path / "sums.sqlite", max_failure_share=0.5, memory_rows=7)
     posterior = Posterior(likelihood, full.prior, coarse=full)
@@ -222,7 +222,7 @@ def test_problems_with_the_noise_integrated_out():
 
 @pytest.mark.slow
 def test_a_sampler_finds_the_same_evidence_with_fewer_simulations(full, seed):
-    """SMC against the exact evidence (a sum over the plane of stiffness and damping), with the noise and without it."""
+    """SMC against the exact evidence (a sum over stiffness and damping), with the noise parameters and without them."""
     from samplers import SMCSampler
 
     marginal = full.marginal()
@@ -246,7 +246,7 @@ def test_a_sampler_finds_the_same_evidence_with_fewer_simulations(full, seed):
             means.append(sampler.get_chain(flat=True)[:, :2].mean(axis=0))
         simulations[name] = posterior.likelihood.simulations
         sd = np.sqrt(weights @ (plane - mean) ** 2)
-        # 800 points, worth some 400 independent ones; the evidence of one run spreads by some .05
+        # 800 points, worth about 400 independent ones; the standard deviation of the evidence of one run is about 0.05
         assert np.all(np.abs(np.mean(means, axis=0) - mean) < 4.5 * sd / math.sqrt(400.0)), name
         assert abs(np.mean(found) - exact) < 0.1, name
     assert simulations["marginal"] < 0.75 * simulations["full"], simulations

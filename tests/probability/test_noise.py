@@ -1,4 +1,4 @@
-"""The Gaussian noise against the sum of normal densities over every sample."""
+"""Gaussian noise against the sum of normal log-densities over all samples."""
 
 import math
 import warnings
@@ -60,7 +60,7 @@ def test_impossible_values_are_minus_infinity_without_a_warning(noise):
         values = noise.log_likelihood(misfit, 10, sigma)
     assert np.isneginf(values[:8]).all()
     assert values[8] == pytest.approx(-10.0 * math.log(2.0 * math.pi))
-    assert values[9] == pytest.approx(-10.0 * math.log(2.0 * math.pi) + 20.0 * math.log(1e300))  # a perfect fit
+    assert values[9] == pytest.approx(-10.0 * math.log(2.0 * math.pi) + 20.0 * math.log(1e300))  # an exact fit
     assert np.isneginf(values[10])
     assert noise.log_likelihood(np.empty((0, 2)), 10, np.empty((0, 2))).shape == (0,)
 
@@ -72,7 +72,7 @@ def test_a_row_does_not_depend_on_the_others(noise, rng):
     assert together.tolist() == apart
 
 
-def test_a_shared_sigma_is_one_in_units_of_each_channels_scale(noise, rng):
+def test_a_shared_sigma_is_in_units_of_the_scale_of_each_channel(noise, rng):
     shared = SharedGaussianNoise(CHANNELS, [2.0, 0.03])
     assert shared.parameter_names == ("sigma",)
     sigma = rng.uniform(0.1, 3.0, (6, 1))
@@ -93,6 +93,6 @@ def test_scales_of_a_shared_sigma_are_the_root_mean_squares(rng):
 
 
 @pytest.mark.parametrize("scales", [[1.0], [1.0, 0.0], [1.0, -2.0], [math.nan, 1.0]])
-def test_scales_that_cannot_be_are_refused(scales):
+def test_invalid_scales_are_refused(scales):
     with pytest.raises(ValueError, match="scale"):
         SharedGaussianNoise(CHANNELS, scales)

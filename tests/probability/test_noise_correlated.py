@@ -1,4 +1,4 @@
-"""Noise for real measurements: errors that last, known sensors, effective samples; and what white noise would say."""
+"""Noise for real measurements: correlated errors, known sensor noise, effective samples, compared with white noise."""
 
 import math
 import warnings
@@ -25,7 +25,7 @@ CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "rela
 
 
 def autoregressive(rng, shape, rho):
-    """AR(1) series of unit variance along the last axis, written as its definition."""
+    """AR(1) series of unit variance along the last axis, by its definition."""
     errors = rng.standard_normal(shape)
     for t in range(1, shape[-1]):
         errors[..., t] = rho * errors[..., t - 1] + math.sqrt(1.0 - rho**2) * errors[..., t]
@@ -62,7 +62,7 @@ def test_is_white_noise_without_correlation(rng):
 
 
 def test_residuals_smoother_than_round_off_do_not_cancel():
-    """With products of neighbours in place of differences, nothing would be left of Q at this correlation."""
+    """With products of neighbours instead of differences, Q would cancel completely at this correlation."""
     residuals = 1.0 + 1e-9 * np.sin(np.arange(50.0))[None]
     rho, sigma = 1.0 - 1e-12, 1.3
     new = (residuals[0, 1:] - residuals[0, :-1]) + (1.0 - rho) * residuals[0, :-1]
@@ -106,7 +106,7 @@ def test_a_known_sensor_adds_its_variance(rng, given):
     )
     lasting = AutoregressiveNoise(CHANNELS, sensor=given)
     np.testing.assert_allclose(lasting.standard_deviations(np.hstack([sigma, 0.0 * sigma])), total)
-    # no model error at all is possible where the sensor is known, and only there; a negative one is not
+    # a model error of zero is possible only with known sensor noise; a negative one is not possible
     edge = np.array([[0.5, 0.0], [0.0, 0.5], [0.5, -1e-9], [0.5, math.nan]])
     assert np.isfinite(noise.log_likelihood(misfit, 30, edge)).tolist() == [True, False, False, False]
     assert len({repr(noise), repr(white), repr(GaussianNoise(CHANNELS, sensor=(0.0, 0.04)))}) == 3
@@ -118,7 +118,7 @@ def test_effective_samples_weigh_the_channels(rng):
     for given, expected in (
         ((10.0, 4.0), 0.25 * apart[0] + 0.1 * apart[1]),
         ({"drift": 4.0}, apart[0] + 0.1 * apart[1]),
-        ((1e9, 40.0), apart[0] + apart[1]),  # never more than there are
+        ((1e9, 40.0), apart[0] + apart[1]),  # at most the number of samples
     ):
         noise = GaussianNoise(CHANNELS, effective_samples=given)
         np.testing.assert_allclose(noise.log_likelihood(misfit, 40, sigma), expected, rtol=1e-13)
@@ -132,7 +132,7 @@ def test_effective_samples_weigh_the_channels(rng):
 
 
 @pytest.mark.parametrize("kind", [GaussianNoise, AutoregressiveNoise])
-def test_sensors_that_cannot_be_are_refused(kind):
+def test_invalid_sensor_noise_is_refused(kind):
     for sensor, message in (
         ({"bottom": 1.0}, "unknown channels .*bottom.*the channels are top, drift"),
         ([1.0], "one number for each of top, drift; got 1"),
@@ -150,7 +150,7 @@ def test_sensors_that_cannot_be_are_refused(kind):
 
 
 class Line:
-    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one, and counts its runs."""
+    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one; counts its runs."""
 
     parameter_names = ("offset", "slope")
     channels = CHANNELS
@@ -170,7 +170,7 @@ class Line:
 
 
 class BatchLine(Line):
-    """With its own sums of squares, which must not be taken for anything else."""
+    """A model with its own sums of squares, which must not be used as another statistic."""
 
     def simulate_batch(self, thetas):
         self.runs += len(thetas)
@@ -186,7 +186,7 @@ def measured_by(model, rng):
 
 
 @pytest.mark.parametrize("kind", [Line, BatchLine])
-def test_sigmas_and_correlations_cost_no_simulation(rng, kind):
+def test_sigmas_and_correlations_need_no_simulation(rng, kind):
     model = kind()
     likelihood = FELikelihood(model, measured_by(Line(), rng), AutoregressiveNoise(CHANNELS))
     assert likelihood.fast_parameters == (2, 3, 4, 5)
@@ -202,14 +202,14 @@ def test_sigmas_and_correlations_cost_no_simulation(rng, kind):
         np.array([lag_one_sums(r) for r in residuals]), 12, good[:, 2:]
     )
     np.testing.assert_allclose(likelihood.log_likelihood(good), expected, rtol=1e-12)
-    # sums of squares stay what they were, for those who ask for them
+    # the sums of squares are unchanged
     np.testing.assert_allclose(likelihood.misfit(good[:, :2]), np.square(residuals).sum(axis=2), rtol=1e-13)
     power = np.square(likelihood.measurements.values).sum(axis=1)
     posterior = Posterior(likelihood, dict(zip(likelihood.parameter_names, [Uniform(-9.0, 9.0)] * 6, strict=True)))
     np.testing.assert_allclose(fit_measures(posterior, good), likelihood.misfit(good[:, :2]) / power)
 
 
-def test_no_propositions_outside_the_possible_are_simulated(rng):
+def test_impossible_noise_parameters_are_not_simulated(rng):
     model = Line()
     likelihood = FELikelihood(model, measured_by(model, rng), AutoregressiveNoise(CHANNELS))
     x = np.array([[0.0, 0.0, 1.0, 1.0, 0.5, 1.0], [0.0, 0.0, 1.0, -1.0, 0.5, 0.5]])
@@ -217,8 +217,8 @@ def test_no_propositions_outside_the_possible_are_simulated(rng):
 
 
 @pytest.mark.parametrize("responses", [False, True])
-def test_the_cache_tells_statistics_apart(tmp_path, rng, responses):
-    """What was kept for white noise must not be served to another one, in either order."""
+def test_the_cache_separates_statistics(tmp_path, rng, responses):
+    """Rows stored for white noise are not used for another noise, in either order."""
     measurements, thetas = measured_by(Line(), rng), rng.uniform(-1.0, 1.0, size=(6, 2))
     cache = SimulationCache(tmp_path / "lines.sqlite", responses=responses)
     expected = {}
@@ -265,8 +265,8 @@ def test_drawn_errors_have_the_covariance_that_the_likelihood_assumes(rng):
         assert np.all(np.abs(got - expected) < 4.5 * error)
 
 
-def test_predictions_draw_errors_that_last(rng):
-    """Every reading spreads by sigma, whatever the correlation; their mean spreads the more the longer errors last."""
+def test_predictions_draw_correlated_errors(rng):
+    """The standard deviation of a sample is sigma for any correlation; that of the mean grows with the correlation."""
     sigma, rho, n = 0.3, 0.8, 4000
     likelihood = FELikelihood(Line(), measured_by(Line(), rng), AutoregressiveNoise(CHANNELS))
     names = likelihood.parameter_names
@@ -288,13 +288,13 @@ def test_predictions_draw_errors_that_last(rng):
 
 LEVEL, N_DATA, RHO = 0.9, 200, 0.9
 STEPS = 600
-# at this period [s] the spectrum of the errors is what effective_samples takes it to be, (1 + rho^2) / (1 - rho^2) of
-# white noise; at a shorter one it is lower, and the effective number errs on the safe side
+# at this period [s] the spectrum of the errors is that assumed by effective_samples, (1 + rho^2) / (1 - rho^2) times
+# that of white noise; at a shorter period it is lower, and the effective number is conservative
 LIKE_THE_ERRORS = 1.2
 
 
 def credible_interval_holds(likelihood, noise, statistics, grid, truth, options):
-    """Whether the central 90 % interval of the first parameter, by summation over a grid, holds the truth.
+    """Whether the central 90 % interval of the first parameter, by summation over a grid, contains the true value.
 
     `grid` are its values, `options` those of the noise's parameters (rows), with flat priors over the grid.
     """
@@ -308,8 +308,8 @@ def credible_interval_holds(likelihood, noise, statistics, grid, truth, options)
 
 
 @pytest.mark.parametrize("period", [0.6, LIKE_THE_ERRORS])
-def test_coverage_of_what_each_noise_infers_from_errors_that_last(rng, period):
-    """The 90 % interval of the stiffness over 200 data sets whose errors are AR(1) with rho = .9."""
+def test_coverage_of_each_noise_for_correlated_errors(rng, period):
+    """The 90 % interval of the stiffness over 200 data sets whose errors are AR(1) with rho = 0.9."""
     oscillator = LinearOscillator(Record("noise", 0.02, rng.normal(size=STEPS)), period=period, damping_ratio=0.05)
 
     class OneChannel:

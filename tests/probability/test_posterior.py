@@ -1,4 +1,4 @@
-"""The posterior: its formula, its promises to any client, and what it does with models that misbehave."""
+"""The posterior: its formula, the properties that clients rely on, and models that fail."""
 
 import logging
 import math
@@ -54,7 +54,7 @@ def posterior(oscillator, measurements, prior):
 
 
 class Polynomial:
-    """Responses ``theta[0] + theta[1] t``, in two channels; misbehaves where it is told to, and counts its runs."""
+    """Responses ``theta[0] + theta[1] t``, in two channels; fails at chosen points, and counts its runs."""
 
     parameter_names = ("offset", "slope")
     channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
@@ -68,7 +68,7 @@ class Polynomial:
     def simulate(self, theta):
         offset, slope = theta
         self.runs.append(tuple(theta))
-        theta[:] = np.nan  # a model that scribbles on its input must not harm the caller
+        theta[:] = np.nan  # a model that changes its input must not affect the caller
         if offset == 1.0:
             raise SimulationFailed("no convergence at step 3")
         if offset == 2.0:
@@ -92,7 +92,7 @@ class Polynomial:
 
 
 class BatchPolynomial(Polynomial):
-    """The same with batch methods, which break as a whole where `broken` says how."""
+    """The same model with batch methods, which fail as a whole in the way given by `broken`."""
 
     broken = ""
 
@@ -326,14 +326,14 @@ def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     assert report["failure_count"] == sum(report["failure_reasons"].values()) == len(BAD)
     assert report["cache_hits"] == 0
     assert report["seconds"] > 0.0
-    assert len(caplog.records) == 1  # the first failure speaks, the others are counted
+    assert len(caplog.records) == 1  # only the first failure is logged
     assert "no convergence at step 3" in caplog.text
     assert posterior(x[0]) == -np.inf
     assert type(posterior.log_likelihood(x[0])) is float
     assert len(caplog.records) == 1
 
 
-def test_an_interrupt_passes():
+def test_an_interrupt_is_passed_on():
     posterior = polynomial_posterior(Polynomial())
     with pytest.raises(KeyboardInterrupt):
         posterior([7.0, 0.1, 0.5, 1.0])
@@ -392,7 +392,7 @@ def test_nothing_is_simulated_outside_the_support():
     assert posterior.report()["failure_count"] == 0
 
 
-def test_the_likelihood_alone_simulates_only_what_can_count():
+def test_the_likelihood_does_not_simulate_impossible_points():
     model = Polynomial()
     likelihood = polynomial_posterior(model).likelihood
     x = np.array([[0.5, 0.1, 0.0, 1.0], [0.5, 0.1, 0.5, -1.0], [np.nan, 0.1, 0.5, 1.0], [0.5, np.inf, 0.5, 1.0]])
@@ -442,7 +442,7 @@ def test_batch_methods_give_the_same_as_single_simulations(kind, rng):
 
 @pytest.mark.parametrize("kind", [BatchPolynomial, MisfitPolynomial])
 @pytest.mark.parametrize("broken", ["raises", "shape"])
-def test_a_batch_that_breaks_as_a_whole_is_run_row_by_row(kind, broken, caplog):
+def test_a_batch_that_fails_as_a_whole_is_run_row_by_row(kind, broken, caplog):
     thetas = np.array([[0.5, 0.1], [1.0, 0.1], [0.6, 0.3]])
     model = kind()
     model.broken = broken
@@ -481,7 +481,7 @@ def test_spawned_processes_give_the_same_bits(posterior, oscillator, measurement
         np.testing.assert_array_equal(pooled(x), expected)
         assert pooled.report()["failures"] == posterior.report()["failures"]
         assert pooled.report()["failure_count"] == 1
-        np.testing.assert_array_equal(pool.map(pooled, list(x)), expected)  # the pool itself stays at home
+        np.testing.assert_array_equal(pool.map(pooled, list(x)), expected)  # the pool is not pickled
 
 
 def test_pickle(posterior):
@@ -520,7 +520,7 @@ def test_optimum_is_near_the_truth(posterior):
         options={"maxiter": 2000, "maxfev": 2000, "xatol": 1e-8, "fatol": 1e-8},
     )
     assert result.success
-    # standard deviations from the curvature at the optimum, in steps of a thousandth
+    # standard deviations from the curvature at the optimum, with steps of 0.001
     step = 1e-3 * result.x
     sd = []
     for k in range(4):

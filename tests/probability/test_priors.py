@@ -1,4 +1,4 @@
-"""Prior densities against scipy.stats, and the promises of a joint prior."""
+"""Prior densities against scipy.stats, and the properties of a joint prior."""
 
 import math
 import pickle
@@ -44,12 +44,14 @@ def test_density_equals_scipy_far_into_the_tails(ours, theirs):
 
 @both
 def test_quantiles_return_through_both_tails(ours, theirs):
-    # round-off of the value itself, seen through the distribution function: |dF / F| = density |dx| / F
+    # effect of the round-off of the value on the distribution function: |dF / F| = density |dx| / F
     u = np.concatenate([np.logspace(-12, -0.31, 60), [0.5]])
     resolution = 8 * np.finfo(float).eps * max(abs(getattr(ours, "mean", 0.0)), getattr(ours, "sd", 0.0))
     for tail, probability in ((theirs.cdf, u), (theirs.sf, 1.0 - u)):
         x = ours.ppf(probability)
-        share = u if tail == theirs.cdf else 1.0 - probability  # 1 - u is rounded: compare with what was asked for
+        share = (
+            u if tail == theirs.cdf else 1.0 - probability
+        )  # 1 - u is rounded, so compare with the probability given
         slack = 1e-11 + theirs.pdf(x) * (resolution + 4 * np.spacing(np.abs(x))) / share
         assert (np.abs(tail(x) / share - 1.0) <= slack).all()
     ends = ours.ppf(np.array([0.0, 1.0]))
@@ -67,7 +69,7 @@ def test_draws_follow_the_distribution(ours, theirs, seed):
 
 
 @both
-def test_moments_are_those_of_the_distribution_as_truncated(ours, theirs):
+def test_moments_are_those_after_truncation(ours, theirs):
     np.testing.assert_allclose(ours.moments, (theirs.mean(), theirs.std()), rtol=1e-8)
 
 
@@ -169,7 +171,7 @@ def test_prior_is_the_sum_of_its_densities(prior, seed):
     assert prior.logpdf(x[:0]).shape == (0,)
 
 
-def test_prior_has_what_clients_ask_for(prior):
+def test_prior_has_the_attributes_that_clients_expect(prior):
     assert prior.dim == len(PAIRS)
     assert prior.names == tuple(PAIRS)
     assert prior.bounds.shape == (prior.dim, 2)

@@ -1,4 +1,4 @@
-"""Residuals of known origin: their correlation, their worth in samples, their checks."""
+"""Residuals of known origin: their correlation, effective number of samples and checks."""
 
 import math
 
@@ -43,25 +43,27 @@ def test_sums_are_their_definition(rng):
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9, -0.9])
 def test_effective_samples_of_autoregressive_errors(rng, rho):
-    """n (1 - rho^2) / (1 + rho^2), and the same for either sign: 200 series, so the mean is known to some percent."""
+    """n (1 - rho^2) / (1 + rho^2), for both signs of rho; the mean of 200 series is accurate to a few percent."""
     found = effective_samples(autoregressive(rng, rho, n_channels=200)).mean()
     assert found == pytest.approx(N * (1.0 - rho**2) / (1.0 + rho**2), rel=0.06)
 
 
-def test_effective_samples_are_what_sigma_is_inferred_from(rng):
-    """The mean square of correlated errors spreads as that of n_eff independent ones."""
+def test_effective_samples_give_the_variance_of_the_mean_square(rng):
+    """The mean square of correlated errors has the variance of that of n_eff independent errors."""
     errors = autoregressive(rng, 0.8, n=1000, n_channels=2000)
     spread = np.square(errors).mean(axis=1).var()
     assert 2.0 / spread == pytest.approx(effective_samples(errors).mean(), rel=0.15)
 
 
-def test_errors_that_oscillate_are_worth_fewer_samples_too(rng):
-    """The correlation time of a mean would say the contrary: more samples than there are."""
+def test_oscillating_errors_are_worth_fewer_samples(rng):
+    """The correlation time of a mean would give more than n samples."""
     z = rng.standard_normal((1, N))
     pole = 0.97 * np.exp(0.6j)
     errors = signal.lfilter([1.0], np.poly([pole, pole.conjugate()]).real, z, axis=1)
     pulse = signal.lfilter([1.0], np.poly([pole, pole.conjugate()]).real, np.eye(1, N)[0])
-    assert pulse.sum() ** 2 / np.square(pulse).sum() < 1.0  # that time: spectrum at zero frequency over the variance
+    assert (
+        pulse.sum() ** 2 / np.square(pulse).sum() < 1.0
+    )  # that time is the spectrum at zero frequency over the variance
     assert effective_samples(errors)[0] < 0.1 * N
 
 
@@ -80,22 +82,22 @@ def test_innovations_of_autoregressive_errors_are_white(rng):
         innovations(errors, [1.0])
 
 
-def test_checks_tell_white_from_lasting_and_normal_from_heavy_tails(rng):
-    """Of true ones probabilities are uniform: 400 of each, a share below .1 within its binomial error."""
+def test_checks_detect_correlation_and_heavy_tails(rng):
+    """Under the hypothesis the probabilities are uniform: of 400, the share below 0.1 is within its binomial error."""
     white = residual_checks(rng.standard_normal((400, 500)))
-    lasting = residual_checks(autoregressive(rng, 0.9, n=2000, n_channels=400))
+    correlated = residual_checks(autoregressive(rng, 0.9, n=2000, n_channels=400))
     error = math.sqrt(0.1 * 0.9 / 400)
     assert abs(np.mean(white.white < 0.1) - 0.1) < 4.0 * error
     assert abs(np.mean(white.normal < 0.1) - 0.1) < 4.0 * error
-    assert np.mean(lasting.white < 1e-6) == 1.0
-    assert np.mean(lasting.normal < 0.1) < 0.25  # lasting errors are normal all the same
+    assert np.mean(correlated.white < 1e-6) == 1.0
+    assert np.mean(correlated.normal < 0.1) < 0.25  # correlated errors are normal
     heavy = residual_checks(rng.standard_t(3, size=(50, 1000)))
     assert np.mean(heavy.normal < 0.01) > 0.95
-    np.testing.assert_allclose(lasting.lag_one, 0.9, atol=0.06)
+    np.testing.assert_allclose(correlated.lag_one, 0.9, atol=0.06)
 
 
 @pytest.mark.parametrize("function", [autocorrelation, effective_samples, residual_checks])
-def test_what_are_no_residuals_is_refused(function):
+def test_invalid_residuals_are_refused(function):
     for residuals, message in (
         (np.ones(5), "shape"),
         (np.ones((1, 1)), "two samples"),

@@ -1,4 +1,4 @@
-"""What was simulated is kept on disk: one simulation for every noise, sampler and run, and never an old value."""
+"""Cache on disk: one simulation serves every noise, sampler and run, and an outdated value is never used."""
 
 import dataclasses
 import multiprocessing
@@ -30,7 +30,7 @@ SINE = np.sin(np.arange(50.0))
 
 
 class Line:
-    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above `steepest`, and counts its runs."""
+    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above `steepest`; counts its runs."""
 
     parameter_names = ("offset", "slope")
     channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
@@ -51,7 +51,7 @@ class Line:
 
 
 class Batched(Line):
-    """The same, many at once."""
+    """The same model with a batch method."""
 
     def __init__(self, *args):
         super().__init__(*args)
@@ -76,7 +76,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def thetas(rng):
-    """Three hundred points, some fifty of which fail."""
+    """Three hundred points, of which about fifty fail."""
     return np.column_stack([rng.normal(size=300), rng.uniform(0.0, 1.2, size=300)])
 
 
@@ -97,7 +97,7 @@ def test_another_run_simulates_nothing(path, thetas):
     assert second.model.runs == 0
 
 
-def test_failures_are_remembered_with_their_reasons(path, thetas):
+def test_failures_are_cached_with_their_reasons(path, thetas):
     first, second = likelihood_of(Line(), path), likelihood_of(Line(), path)
     first.misfit(thetas)
     second.misfit(thetas)
@@ -120,14 +120,14 @@ def test_duplicates_and_zeros_of_both_signs(path):
     assert likelihood.cache.info().simulations == 2
 
 
-def test_without_memory_the_disk_answers(path, thetas):
+def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
     likelihood = likelihood_of(Line(), path, memory_rows=0)
     for _ in range(3):
         likelihood.misfit(thetas)
     assert (likelihood.simulations, likelihood.disk_hits) == (300, 600)
 
 
-def test_a_batch_is_asked_for_once_and_written_once(path, thetas):
+def test_a_batch_needs_one_query_and_one_write(path, thetas):
     likelihood = likelihood_of(Batched(), path)
     statements = []
     likelihood.cache._file.connection().set_trace_callback(statements.append)
@@ -138,10 +138,10 @@ def test_a_batch_is_asked_for_once_and_written_once(path, thetas):
     assert kinds.count("INSERT") == 300
     statements.clear()
     likelihood.misfit(thetas)
-    assert statements == []  # memory is in front
+    assert statements == []  # served by the cache in memory
 
 
-def test_more_rows_than_one_query_takes(path, rng):
+def test_a_batch_of_several_queries(path, rng):
     thetas = np.column_stack([rng.normal(size=2345), np.full(2345, 0.5)])
     likelihood_of(Line(), path).misfit(thetas[::2])
     likelihood = likelihood_of(Line(), path)
@@ -172,7 +172,7 @@ def oscillator(path, **changes):
     ],
     ids=lambda change: next(iter(change)),
 )
-def test_whatever_changes_a_misfit_is_simulated_anew(path, change):
+def test_a_change_of_anything_the_misfit_depends_on_needs_a_simulation(path, change):
     theta = [[1.1, 0.9]]
     oscillator(path).misfit(theta)
     changed = oscillator(path, **change)
@@ -218,7 +218,7 @@ def test_noise_prior_and_display_units_change_nothing(path):
     assert shown.simulations == 0
 
 
-def test_a_model_that_changes_under_way_is_an_error(path):
+def test_a_model_that_changes_during_the_run_is_an_error(path):
     likelihood = oscillator(path)
     likelihood.misfit([[1.0, 1.0]])
     likelihood.model.period = 0.7
@@ -238,7 +238,7 @@ def test_fingerprint_and_parameters_cannot_be_confused():
 # failures once more ---------------------------------------------------------------------------------------------------
 
 
-def test_failures_are_run_again_where_asked(path):
+def test_failures_are_run_again_with_retry_failures(path):
     steep = [[0.0, 0.5], [0.0, 2.0], [0.0, 3.0]]
     likelihood_of(Line(1.0), path).misfit(steep)
     retried = likelihood_of(Line(2.5), SimulationCache(path, retry_failures=True))
@@ -246,11 +246,11 @@ def test_failures_are_run_again_where_asked(path):
         misfit = retried.misfit(steep)
     assert (retried.model.runs, retried.disk_hits) == (2, 1)
     assert np.isfinite(misfit[:2]).all() and np.isnan(misfit[2]).all()
-    after = likelihood_of(Line(1.0), path)  # the success has replaced the failure
+    after = likelihood_of(Line(1.0), path)  # a success replaces a failure
     np.testing.assert_array_equal(after.misfit(steep), misfit)
     assert (after.simulations, after.failure_count) == (0, 1)
     after.cache.store(after.fingerprint, np.array([[0.0, 0.5]]), 8, np.full((1, 2), np.nan), ["now it fails"], 0.1)
-    assert np.isfinite(likelihood_of(Line(), path).misfit(steep[:1])).all()  # and is never replaced by one
+    assert np.isfinite(likelihood_of(Line(), path).misfit(steep[:1])).all()  # a failure does not replace a success
 
 
 def test_reasons_of_any_kind(path):
@@ -276,7 +276,7 @@ def test_the_oldest_are_evicted(path, rng):
     assert (cache.info().simulations, cache.evictions) == (10, 4)
     known = SimulationCache(path).look_up(likelihood.simulation_key, thetas, 2, 8).known
     assert np.flatnonzero(known).tolist() == list(range(4, 14))
-    likelihood.misfit(thetas)  # a batch larger than the bound
+    likelihood.misfit(thetas)  # a batch larger than max_rows
     assert (cache.info().simulations, cache.evictions) == (10, 15)
 
 
@@ -286,7 +286,7 @@ def test_the_file_does_not_grow_beyond_its_bound(path, rng):
     for _ in range(30):
         thetas = rng.normal(size=(500, 2))
         cache.store("f", thetas, 8, thetas, [""] * 500, 1.0)
-        cache.close()  # moves the log into the file
+        cache.close()  # moves the write-ahead log into the file
         sizes.append(path.stat().st_size)
     assert max(sizes) < 3 * sizes[0]
 
@@ -323,14 +323,14 @@ def test_export_and_import(tmp_path, path, thetas):
     misfit = likelihood.misfit(thetas)
     assert likelihood.simulations == 0
     np.testing.assert_array_equal(misfit[1:], likelihood_of(Line()).misfit(thetas)[1:])
-    assert (misfit[0] == 1.0).all()  # what was known stays
+    assert (misfit[0] == 1.0).all()  # stored rows are not changed
     assert likelihood.failure_reasons == first.failure_reasons
     assert other.info().seconds > 1.0
     empty = SimulationCache(tmp_path / "empty.sqlite")
     assert empty.export_hdf5(tmp_path / "empty.h5") == other.import_hdf5(tmp_path / "empty.h5") == 0
 
 
-def test_exports_that_cannot_be_taken_in(tmp_path, path, thetas):
+def test_exports_that_cannot_be_imported(tmp_path, path, thetas):
     likelihood_of(Line(), path).misfit(thetas)
     cache = SimulationCache(path)
     with pytest.raises(ValueError, match="the cache itself"):
@@ -354,7 +354,7 @@ def test_exports_that_cannot_be_taken_in(tmp_path, path, thetas):
 
 @pytest.mark.parametrize("name", ["max_rows", "max_response_bytes"])
 @pytest.mark.parametrize("value", [0, -1, 2.5, None, True])
-def test_impossible_bounds(path, name, value):
+def test_invalid_bounds(path, name, value):
     with pytest.raises(ValueError, match=f"{name} must be a whole number"):
         SimulationCache(path, **{name: value})
     assert not path.exists()
@@ -372,7 +372,7 @@ def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
     assert sum(model.sizes) == 300
 
 
-def test_an_interrupted_batch_is_kept_so_far(path, rng, monkeypatch):
+def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypatch):
     monkeypatch.setattr("fe_likelihoods.probability.likelihood._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
@@ -391,7 +391,7 @@ def test_an_interrupted_batch_is_kept_so_far(path, rng, monkeypatch):
 
 
 class Pool:
-    """Runs here, and notes how many items came at once."""
+    """Pool that runs items in this process and records their number per call."""
 
     def __init__(self, **attributes):
         self.sizes = []
@@ -414,7 +414,7 @@ def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attri
     assert pool.sizes == sizes
 
 
-def test_chunks_grow_with_the_speed_but_not_at_once(path, rng):
+def test_chunks_grow_step_by_step_with_the_speed(path, rng):
     class Fast(Batched):
         def simulate_batch(self, thetas):
             return SimulationBatch(np.zeros((len(thetas), 2, 8)), self.sizes.append(len(thetas)) or [""] * len(thetas))
@@ -446,9 +446,9 @@ def test_other_processes_share_the_file(path, thetas, method):
     process.join(60)
     assert process.exitcode == 0
     np.testing.assert_array_equal(misfit[:200], expected)
-    # both count on; a fork brings the memory along, a spawned process reads from disk
+    # a forked process has a copy of the cache in memory, a spawned one reads from disk
     assert (simulations, disk_hits) == (300, 0 if method == "fork" else 200)
-    likelihood.misfit(thetas)  # what the other one has simulated
+    likelihood.misfit(thetas)  # the rows of the other process
     assert likelihood.simulations == 200
     assert likelihood.disk_hits == 100
 
@@ -468,7 +468,7 @@ def test_a_connection_does_not_go_through_a_fork(path, thetas):
 
 
 def test_forks_while_threads_write(path, rng):
-    """A lock held by another thread, or a connection taken along, would hang or break the child."""
+    """A lock held by another thread, or an inherited connection, would block or break the child."""
     if not hasattr(os, "fork"):
         pytest.skip("NO fork ON THIS SYSTEM")
     cache = SimulationCache(path)
@@ -547,7 +547,7 @@ def models():
 
 
 @pytest.mark.parametrize("model", models(), ids=lambda model: type(model).__name__)
-def test_responses_are_kept_beside_the_sums(path, rng, model):
+def test_responses_are_stored_in_addition_to_the_sums(path, rng, model):
     thetas = rng.uniform(0.5, 1.4, size=(12, len(model.parameter_names)))
     likelihood = likelihood_of(model, SimulationCache(path, responses=True), data=0.1)
     np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(model, data=0.1).misfit(thetas))

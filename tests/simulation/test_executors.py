@@ -1,4 +1,4 @@
-"""The rule for ``pool=``: every executor gives the same bits, the model travels once, bad input is refused early."""
+"""Executors of ``pool=``: same bits, one transfer of the model per process, early errors for invalid pools."""
 
 import multiprocessing
 import os
@@ -28,7 +28,7 @@ SPAWN = multiprocessing.get_context("spawn")
 
 
 class Recorder:
-    """A pool that pickles as processes would, and counts the bytes."""
+    """A pool that pickles like processes, and counts the bytes."""
 
     def __init__(self, forget=False):
         self.bytes, self.forget = [], forget
@@ -103,8 +103,8 @@ def test_kind_of_executor():
     assert type(as_executor(Recorder())) is PoolExecutor
 
 
-def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
-    """A client that does the work itself, and notes what each task was."""
+def test_dask_sends_short_runs_in_groups_and_long_ones_one_by_one(monkeypatch):
+    """A client that runs the tasks itself and records their sizes."""
 
     class Client:
         def __init__(self):
@@ -133,10 +133,10 @@ def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
         assert executor.map(lambda item: (item, ""), items) == [(item, "") for item in items]
     assert executor.map(slow, items[:3]) == [(item, "") for item in items[:3]]
     assert executor.map(slow, items[:12]) == [(item, "") for item in items[:12]]
-    assert client.tasks[0] == [1] * 64  # nothing is known yet
+    assert client.tasks[0] == [1] * 64  # the duration of an item is not known yet
     assert client.tasks[1][0] == 16 and client.tasks[1][-1] == 1 and sum(client.tasks[1]) == 64
     assert len(client.tasks[1]) < 20
-    assert client.tasks[3] == [2, 2, 2, 1, 1, 1, 1, 1, 1]  # .35 s each, so two to a second
+    assert client.tasks[3] == [2, 2, 2, 1, 1, 1, 1, 1, 1]  # 0.35 s each, so two per second
 
 
 @pytest.mark.parametrize(
@@ -144,12 +144,12 @@ def test_dask_sends_short_runs_in_groups_and_long_ones_alone(monkeypatch):
     [0, -1, True, 2.5, "four", object(), float("nan"), [2]],
     ids=lambda pool: type(pool).__name__ if type(pool) is object else str(pool),
 )
-def test_bad_pools_are_refused(pool):
+def test_invalid_pools_are_refused(pool):
     with pytest.raises(ValueError, match="pool must be None, a positive number of processes, or an object with map"):
         posterior_of(Treacherous(), pool=pool)
 
 
-def test_model_travels_once_to_each_process():
+def test_model_is_sent_once_to_each_process():
     with LocalPool(2) as pool:
         for _ in range(3):
             batch = simulate_batch(Large(), np.tile([0.2, 0.3], (20, 1)), pool)
@@ -166,7 +166,7 @@ def test_bytes_sent_with_each_item(forget, monkeypatch):
     recorder = Recorder()
     executor = as_executor(recorder)
     treacherous.LOADED.clear()
-    if forget:  # as on another machine: there is no such folder, so the model travels beside the items
+    if forget:  # as on another machine without the folder: the model is sent with the items
         monkeypatch.setattr(executors.Path, "read_bytes", _absent_file)
     for _ in range(2):
         batch = simulate_batch(model, thetas, executor)
@@ -178,7 +178,7 @@ def test_bytes_sent_with_each_item(forget, monkeypatch):
     assert recorder.bytes[-20:] == [recorder.bytes[-1]] * 20
 
 
-def test_few_functions_are_kept_in_a_worker():
+def test_a_worker_keeps_a_bounded_number_of_functions():
     executor = as_executor(Recorder())
     for ballast in range(20):
         model = Treacherous()
@@ -187,7 +187,7 @@ def test_few_functions_are_kept_in_a_worker():
     assert len(executors.loaded_functions) == executors.MAX_LOADED_FUNCTIONS
 
 
-def test_temporary_files_go_with_the_executor():
+def test_temporary_files_are_removed_with_the_executor():
     executor = as_executor(Recorder())
     simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), executor)
     folder = executor._folder.path
@@ -212,7 +212,7 @@ def test_model_that_cannot_be_pickled_runs_in_threads():
         assert np.isfinite(posterior(posterior.sample_prior(5, 1))).all()
 
 
-def test_model_that_cannot_be_loaded_is_an_error_and_no_failure():
+def test_model_that_cannot_be_loaded_is_an_error_not_a_failure():
     posterior = posterior_of(Absent(), pool=1)
     with pytest.raises(ValueError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
         posterior(posterior.sample_prior(5, 1))
@@ -223,7 +223,7 @@ def test_model_that_cannot_be_loaded_is_an_error_and_no_failure():
     assert posterior.report()["simulations"] == 0
 
 
-def test_local_pool_maps_any_function_and_raises_what_it_raises():
+def test_local_pool_maps_any_function_and_raises_its_exceptions():
     with LocalPool(2) as pool:
         assert pool.map(abs, range(-5, 0)) == [5, 4, 3, 2, 1]
         assert pool.map(abs, []) == []
@@ -238,7 +238,7 @@ def test_threads_in_workers_are_limited(monkeypatch):
     names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"]
     for name in names:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # the user's own word
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # a choice of the user, which is kept
     with LocalPool(1) as pool:
         assert pool.map(os.getenv, names) == ["2", "1", "1"]
 
@@ -254,7 +254,7 @@ def test_likelihood_with_a_pool_of_its_own_pickles_without_it():
 
 
 def test_as_the_pool_of_a_sampler(seed):
-    """The posterior goes to the processes once, and the chain is that of a run without them."""
+    """The chain equals that of a run without a pool."""
     posterior = posterior_of(Treacherous())
     start = posterior.sample_prior(10, seed)
     chains = []
@@ -315,7 +315,7 @@ def test_models_of_a_notebook_are_refused():
 
 @pytest.mark.parametrize("system", ["column", "bridge"])
 def test_compiled_models_go_through_a_pool_to_the_same_bits(system):
-    """Without a pool a batch runs on threads of this process, with one set by set in the workers."""
+    """Without a pool a batch runs on threads of this process; with a pool, sets run one by one in the workers."""
     if system == "column":
         posterior = problems.bridge_column(duration=2.0)
         thetas = posterior.sample_prior(6, 1)[:, :5]

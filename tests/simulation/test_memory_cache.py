@@ -1,4 +1,4 @@
-"""What was simulated is not simulated again, and the digest that says whether two posteriors are the same."""
+"""Cache of statistics in memory, and fingerprints of posteriors."""
 
 import dataclasses
 import os
@@ -23,7 +23,7 @@ from fe_likelihoods.simulation.model import SimulationFailed
 
 
 class Line:
-    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one, and counts its runs."""
+    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one; counts its runs."""
 
     parameter_names = ("offset", "slope")
     channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
@@ -50,10 +50,10 @@ def points(rng, n, slope=0.5):
     return np.column_stack([rng.normal(size=n), np.full(n, slope), rng.uniform(0.5, 2.0, size=(n, 2))])
 
 
-# memory ---------------------------------------------------------------------------------------------------------------
+# cache ----------------------------------------------------------------------------------------------------------------
 
 
-def test_a_change_of_the_noise_costs_no_simulation(rng):
+def test_a_change_of_the_noise_needs_no_simulation(rng):
     model = Line()
     likelihood = likelihood_of(model)
     x = points(rng, 20)
@@ -79,11 +79,11 @@ def test_hits_are_rows_from_memory_only():
     np.testing.assert_array_equal(first[:4], likelihood_of(Line()).misfit(thetas))
     np.testing.assert_array_equal(first[4], first[5])
     assert np.isnan(first[6]).all()
-    first[:] = 0.0  # what is handed out is not what is remembered
+    first[:] = 0.0  # the returned array is a copy of the cached one
     assert (likelihood.misfit(thetas) > 0.0).all()
 
 
-def test_failures_are_remembered_and_recorded_once():
+def test_failures_are_cached_and_recorded_once():
     model = Line()
     likelihood = likelihood_of(model)
     for _ in range(3):
@@ -94,14 +94,14 @@ def test_failures_are_remembered_and_recorded_once():
     assert likelihood.cache_hits == 4
 
 
-def test_the_memory_is_bounded(rng):
+def test_the_cache_is_bounded(rng):
     model = Line()
     likelihood = likelihood_of(model, memory_rows=10)
     thetas = points(rng, 15)[:, :2]
-    likelihood.misfit(thetas)  # a batch larger than the memory
+    likelihood.misfit(thetas)  # a batch larger than the cache
     likelihood.misfit(thetas[5:])
     assert likelihood.simulations == 15
-    likelihood.misfit(thetas[5:6])  # asked for just now, so it outlives the others
+    likelihood.misfit(thetas[5:6])  # now the most recently used row
     likelihood.misfit(points(rng, 9)[:, :2])
     assert likelihood.simulations == 24
     likelihood.misfit(thetas[[5, 6]])
@@ -109,7 +109,7 @@ def test_the_memory_is_bounded(rng):
     assert len(likelihood._memory) == 10
 
 
-def test_without_memory():
+def test_without_a_cache():
     model = Line()
     likelihood = likelihood_of(model, memory_rows=0)
     for _ in range(2):
@@ -119,12 +119,12 @@ def test_without_memory():
 
 
 @pytest.mark.parametrize("rows", [-1, 2.5, None, True])
-def test_impossible_memories(rows):
+def test_invalid_sizes(rows):
     with pytest.raises(ValueError, match="memory_rows must be the number of simulations"):
         likelihood_of(Line(), memory_rows=rows)
 
 
-def test_memory_does_not_travel(rng):
+def test_the_cache_is_not_pickled(rng):
     likelihood = likelihood_of(Line(), memory_rows=500)
     x = points(rng, 200)
     small = len(pickle.dumps(likelihood))
@@ -138,7 +138,7 @@ def test_memory_does_not_travel(rng):
     assert len(copy.model.runs) == 200
 
 
-def test_threads_share_a_memory(rng):
+def test_threads_share_a_cache(rng):
     likelihood = likelihood_of(Line(), memory_rows=50)
     x = points(rng, 60)
     expected = likelihood_of(Line()).log_likelihood(x)
@@ -151,14 +151,14 @@ def test_threads_share_a_memory(rng):
     assert len(likelihood._memory) == 50
 
 
-def test_the_memory_alone():
+def test_the_least_recently_used_row_is_evicted():
     memory = MemoryCache(2)
     misfit, known = memory.look_up([], 3)
     assert misfit.shape == (0, 3)
     assert known == []
     memory.store([b"a", b"b"], np.array([[1.0], [2.0]]))
     memory.look_up([b"a"], 1)
-    memory.store([b"c"], np.array([[3.0]]))  # b is the one not asked for longest
+    memory.store([b"c"], np.array([[3.0]]))  # b is the least recently used
     misfit, known = memory.look_up([b"a", b"b", b"c"], 1)
     assert known == [True, False, True]
     assert misfit[known].ravel().tolist() == [1.0, 3.0]
@@ -184,7 +184,7 @@ def oscillator_posterior(**changes):
 
 @dataclass(frozen=True)
 class ScaledNoise:
-    """Two levels and a table of weights."""
+    """A noise with two parameters and a large table."""
 
     weights: np.ndarray
     parameter_names: tuple[str, ...] = ("level_a", "level_b")
@@ -200,7 +200,7 @@ class NamelessNoise(ScaledNoise):
 def test_fingerprint_changes_with_what_the_density_depends_on():
     weights = np.ones(2000)
     other = weights.copy()
-    other[1000] += 1e-12  # in the middle of a long table, and far behind the point
+    other[1000] += 1e-12  # a small change in the middle of a long table
     changes = [
         {},
         {"record": np.cos(np.arange(50.0))},
@@ -225,12 +225,12 @@ def test_fingerprint_changes_with_what_the_density_depends_on():
     assert Posterior(swapped.likelihood, traded).fingerprint not in fingerprints
 
 
-def test_fingerprint_of_a_noise_that_does_not_say_what_it_is():
+def test_fingerprint_of_a_noise_without_a_repr_of_its_values():
     with pytest.raises(ValueError, match="repr that shows all values of NamelessNoise"):
         _ = oscillator_posterior(noise=NamelessNoise(np.ones(2))).fingerprint
 
 
-def test_fingerprint_of_a_distribution_that_does_not_say_what_it_is():
+def test_fingerprint_of_a_distribution_without_a_repr_of_its_values():
     class Vague(Distribution):
         bounds = (0.0, 1.0)
         moments = (0.5, 0.3)
