@@ -364,11 +364,7 @@ def test_comparison_run_twice_simulates_once(tmp_path):
 @pytest.mark.parametrize("pool", ["local", "dask"])
 def test_own_models_agree_and_are_simulated_once(pool, tmp_path):
     if pool == "dask":
-<<<<<<< HEAD
         pytest.importorskip("distributed", reason="NO DISTRIBUTED: install it to test this executor")
-=======
-        pytest.importorskip("distributed", reason="NO DISTRIBUTED: install it to test this pool")
->>>>>>> 8d586e1 (Executors: names and messages; benchmarks of the executors)
     results = []
     for used in (pool, "none"):  # the second run needs no pool
         run_tutorial("05_your_own_model.py", "--pool", used, "--out", str(tmp_path))
