@@ -1,26 +1,26 @@
-"""Models of a user's own, for tutorial 05: one structure as a Python function, as OpenSees commands, and as a program.
+"""User-defined models for tutorial 05: one structure as a Python function, as OpenSees commands, and as a program.
 
-A mass on a bilinear spring under a base motion. The parameters are multiples of a nominal stiffness and of a nominal
-yield strength. Functions that go to other processes stand in a module like this one, not in the script itself.
+The structure is a mass on a bilinear spring under a base motion. The parameters are multiples of a nominal stiffness
+and of a nominal yield strength. Functions that are sent to other processes should be in a module like this one, not in
+the script itself.
 """
 
 from pathlib import Path
 
 import numpy as np
-from fe_likelihoods.data.make_isolated_bridge import table_motion
 from own_program import solve
 
-from fe_likelihoods.signals.channels import Channel
+from fe_likelihoods import Channel, table_motion
 
 NAMES = ("stiffness", "strength")
 CHANNELS = (
     Channel("acceleration", "absolute acceleration", "g"),
     Channel("displacement", "relative displacement", "mm"),
 )
-STIFFNESS = (2.0 * np.pi / 0.8) ** 2  # of a unit mass [1/s2]: a period of .8 s
-STRENGTH = 0.02 * STIFFNESS  # [m/s2]: yields at 20 mm
-HARDENING = 0.05  # share of the stiffness left after yielding
-DAMPING = 2.0 * 0.03 * np.sqrt(STIFFNESS)  # [1/s]: 3 % of critical
+STIFFNESS = (2.0 * np.pi / 0.8) ** 2  # per unit mass [1/s²]: a period of 0.8 s
+STRENGTH = 0.02 * STIFFNESS  # per unit mass [m/s²]: yields at 20 mm
+HARDENING = 0.05  # ratio of the stiffness after yielding to the initial one
+DAMPING = 2.0 * 0.03 * np.sqrt(STIFFNESS)  # per unit mass [1/s]: 3 % of critical damping
 RECORD = table_motion().trim(0.0, 8.0).resample(0.01)
 
 PROGRAM = Path(__file__).with_name("own_program.py")
@@ -30,13 +30,13 @@ $stiffness $strength {stiffness!r} {strength!r} {hardening!r} {damping!r} {dt!r}
 
 
 def bilinear(theta: np.ndarray) -> np.ndarray:
-    """Response (2, n_steps), by the same solver that the program has."""
+    """Response (2, n_steps) [m/s², m], computed by the solver of the program."""
     stiffness, strength = STIFFNESS * theta[0], STRENGTH * theta[1]
     return np.array(solve(stiffness, strength, HARDENING, DAMPING, RECORD.dt, RECORD.acceleration.tolist())).T
 
 
 def bilinear_in_opensees(ops, theta: np.ndarray) -> np.ndarray:
-    """The same in OpenSees: a zero-length element of Steel01 beside a dashpot."""
+    """The same structure in OpenSees: a zero-length element with Steel01 and a dashpot in parallel."""
     ops.model("basic", "-ndm", 1, "-ndf", 1)
     ops.node(1, 0.0)
     ops.node(2, 0.0)
@@ -64,13 +64,13 @@ def bilinear_in_opensees(ops, theta: np.ndarray) -> np.ndarray:
 
 
 def write_motion(path: Path) -> Path:
-    """The base motion as the program reads it."""
+    """Write the base motion in the form that the program reads; return the path."""
     path.write_text("\n".join(repr(value) for value in RECORD.acceleration.tolist()) + "\n")
     return path
 
 
 def input_template() -> str:
-    """Input file of the program: placeholders for the parameters, numbers for what is fixed."""
+    """Template of the input file of the program, with placeholders for the parameters."""
     return INPUT.format(
         stiffness=float(STIFFNESS), strength=float(STRENGTH), hardening=HARDENING, damping=float(DAMPING), dt=RECORD.dt
     )

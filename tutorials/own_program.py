@@ -1,13 +1,18 @@
-"""A program as others have it: ``python own_program.py INPUT`` reads text, solves, writes ``response.txt``.
+"""Example of an external program: ``python own_program.py INPUT`` reads text files and writes ``response.txt``.
 
-A mass on a bilinear spring under a base motion, with the standard library alone; stands for any executable.
+It simulates a mass on a bilinear spring under a base motion with the standard library only, and represents any
+executable.
 """
 
 import sys
 
 
 def solve(stiffness: float, strength: float, hardening: float, damping: float, dt: float, ground: list) -> list:
-    """(absolute acceleration, displacement) at each sample: Newmark's average acceleration, a return map."""
+    """Absolute acceleration and displacement at each sample, by the average-acceleration method of Newmark (1959).
+
+    The bilinear spring has linear kinematic hardening; its force is found by a return map (Simo & Hughes, 1998,
+    section 1.4).
+    """
     kinematic = hardening * stiffness / (1.0 - hardening)  # hardening modulus of the plastic part
     u = v = plastic = 0.0
     a = -ground[0]
