@@ -4,14 +4,14 @@ Updating a seismically isolated bridge with TMCMC, and predicting with the remai
 
 The second system is a rigid deck on two flexible piers on a shake table. Between deck and piers are sliding bearings
 with velocity-dependent friction, rubber devices and fluid dampers. Ten multiples of nominal values of friction and
-dampers and one noise level are sampled by TMCMC with 1000 samples per stage. The script draws Figures 5 to 7 of the
-paper that it follows, propagates the uncertainty to motions that were not used, and compares two model classes by
-their evidence.
+dampers and one noise level are sampled by TMCMC (Ching & Chen, 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)) with
+1000 samples per stage. The script follows a published study of the shake-table tests of Tsopelas et al. (1994, report
+NCEER-94-0002) and draws its Figures 5 to 7. It also propagates the uncertainty to motions that were not used, and
+compares two model classes by their evidence.
 
 **The data are synthetic and the nominal values are assumed**: neither the measurements nor most of the values of the
-tested bridge (Tsopelas et al., 1994, report NCEER 94-0002) are public. The data are responses of the model at
-parameters that differ from the nominal ones, under a stochastic table motion, plus white noise of 5 % of the root
-mean square of each channel::
+tested bridge are public. The data are responses of the model at parameters that differ from the nominal ones, under a
+stochastic table motion, plus white noise of 5 % of the root mean square of each channel::
 
     python tutorials/03_isolated_bridge.py                       # TMCMC, 1000 samples per stage
     python tutorials/03_isolated_bridge.py --sampler smc         # the same posterior by SMC
@@ -97,7 +97,7 @@ begin = time.perf_counter()
 # --------------------------
 #
 # With a time step of 0.5 ms displacements are accurate to 3e-5 of their peaks, forces to 0.1 % and accelerations to
-# 0.3 %, far below the noise. As in the paper, one sigma is shared by all channels; it is relative to the measured root
+# 0.3 %, far below the noise. As in the study, one sigma is shared by all channels; it is relative to the measured root
 # mean square of each channel.
 
 problem = dict(data=args.data, channels=args.channels, noise=args.noise, step=step)
@@ -251,9 +251,9 @@ figure.savefig(args.out / "corner.png", dpi=80)
 # Figure 7: predicted histories with their uncertainty
 # ----------------------------------------------------
 #
-# The prediction is the mean, the variance and the quantiles of every channel at every time over the posterior samples
-# (equations 9 to 13 of the paper). The band of the response alone is narrow, as in the paper. The band that includes
-# the noise should contain about 90 % of the measured samples.
+# The prediction is the mean, the variance and the quantiles of every channel at every time over the posterior samples.
+# The band of the response alone is narrow. The band that includes the noise should contain about 90 % of the measured
+# samples. The equations are in ``docs/theory/prediction.rst``.
 
 draws = samples[rng.choice(len(samples), min(propagated, len(samples)), replace=False)]
 prediction = propagate(posterior, draws, noise=True, seed=args.seed)
