@@ -33,7 +33,7 @@ def run_tutorial(name: str, *arguments: str) -> str:
         env=os.environ | {"FAST": "1"},
         capture_output=True,
         text=True,
-        timeout=400,
+        timeout=570,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout

@@ -14,9 +14,9 @@ samples. The tutorial shows how this affects the posterior, the evidence and the
 
     python tutorials/06_real_bridges.py --data FOLDER
 
-FOLDER contains the processed records as downloaded: ``*ce01336p.zip`` (Meloland, station 01336) and ``*ce89324p.zip``
-(Painter Street, station 89324). Download them from the Center for Engineering Strong Motion Data,
-https://www.strongmotioncenter.org, and acknowledge the source: recorded by the California Strong Motion
+FOLDER contains the processed records as downloaded: ``*ce01336p.zip`` (Meloland, station 01336) and
+``*25apr1992*ce89324p.zip`` (Painter Street, station 89324). Download them from the Center for Engineering Strong Motion
+Data, https://www.strongmotioncenter.org, and acknowledge the source: recorded by the California Strong Motion
 Instrumentation Program of the California Geological Survey.
 """
 
@@ -109,7 +109,7 @@ BRIDGES = {
     ),
     "painter": Bridge(
         "Painter Street Overpass, Petrolia 1992",
-        "*ce89324p.zip",
+        "*25apr1992*ce89324p.zip",
         "CHAN{:d}.V2",
         column=3,
         ends=(4, 9),
