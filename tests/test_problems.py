@@ -1,4 +1,4 @@
-"""The ready-made bridge column: bundled data, prior, options, and no holes in the posterior."""
+"""The ready-made posteriors: bundled data, priors, options, and simulations that do not fail."""
 
 from importlib import resources
 
@@ -9,7 +9,7 @@ import pytest
 from fe_likelihoods.data import make_bridge_column_eq1, make_isolated_bridge
 from scipy import stats
 
-from fe_likelihoods import problems
+from fe_likelihoods import problems, rrmse
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.problems import (
     BRIDGE_COLUMN_MEANS,
@@ -28,12 +28,10 @@ from fe_likelihoods.units import G0, to_si
 INCH = to_si(1.0, "in").item()
 TRUTH = np.array(list(BRIDGE_COLUMN_MEANS.values()))
 NOISE = np.array(list(BRIDGE_COLUMN_NOISE.values()))
-PAPER_CV = np.array([0.30, 0.10, 1.2, 9.2, 0.68]) / 100  # of the posterior, Ec Es a0 a1 ft
+PAPER_CV = (
+    np.array([0.30, 0.10, 1.2, 9.2, 0.68]) / 100
+)  # CV of the posterior, Ec Es a0 a1 ft
 REAL_RECORD = "loma_prieta_1989_apeel2_redwood_city_133.csv"
-
-
-def rrmse(values, reference):
-    return np.sqrt(np.sum((values - reference) ** 2, axis=-1) / np.sum(reference**2, axis=-1))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +56,7 @@ def test_the_data_have_the_features_of_the_paper(data):
     assert (measurements.n_channels, measurements.n_steps, measurements.dt) == (2, 12800, 1 / 256)
     assert [c.name for c in measurements.channels] == ["acceleration", "displacement"]
     assert 1.5 < np.abs(measurements.channel("displacement")).max() / INCH < 3.0
-    # at rest in the end: no drift of velocity, which a stochastic record easily keeps
+    # The velocity is zero at the end. A stochastic record easily has a drift of velocity.
     velocity = np.cumsum(record.acceleration) * record.dt
     assert abs(velocity[-1]) < 0.02 * np.abs(velocity).max()
 
@@ -71,7 +69,7 @@ def test_the_data_say_that_they_are_synthetic(data):
     assert data.attributes["truth"] == pytest.approx(expected)
 
 
-def test_damage_is_noticed(tmp_path):
+def test_damage_is_detected(tmp_path):
     with resources.as_file(resources.files("fe_likelihoods.data") / "bridge_column_eq1.h5") as path:
         copy = tmp_path / "copy.h5"
         copy.write_bytes(path.read_bytes())
@@ -84,7 +82,7 @@ def test_damage_is_noticed(tmp_path):
 
 def test_the_base_motion_can_be_made_again(data):
     record = make_bridge_column_eq1.base_motion()
-    # to round-off: logarithms and exponentials differ in the last digit from machine to machine
+    # Within round-off: logarithms and exponentials differ in the last digit from machine to machine.
     np.testing.assert_allclose(record.acceleration, data.record.acceleration, rtol=0, atol=1e-12 * G0)
     assert (record.dt, record.name, record.source) == (data.record.dt, data.record.name, data.record.source)
     assert data.attributes["seed"] == make_bridge_column_eq1.SEED
@@ -119,22 +117,22 @@ def test_noise_of_the_data_is_white_and_of_the_published_level(data):
     np.testing.assert_allclose(NOISE, [7.7 * INCH, 0.09 * INCH], rtol=1e-12)
 
 
-def test_made_measurements(strong):
+def test_synthetic_measurements(strong):
     one, again, other = (bridge_column_measurements(strong, seed=seed, n_strips=40) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one.values, again.values)
     assert (one.values != other.values).mean() > 0.99
-    silent = bridge_column_measurements(strong, noise=False)
-    assert "SYNTHETIC" in one.description and "SYNTHETIC" in silent.description
-    assert "noise" in one.description and "noise" not in silent.description
+    noiseless = bridge_column_measurements(strong, noise=False)
+    assert "SYNTHETIC" in one.description and "SYNTHETIC" in noiseless.description
+    assert "noise" in one.description and "noise" not in noiseless.description
     finer = bridge_column_measurements(strong, noise=False, n_strips=400, substeps=8)
     coarse = RCColumn.lhpost(strong).simulate(TRUTH)
-    assert rrmse(silent.values, finer.values).max() < 0.5 * rrmse(coarse, finer.values).max()
+    assert rrmse(noiseless.values, finer.values).max() < 0.5 * rrmse(coarse, finer.values).max()
 
 
 # --- prior and posterior ---------------------------------------------------------------------------------------------
 
 
-def test_the_prior_is_the_papers():
+def test_the_prior_is_that_of_the_paper():
     prior = bridge_column_prior()
     cvs = dict(Ec=0.30, Es=0.20, a0=0.60, a1=0.60, ft=0.40)
     peers = {name: stats.truncnorm(-1 / cv, np.inf, loc=1.0, scale=cv) for name, cv in cvs.items()}
@@ -153,7 +151,7 @@ def test_the_default_posterior(data):
     assert posterior.parameter_names == ["Ec", "Es", "a0", "a1", "ft", "sigma_acceleration", "sigma_displacement"]
     assert posterior.fast_parameters == (5, 6)
     nominal, truth = (posterior.likelihood.model.simulate(theta) for theta in (np.ones(5), TRUTH))
-    # about as far off as in the paper (94 and 89 %), and nothing but noise and mesh left at the truth
+    # Errors about as large as in the paper (94 and 89 %); at the truth only noise and mesh are left.
     assert (rrmse(nominal, data.measurements.values) > 0.6).all()
     assert (rrmse(truth, data.measurements.values) < 0.35).all()
     log_likelihood = posterior.log_likelihood(np.append(TRUTH, NOISE))
@@ -207,7 +205,7 @@ def test_measurements_must_fit(data, strong):
 
 
 def test_six_lines_of_emcee():
-    """The promise to every Bayesian client, in small."""
+    """Any Bayesian client can call the posterior."""
     posterior = bridge_column(every=8, duration=5)
     sampler = emcee.EnsembleSampler(16, posterior.ndim, posterior, vectorize=True)
     sampler.run_mcmc(posterior.sample_prior(16, rng=1), 4, progress=False)
@@ -220,8 +218,8 @@ def test_six_lines_of_emcee():
     assert posterior.report()["simulations"] > 16
 
 
-def test_posteriors_of_different_problems_are_told_apart(strong):
-    """Control: a cache must never take one base motion, or one model, for another."""
+def test_posteriors_of_different_problems_have_different_fingerprints(strong):
+    """A cache must never use the simulations of another base motion or another model."""
     posteriors = [
         bridge_column(duration=2.0),
         bridge_column(duration=2.0, mesh=20),
@@ -233,45 +231,45 @@ def test_posteriors_of_different_problems_are_told_apart(strong):
     assert bridge_column(duration=2.0).likelihood.fingerprint == posteriors[0].likelihood.fingerprint
 
 
-# --- no holes --------------------------------------------------------------------------------------------------------
+# --- failures --------------------------------------------------------------------------------------------------------
 
 
 def failures(model, thetas):
-    """Reasons of the failures among `thetas`, and the response of every other finite."""
+    """Reasons of the failed simulations. All other responses are finite."""
     response, reasons = model.simulate_batch(thetas)
     failed = np.array([bool(reason) for reason in reasons])
     assert np.isfinite(response[~failed]).all() and np.isnan(response[failed]).all()
     return [f"{theta}: {reason}" for theta, reason in zip(thetas, reasons, strict=True) if reason]
 
 
-def around_the_papers_posterior(n, rng):
+def draws_of_the_papers_posterior(n, rng):
     return TRUTH * (1 + PAPER_CV * rng.standard_normal((n, 5)))
 
 
-def test_strong_shaking_is_survived(strong, rng):
+def test_strong_shaking_does_not_fail(strong, rng):
     draws = bridge_column_prior().rvs(100, rng)[:, :5]
-    # one in a hundred would be ten times what the slow test allows
-    told = failures(RCColumn.lhpost(strong), draws)
-    assert len(told) <= 1, told
+    # One failure in a hundred is ten times the share that the slow test allows.
+    failed = failures(RCColumn.lhpost(strong), draws)
+    assert len(failed) <= 1, failed
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("which", "n", "allowed"), [("prior", 5000, 4), ("posterior", 2000, 0)])
-def test_no_holes_on_the_real_record(shared, rng, which, n, allowed):
-    """A run that fails inside the bulk of the posterior is a bias, not a nuisance."""
+def test_simulations_do_not_fail_on_the_real_record(shared, rng, which, n, allowed):
+    """Simulations that fail inside the bulk of the posterior would bias it."""
     record = read_csv(shared / "records" / REAL_RECORD).scale(0.85)
     model = RCColumn.lhpost(record)
-    draws = bridge_column_prior().rvs(n, rng)[:, :5] if which == "prior" else around_the_papers_posterior(n, rng)
-    told = [reason for part in np.split(draws, range(100, n, 100)) for reason in failures(model, part)]
-    print(f"\n{len(told)} of {n} draws of the {which} failed: {told}")
-    assert len(told) <= allowed, told
+    draws = bridge_column_prior().rvs(n, rng)[:, :5] if which == "prior" else draws_of_the_papers_posterior(n, rng)
+    failed = [reason for part in np.split(draws, range(100, n, 100)) for reason in failures(model, part)]
+    print(f"\n{len(failed)} of {n} draws of the {which} failed: {failed}")
+    assert len(failed) <= allowed, failed
 
 
 # --- the isolated bridge ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["twin", "means"])
-def test_the_bridges_data_say_what_they_are(name):
+def test_the_data_of_the_bridge_say_that_they_are_synthetic(name):
     record, measurements, attributes = problems.isolated_bridge_data(name)
     assert "SYNTHETIC" in record.source
     assert measurements.description.startswith("SYNTHETIC, nominal values assumed")
@@ -284,7 +282,7 @@ def test_the_bridges_data_say_what_they_are(name):
     np.testing.assert_allclose(record.acceleration, make_isolated_bridge.table_motion().acceleration, atol=1e-11)
 
 
-def test_noise_of_the_bridges_data_is_white_and_of_its_level():
+def test_noise_of_the_data_of_the_bridge_is_white_and_of_the_stated_level():
     record, measurements, _ = problems.isolated_bridge_data()
     clean = problems.isolated_bridge_measurements(record, noise=0.0, step=0.25e-3)
     rms = np.sqrt(np.mean(clean.values**2, axis=1, keepdims=True))
@@ -295,8 +293,8 @@ def test_noise_of_the_bridges_data_is_white_and_of_its_level():
     assert np.all(np.abs((noise[:, 1:] * noise[:, :-1]).mean(axis=1)) < 4.0 / np.sqrt(n))
 
 
-def test_the_bridges_posterior_is_that_of_the_specification():
-    """Section 5: one sigma on channels divided by their measured root mean squares."""
+def test_the_likelihood_of_the_bridge_has_one_sigma_for_normalised_channels():
+    """One sigma for channels that are divided by their measured root mean squares."""
     posterior = problems.isolated_bridge(step=0.5e-3)
     assert posterior.parameter_names[-1] == "sigma" and posterior.ndim == 11
     x = np.append(np.full(10, 1.05), 0.07)
@@ -313,7 +311,7 @@ def test_the_bridges_posterior_is_that_of_the_specification():
     assert posterior.log_likelihood(x) == pytest.approx(expected, rel=1e-12)
     assert posterior.log_prob(np.append(np.full(10, 1.05), 0.0005)) == -np.inf
     assert posterior.log_prob(np.append(np.full(10, 0.19), 0.05)) == -np.inf
-    assert posterior.report()["simulations"] == 1, "nothing is simulated outside the support"
+    assert posterior.report()["simulations"] == 1, "no simulation outside of the support"
 
 
 def test_channels_and_noise_of_the_bridge_can_be_chosen():
@@ -329,7 +327,7 @@ def test_channels_and_noise_of_the_bridge_can_be_chosen():
     assert problems.isolated_bridge(channels=("acc_p1", "Ub_2")).likelihood.model.outputs == ("acc_p1", "Ub_2")
 
 
-def test_the_means_do_not_tell_the_piers_apart():
+def test_the_means_do_not_distinguish_the_piers():
     posterior = problems.isolated_bridge(data="means")
     model = posterior.likelihood.model
     truth = np.array(list(problems.ISOLATED_BRIDGE_TRUTH["means"].values()))
@@ -368,8 +366,8 @@ def test_bad_arguments_of_the_bridge_are_refused(arguments, message):
         problems.isolated_bridge(**arguments)
 
 
-def test_the_coarse_column_sees_the_first_part(data, tmp_path):
-    """Of the same response, nearly: it knows less but says nothing else."""
+def test_the_coarse_column_uses_the_first_part_of_the_record(data, tmp_path):
+    """Its response is nearly the first part of the response of the other."""
     fine = bridge_column(every=8, duration=12.0, cache=tmp_path / "cache.db")
     coarse = fine.coarse
     assert coarse.parameter_names == fine.parameter_names
@@ -385,7 +383,7 @@ def test_the_coarse_column_sees_the_first_part(data, tmp_path):
     assert np.all(rrmse(cheap, whole[:, :n]) < 5e-3)
 
 
-def test_a_coarse_column_needs_a_record_to_cut(data):
+def test_a_record_that_is_too_short_has_no_coarse_column(data):
     record = Record("two samples", data.record.dt, [0.0, 1.0])
     posterior = bridge_column(record=record)
     assert posterior.coarse is None

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 __all__ = ["BLUE", "GREY", "ORANGE", "channel_label", "new_axes", "select_names", "set_time_axis", "stack_axes"]
 
-BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
+BLUE = "#1f5a8c"
+ORANGE = "#d9822b"
+GREY = "#8a8f98"
 
 
 def new_axes(axes: Axes | None, size: tuple[float, float]) -> Axes:
