@@ -28,9 +28,7 @@ from fe_likelihoods.units import G0, to_si
 INCH = to_si(1.0, "in").item()
 TRUTH = np.array(list(BRIDGE_COLUMN_MEANS.values()))
 NOISE = np.array(list(BRIDGE_COLUMN_NOISE.values()))
-PAPER_CV = (
-    np.array([0.30, 0.10, 1.2, 9.2, 0.68]) / 100
-)  # CV of the posterior, Ec Es a0 a1 ft
+PAPER_CV = np.array([0.30, 0.10, 1.2, 9.2, 0.68]) / 100  # CV of the posterior, Ec Es a0 a1 ft
 REAL_RECORD = "loma_prieta_1989_apeel2_redwood_city_133.csv"
 
 
