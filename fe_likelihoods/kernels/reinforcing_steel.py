@@ -5,7 +5,7 @@ quantities::
 
     sigma = s/(1 + eps),   d sigma/d eps = (E - s)/(1 + eps)^2
 
-The backbone s_b(x) is odd in x. With z = |x|::
+The backbone s_b(x) is odd in x. With z = abs(x)::
 
     up to a        s = z [(E0-Ep)/(1+q^10)^0.1 + Ep],   q = (E0-Ep) z/f0       elastic range, knee and plateau
     up to shp+d    s = (EhT-Ep)(z-a)^2/(2 (shp+d-a)) + Ep z + f0               transition
