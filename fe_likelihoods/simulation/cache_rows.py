@@ -1,18 +1,89 @@
-"""Rows of the simulation cache: their keys and their checksums."""
+"""Rows of the simulation cache: their keys, checksums and SQL statements, and what a cache returns of them."""
 
 import hashlib
 import struct
 import zlib
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["COLUMNS", "checksum", "is_undamaged", "pack_row", "simulation_keys"]
+__all__ = [
+    "COLUMNS",
+    "STORE",
+    "STORE_RESPONSE",
+    "CacheInfo",
+    "CachedRows",
+    "checksum",
+    "is_undamaged",
+    "pack_row",
+    "simulation_keys",
+]
 
 COLUMNS = "key, misfit, n_steps, reason, seconds, crc"
 KEY_BYTES = 16
 MAX_REASON_LENGTH = 2000
 NUMBERS = struct.Struct("<qd")
+
+
+STORE = (
+    "INSERT INTO simulations (key, misfit, n_steps, reason, seconds, crc) VALUES (?, ?, ?, ?, ?, ?) "
+    "ON CONFLICT (key) DO UPDATE SET misfit = excluded.misfit, n_steps = excluded.n_steps, reason = excluded.reason, "
+    "seconds = excluded.seconds, crc = excluded.crc WHERE length(reason) > 0"  # a success is never overwritten
+)
+STORE_RESPONSE = (
+    "INSERT INTO responses (key, n_channels, size, crc, response) VALUES (?, ?, ?, ?, ?) ON CONFLICT (key) DO NOTHING"
+)
+
+
+class CachedRows(NamedTuple):
+    """Result of looking up n simulations.
+
+    Attributes
+    ----------
+    misfit : (n, n_channels) float
+        Sums of squared residuals [SI unit of the channel, squared]; NaN where the simulation failed or is not stored.
+    reasons : list of n str
+        Reasons of failures; empty where the simulation succeeded or is not stored.
+    known : (n,) bool
+        Whether the simulation is stored.
+    """
+
+    misfit: np.ndarray
+    reasons: list[str]
+    known: np.ndarray
+
+
+class CacheInfo(NamedTuple):
+    """State of a cache.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    simulations, failures : int
+        Number of stored simulations, and of failed ones among them.
+    responses, response_bytes : int
+        Number of stored responses, and their size [bytes].
+    seconds : float
+        Wall time of the stored simulations [s].
+    file_bytes : int
+        Size of the file without its write-ahead log [bytes].
+    hits, misses, evictions, damaged : int
+        Rows found, not found, evicted and found damaged by this object in this process.
+    """
+
+    path: Path
+    simulations: int
+    failures: int
+    responses: int
+    response_bytes: int
+    seconds: float
+    file_bytes: int
+    hits: int
+    misses: int
+    evictions: int
+    damaged: int
 
 
 def simulation_keys(fingerprint: str, thetas: np.ndarray) -> list[bytes]:

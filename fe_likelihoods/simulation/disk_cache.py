@@ -20,82 +20,33 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from .cache_exchange import read_rows, write_rows
-from .cache_rows import COLUMNS, checksum, is_undamaged, pack_row, simulation_keys
+from .cache_rows import (
+    COLUMNS,
+    STORE,
+    STORE_RESPONSE,
+    CachedRows,
+    CacheInfo,
+    checksum,
+    is_undamaged,
+    pack_row,
+    simulation_keys,
+)
 from .model import Model
 from .source_digest import simulation_fingerprint
 from .sqlite_file import CacheFile, is_damage
 
-__all__ = ["CacheInfo", "CachedRows", "SimulationCache"]
+__all__ = ["SimulationCache"]
 
 logger = logging.getLogger(__name__)
 
 KEYS_PER_QUERY = 500  # keys in one SELECT
 RETRY_SECONDS = 60.0  # wait after a failed access to the file
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
-
-_STORE = (
-    "INSERT INTO simulations (key, misfit, n_steps, reason, seconds, crc) VALUES (?, ?, ?, ?, ?, ?) "
-    "ON CONFLICT (key) DO UPDATE SET misfit = excluded.misfit, n_steps = excluded.n_steps, reason = excluded.reason, "
-    "seconds = excluded.seconds, crc = excluded.crc WHERE length(reason) > 0"  # a success is never overwritten
-)
-_STORE_RESPONSE = (
-    "INSERT INTO responses (key, n_channels, size, crc, response) VALUES (?, ?, ?, ?, ?) ON CONFLICT (key) DO NOTHING"
-)
-
-
-class CachedRows(NamedTuple):
-    """Result of looking up n simulations.
-
-    Attributes
-    ----------
-    misfit : (n, n_channels) float
-        Sums of squared residuals [SI unit of the channel, squared]; NaN where the simulation failed or is not stored.
-    reasons : list of n str
-        Reasons of failures; empty where the simulation succeeded or is not stored.
-    known : (n,) bool
-        Whether the simulation is stored.
-    """
-
-    misfit: np.ndarray
-    reasons: list[str]
-    known: np.ndarray
-
-
-class CacheInfo(NamedTuple):
-    """State of a cache.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    simulations, failures : int
-        Number of stored simulations, and of failed ones among them.
-    responses, response_bytes : int
-        Number of stored responses, and their size [bytes].
-    seconds : float
-        Wall time of the stored simulations [s].
-    file_bytes : int
-        Size of the file without its write-ahead log [bytes].
-    hits, misses, evictions, damaged : int
-        Rows found, not found, evicted and found damaged by this object in this process.
-    """
-
-    path: Path
-    simulations: int
-    failures: int
-    responses: int
-    response_bytes: int
-    seconds: float
-    file_bytes: int
-    hits: int
-    misses: int
-    evictions: int
-    damaged: int
 
 
 class SimulationCache:
@@ -263,7 +214,7 @@ class SimulationCache:
         """
         keys = simulation_keys(fingerprint, thetas)
         self._write(
-            _STORE,
+            STORE,
             [
                 pack_row(key, sums, n_steps, reason, seconds / len(keys))
                 for key, sums, reason in zip(keys, misfit, reasons, strict=True)
@@ -290,7 +241,7 @@ class SimulationCache:
             if np.isfinite(single).all():
                 data = single.tobytes()
                 rows.append((key, len(single), len(data), zlib.crc32(key + data), data))
-        self._write(_STORE_RESPONSE, rows)
+        self._write(STORE_RESPONSE, rows)
 
     def response(self, model: Model, theta: np.ndarray) -> np.ndarray | None:
         """Stored response of a model.
@@ -397,7 +348,7 @@ class SimulationCache:
             If either file cannot be used.
         """
         rows = [(*row, checksum(*row)) for row in read_rows(path)]
-        self._insist(lambda connection: self._insert(connection, _STORE, rows))
+        self._insist(lambda connection: self._insert(connection, STORE, rows))
         return len(rows)
 
     def close(self) -> None:
@@ -405,7 +356,7 @@ class SimulationCache:
         with self._file.lock:
             self._pauses.clear()
             if self._waiting:
-                self._write(_STORE, [])
+                self._write(STORE, [])
             self._file.close()
 
     def _pages(self) -> Iterator[list[tuple]]:
@@ -434,7 +385,7 @@ class SimulationCache:
         evicted = connection.execute(
             "DELETE FROM simulations WHERE id <= (SELECT max(id) FROM simulations) - ?", (self.max_rows,)
         ).rowcount
-        if statement is _STORE_RESPONSE:
+        if statement is STORE_RESPONSE:
             ((excess,),) = connection.execute("SELECT total(size) - ? FROM responses", (self.max_response_bytes,))
             for age, size in connection.execute("SELECT id, size FROM responses ORDER BY id").fetchall():
                 if excess <= 0:
@@ -450,10 +401,10 @@ class SimulationCache:
             if not self._file.writable:
                 self._warn_read_only()
                 return
-            if statement is _STORE:  # responses can be computed again and do not wait
+            if statement is STORE:  # responses can be computed again and do not wait
                 rows = self._waiting = (self._waiting + rows)[-MAX_WAITING_ROWS:]
             if self._try("written", lambda connection: self._insert(connection, statement, rows) or True, False):
-                if statement is _STORE:
+                if statement is STORE:
                     self._waiting = []
 
     def _warn_read_only(self) -> None:
