@@ -26,15 +26,15 @@ class AveragedPrediction(NamedTuple):
 
     Attributes
     ----------
-    mean : ndarray, shape (*shape)
+    mean : ndarray, shape (...)
         Mean of the mixture.
-    variance : ndarray, shape (*shape)
+    variance : ndarray, shape (...)
         Variance of the mixture, ``within + between``.
-    within : ndarray, shape (*shape)
+    within : ndarray, shape (...)
         Mean of the variances of the models.
-    between : ndarray, shape (*shape)
+    between : ndarray, shape (...)
         Variance of the means of the models.
-    standard_error : ndarray, shape (*shape)
+    standard_error : ndarray, shape (...)
         Monte Carlo error of `mean` for the given probabilities.
     probabilities : dict of str to float
         Probabilities of the models.
@@ -55,7 +55,7 @@ class AveragedPrediction(NamedTuple):
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation, shape (*shape)."""
+        """Standard deviation, shape (...)."""
         return np.sqrt(self.variance)
 
 

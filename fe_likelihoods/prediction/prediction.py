@@ -21,23 +21,24 @@ __all__ = ["Prediction"]
 class Prediction:
     """Moments and quantiles of a quantity over samples of the parameters.
 
-    `shape` is the shape of the quantity: (n_channels, n_steps) for histories, () for a peak. Values are in SI units.
+    The shape of the quantity is written (...): (n_channels, n_steps) for histories, () for a peak. Values are in SI
+    units.
 
     Attributes
     ----------
-    mean : ndarray, shape (*shape)
+    mean : ndarray, shape (...)
         Mean.
-    variance : ndarray, shape (*shape)
+    variance : ndarray, shape (...)
         Variance.
-    standard_error : ndarray, shape (*shape)
+    standard_error : ndarray, shape (...)
         Monte Carlo error of `mean`: standard deviation / sqrt(effective sample size).
     probabilities : tuple of float
         Probabilities of the quantiles.
-    quantiles : ndarray, shape (n_probabilities, *shape)
+    quantiles : ndarray, shape (n_probabilities, ...)
         Quantiles.
-    quantile_error : ndarray, shape (n_probabilities, *shape)
+    quantile_error : ndarray, shape (n_probabilities, ...)
         Monte Carlo errors of the quantiles.
-    values : ndarray, shape (n_samples, *shape), or None
+    values : ndarray, shape (n_samples, ...), or None
         The quantity of every sample that did not fail, in their order. None for histories, and for arrays that exceed
         the limit of memory.
     n_samples : int
@@ -77,7 +78,7 @@ class Prediction:
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation, shape (*shape)."""
+        """Standard deviation, shape (...)."""
         return np.sqrt(self.variance)
 
     @property
@@ -92,7 +93,7 @@ class Prediction:
         return np.arange(self.mean.shape[1]) * self.dt
 
     def quantile(self, probability: float) -> np.ndarray:
-        """Return the quantile, shape (*shape), of one of the `probabilities`; raise ValueError for another one."""
+        """Return the quantile, shape (...), of one of the `probabilities`; raise ValueError for another one."""
         if probability not in self.probabilities:
             raise ValueError(
                 f"no quantile {probability!r} in this prediction, it has {self.probabilities}: propagate with "

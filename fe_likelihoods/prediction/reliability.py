@@ -68,11 +68,11 @@ def exceedance(
 
     Parameters
     ----------
-    prediction_or_values : Prediction, or (n, *shape) array_like
+    prediction_or_values : Prediction, or (n, ...) array_like
         A prediction with `values`, for instance of ``quantity=peak(...)``, or the values of the samples.
     threshold : float or array_like
         If the quantity is a number: one threshold or an array of any shape. If it is an array: one threshold, or one
-        for each entry, shape (*shape).
+        for each entry, shape (...).
     unit : str, optional
         Unit of the threshold. It must have the dimension of the channel of the prediction. Default: SI.
     effective_sample_size : float, optional

@@ -30,7 +30,7 @@ class RunningMoments:
     ----------
     count : float
         Number of samples so far.
-    mean : ndarray, shape (*shape)
+    mean : ndarray, shape (...)
         Their mean, None before the first sample.
     """
 
@@ -40,7 +40,7 @@ class RunningMoments:
         self._squares: np.ndarray | None = None
 
     def add(self, values: np.ndarray, counts: np.ndarray) -> None:
-        """Add results `values` (m, *shape) that stand for `counts` (m,) samples each."""
+        """Add results `values` (m, ...) that stand for `counts` (m,) samples each."""
         total = float(counts.sum())
         if total == 0.0:
             return
@@ -60,7 +60,7 @@ class RunningMoments:
 
     @property
     def variance(self) -> np.ndarray:
-        """Mean squared deviation from the mean, shape (*shape)."""
+        """Mean squared deviation from the mean, shape (...)."""
         return self._squares / self.count
 
 
@@ -126,7 +126,7 @@ class RetainedResults:
         return self._position[result] >= 0
 
     def add(self, results: np.ndarray, values: np.ndarray) -> None:
-        """Add the values (m, *shape) of the results with indices `results` (m,). Results not chosen are skipped."""
+        """Add the values (m, ...) of the results with indices `results` (m,). Results not chosen are skipped."""
         positions = self._position[results]
         wanted = positions >= 0
         if not wanted.any():
@@ -142,11 +142,11 @@ class RetainedResults:
         return int(self._counts[self._filled].sum())
 
     def values_of(self, results: np.ndarray) -> np.ndarray:
-        """Return the values (m, *shape) of the results with indices `results` (m,), all of them added before."""
+        """Return the values (m, ...) of the results with indices `results` (m,), all of them added before."""
         return self._rows[self._position[results]].reshape(len(results), *self.shape)
 
     def quantiles(self, probabilities: Sequence[float], effective: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return quantiles and their standard errors, each (n_probabilities, *shape); see `quantiles_with_errors`."""
+        """Return quantiles and their standard errors, each (n_probabilities, ...); see `quantiles_with_errors`."""
         counts = self._counts[self._filled]
         size = self._rows.shape[1]
         out = np.empty((2, len(probabilities), size))
