@@ -173,8 +173,9 @@ class FELikelihood:
 
     @property
     def data_fingerprint(self) -> str:
-        """Hex digest of the measurements: equal for likelihoods of the same data."""
-        return self.measurements.fingerprint
+        """Hex digest of the measurements: equal for likelihoods of the same data, in any order of the channels."""
+        names = sorted(channel.name for channel in self.measurements.channels)
+        return self.measurements.select(names).fingerprint
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals: the first columns of `statistics`.

@@ -141,7 +141,6 @@ def test_the_same_data_are_compared():
     assert np.allclose(found.probability, 0.25)
 
 
-@pytest.mark.skipif(not hasattr(Posterior, "data_fingerprint"), reason="posteriors have no data_fingerprint yet")
 def test_posteriors_state_their_measurements(rng):
     """The digest of a real posterior depends on the values, and not on the order of the channels."""
     channels = (Channel("a", "acceleration", "g"), Channel("d", "displacement", "cm"))
