@@ -30,7 +30,7 @@ def map_threads(
 
     Returns
     -------
-    out : (n, *shape) float
+    out : (n, ...) float
         NaN where a simulation failed.
     reasons : list of str
         Reasons of failures; empty where a simulation succeeded.
