@@ -92,6 +92,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         Exceedance,
         exceedance,
     )
+    from .probability.autoregressive_noise import (
+        AutoregressiveNoise,
+    )
     from .probability.failures import (
         TooManyFailures,
     )
@@ -102,7 +105,6 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         MarginalNoise,
     )
     from .probability.noise import (
-        AutoregressiveNoise,
         GaussianNoise,
         Noise,
         SharedGaussianNoise,
@@ -314,11 +316,11 @@ _EXPORTS = {
         "Exceedance",
         "exceedance",
     ),
+    "probability.autoregressive_noise": ("AutoregressiveNoise",),
     "probability.failures": ("TooManyFailures",),
     "probability.likelihood": ("FELikelihood",),
     "probability.marginal_noise": ("MarginalNoise",),
     "probability.noise": (
-        "AutoregressiveNoise",
         "GaussianNoise",
         "Noise",
         "SharedGaussianNoise",

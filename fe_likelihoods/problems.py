@@ -31,8 +31,9 @@ from typing import Any
 import numpy as np
 
 from .models.isolated_bridge_channels import CHANNEL_SETS
+from .probability.autoregressive_noise import AutoregressiveNoise
 from .probability.likelihood import FELikelihood
-from .probability.noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
+from .probability.noise import GaussianNoise, SharedGaussianNoise
 from .probability.posterior import Posterior
 from .probability.priors import HalfNormal, Prior, TruncatedNormal, Uniform
 from .signals.channels import Channel, Measurements

@@ -20,7 +20,7 @@ Which noise to take:
 Real measurements differ from a model by more than the noise of a sensor, and the differences are correlated in time.
 White noise counts the n samples of a channel as n independent observations, which makes the posterior too narrow. The
 module `fe_likelihoods.probability.residuals` has checks of this assumption and estimates the effective number of
-samples.
+samples. `AutoregressiveNoise` is in `fe_likelihoods.probability.autoregressive_noise`.
 """
 
 import math
@@ -31,21 +31,22 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from .residuals import lag_one_sums
 
 __all__ = [
-    "AutoregressiveNoise",
     "GaussianNoise",
     "Noise",
     "SharedGaussianNoise",
     "noise_channels",
     "noise_statistic",
+    "options_repr",
     "sampled_noise",
+    "set_channels",
+    "total_deviations",
 ]
 
 Statistic = Callable[[np.ndarray], np.ndarray]
 PerChannel = Mapping[str, float] | Sequence[float] | None
-_HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Noise(Protocol):
@@ -134,13 +135,13 @@ class GaussianNoise:
     def __init__(
         self, channels: Sequence[Channel], *, sensor: PerChannel = None, effective_samples: PerChannel = None
     ) -> None:
-        _set_channels(self, channels, sensor)
+        set_channels(self, channels, sensor)
         _set_effective(self, effective_samples)
 
     def __repr__(self) -> str:
         # display units change no value, so they are left out
         named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
-        return f"GaussianNoise({', '.join(named + _options(self.sensor, self.effective_samples))})"
+        return f"GaussianNoise({', '.join(named + options_repr(self.sensor, self.effective_samples))})"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -181,7 +182,7 @@ class GaussianNoise:
         (n, n_channels) float
             [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
         """
-        return _total(np.asarray(parameters, dtype=float), self.sensor)
+        return total_deviations(np.asarray(parameters, dtype=float), self.sensor)
 
 
 @dataclass(frozen=True)
@@ -238,7 +239,7 @@ class SharedGaussianNoise:
                     f"SharedGaussianNoise expects positive scales; got {scale} for channel {channel.name!r}: remove a "
                     "channel without signal from the measurements, or give its scale"
                 )
-        _set_channels(self, channels, sensor)
+        set_channels(self, channels, sensor)
         _set_effective(self, effective_samples)
 
     @classmethod
@@ -255,7 +256,7 @@ class SharedGaussianNoise:
 
     def __repr__(self) -> str:
         named = [f"{c.name}: {c.quantity} / {scale!r}" for c, scale in zip(self.channels, self.scales, strict=True)]
-        return f"SharedGaussianNoise({', '.join(named + _options(self.sensor, self.effective_samples))})"
+        return f"SharedGaussianNoise({', '.join(named + options_repr(self.sensor, self.effective_samples))})"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -275,7 +276,7 @@ class SharedGaussianNoise:
         (n, n_channels) float
             [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
         """
-        return _total(np.asarray(parameters, dtype=float) * np.array(self.scales), self.sensor)
+        return total_deviations(np.asarray(parameters, dtype=float) * np.array(self.scales), self.sensor)
 
     def log_likelihood(self, misfit: np.ndarray, n_steps: int, sigma: np.ndarray) -> np.ndarray:
         """Log-likelihood of the measurements.
@@ -299,121 +300,7 @@ class SharedGaussianNoise:
         return _log_likelihood(misfit, n_steps, self.standard_deviations(sigma), self.effective_samples)
 
 
-@dataclass(frozen=True)
-class AutoregressiveNoise:
-    """Stationary first-order autoregressive Gaussian noise, with unknown standard deviation and lag-one correlation.
-
-    Both parameters are unknown for each channel.
-
-    Parameters
-    ----------
-    channels : sequence of Channel
-        The measured channels, in the order of the sums of squared residuals.
-    sensor : mapping of channel names to float, or sequence of float, optional
-        Known standard deviations of the sensors, as for `GaussianNoise`. They are a lower bound of the standard
-        deviation of the whole error. The lag-one correlation is that of the whole error, not of the model error alone.
-
-    Raises
-    ------
-    ValueError
-        As `GaussianNoise`.
-
-    Notes
-    -----
-    With e_1 ~ N(0, sigma^2) and e_t = rho e_{t-1} + sqrt(1 - rho^2) sigma z_t, the errors of n samples are normal with
-    covariance sigma^2 rho^|i-j|. Their exact likelihood is ([1]_, section 5.2, there with the variance of z)::
-
-        log L = -n/2 log(2 pi) - n log(sigma) - (n-1)/2 log(1 - rho^2) - Q / (2 sigma^2 (1 - rho^2))
-        Q     = (1 - rho)^2 J + rho D + rho (1 - rho) E
-
-    with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2 (`residuals.lag_one_sums`). For rho = 0
-    this is white noise. Q is written with differences instead of the products r_t r_{t-1}, because for rho near one
-    their sum would cancel against J. The mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
-
-    Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one and the
-    likelihood becomes that of the differences. Decimate the measurements (`Measurements.decimate`) to a step at which
-    rho is well below one.
-
-    References
-    ----------
-    .. [1] J. D. Hamilton (1994), "Time Series Analysis", Princeton University Press.
-    """
-
-    channels: tuple[Channel, ...]
-    sensor: tuple[float, ...] | None
-
-    def __init__(self, channels: Sequence[Channel], *, sensor: PerChannel = None) -> None:
-        _set_channels(self, channels, sensor)
-
-    def __repr__(self) -> str:
-        named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
-        return f"AutoregressiveNoise({', '.join(named + _options(self.sensor))})"
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """``sigma_<channel>`` of all channels [SI], then ``rho_<channel>`` of all channels [-], between -1 and 1."""
-        names = [channel.name for channel in self.channels]
-        return tuple(f"sigma_{name}" for name in names) + tuple(f"rho_{name}" for name in names)
-
-    @property
-    def statistic(self) -> Statistic:
-        """Statistic of the residuals: `residuals.lag_one_sums`, three numbers per channel."""
-        return lag_one_sums
-
-    def log_likelihood(self, statistics: np.ndarray, n_steps: int, parameters: np.ndarray) -> np.ndarray:
-        """Log-likelihood of the measurements.
-
-        Parameters
-        ----------
-        statistics : (n, 3 n_channels) float
-            J of all channels, then D, then E (see Notes of the class) [SI unit of the channel, squared]; NaN where the
-            simulation failed.
-        n_steps : int
-            Number of samples per channel.
-        parameters : (n, 2 n_channels) float
-            Standard deviations of the errors of all channels [SI], then their lag-one correlations.
-
-        Returns
-        -------
-        (n,) float
-            -inf where a sigma is impossible (see `GaussianNoise.log_likelihood`), where a rho is not between -1 and 1,
-            and where a statistic is NaN or infinite; never NaN.
-        """
-        statistics = np.asarray(statistics, dtype=float)
-        n_channels = len(self.channels)
-        squares, differences, ends = (statistics[:, k * n_channels : (k + 1) * n_channels] for k in range(3))
-        sigma, rho = self.standard_deviations(parameters), self.lag_one_correlations(parameters)
-        with np.errstate(all="ignore"):
-            spread = (1.0 - rho) * (1.0 + rho)
-            quadratic = (1.0 - rho) ** 2 * squares + rho * differences + rho * (1.0 - rho) * ends
-            ratio = np.sqrt(np.maximum(quadratic, 0.0) / spread) / sigma
-            terms = (
-                -n_steps * (_HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * (n_steps - 1) * np.log(spread) - 0.5 * ratio**2
-            )
-        possible = (sigma > 0.0) & (sigma < np.inf) & (np.abs(rho) < 1.0) & np.isfinite(squares + differences + ends)
-        return np.where(possible, terms, -np.inf).sum(axis=-1)
-
-    def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of the errors of every channel, sensor noise included.
-
-        Parameters
-        ----------
-        parameters : (n, 2 n_channels) float
-            Parameters of the noise.
-
-        Returns
-        -------
-        (n, n_channels) float
-            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
-        """
-        return _total(np.asarray(parameters, dtype=float)[..., : len(self.channels)], self.sensor)
-
-    def lag_one_correlations(self, parameters: np.ndarray) -> np.ndarray:
-        """Correlation of successive errors of every channel [-], (n, n_channels), from parameters (n, 2 n_channels)."""
-        return np.asarray(parameters, dtype=float)[..., len(self.channels) :]
-
-
-def _set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) -> None:
+def set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) -> None:
     """Set and check the fields `channels` and `sensor` of a frozen noise."""
     object.__setattr__(noise, "channels", tuple(channels))
     if not noise.channels:
@@ -457,13 +344,13 @@ def _per_channel(noise: Any, what: str, given: PerChannel, default: float) -> tu
     return values
 
 
-def _options(sensor: tuple[float, ...] | None, effective_samples: tuple[float, ...] | None = None) -> list[str]:
+def options_repr(sensor: tuple[float, ...] | None, effective_samples: tuple[float, ...] | None = None) -> list[str]:
     """Options that differ from the default, for the `repr`, which fingerprints are made of."""
     options = {"sensor": sensor, "effective_samples": effective_samples}
     return [f"{name}={value!r}" for name, value in options.items() if value is not None]
 
 
-def _total(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.ndarray:
+def total_deviations(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.ndarray:
     """Standard deviations of model error and sensor noise together; NaN for a negative sigma."""
     if sensor is None:
         return sigma
@@ -479,7 +366,7 @@ def _log_likelihood(
     with np.errstate(all="ignore"):
         # the ratio is squared instead of sigma: the square of a tiny sigma would be zero, and 0 / 0 for zero misfit
         ratio = np.sqrt(misfit) / sigma
-        terms = -n_steps * (_HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * ratio * ratio
+        terms = -n_steps * (HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * ratio * ratio
     if effective is not None:
         terms = terms * np.minimum(np.array(effective) / n_steps, 1.0)
     possible = (sigma > 0.0) & np.isfinite(misfit)

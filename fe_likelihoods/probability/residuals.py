@@ -4,7 +4,7 @@ A residual is the measured minus the simulated response at parameters that fit. 
 channel as independent. Residuals of real measurements are not, because the error of a model changes slowly and repeats
 from cycle to cycle. `residual_checks` measures how far they are from white noise, `effective_samples` gives the number
 of independent samples for `fe_likelihoods.probability.noise.GaussianNoise`, and `innovations` shows whether
-`fe_likelihoods.probability.noise.AutoregressiveNoise` explains them::
+`fe_likelihoods.AutoregressiveNoise` explains them::
 
     residuals = posterior.likelihood.residuals(best)
     residual_checks(residuals)
@@ -63,7 +63,7 @@ class ResidualChecks(NamedTuple):
 
 
 def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
-    """Statistics of an AR(1) error: J, D and E of `fe_likelihoods.probability.noise.AutoregressiveNoise`.
+    """Statistics of an AR(1) error: J, D and E of `fe_likelihoods.AutoregressiveNoise`.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
     sensitivity has the same spectrum as the errors; in general, one factor rho_k is the autocorrelation of the
     sensitivity (compare [2]_). Intervals are therefore too wide for a parameter whose sensitivity varies faster than
     the errors, and too narrow for one whose sensitivity varies more slowly, such as an offset.
-    `fe_likelihoods.probability.noise.AutoregressiveNoise` makes this distinction, a single number cannot. For AR(1)
+    `fe_likelihoods.AutoregressiveNoise` makes this distinction, a single number cannot. For AR(1)
     errors the number is n (1 - rho^2) / (1 + rho^2).
 
     The integrated autocorrelation time of a mean, which samplers report, is not suitable: it is less than one for

@@ -641,7 +641,7 @@ def test_paths_without_permission_are_refused(open_folder):
     as_somebody(run)
 
 
-# other people's files -------------------------------------------------------------------------------------------------
+# files of other programs ----------------------------------------------------------------------------------------------
 
 
 def foreign_tables(path):

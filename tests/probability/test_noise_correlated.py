@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
+from fe_likelihoods import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.accumulator import SampleNoise
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.noise import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.residuals import effective_samples, lag_one_sums

@@ -369,7 +369,7 @@ def test_nan_from_a_noise_is_a_failure():
     assert likelihood.failures[0]["reason"] == "the log-likelihood of the noise is nan"
 
 
-# what is simulated ----------------------------------------------------------------------------------------------------
+# number of simulations ------------------------------------------------------------------------------------------------
 
 
 def test_nothing_is_simulated_outside_the_support():

@@ -149,7 +149,7 @@ def test_a_batch_of_several_queries(path, rng):
     assert (likelihood.simulations, likelihood.disk_hits) == (1172, 1173)
 
 
-# what is another simulation, and what is not --------------------------------------------------------------------------
+# what the key depends on ---------------------------------------------------------------------------------------------
 
 
 def oscillator(path, **changes):
@@ -235,7 +235,7 @@ def test_fingerprint_and_parameters_cannot_be_confused():
     assert not set(swapped) & set(keys[0])
 
 
-# failures once more ---------------------------------------------------------------------------------------------------
+# retry of failures  ---------------------------------------------------------------------------------------------------
 
 
 def test_failures_are_run_again_with_retry_failures(path):

@@ -1,0 +1,127 @@
+"""Autoregressive noise: errors that are correlated in time.
+
+The equations are on the page ``docs/theory/noise.rst``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..signals.channels import Channel
+from .noise import HALF_LOG_TWO_PI, PerChannel, Statistic, options_repr, set_channels, total_deviations
+from .residuals import lag_one_sums
+
+__all__ = ["AutoregressiveNoise"]
+
+
+@dataclass(frozen=True)
+class AutoregressiveNoise:
+    """Stationary first-order autoregressive Gaussian noise, with unknown standard deviation and lag-one correlation.
+
+    Both parameters are unknown for each channel.
+
+    Parameters
+    ----------
+    channels : sequence of Channel
+        The measured channels, in the order of the sums of squared residuals.
+    sensor : mapping of channel names to float, or sequence of float, optional
+        Known standard deviations of the sensors, as for `GaussianNoise`. They are a lower bound of the standard
+        deviation of the whole error. The lag-one correlation is that of the whole error, not of the model error alone.
+
+    Raises
+    ------
+    ValueError
+        As `GaussianNoise`.
+
+    Notes
+    -----
+    With e_1 ~ N(0, sigma^2) and e_t = rho e_{t-1} + sqrt(1 - rho^2) sigma z_t, the errors of n samples are normal with
+    covariance sigma^2 rho^|i-j|. Their exact likelihood is ([1]_, section 5.2, there with the variance of z)::
+
+        log L = -n/2 log(2 pi) - n log(sigma) - (n-1)/2 log(1 - rho^2) - Q / (2 sigma^2 (1 - rho^2))
+        Q     = (1 - rho)^2 J + rho D + rho (1 - rho) E
+
+    with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2 (`residuals.lag_one_sums`). For rho = 0
+    this is white noise. Q is written with differences instead of the products r_t r_{t-1}, because for rho near one
+    their sum would cancel against J. The mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
+
+    Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one and the
+    likelihood becomes that of the differences. Decimate the measurements (`Measurements.decimate`) to a step at which
+    rho is well below one.
+
+    References
+    ----------
+    .. [1] J. D. Hamilton (1994), "Time Series Analysis", Princeton University Press.
+    """
+
+    channels: tuple[Channel, ...]
+    sensor: tuple[float, ...] | None
+
+    def __init__(self, channels: Sequence[Channel], *, sensor: PerChannel = None) -> None:
+        set_channels(self, channels, sensor)
+
+    def __repr__(self) -> str:
+        named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
+        return f"AutoregressiveNoise({', '.join(named + options_repr(self.sensor))})"
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """``sigma_<channel>`` of all channels [SI], then ``rho_<channel>`` of all channels [-], between -1 and 1."""
+        names = [channel.name for channel in self.channels]
+        return tuple(f"sigma_{name}" for name in names) + tuple(f"rho_{name}" for name in names)
+
+    @property
+    def statistic(self) -> Statistic:
+        """Statistic of the residuals: `residuals.lag_one_sums`, three numbers per channel."""
+        return lag_one_sums
+
+    def log_likelihood(self, statistics: np.ndarray, n_steps: int, parameters: np.ndarray) -> np.ndarray:
+        """Log-likelihood of the measurements.
+
+        Parameters
+        ----------
+        statistics : (n, 3 n_channels) float
+            J of all channels, then D, then E (see Notes of the class) [SI unit of the channel, squared]; NaN where the
+            simulation failed.
+        n_steps : int
+            Number of samples per channel.
+        parameters : (n, 2 n_channels) float
+            Standard deviations of the errors of all channels [SI], then their lag-one correlations.
+
+        Returns
+        -------
+        (n,) float
+            -inf where a sigma is impossible (see `GaussianNoise.log_likelihood`), where a rho is not between -1 and 1,
+            and where a statistic is NaN or infinite; never NaN.
+        """
+        statistics = np.asarray(statistics, dtype=float)
+        n_channels = len(self.channels)
+        squares, differences, ends = (statistics[:, k * n_channels : (k + 1) * n_channels] for k in range(3))
+        sigma, rho = self.standard_deviations(parameters), self.lag_one_correlations(parameters)
+        with np.errstate(all="ignore"):
+            spread = (1.0 - rho) * (1.0 + rho)
+            quadratic = (1.0 - rho) ** 2 * squares + rho * differences + rho * (1.0 - rho) * ends
+            ratio = np.sqrt(np.maximum(quadratic, 0.0) / spread) / sigma
+            terms = -n_steps * (HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * (n_steps - 1) * np.log(spread) - 0.5 * ratio**2
+        possible = (sigma > 0.0) & (sigma < np.inf) & (np.abs(rho) < 1.0) & np.isfinite(squares + differences + ends)
+        return np.where(possible, terms, -np.inf).sum(axis=-1)
+
+    def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
+        """Standard deviation of the errors of every channel, sensor noise included.
+
+        Parameters
+        ----------
+        parameters : (n, 2 n_channels) float
+            Parameters of the noise.
+
+        Returns
+        -------
+        (n, n_channels) float
+            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
+        """
+        return total_deviations(np.asarray(parameters, dtype=float)[..., : len(self.channels)], self.sensor)
+
+    def lag_one_correlations(self, parameters: np.ndarray) -> np.ndarray:
+        """Correlation of successive errors of every channel [-], (n, n_channels), from parameters (n, 2 n_channels)."""
+        return np.asarray(parameters, dtype=float)[..., len(self.channels) :]
