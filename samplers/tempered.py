@@ -15,10 +15,10 @@ ladder and the evidence.
 import copy
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from emcee import EnsembleSampler, State
@@ -30,35 +30,22 @@ from .moves.kernels import RandomWalkMove
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import header
 from .storage.emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
-from .storage.evaluation import CallingConvention, Evaluator, FailureLimit
+from .storage.evaluation import CallingConvention, Evaluator, FailureLimit, OptionalAttributes
 from .storage.journal import RunStart
+from .storage.recording import record, show_progress
 from .storage.returned_values import ErrorCapturing
 from .tempering.anneal import anneal
 from .tempering.diagnostics import check_evidence, warn
 from .tempering.evidence_check import EvidenceCheck
 from .tempering.genealogy import standard_error_of_mean
 from .tempering.mutation import MoveSchedule
-from .tempering.population import Population, Restart, Stage
+from .tempering.population import Population, Stage, Sweep
 from .tempering.results import AnnealingResult
-from .tempering.settings import Settings, refuse_unused
+from .tempering.settings import Settings, combine_settings, refuse_unused
 
 __all__ = ["TemperedSampler"]
 
 logger = logging.getLogger(__name__)
-
-
-class _OptionalAttributes(NamedTuple):
-    """What a user's `log_prob_fn` may offer besides being callable; read once, here."""
-
-    log_prior: Callable | None
-    sample_prior: Callable | None
-    report: Callable[[], Mapping[str, Any]] | None
-    fast_parameters: Sequence[int]
-
-    @classmethod
-    def of(cls, log_prob_fn: Callable) -> "_OptionalAttributes":
-        found = (getattr(log_prob_fn, name, None) for name in ("log_prior", "sample_prior", "report"))
-        return cls(*found, getattr(log_prob_fn, "fast_parameters", ()))
 
 
 class TemperedSampler(EnsembleSampler):
@@ -132,7 +119,7 @@ class TemperedSampler(EnsembleSampler):
     ):
         if not callable(log_prob_fn):
             raise ValueError(f"log_prob_fn must be callable; got {log_prob_fn!r}")
-        self._optional = _OptionalAttributes.of(log_prob_fn)
+        self._optional = OptionalAttributes.of(log_prob_fn)
         self.log_prior_fn = self._optional.log_prior if log_prior_fn is None else log_prior_fn
         if not callable(self.log_prior_fn):
             raise ValueError(
@@ -144,7 +131,7 @@ class TemperedSampler(EnsembleSampler):
                 "a population must span the parameters: at least 2 ndim walkers and one parameter are needed, some "
                 f"hundreds of walkers are usual; got nwalkers={nwalkers} for ndim={ndim}"
             )
-        given = _settings(type(self).__name__, settings, overrides)
+        given = combine_settings(type(self).__name__, settings, overrides)
         recycle, moves = self._choose(given, moves, nwalkers)
         self.settings = replace(given, recycle=recycle)
         if coarse_log_prob_fn is not None and not (callable(coarse_log_prob_fn) and recycle):
@@ -482,32 +469,18 @@ class TemperedSampler(EnsembleSampler):
 
     def _anneal(self, state: State, skip_check: bool, bar: dict) -> State:
         """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
-        seconds, evaluations = time.perf_counter(), self.evaluations
         self._result = AnnealingResult()
-        population = self._start(state, skip_check)
-        coarse = self._coarse_evaluator
+        population, coarse = self._start(state, skip_check), self._coarse_evaluator
         if coarse is not None:
             coarse.pool = self.pool
-        steps = anneal(
-            population, self._evaluator, get_random(self), MoveSchedule(*get_moves(self)), self.settings, coarse
-        )
+        schedule = MoveSchedule(*get_moves(self))
+        steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse)
         labels = {"desc": "ladder", "unit": " sweeps", **(bar["progress_kwargs"] or {})}
         with get_progress_bar(bar["progress"], None, **labels) as shown:
-            for population, report in steps:
-                result = self._result
-                if isinstance(report, Stage):
-                    now = time.perf_counter(), self.evaluations
-                    stage = report._replace(seconds=now[0] - seconds, evaluations=now[1] - evaluations)
-                    seconds, evaluations = now
-                    stage = self._checkpoint.store_stage(len(result.ladder), stage)
-                    self._result = result._replace(ladder=(*result.ladder, stage))
-                elif isinstance(report, EvidenceCheck):
-                    evaluations += report.evaluations  # these belong to no stage
-                    self._result = result._replace(check=report)
-                elif isinstance(report, Restart):
-                    self._result = AnnealingResult()
-                else:
-                    self._show(shown, population, report.acceptance)
+            for result, population, report in record(steps, self._evaluator, self._checkpoint):
+                self._result = result
+                if isinstance(report, Sweep):
+                    show_progress(shown, population, report, self.evaluations, self._optional.report)
         if coarse is not None and coarse.failures.count:
             logger.warning(
                 "%d of %d evaluations of the coarse model failed and count as impossible (%s)",
@@ -515,33 +488,7 @@ class TemperedSampler(EnsembleSampler):
                 coarse.evaluations,
                 coarse.failures.most_common(),
             )
-        self._result = self._result._replace(founders=population.founders[0])
-        self._checkpoint.store_check(self._result)
         if self._result.check is not None:
             check_evidence(self.log_evidence_ladder, self.ladder[-1].log_evidence_error, self._result.check)
         log_prob, blobs = self._evaluator.unpack(population.records)
         return State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
-
-    def _show(self, bar: Any, population: Population, acceptance: float) -> None:
-        """Advance the progress bar by one sweep."""
-        if hasattr(bar, "set_postfix"):  # emcee's silent bar has only update
-            figures = {"beta": f"{population.beta:.3g}", "ESS": f"{population.effective_sample_size:.0f}"}
-            figures |= {"acceptance": f"{acceptance:.2f}", "evaluations": str(self.evaluations)}
-            simulations = None if self._optional.report is None else self._optional.report().get("simulations")
-            if simulations is not None:
-                figures["simulations"] = str(simulations)
-            bar.set_postfix(figures, refresh=False)
-        bar.update(1)
-
-
-def _settings(sampler: str, settings: Settings | None, overrides: Mapping[str, Any]) -> Settings:
-    """The settings with single ones replaced."""
-    if settings is not None and not isinstance(settings, Settings):
-        raise ValueError(f"settings must be a samplers.Settings; got {settings!r}")
-    unknown = set(overrides) - set(Settings.__dataclass_fields__)
-    if unknown:
-        raise TypeError(
-            f"{sampler}() got an unexpected keyword argument {min(unknown)!r}; settings are "
-            f"{', '.join(Settings.__dataclass_fields__)}"
-        )
-    return replace(Settings() if settings is None else settings, **overrides)

@@ -6,7 +6,7 @@ the support of the prior are not evaluated. A point for which the function raise
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +16,37 @@ from .checkpoint import Checkpoint
 from .journal import EvaluatedBatch
 from .returned_values import ErrorCapturing, log_probabilities, outcomes
 
-__all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures"]
+__all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures", "OptionalAttributes"]
 
 KEPT_FAILURES = 1000
 KEPT_REASONS = 100
+
+
+class OptionalAttributes(NamedTuple):
+    """What a user's `log_prob_fn` may offer besides being callable.
+
+    Attributes
+    ----------
+    log_prior : callable, optional
+        Log-prior of a point or a batch.
+    sample_prior : callable, optional
+        Function of (n, random) that returns n draws of the prior.
+    report : callable, optional
+        Function that returns a dictionary, such as ``{"simulations": 120}``.
+    fast_parameters : sequence of int
+        Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
+    """
+
+    log_prior: Callable | None
+    sample_prior: Callable | None
+    report: Callable[[], Mapping[str, Any]] | None
+    fast_parameters: Sequence[int]
+
+    @classmethod
+    def of(cls, log_prob_fn: Callable) -> "OptionalAttributes":
+        """Read the attributes of a function."""
+        found = (getattr(log_prob_fn, name, None) for name in ("log_prior", "sample_prior", "report"))
+        return cls(*found, getattr(log_prob_fn, "fast_parameters", ()))
 
 
 class Failures:
@@ -212,7 +239,7 @@ class Evaluator:
         return self.log_prior(coords) > -np.inf
 
     def evaluate(self, coords: np.ndarray) -> np.ndarray:
-        """Records (n,) of points (n, ndim).
+        """Records (n,) of points (n, ndim): of the interrupted run that is continued, or from new evaluations.
 
         Raises
         ------
@@ -223,19 +250,18 @@ class Evaluator:
             raise ValueError("At least one parameter value was infinite or NaN")
         log_prior = self.log_prior(coords)
         inside = log_prior > -np.inf
-        return self._records.pack_batch(log_prior, inside, self._evaluate(coords[inside]) if inside.any() else None)
-
-    def _evaluate(self, coords: np.ndarray) -> EvaluatedBatch:
-        """Results for points (n, ndim): from the interrupted run that is continued, or new ones."""
-        batch = None if self._checkpoint is None else self._checkpoint.find(coords)
+        if not inside.any():
+            return self._records.pack_batch(log_prior, inside, None)
+        points = coords[inside]
+        batch = None if self._checkpoint is None else self._checkpoint.find(points)
         if batch is None:
-            batch = self.compute(coords)
+            batch = self.compute(points)
             if self._limit is not None:
                 self._limit.check(batch, self.evaluations, self.failures.count)
             if self._checkpoint is not None:
                 self._checkpoint.evaluated(batch)
         self.count(batch)
-        return batch
+        return self._records.pack_batch(log_prior, inside, batch)
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""

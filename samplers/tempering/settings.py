@@ -4,11 +4,12 @@ Every default is written here, once. A setting that cannot act on the chosen pat
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from .resampling import RESAMPLING
 
-__all__ = ["RecyclingSettings", "Settings", "changed_settings", "refuse_unused"]
+__all__ = ["RecyclingSettings", "Settings", "changed_settings", "combine_settings", "refuse_unused"]
 
 
 @dataclass(frozen=True)
@@ -188,6 +189,36 @@ class Settings:
         variation = self.coefficient_of_variation
         ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
         return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
+
+
+def combine_settings(sampler: str, settings: Settings | None, overrides: Mapping[str, Any]) -> Settings:
+    """Settings of which single ones are replaced.
+
+    Parameters
+    ----------
+    sampler : str
+        Name of the sampler's class in messages.
+    settings : Settings, optional
+        The settings; the defaults if None.
+    overrides : mapping
+        Single settings by name.
+
+    Raises
+    ------
+    TypeError
+        If a name is not a setting.
+    ValueError
+        If `settings` are not `Settings`, or a value is impossible.
+    """
+    if settings is not None and not isinstance(settings, Settings):
+        raise ValueError(f"settings must be a samplers.Settings; got {settings!r}")
+    names = [field.name for field in fields(Settings)]
+    unknown = set(overrides) - set(names)
+    if unknown:
+        raise TypeError(
+            f"{sampler}() got an unexpected keyword argument {min(unknown)!r}; settings are {', '.join(names)}"
+        )
+    return replace(Settings() if settings is None else settings, **overrides)
 
 
 def changed_settings(settings: Settings) -> tuple[str, ...]:

@@ -485,6 +485,23 @@ def warnings_of(Sampler, posterior, nwalkers=200, **settings):
     return [str(warning.message) for warning in caught]
 
 
+def test_warnings_point_at_the_line_that_ran_the_sampler():
+    """Whichever part of the sampler issues them, from within emcee or a generator."""
+
+    def log_likelihood(x):
+        return np.where(x[..., 0] < 0.25, np.nan, -x[..., 1])
+
+    failing, lines = SMCSampler(N, 2, Box([0, 0], [1, 1], log_likelihood), vectorize=True, seed=1), []
+    stuck = SMCSampler(N, 3, Gaussian(), vectorize=True, seed=1, moves=emcee.moves.GaussianMove(1e6))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SamplingWarning)
+        for sampler in (failing, stuck):
+            sampler.run_mcmc(None, 1)  # the line
+            lines += [(warning.filename, warning.lineno) for warning in caught]
+    (place,) = set(lines)
+    assert place[0] == __file__ and Path(__file__).read_text().splitlines()[place[1] - 1].endswith("# the line")
+
+
 def test_moves_too_short_are_reported():
     """The published steps of TMCMC leave points near their resampled start; ten full steps of a random walk do not."""
     found = [m for m in warnings_of(TMCMCSampler, Gaussian(2), **CHING_CHEN_2007) if "still correlated" in m]
