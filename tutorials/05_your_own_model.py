@@ -159,7 +159,7 @@ def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
     """Structural parameters of all posteriors on common axes."""
     colours = dict(zip(draws, ("#1f5a8c", "#d9822b", "#5b8c5a"), strict=False))
     together = np.concatenate([x[:, :2] for x in draws.values()] + [TRUTH[None]])
-    margin = 0.05 * np.ptp(together, axis=0)
+    margin = 0.25 * np.ptp(together, axis=0)
     figure = plt.figure(figsize=(6.5, 6.5))
     for width, (name, x) in zip((4.0, 2.0, 0.8), draws.items(), strict=False):  # equal curves stay visible
         corner.corner(
