@@ -254,6 +254,8 @@ for name in args.problem or PROBLEMS:
             label_kwargs={"fontsize": 16},
             max_n_ticks=3,
         )
+    for axes in figure.axes[:: posterior.ndim + 1]:  # corner scales each diagonal panel to the last histogram only
+        axes.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches))
     handles = [Line2D([], [], color=COLOURS[label], label=label) for label in shown]
     figure.legend(handles=handles, loc="upper right", fontsize=22, frameon=False)
     title = f"{name}: contours contain 50 and 90 % (synthetic data; grey: truth)"
