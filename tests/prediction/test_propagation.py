@@ -293,7 +293,7 @@ def test_with_record_of_the_column(rng):
     moved = column.with_record(other)
     assert moved.loading is other and moved.channels == column.channels and moved.mesh == 20 and moved.dt == 0.005
     assert column.loading.name == "short" and moved.fingerprint != column.fingerprint
-    with pytest.raises(ValueError, match="a Record, as the loading of this column"):
+    with pytest.raises(ValueError, match="a Record, the type of this column's loading"):
         column.with_record(DisplacementHistory("push", [0.0, 0.01]))
     push = RCColumn.lhpost(DisplacementHistory("push", [0.0, 0.01]), parameters=("Ec",))
     assert push.with_record(DisplacementHistory("more", [0.0, 0.01, 0.02])).n_steps == 3
