@@ -104,7 +104,7 @@ def pair_plot(
     labels : sequence of str, optional
         One label per parameter, with its unit.
     truth : sequence of float, shape (ndim,), optional
-        True parameters, where they are known; marked by lines.
+        True parameters, where they are known; marked by lines, which are inside the limits of the axes.
     max_points : int
         Largest number of samples that are plotted and used for the two-dimensional densities.
     grid : int
@@ -127,6 +127,8 @@ def pair_plot(
     ndim = samples.shape[1]
     shown = samples[np.linspace(0, len(samples) - 1, min(max_points, len(samples))).astype(int)]
     low, high = np.quantile(samples, [0.002, 0.998], axis=0)
+    if truth is not None:
+        low, high = np.minimum(low, truth), np.maximum(high, truth)
     margin = np.where(high > low, 0.12 * (high - low), np.maximum(0.05 * np.abs(low), 1e-12))
     low, high = low - margin, high + margin
     size = max(4.0, 1.5 * ndim + 0.8)
