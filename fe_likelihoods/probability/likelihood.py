@@ -83,6 +83,10 @@ class FELikelihood:
         Rows among them that came from the cache on disk.
     seconds : float
         Wall time of the simulations [s].
+    memory_cache : MemoryCache
+        The statistics that are cached in memory.
+    chunk_size : int
+        Number of simulations after which the next results are stored on disk; adapted to their duration.
 
     Raises
     ------
@@ -118,11 +122,11 @@ class FELikelihood:
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
         self._n_structural = len(model.parameter_names)
         self.fast_parameters = tuple(range(self._n_structural, len(self.parameter_names)))
-        self._memory = MemoryCache(memory_rows)
+        self.memory_cache = MemoryCache(memory_rows)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._model_fingerprint = None if cache is None else model.fingerprint
         self._key = None if cache is None else self.simulation_key
-        self._chunk = 1
+        self.chunk_size = 1
         self.simulations = 0
         self.cache_hits = 0
         self.disk_hits = 0
@@ -251,7 +255,7 @@ class FELikelihood:
     def _statistics(self, thetas: np.ndarray) -> np.ndarray:
         """Statistics of finite rows; few calls of numpy, because a cached row has to cost less than 10 microseconds."""
         keys, distinct = distinct_keys(thetas)
-        misfit, known = self._memory.look_up(keys, self._width)
+        misfit, known = self.memory_cache.look_up(keys, self._width)
         if all(known):
             self.cache_hits += len(thetas)
         else:
@@ -305,7 +309,7 @@ class FELikelihood:
             self.model,
             self.measurements,
             noise,
-            memory_rows=self._memory.rows,
+            memory_rows=self.memory_cache.rows,
             cache=self.cache,
             max_failure_share=self.max_failure_share,
         )
@@ -322,17 +326,17 @@ class FELikelihood:
             for row in np.flatnonzero(on_disk):
                 if reasons[row]:
                     self._failures.add(thetas[row], reasons[row])
-            self._memory.store([keys[row] for row in np.flatnonzero(on_disk)], misfit[on_disk])
+            self.memory_cache.store([keys[row] for row in np.flatnonzero(on_disk)], misfit[on_disk])
         left = np.flatnonzero(~on_disk)
         smallest, largest = self._chunk_limits(len(left)) if len(left) else (0, 0)
         while len(left):
-            size = max(smallest, min(largest, self._chunk))
+            size = max(smallest, min(largest, self.chunk_size))
             rows, left = left[:size], left[size:]
             start = time.perf_counter()
             misfit[rows] = self._simulate(thetas[rows])
             # the size grows by steps: the first simulations may be failures that took no time
-            self._chunk = min(4 * size, 1 + int(_SECONDS_PER_CHUNK * len(rows) / (time.perf_counter() - start)))
-            self._memory.store([keys[row] for row in rows], misfit[rows])
+            self.chunk_size = min(4 * size, 1 + int(_SECONDS_PER_CHUNK * len(rows) / (time.perf_counter() - start)))
+            self.memory_cache.store([keys[row] for row in rows], misfit[rows])
         return misfit, on_disk
 
     def _chunk_limits(self, n: int) -> tuple[int, int]:

@@ -83,6 +83,10 @@ class SimulationCache:
         Rows evicted by this object.
     damaged : int
         Rows that were damaged and deleted.
+    file : CacheFile
+        The SQLite file and its connection.
+    retry_times : dict of str to float
+        Actions on the file that failed, and the monotonic time [s] before which they are not tried again.
 
     Raises
     ------
@@ -112,13 +116,13 @@ class SimulationCache:
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"SimulationCache: {name} must be a whole number of 1 or more; got {value!r}")
         self._set_up(path, int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes), timeout)
-        self._file.check()
-        if not self._file.writable:
+        self.file.check()
+        if not self.file.writable:
             self._warn_read_only()
 
     def _set_up(self, path, max_rows, retry_failures, responses, max_response_bytes, timeout) -> None:
         """Set all attributes without opening the file."""
-        self._file = CacheFile(path, timeout)
+        self.file = CacheFile(path, timeout)
         self.max_rows = max_rows
         self.retry_failures = retry_failures
         self.responses = responses
@@ -126,7 +130,7 @@ class SimulationCache:
         self.hits = self.misses = self.evictions = self.damaged = 0
         self._waiting: list[tuple] = []
         self._warned_read_only = False
-        self._pauses: dict[str, float] = {}  # time before which an action that failed is not tried again
+        self.retry_times: dict[str, float] = {}  # time before which an action that failed is not tried again
 
     def __getstate__(self) -> tuple:
         return (
@@ -135,7 +139,7 @@ class SimulationCache:
             self.retry_failures,
             self.responses,
             self.max_response_bytes,
-            self._file.timeout,
+            self.file.timeout,
         )
 
     def __setstate__(self, state: tuple) -> None:
@@ -147,7 +151,7 @@ class SimulationCache:
     @property
     def path(self) -> Path:
         """Path of the file."""
-        return self._file.path
+        return self.file.path
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int) -> CachedRows:
         """Look up simulations, with few queries for the whole batch.
@@ -167,7 +171,7 @@ class SimulationCache:
         """
         keys = simulation_keys(fingerprint, thetas)
         misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
-        with self._file.lock:
+        with self.file.lock:
             found, bad = {}, []
             for row in self._try("read", lambda connection: self._select(connection, keys), []):
                 key, sums, steps, reason = row[:4]
@@ -259,7 +263,7 @@ class SimulationCache:
         """
         (key,) = simulation_keys(simulation_fingerprint(model), np.atleast_2d(np.asarray(theta, dtype=float)))
         query = "SELECT n_channels, crc, response FROM responses WHERE key = ?"
-        with self._file.lock:
+        with self.file.lock:
             found = self._try("read", lambda connection: connection.execute(query, (key,)).fetchall(), [])
             for n_channels, crc, data in found:
                 if isinstance(data, bytes) and crc == zlib.crc32(key + data):
@@ -277,7 +281,7 @@ class SimulationCache:
             ((responses, response_bytes),) = connection.execute("SELECT count(*), total(size) FROM responses")
             return n, int(failures), responses, int(response_bytes), seconds
 
-        with self._file.lock:
+        with self.file.lock:
             counted = self._try("read", ask, (0, 0, 0, 0, 0.0))
             size = self.path.stat().st_size if self.path.exists() else 0
             return CacheInfo(self.path, *counted, size, self.hits, self.misses, self.evictions, self.damaged)
@@ -297,7 +301,7 @@ class SimulationCache:
             connection.execute("DELETE FROM responses")
             connection.execute("COMMIT")
 
-        with self._file.lock:
+        with self.file.lock:
             self._insist(delete)
             self._waiting.clear()
             # returns the space to the disk; may fail while others read
@@ -353,11 +357,11 @@ class SimulationCache:
 
     def close(self) -> None:
         """Store waiting rows, if possible, and close the connection of this process; the next use opens a new one."""
-        with self._file.lock:
-            self._pauses.clear()
+        with self.file.lock:
+            self.retry_times.clear()
             if self._waiting:
                 self._write(STORE, [])
-            self._file.close()
+            self.file.close()
 
     def _pages(self) -> Iterator[list[tuple]]:
         """All undamaged rows, without their checksums, oldest first."""
@@ -397,8 +401,8 @@ class SimulationCache:
         self.evictions += evicted
 
     def _write(self, statement: str, rows: list[tuple]) -> None:
-        with self._file.lock:
-            if not self._file.writable:
+        with self.file.lock:
+            if not self.file.writable:
                 self._warn_read_only()
                 return
             if statement is STORE:  # responses can be computed again and do not wait
@@ -419,35 +423,35 @@ class SimulationCache:
         if not self.damaged:
             logger.warning("%s has damaged rows; they are simulated again, see SimulationCache.damaged", self.path)
         self.damaged += len(keys)
-        if not self._file.writable:
+        if not self.file.writable:
             return
         delete = f"DELETE FROM {table} WHERE key = ?"
         self._try("repaired", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
 
     def _try(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
         """Result of an action on the connection; after an error a warning, `otherwise`, and a pause of this action."""
-        with self._file.lock:
-            if time.monotonic() < self._pauses.get(what, -np.inf):
+        with self.file.lock:
+            if time.monotonic() < self.retry_times.get(what, -np.inf):
                 return otherwise
             for attempt in range(2):
                 try:
-                    result = action(self._file.connection())
-                    self._pauses.pop(what, None)
+                    result = action(self.file.connection())
+                    self.retry_times.pop(what, None)
                     return result
                 except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # a damaged size may be huge
-                    self._file.close()  # also ends a transaction
+                    self.file.close()  # also ends a transaction
                     failure = error
                 except BaseException:
-                    self._file.close()
+                    self.file.close()
                     raise
-                if attempt or not self._file.writable or not is_damage(failure):
+                if attempt or not self.file.writable or not is_damage(failure):
                     break
                 try:
-                    self._file.set_aside(str(failure))
+                    self.file.set_aside(str(failure))
                 except OSError as error:
                     failure = error
                     break
-            if what not in self._pauses:
+            if what not in self.retry_times:
                 logger.warning(
                     "%s cannot be %s (%s); the run continues without it and tries again after %g s",
                     self.path,
@@ -455,17 +459,17 @@ class SimulationCache:
                     failure,
                     RETRY_SECONDS,
                 )
-            self._pauses[what] = time.monotonic() + RETRY_SECONDS
+            self.retry_times[what] = time.monotonic() + RETRY_SECONDS
             return otherwise
 
     def _insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
         """Result of an action that the user has called explicitly; errors are raised."""
-        with self._file.lock:
+        with self.file.lock:
             try:
-                return action(self._file.connection())
+                return action(self.file.connection())
             except (sqlite3.Error, ValueError) as error:
-                self._file.close()
+                self.file.close()
                 raise OSError(f"{self.path} cannot be used: {error}") from error
             except BaseException:
-                self._file.close()
+                self.file.close()
                 raise

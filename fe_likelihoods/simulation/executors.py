@@ -188,11 +188,16 @@ class PoolExecutor:
     Parameters
     ----------
     pool : object
+
+    Attributes
+    ----------
+    folder : TemporaryFolder, optional
+        Where mapped functions are stored for the workers; None before the first map.
     """
 
     def __init__(self, pool: Any) -> None:
         self.pool = pool
-        self._folder: TemporaryFolder | None = None
+        self.folder: TemporaryFolder | None = None
 
     @property
     def other_processes(self) -> bool:
@@ -208,13 +213,13 @@ class PoolExecutor:
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
         """Outcomes of a function for every item, in their order; RuntimeError if a worker cannot load the function."""
         items = list(items)
-        if self._folder is None:
-            self._folder = TemporaryFolder()
-        outcomes = self._map(_FunctionReference(function, self._folder.path), items)
+        if self.folder is None:
+            self.folder = TemporaryFolder()
+        outcomes = self._map(_FunctionReference(function, self.folder.path), items)
         missing = [index for index, outcome in enumerate(outcomes) if isinstance(outcome, _Missing)]
         if missing:
             carried = self._map(
-                _FunctionReference(function, self._folder.path, carried=True), [items[index] for index in missing]
+                _FunctionReference(function, self.folder.path, carried=True), [items[index] for index in missing]
             )
             for index, outcome in zip(missing, carried, strict=True):
                 outcomes[index] = outcome

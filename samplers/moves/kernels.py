@@ -85,6 +85,11 @@ class _FittedMove(MHMove):
         self._mean, self._root = location_and_root(coords, weights)
 
     @property
+    def mean(self) -> np.ndarray | None:
+        """Weighted mean (ndim,) of the points that the proposal was fitted to; None before the first fit."""
+        return self._mean
+
+    @property
     def root(self) -> np.ndarray | None:
         """Lower-triangular root (ndim, ndim) of the fitted covariance or scale matrix; None before the first fit."""
         return self._root

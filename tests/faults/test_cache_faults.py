@@ -155,7 +155,7 @@ def test_a_killed_writer_does_not_block_others(path):
 
     def hold():
         other = SimulationCache(path)
-        other._file.connection().execute("BEGIN IMMEDIATE")
+        other.file.connection().execute("BEGIN IMMEDIATE")
         sender.send_bytes(b"held")
         time.sleep(60)
 
@@ -401,7 +401,7 @@ def test_a_damaged_response_is_missing(path, thetas):
     likelihood = likelihood_of(SimulationCache(path, responses=True))
     likelihood.misfit([[1.0, 1.0]])
     assert likelihood.cache.response(MODEL, [1.0, 1.0]) is not None
-    likelihood.cache._file.connection().execute("UPDATE responses SET response = zeroblob(160)")
+    likelihood.cache.file.connection().execute("UPDATE responses SET response = zeroblob(160)")
     assert likelihood.cache.response(MODEL, [1.0, 1.0]) is None
     assert (likelihood.cache.damaged, likelihood.cache.info().responses) == (1, 0)
 
@@ -445,7 +445,7 @@ def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
     cache.store(FINGERPRINT, thetas, 20, sums_of(thetas), [""] * len(thetas), 1.0)
     log = filled.with_name(filled.name + "-wal")
     assert log.stat().st_size > 0
-    cache._file.set_aside("for a test")
+    cache.file.set_aside("for a test")
     assert not log.exists()
     assert SimulationCache(filled).info().simulations == 0
     keep.close()
@@ -455,7 +455,7 @@ def test_a_connection_to_the_damaged_file_does_not_affect_the_new_one(filled, th
     """SQLite removes the log by its name when the last connection closes; it must not remove that of the new file."""
     first, second = SimulationCache(filled), SimulationCache(filled)
     second.look_up(FINGERPRINT, thetas, 2, 8)
-    first._file.set_aside("for a test")
+    first.file.set_aside("for a test")
     for number, cache in enumerate((first, second)):
         batch = batch_of(3, number)
         cache.store(FINGERPRINT, batch, 8, sums_of(batch), [""] * len(batch), 1.0)
@@ -500,11 +500,11 @@ def test_a_full_disk_does_not_stop_the_run(path, thetas, expected, caplog, full,
     assert stored < 300
     # space becomes available: the waiting rows are stored with the next ones
     full["full"] = False
-    likelihood.cache._file.close()
+    likelihood.cache.file.close()
     likelihood.misfit(thetas[300:310])
     assert likelihood.cache.info().simulations == stored  # writing is not tried again before the pause ends
     monkeypatch.setattr(cache_module, "RETRY_SECONDS", 0.0)
-    likelihood.cache._pauses["written"] = time.monotonic()
+    likelihood.cache.retry_times["written"] = time.monotonic()
     likelihood.misfit(thetas[310:320])
     again = likelihood_of(path)
     np.testing.assert_array_equal(again.misfit(thetas[:320]), expected[:320])
@@ -526,10 +526,10 @@ def test_a_really_full_disk(thetas, expected, caplog):
             np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
             assert likelihood.simulations == 400
             assert warnings_of(caplog, "cannot be") >= 1
-            likelihood.cache._file.close()
+            likelihood.cache.file.close()
             again = likelihood_of(Path(folder) / "cache.sqlite")
             np.testing.assert_array_equal(again.misfit(thetas), expected)
-            again.cache._file.close()
+            again.cache.file.close()
         finally:
             subprocess.run(["umount", folder], check=True)
 

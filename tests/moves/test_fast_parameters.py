@@ -29,6 +29,7 @@ from samplers import (
     TMCMCSampler,
 )
 from samplers.moves.fast_parameters import FastWalk, WithFastSweeps
+from samplers.storage.emcee_internals import get_moves, set_moves
 from tests.contract.targets import Gaussian, WithBlobs
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
@@ -100,7 +101,7 @@ MODES = {
 def test_conjugate_sample(mode, seed):
     posterior = NormalInverseGamma()
     samplers = runs(posterior, seed, **MODES[mode])
-    assert all(isinstance(move, WithFastSweeps) for s in samplers for move in s._moves)
+    assert all(isinstance(move, WithFastSweeps) for s in samplers for move in get_moves(s)[0])
     assert within(deviations(samplers, posterior.mean, lambda x: x[:, 0]), samplers)
     assert within(deviations(samplers, posterior.variance, lambda x: x[:, 1] ** 2), samplers)
     assert within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
@@ -128,9 +129,9 @@ def test_wrong_fast_sweeps_are_detected(seed):
     samplers = []
     for k in range(8):
         sampler = SMCSampler(200, 2, posterior, vectorize=True, seed=[seed, k], recycle=False, fast_sweeps=0)
-        sampler._moves = [
-            WrongMove(MixtureMove(), (1,))
-        ]  # set directly: a sampler copies its moves, and this closure cannot be copied
+        set_moves(
+            sampler, [WrongMove(MixtureMove(), (1,))]
+        )  # a sampler would copy the move, a closure
         sampler.run_mcmc(None, 4)
         samplers.append(sampler)
     assert not within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
@@ -291,7 +292,8 @@ def test_presets_make_no_fast_sweeps(preset, seed):
 
 
 def kinds(posterior, Sampler=SMCSampler, **kwargs):
-    return {type(move) for move in Sampler(50, 3, posterior, log_prior_fn=Gaussian().log_prior, **kwargs)._moves}
+    sampler = Sampler(50, 3, posterior, log_prior_fn=Gaussian().log_prior, **kwargs)
+    return {type(move) for move in get_moves(sampler)[0]}
 
 
 def test_only_if_some_parameters_are_fast():
@@ -360,7 +362,7 @@ def test_a_reopened_file_continues(tmp_path):
 
     def reopen(name):
         sampler = SMCSampler(40, 3, Noisy(), vectorize=True, seed=1, backend=emcee.backends.HDFBackend(tmp_path / name))
-        assert sampler._moves[0].indices == (0, 2)
+        assert get_moves(sampler)[0][0].indices == (0, 2)
         return sampler
 
     chains = []

@@ -130,8 +130,8 @@ def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
 def test_a_batch_needs_one_query_and_one_write(path, thetas):
     likelihood = likelihood_of(Batched(), path)
     statements = []
-    likelihood.cache._file.connection().set_trace_callback(statements.append)
-    likelihood._chunk = 1000
+    likelihood.cache.file.connection().set_trace_callback(statements.append)
+    likelihood.chunk_size = 1000
     likelihood.misfit(thetas)
     kinds = [statement.split()[0] for statement in statements]
     assert kinds.count("SELECT") == kinds.count("BEGIN") == kinds.count("COMMIT") == 1
@@ -458,9 +458,9 @@ def test_a_connection_does_not_go_through_a_fork(path, thetas):
         pytest.skip("NO fork ON THIS SYSTEM")
     likelihood = likelihood_of(Line(), path)
     likelihood.misfit(thetas)
-    assert likelihood.cache._file._connection is not None
+    assert likelihood.cache.file._connection is not None
     context = multiprocessing.get_context("fork")
-    process = context.Process(target=lambda: sys.exit(17 if likelihood.cache._file._connection is None else 1))
+    process = context.Process(target=lambda: sys.exit(17 if likelihood.cache.file._connection is None else 1))
     process.start()
     process.join(60)
     assert process.exitcode == 17
@@ -495,7 +495,7 @@ def test_forks_while_threads_write(path, rng):
     finally:
         stop.set()
         thread.join()
-    assert cache._file.connection().execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    assert cache.file.connection().execute("PRAGMA integrity_check").fetchall() == [("ok",)]
 
 
 def test_threads_share_a_cache(path, rng):

@@ -190,7 +190,7 @@ def test_a_worker_keeps_a_bounded_number_of_functions():
 def test_temporary_files_are_removed_with_the_executor():
     executor = as_executor(Recorder())
     simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), executor)
-    folder = executor._folder.path
+    folder = executor.folder.path
     assert [file.stat().st_size > 0 for file in folder.iterdir()] == [True]
     del executor
     assert not folder.exists()

@@ -106,7 +106,7 @@ def test_the_cache_is_bounded(rng):
     assert likelihood.simulations == 24
     likelihood.misfit(thetas[[5, 6]])
     assert likelihood.simulations == 25
-    assert len(likelihood._memory) == 10
+    assert len(likelihood.memory_cache) == 10
 
 
 def test_without_a_cache():
@@ -132,8 +132,8 @@ def test_the_cache_is_not_pickled(rng):
     likelihood.model.runs = []
     assert len(pickle.dumps(likelihood)) <= small + 100
     copy = pickle.loads(pickle.dumps(likelihood))
-    assert len(copy._memory) == 0
-    assert copy._memory.rows == 500
+    assert len(copy.memory_cache) == 0
+    assert copy.memory_cache.rows == 500
     np.testing.assert_array_equal(copy.log_likelihood(x), values)
     assert len(copy.model.runs) == 200
 
@@ -148,7 +148,7 @@ def test_threads_share_a_cache(rng):
             batches, pool.map(lambda rows: likelihood.log_likelihood(x[rows]), batches), strict=True
         ):
             np.testing.assert_array_equal(values, expected[rows])
-    assert len(likelihood._memory) == 50
+    assert len(likelihood.memory_cache) == 50
 
 
 def test_the_least_recently_used_row_is_evicted():

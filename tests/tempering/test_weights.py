@@ -137,10 +137,10 @@ def test_roots_are_regular_and_follow_units(rng):
 def test_student_t_is_drawn_from_the_density_it_states(rng):
     move = StudentTMove(dof=5.0)
     move.calibrate(rng.standard_normal((500, 2)) @ np.array([[1.0, 0.0], [2.0, 0.3]]), np.full(500, 1 / 500))
-    x, factors = move._draw(np.zeros((20000, 2)), rng)
-    theirs = stats.multivariate_t(move._mean, move._root @ move._root.T, df=5.0)
+    x, factors = move.get_proposal(np.zeros((20000, 2)), rng)
+    theirs = stats.multivariate_t(move.mean, move.root @ move.root.T, df=5.0)
     assert np.allclose(factors, theirs.logpdf(np.zeros(2)) - theirs.logpdf(x))
-    distance = np.linalg.solve(move._root, (x - move._mean).T)
+    distance = np.linalg.solve(move.root, (x - move.mean).T)
     assert stats.kstest(np.sum(distance**2, axis=0) / 2, stats.f(2, 5).cdf).pvalue > 1e-4
     with pytest.raises(ValueError, match="dof"):
         StudentTMove(dof=2.0)
