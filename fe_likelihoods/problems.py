@@ -1,8 +1,8 @@
 """Ready-made posteriors with bundled data: a bridge column and a seismically isolated bridge.
 
-`bridge_column` is the full-scale bridge column of the LHPOST tests, updated as in Ramancha et al. (2022): five multiples
-of nominal values with normal priors truncated at zero, and two noise levels with half-normal priors. The measured
-record and responses are not public. The bundled data are **synthetic** (see ``data/README.md``), and
+`bridge_column` is the full-scale bridge column of the LHPOST tests, updated as in Ramancha et al. (2022): five
+multiples of nominal values with normal priors truncated at zero, and two noise levels with half-normal priors. The
+measured record and responses are not public. The bundled data are **synthetic** (see ``data/README.md``), and
 `bridge_column_measurements` makes such data for any other base motion.
 
 `isolated_bridge` is a bridge on sliding bearings with fluid dampers, after the shake-table tests of Tsopelas et al.
@@ -78,7 +78,7 @@ def _bundled(name: str) -> Dataset:
 
 
 def bridge_column_data() -> Dataset:
-    """Read the bundled synthetic data of earthquake EQ1: base motion, measured channels and truth (``data/README.md``)."""
+    """Read the bundled synthetic data of earthquake EQ1: base motion, channels and truth (``data/README.md``)."""
     return _bundled("bridge_column_eq1.h5")
 
 

@@ -1,12 +1,13 @@
 """Transitional Markov chain Monte Carlo behind emcee's interface.
 
 Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816): the next exponent is the one at which the coefficient
-of variation of the weights is 1, and chains grow from resampled leaders by a random walk with a fraction of the weighted
-covariance. As published, with one step per point at a fixed scale, it can collapse on a sharp posterior; these settings
-are `samplers.presets.CHING_CHEN_2007`. By default every point is moved until the population is nearly uncorrelated with
-its resampled start, by walks whose scale follows their acceptance and by draws that cross between modes: after Betz,
-Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066, and BASIS (Angelikopoulos, Papadimitriou &
-Koumoutsakos 2012, doi:10.1063/1.4757266), whose chains have equal lengths, so that all processors of a pool are busy.
+of variation of the weights is 1, and chains grow from resampled leaders by a random walk with a fraction of the
+weighted covariance. As published, with one step per point at a fixed scale, it can collapse on a sharp posterior; these
+settings are `samplers.presets.CHING_CHEN_2007`. By default every point is moved until the population is nearly
+uncorrelated with its resampled start, by walks whose scale follows their acceptance and by draws that cross between
+modes: after Betz, Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066, and BASIS (Angelikopoulos,
+Papadimitriou & Koumoutsakos 2012, doi:10.1063/1.4757266), whose chains have equal lengths, so that all processors of a
+pool are busy.
 """
 
 from collections.abc import Mapping

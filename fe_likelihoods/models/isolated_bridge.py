@@ -31,6 +31,7 @@ from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Sl
 from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, step_isolated
 from ..signals.channels import Channel
 from ..signals.records import Record
+from ..signals.sampling import same_sampling
 from ..simulation.model import SimulationFailed
 from .base import History
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS, channel_matrix
@@ -337,8 +338,7 @@ class IsolatedBridge(ThreadedModel):
             )
         if self.vertical is not None and (
             not isinstance(self.vertical, Record)
-            or self.vertical.n_steps != self.record.n_steps
-            or abs(self.vertical.dt - self.record.dt) > 1e-9 * self.record.dt
+            or not same_sampling(self.record.dt, self.record.n_steps, self.vertical.dt, self.vertical.n_steps)
         ):
             raise invalid(
                 f"a vertical Record of {self.record.n_steps} samples at {self.record.dt} s, like the horizontal one",

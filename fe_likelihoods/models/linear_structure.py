@@ -30,7 +30,7 @@ from ..kernels.complex_modes import superpose_modes
 from ..kernels.jit import KERNEL_HASH
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sampling import sample_window
+from ..signals.sampling import same_sampling, sample_window
 from ..signals.sdof import hold_integrals
 from ..simulation.model import SimulationFailed
 from .external import ExternalModel
@@ -257,7 +257,7 @@ class LinearStructure(ExternalModel):
             )
         first = supports[0]
         for support in supports[1:]:
-            if support.n_steps != first.n_steps or abs(support.dt - first.dt) > 1e-9 * first.dt:
+            if not same_sampling(first.dt, first.n_steps, support.dt, support.n_steps):
                 raise ValueError(
                     f"LinearStructure: expected supports with the same step and length; got {first.n_steps} samples at "
                     f"{first.dt} s ({first.name}) and {support.n_steps} at {support.dt} s ({support.name}); use "

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Measurements
+from ..signals.sampling import same_step
 from ..simulation.model import Model
 from .noise import Noise, noise_channels
 
@@ -78,7 +79,7 @@ def match_measurements(model: Model, measurements: Measurements) -> Measurements
             raise ValueError(
                 f"channel {ours.name!r} is {ours.quantity!r} in the model and {theirs.quantity!r} in the measurements"
             )
-    if abs(matched.dt - model.dt) > 1e-9 * model.dt:
+    if not same_step(model.dt, matched.dt):
         raise ValueError(
             f"the time step of the model's response is {model.dt} s, that of the measurements {matched.dt} s; make "
             "them equal with Record.resample(dt) on the excitation or Measurements.decimate(factor)"

@@ -154,7 +154,7 @@ class Measurements:
         return replace(self, channels=tuple(self.channels[row] for row in rows), values=self.values[rows])
 
     def trim(self, start: float = 0.0, stop: float | None = None) -> "Measurements":
-        """Return the samples between two times [s], both included, as `Record.trim` does. Time starts again from zero."""
+        """Return the samples between two times [s], both included, as in `Record.trim`. Time starts at zero again."""
         window = sample_window("the measurements", self.n_steps, self.dt, start, stop)
         return replace(self, values=self.values[:, window])
 

@@ -166,7 +166,7 @@ def _unzip(content: bytes, name: str) -> Iterator[tuple[str, bytes]]:
 
 
 def _split_v2(text: str, file: str) -> list[V2Channel]:
-    """Return the channels of a V2 file. Channels of velocity and displacement, which COSMOS files have, are left out."""
+    """Return the channels of a V2 file. Channels of velocity and displacement (in COSMOS files) are left out."""
     channels = []
     lines = text.splitlines()
     first = 0

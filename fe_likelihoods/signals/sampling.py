@@ -6,7 +6,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["array_digest", "check_samples", "check_step", "same_sampling", "sample_window"]
+__all__ = ["array_digest", "check_samples", "check_step", "same_sampling", "same_step", "sample_window"]
 
 _TIME_TOLERANCE = 1e-9  # in steps: round-off of times that are multiples of the step
 _STEP_TOLERANCE = 1e-9  # relative difference up to which two steps are equal
@@ -63,9 +63,14 @@ def check_step(dt: float, name: str) -> float:
     return step
 
 
+def same_step(dt: float, other_dt: float) -> bool:
+    """Return whether two time steps [s] are equal within round-off."""
+    return not abs(dt - other_dt) > _STEP_TOLERANCE * dt
+
+
 def same_sampling(dt: float, n_steps: int, other_dt: float, other_n_steps: int) -> bool:
     """Return whether two series have the same number of samples and, within round-off, the same step [s]."""
-    return n_steps == other_n_steps and not abs(dt - other_dt) > _STEP_TOLERANCE * dt
+    return n_steps == other_n_steps and same_step(dt, other_dt)
 
 
 def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float | None) -> slice:

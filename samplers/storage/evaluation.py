@@ -1,8 +1,8 @@
 """Evaluation of a log-density at batches of points: calls, failures, and the records that travel with the points.
 
-`Evaluator` calls a user's function as emcee does (batch, pool or map; dictionaries for named parameters). Points outside
-the support of the prior are not evaluated. A point for which the function raises an exception or returns NaN counts as
--inf, and its reason is recorded.
+`Evaluator` calls a user's function as emcee does (batch, pool or map; dictionaries for named parameters). Points
+outside the support of the prior are not evaluated. A point for which the function raises an exception or returns NaN
+counts as -inf, and its reason is recorded.
 """
 
 from collections import Counter

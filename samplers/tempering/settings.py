@@ -276,7 +276,7 @@ def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unu
         if settings.check_draws != 0:
             reasons.setdefault(
                 "check_draws",
-                "the check of recycling takes as many draws as there are walkers: pass 0 for no check, or recycle=False",
+                "the check of recycling takes as many draws as there are walkers: pass 0 for none, or recycle=False",
             )
     else:
         reasons.setdefault("recycling", "the annealing is by moves: pass recycle=True")

@@ -129,9 +129,7 @@ def test_wrong_fast_sweeps_are_detected(seed):
     samplers = []
     for k in range(8):
         sampler = SMCSampler(200, 2, posterior, vectorize=True, seed=[seed, k], recycle=False, fast_sweeps=0)
-        set_moves(
-            sampler, [WrongMove(MixtureMove(), (1,))]
-        )  # a sampler would copy the move, a closure
+        set_moves(sampler, [WrongMove(MixtureMove(), (1,))])  # a sampler would copy the move, a closure
         sampler.run_mcmc(None, 4)
         samplers.append(sampler)
     assert not within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
