@@ -44,10 +44,10 @@ def executors(repeats: int) -> list[Row]:
         answer = _answer("overhead", name, repeats)
         case = f"{name}, {WORKERS} workers"
         rows.append(
-            Row("executor: overhead per simulation", case, answer.get("microseconds"), "us", answer.get("told", ""))
+            Row("executor: overhead per simulation", case, answer.get("microseconds"), "us", answer.get("note", ""))
         )
         answer = _answer("death", name, repeats)
-        rows.append(Row("executor: a worker is killed (SIGKILL)", case, answer.get("seconds"), "s", answer["told"]))
+        rows.append(Row("executor: a worker is killed (SIGKILL)", case, answer.get("seconds"), "s", answer["note"]))
         rows.append(Row("executor: the parent is killed (SIGKILL)", case, *_left_over(name)))
     for name in ("isolated function", "program"):
         answer = _answer("overhead", name, repeats)
@@ -61,7 +61,7 @@ def executors(repeats: int) -> list[Row]:
                 case,
                 answer.get("microseconds"),
                 "us",
-                answer.get("told", ""),
+                answer.get("note", ""),
             )
         )
     return rows
@@ -93,7 +93,7 @@ def _answer(what: str, name: str, repeats: int) -> dict:
         found = [row for row in output.read().splitlines() if row.startswith('{"')]
     if found:
         return json.loads(found[-1])
-    return {"told": f"hangs: stopped after {LIMIT:g} s" if hangs else f"everything ends (exit code {exit_code})"}
+    return {"note": f"hangs: stopped after {LIMIT:g} s" if hangs else f"everything ends (exit code {exit_code})"}
 
 
 def _left_over(name: str) -> tuple[float | None, str, str]:
@@ -179,10 +179,10 @@ def _cluster() -> dict:
     batch = simulate_batch(Sleeper(), thetas, executor)
     seconds = time.perf_counter() - start
     if any(batch.reasons):
-        return {"told": f"a run failed: {next(filter(None, batch.reasons))}"}
+        return {"note": f"a run failed: {next(filter(None, batch.reasons))}"}
     efficiency = len(thetas) / THREADS / seconds
-    told = f"{len(thetas)} runs in {seconds:.2f} s, {100 * efficiency:.0f} % of {THREADS} threads used"
-    return {"microseconds": 1e6 * (seconds - len(thetas) / THREADS) / len(thetas), "told": told}
+    note = f"{len(thetas)} runs in {seconds:.2f} s, {100 * efficiency:.0f} % of {THREADS} threads used"
+    return {"microseconds": 1e6 * (seconds - len(thetas) / THREADS) / len(thetas), "note": note}
 
 
 def _death(name: str) -> dict:
@@ -196,10 +196,10 @@ def _death(name: str) -> dict:
         try:
             batch = simulate_batch(DiesOnce(Path(folder)), thetas, executor)
         except Exception as error:
-            return {"seconds": time.perf_counter() - start, "told": f"error: {type(error).__name__}"}
+            return {"seconds": time.perf_counter() - start, "note": f"error: {type(error).__name__}"}
         seconds = time.perf_counter() - start
     right = batch.reasons == [""] * 20 and np.array_equal(batch.response, [line(theta) for theta in thetas])
-    return {"seconds": seconds, "told": "goes on, all results right" if right else "goes on, with failures"}
+    return {"seconds": seconds, "note": "goes on, all results right" if right else "goes on, with failures"}
 
 
 def main() -> None:

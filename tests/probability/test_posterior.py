@@ -106,7 +106,7 @@ class BatchPolynomial(Polynomial):
         response[:, 1] = thetas[:, 1:] * self.dt * np.arange(self.n_steps)
         self.runs += [tuple(theta) for theta in thetas]
         response[thetas[:, 0] == 3.0, 1, 5] = np.nan
-        return SimulationBatch(response, ["told so" if theta[0] == 1.0 else "" for theta in thetas])
+        return SimulationBatch(response, ["said so" if theta[0] == 1.0 else "" for theta in thetas])
 
 
 class MisfitPolynomial(BatchPolynomial):
@@ -430,7 +430,7 @@ def test_batch_methods_give_the_same_as_single_simulations(kind, rng):
     single, batch = misfit_batch(Polynomial(), thetas, measured), misfit_batch(model, thetas, measured)
     np.testing.assert_array_equal(batch.misfit, single.misfit)
     assert len(model.runs) == 6
-    assert batch.reasons[2] == "told so"
+    assert batch.reasons[2] == "said so"
     assert "not finite" in batch.reasons[4]
     assert [bool(reason) for reason in batch.reasons] == [bool(reason) for reason in single.reasons]
     assert np.isnan(batch.misfit[[2, 4]]).all()

@@ -37,7 +37,7 @@ class Run(NamedTuple):
 
     samples: np.ndarray
     effective_sample_size: float
-    alarms: list[str]
+    messages: list[str]
     log_evidence: float
     log_evidence_error: float
 
@@ -56,14 +56,14 @@ def tempered(Sampler: type, data: str, seed: int, **settings) -> Run:
         sampler = Sampler(WALKERS, posterior.ndim, posterior, vectorize=True, seed=seed, **settings)
         sampler.run_mcmc(None, 2)
     samples = sampler.get_chain(flat=True)
-    alarms = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
+    messages = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
     print(
         f"\n{Sampler.__name__}{' as published' if settings else ''} on {data!r}, seed {seed}: "
         f"{len(sampler.ladder)} stages, "
         f"{posterior.report()['simulations']} simulations in {time.perf_counter() - start:.0f} s, "
-        f"log evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}, alarms {alarms}"
+        f"log evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}, warnings {messages}"
     )
-    return Run(samples, WALKERS, alarms, sampler.log_evidence, sampler.log_evidence_error)
+    return Run(samples, WALKERS, messages, sampler.log_evidence, sampler.log_evidence_error)
 
 
 def ensemble(data: str, seed: int, initial: np.ndarray, n_steps: int, discard: int) -> Run:
@@ -134,7 +134,7 @@ def test_tmcmc_as_published_is_wrong_and_says_so():
     distance = np.abs(published.samples.mean(axis=0) - right.samples.mean(axis=0)) / right.samples.std(axis=0)
     print("published TMCMC, distance of the means in posterior sd:", np.round(distance, 1))
     assert distance.max() > 3.0
-    assert published.alarms
+    assert published.messages
 
 
 # ------------------------------------------------------------------ two modes of known mass
