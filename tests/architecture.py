@@ -195,8 +195,13 @@ def foreign_reads(root: Path = ROOT) -> dict[str, int]:
 
 
 def second_defaults(root: Path = ROOT) -> dict[str, list[str]]:
-    """Settings of the samplers whose default is written in more than one class, and those classes."""
+    """Settings of the samplers whose default is written in more than one class, and those classes.
+
+    A setting is a field of a class whose name ends with "Settings"; a default is that of a field or of a keyword of a
+    constructor.
+    """
     places: dict[str, list[str]] = {}
+    settings = set()
     for path in modules(root, "samplers"):
         for cls in ast.walk(ast.parse(path.read_text())):
             if not isinstance(cls, ast.ClassDef):
@@ -205,6 +210,7 @@ def second_defaults(root: Path = ROOT) -> dict[str, list[str]]:
                 names = []
                 if isinstance(node, ast.AnnAssign) and node.value is not None:
                     names = [ast.unparse(node.target)]
+                    settings |= set(names) if cls.name.endswith("Settings") else set()
                 elif isinstance(node, ast.FunctionDef) and node.name == "__init__":
                     pairs = zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)
                     names = [
@@ -214,7 +220,7 @@ def second_defaults(root: Path = ROOT) -> dict[str, list[str]]:
                     ]
                 for name in names:
                     places.setdefault(name, []).append(cls.name)
-    return {name: classes for name, classes in sorted(places.items()) if len(classes) > 1}
+    return {name: places[name] for name in sorted(settings) if len(places[name]) > 1}
 
 
 def main() -> None:

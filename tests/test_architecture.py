@@ -5,7 +5,17 @@ import re
 import sys
 from pathlib import Path
 
-from tests.architecture import ORDER, PACKAGES, ROOT, Import, imports, module_cycles, modules, package_graph
+from tests.architecture import (
+    ORDER,
+    PACKAGES,
+    ROOT,
+    Import,
+    imports,
+    module_cycles,
+    modules,
+    package_graph,
+    second_defaults,
+)
 
 PLOTTING = {"arviz", "corner", "matplotlib"}
 CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy"}
@@ -227,6 +237,10 @@ def test_sources_cite_only_what_a_reader_has():
         assert not re.search(r"specs/|papers/\w+\.(txt|md)|FE_SHARED", text), name(path)
         for page in re.findall(r"docs/theory/(\w+)", text):
             assert (ROOT / "docs" / "theory" / f"{page}.rst").is_file(), f"{name(path)} cites docs/theory/{page}"
+
+
+def test_defaults_of_settings_are_written_once():
+    assert not second_defaults()
 
 
 def test_modules_and_classes_keep_their_size():
