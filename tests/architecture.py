@@ -7,6 +7,7 @@ function, and under ``TYPE_CHECKING``. ROOT is the folder of another version of 
 
 import argparse
 import ast
+import functools
 import graphlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,7 @@ __all__ = [
     "modules",
     "package_graph",
     "second_defaults",
+    "tree_of",
 ]
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -95,6 +97,16 @@ class Graph(NamedTuple):
     cycles: list[tuple[str, ...]]
 
 
+@functools.cache
+def _parse(source: str) -> ast.Module:
+    return ast.parse(source)
+
+
+def tree_of(path: Path) -> ast.Module:
+    """Syntax tree of a module; equal sources are parsed once."""
+    return _parse(path.read_text())
+
+
 def modules(root: Path = ROOT, package: str | None = None) -> list[Path]:
     """Source files of one package, or of both."""
     return sorted(p for name in ([package] if package else PACKAGES) for p in (root / name).rglob("*.py"))
@@ -102,7 +114,12 @@ def modules(root: Path = ROOT, package: str | None = None) -> list[Path]:
 
 def imports(path: Path, root: Path = ROOT) -> list[Import]:
     """Every import of a module, relative ones resolved."""
-    tree = ast.parse(path.read_text())
+    return list(_imports_of(path.read_text(), path.relative_to(root).with_suffix("").parts[:-1]))
+
+
+@functools.cache
+def _imports_of(source: str, package: tuple[str, ...]) -> tuple[Import, ...]:
+    tree = _parse(source)
     late = {
         node
         for block in ast.walk(tree)
@@ -110,7 +127,6 @@ def imports(path: Path, root: Path = ROOT) -> list[Import]:
         or (isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING")
         for node in ast.walk(block)
     }
-    package = path.relative_to(root).with_suffix("").parts[:-1]
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -122,7 +138,7 @@ def imports(path: Path, root: Path = ROOT) -> list[Import]:
         else:
             continue
         found += [Import(name, node not in late) for name in names]
-    return found
+    return tuple(found)
 
 
 def _strong_components(nodes: list[str], edges: set[tuple[str, str]]) -> list[tuple[str, ...]]:
@@ -177,7 +193,7 @@ def module_cycles(root: Path = ROOT) -> list[tuple[str, ...]]:
 def _classes(root: Path) -> Iterator[tuple[str, int, int]]:
     """Name, number of methods and number of lines of every class."""
     for path in modules(root):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.ClassDef):
                 methods = sum(isinstance(inner, ast.FunctionDef) for inner in node.body)
                 yield f"{path.relative_to(root)}: {node.name}", methods, node.end_lineno - node.lineno + 1
@@ -187,7 +203,7 @@ def foreign_reads(root: Path = ROOT) -> dict[str, int]:
     """Calls of hasattr and getattr, by file."""
     counts = {}
     for path in modules(root):
-        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        calls = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
         count = sum(isinstance(call.func, ast.Name) and call.func.id in FOREIGN for call in calls)
         if count:
             counts[str(path.relative_to(root))] = count
@@ -203,7 +219,7 @@ def second_defaults(root: Path = ROOT) -> dict[str, list[str]]:
     places: dict[str, list[str]] = {}
     settings = set()
     for path in modules(root, "samplers"):
-        for cls in ast.walk(ast.parse(path.read_text())):
+        for cls in ast.walk(tree_of(path)):
             if not isinstance(cls, ast.ClassDef):
                 continue
             for node in cls.body:

@@ -15,6 +15,7 @@ from tests.architecture import (
     modules,
     package_graph,
     second_defaults,
+    tree_of,
 )
 
 PLOTTING = {"arviz", "corner", "matplotlib"}
@@ -47,7 +48,7 @@ def own(path: Path) -> set[str]:
 
 def trees():
     for path in modules():
-        yield path, ast.parse(path.read_text())
+        yield path, tree_of(path)
 
 
 def test_control_the_reader_of_imports_finds_what_breaks_the_rules(tmp_path):
