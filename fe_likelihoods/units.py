@@ -7,6 +7,8 @@ raises ValueError, because a wrong unit gives results that look right.
 The factors are exact by definition: 1 in = 25.4 mm, 1 lb = 0.45359237 kg, standard gravity 9.80665 m/s².
 """
 
+from __future__ import annotations
+
 import re
 from typing import NamedTuple
 

@@ -14,6 +14,8 @@ J. W. Baker (2015), Efficient analytical fragility function fitting using dynami
 Spectra 31(1), 579-599, doi:10.1193/021113EQS025M.
 """
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

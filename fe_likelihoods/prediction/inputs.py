@@ -112,8 +112,8 @@ def under_record(model: Model, record: Record) -> Model:
     """Return the model under another excitation; raise ValueError if it has no method ``with_record``."""
     if not hasattr(model, "with_record"):
         raise ValueError(
-            f"{type(model).__name__} has one excitation only: give it a method with_record(record) that returns the "
-            "same model under another excitation"
+            f"{type(model).__name__} has one excitation only: write a model class (docs/own_model.rst) with a method "
+            "with_record(record) that returns the same model under another excitation"
         )
     return model.with_record(record)
 

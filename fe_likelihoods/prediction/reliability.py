@@ -13,6 +13,8 @@ C. J. Clopper, E. S. Pearson (1934), The use of confidence or fiducial limits il
 Biometrika 26(4), 404-413, doi:10.1093/biomet/26.4.404.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import NamedTuple
 

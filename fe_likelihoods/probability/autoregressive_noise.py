@@ -42,9 +42,10 @@ class AutoregressiveNoise:
         log L = -n/2 log(2 pi) - n log(sigma) - (n-1)/2 log(1 - rho^2) - Q / (2 sigma^2 (1 - rho^2))
         Q     = (1 - rho)^2 J + rho D + rho (1 - rho) E
 
-    with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2 (`residuals.lag_one_sums`). For rho = 0
-    this is white noise. Q is written with differences instead of the products r_t r_{t-1}, because for rho near one
-    their sum would cancel against J. The mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
+    with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2
+    (`fe_likelihoods.probability.residuals.lag_one_sums`). For rho = 0 this is white noise. Q is written
+    with differences instead of the products r_t r_{t-1}, because for rho near one their sum would cancel against J. The
+    mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
 
     Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one and the
     likelihood becomes that of the differences. Decimate the measurements (`Measurements.decimate`) to a step at which
@@ -73,7 +74,7 @@ class AutoregressiveNoise:
 
     @property
     def statistic(self) -> Statistic:
-        """Statistic of the residuals: `residuals.lag_one_sums`, three numbers per channel."""
+        """Statistic of the residuals: `fe_likelihoods.probability.residuals.lag_one_sums`, three per channel."""
         return lag_one_sums
 
     def log_likelihood(self, statistics: np.ndarray, n_steps: int, parameters: np.ndarray) -> np.ndarray:

@@ -92,8 +92,8 @@ class FELikelihood:
     ------
     ValueError
         If the channels, time step or length of model and measurements differ, or the channels of the noise, if
-        parameter names repeat, if the pool is not one or the model cannot be sent to its processes, or if the file of
-        the cache cannot be used.
+        parameter names repeat, if `pool` is neither a number nor has ``map`` or ``gather``, if the model cannot be sent
+        to its processes, or if the file of the cache cannot be used.
     """
 
     def __init__(

@@ -123,7 +123,7 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
     Raises
     ------
     ValueError
-        As `autocorrelation`.
+        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel.
 
     Notes
     -----
@@ -178,7 +178,8 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     Raises
     ------
     ValueError
-        As `autocorrelation`; also for a wrong number of correlations, or one that is not between -1 and 1.
+        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel; for
+        a wrong number of correlations, or one that is not between -1 and 1.
     """
     residuals = _checked(residuals)
     rho = np.asarray(lag_one, dtype=float)
@@ -204,14 +205,14 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     Raises
     ------
     ValueError
-        As `autocorrelation`.
+        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel.
 
     Notes
     -----
     The lag-one correlation of n white residuals is approximately normal with standard deviation 1 / sqrt(n). Normality
     is tested with the statistic of Jarque and Bera [1]_, with the effective number of samples instead of n, so that
-    correlation alone does not make the test significant. If a probability is below 0.01, look at
-    `plot_residuals`.
+    correlation alone does not make the test significant. If `white` or `normal` is below 0.01, look at the figure of
+    `fe_likelihoods.plot_residuals`.
 
     References
     ----------
@@ -258,7 +259,8 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     Raises
     ------
     ValueError
-        If the number of channels differs from the number of rows, and as `residual_checks`.
+        If the number of channels differs from the number of rows, or the residuals have another shape, fewer than two
+        samples, non-finite values, or only zeros in a channel.
     """
     from ..plots.histories import plot_residual_checks
 

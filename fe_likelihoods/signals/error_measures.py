@@ -1,5 +1,7 @@
 """Measures of the difference between a predicted and a measured history."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

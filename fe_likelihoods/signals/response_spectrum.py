@@ -11,6 +11,8 @@ N. C. Nigam, P. C. Jennings (1969), Calculation of response spectra from strong-
 the Seismological Society of America 59(2), 909-922.
 """
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """Checks of time steps, sample arrays and time windows, shared by records, measurements and predictions."""
 
+from __future__ import annotations
+
 import hashlib
 import math
 
