@@ -32,25 +32,48 @@ class SMCSampler(TemperedSampler):
     nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names
         As in `emcee.EnsembleSampler`, in the same order. By default `moves` is
         `samplers.moves.kernels.MixtureMove`: three kernels from a mixture fitted to every stage.
-    log_prior_fn, seed
-        As in `TemperedSampler`.
+    log_prior_fn : callable, optional
+        Log-density of the normalised prior, called like `log_prob_fn` but without `args` and `kwargs`, always in this
+        process. By default ``log_prob_fn.log_prior``.
     coarse_log_prob_fn : callable, optional
         A cheaper `log_prob_fn` to anneal on first, such as ``posterior.coarse``. The result is that of `log_prob_fn`; a
         `SamplingWarning` says where the coarse model did not help. Requires recycling.
+    seed : int or array of int, optional
+        Seed of the run. By default it is drawn from NumPy's global generator (``np.random.seed``). The random state of
+        a backend that contains a chain takes precedence.
     recycle : bool, optional
         Anneal by recycling every evaluated point (`samplers.tempering.adaptive_importance`), and by moves where its
         result cannot be trusted. By default yes with 250 walkers or more and no `moves` given: with fewer walkers, a
         mode can be lost unnoticed, and recycling often fails.
-    recycling : RecyclingSettings, optional
+    recycling : RecyclingSettings, default RecyclingSettings()
         Constants of the recycling.
-    ess_ratio, ess_rule, ess_floor, resampling : optional
-        Choice of beta and resampling; with ``recycle=False`` only. See `samplers.tempering.settings.Settings`.
-    min_moves, max_moves, max_correlation : optional
-        How long points are moved at each beta, as there; with recycling, at beta = 1.
-    fast_sweeps, check_draws, max_failure_share : optional
-        As there.
-    settings : Settings, optional
-        Settings as one object; keywords take precedence.
+    ess_ratio : float, default 0.5
+        Effective sample size wanted of each stage, as a share of the number of walkers (`ess_rule` "constant") or of
+        the previous stage's target ("declining"); between 0 and 1. Without recycling only, as the next three settings.
+    ess_rule : {"constant", "declining"}, default "constant"
+        What `ess_ratio` refers to.
+    ess_floor : float, default 0.0
+        Lower limit of the declining target.
+    resampling : str or callable, default "systematic"
+        Name of a scheme in `samplers.tempering.resampling`, or a function of (weights, random) that returns indices.
+    min_moves : int, default 2
+        Smallest number of sweeps of the ensemble per stage; with recycling, at beta = 1 only.
+    max_moves : int, default 7
+        Largest number of these sweeps; equal to `min_moves` for a fixed number.
+    max_correlation : float, default 0.15
+        Between these two numbers, moving stops once the correlation of every parameter and of the log-likelihood with
+        their values after the resampling is below this value, or decreases no further.
+    fast_sweeps : int, default 2
+        Sweeps over the fast parameters after every move, where `log_prob_fn` has an attribute ``fast_parameters``; 0
+        for none.
+    check_draws : int, optional
+        Evaluations for an estimate of the evidence that is independent of the annealing. By default as many as there
+        are walkers; 0 for no such estimate.
+    max_failure_share : float, default 0.5
+        The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
+        (a returned -inf is not a failure); 0 stops at the first failure.
+    settings : samplers.Settings, optional
+        These settings as one object; keywords take precedence.
 
     Raises
     ------

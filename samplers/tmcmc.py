@@ -30,21 +30,41 @@ class TMCMCSampler(TemperedSampler):
     ----------
     nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names
         As in `emcee.EnsembleSampler`, in the same order. By default `moves` is `samplers.moves.kernels.MixtureMove`.
-    log_prior_fn, seed
-        As in `TemperedSampler`.
+    log_prior_fn : callable, optional
+        Log-density of the normalised prior, called like `log_prob_fn` but without `args` and `kwargs`, always in this
+        process. By default ``log_prob_fn.log_prior``.
+    seed : int or array of int, optional
+        Seed of the run. By default it is drawn from NumPy's global generator (``np.random.seed``). The random state of
+        a backend that contains a chain takes precedence.
     coefficient_of_variation : float, optional
-        Coefficient of variation of the incremental weights, which determines the next exponent; 1 by default.
-    chains : {"equal", "leaders"}, optional
-        Whether all points are moved equally often, or chains grow from leaders. Moves that need many walkers, such as
-        emcee's stretch move, need "equal".
-    burn_in : int, optional
+        Coefficient of variation of the incremental weights, which determines the next exponent. By default 1, which is
+        an effective sample size of half the number of walkers.
+    resampling : str or callable, default "systematic"
+        Name of a scheme in `samplers.tempering.resampling`, or a function of (weights, random) that returns indices.
+    chains : {"equal", "leaders"}, default "equal"
+        With "equal", every resampled point is moved equally often. With "leaders", a chain grows from each distinct
+        resampled point, one step per copy of it; each point is then moved `burn_in` + 1 times. Moves that need many
+        walkers, such as emcee's stretch move, need "equal".
+    burn_in : int, default 0
         Steps of a chain before its points count; with "leaders" only.
-    min_moves, max_moves, max_correlation : optional
-        How long points are moved at each beta; with "equal" only.
-    resampling, fast_sweeps, check_draws, max_failure_share : optional
-        As in `samplers.tempering.settings.Settings`.
-    settings : Settings, optional
-        Settings as one object; keywords take precedence.
+    min_moves : int, default 2
+        Smallest number of sweeps of the ensemble per stage; with "equal" only, as the next two settings.
+    max_moves : int, default 7
+        Largest number of these sweeps; equal to `min_moves` for a fixed number.
+    max_correlation : float, default 0.15
+        Between these two numbers, moving stops once the correlation of every parameter and of the log-likelihood with
+        their values after the resampling is below this value, or decreases no further.
+    fast_sweeps : int, default 2
+        Sweeps over the fast parameters after every move, where `log_prob_fn` has an attribute ``fast_parameters``; 0
+        for none.
+    check_draws : int, optional
+        Evaluations for an estimate of the evidence that is independent of the annealing. By default as many as there
+        are walkers; 0 for no such estimate.
+    max_failure_share : float, default 0.5
+        The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
+        (a returned -inf is not a failure); 0 stops at the first failure.
+    settings : samplers.Settings, optional
+        These settings as one object; keywords take precedence.
 
     Raises
     ------

@@ -104,7 +104,7 @@ class BridgeHistory(History):
 class IsolatedBridge(ThreadedModel):
     """Isolated bridge on a shake table; theta holds multiples of the nominal parameters.
 
-    Attributes
+    Parameters
     ----------
     record : Record
         Acceleration of the table, linear between its samples, at the scale of the model: for a quarter-scale model the
@@ -115,10 +115,11 @@ class IsolatedBridge(ThreadedModel):
         The parts, one for each pier.
     rubber : Rubber
         Rubber devices, the same at both piers; they have no parameters in theta.
-    outputs : tuple of str, 5, 6, 10 or None
-        Channels by name, or a set of `CHANNEL_SETS`. None: all twelve.
+    outputs : tuple of str, int or None
+        Names of the channels (see the notes), or the number of channels of a measured set: 5 for those of pier 1, 6 for
+        these and ``Ub_2``, 10 for those of both piers. None: all twelve channels that are not means.
     parameters : tuple of str
-        Names out of `PARAMETERS` that make up theta, in this order.
+        Names of the parameters that make up theta, in this order (see the notes).
     friction : str
         "bouc-wen" (regularised, the default), "elastic-plastic" (the law of the sliders in other codes), or "coulomb"
         (exact stick and slip, with isolator forces that are constant over a step, hence of first order).
@@ -143,6 +144,31 @@ class IsolatedBridge(ThreadedModel):
     ------
     ValueError
         If an argument is out of range, or the arguments do not fit together.
+
+    Notes
+    -----
+    The channels of the two piers and of the deck are:
+
+    ========================  ================================================================================
+    ``Ub_1``, ``Ub_2``        displacement of the bearing [m]
+    ``Fb_1``, ``Fb_2``        force of the isolator: friction, rubber and dampers [N]
+    ``drift_1``, ``drift_2``  displacement of the top of the block relative to the table [m]
+    ``shear_1``, ``shear_2``  elastic shear force of the pier [N]
+    ``acc_p1``, ``acc_p2``    absolute acceleration of the top of the block [m/s²]
+    ``Ud``, ``acc_d``         displacement of the deck relative to the table [m], absolute acceleration [m/s²]
+    ========================  ================================================================================
+
+    ``mean_Ub``, ``mean_Fb``, ``mean_drift``, ``mean_shear`` and ``mean_acc_p`` are means over the two piers.
+
+    Each value of theta is a multiple of a nominal value (`nominal`). The parameters of the two piers are:
+
+    ======================  ==================================================================
+    ``fmin_1``, ``fmin_2``  coefficient of friction at rest [-]
+    ``df_1``, ``df_2``      increase of the coefficient of friction at high velocity [-]
+    ``a_1``, ``a_2``        rate of this increase with velocity [s/m]
+    ``Kd_1``, ``Kd_2``      stiffness of the spring of one damper [N/m]
+    ``C0_1``, ``C0_2``      coefficient of the dashpot of one damper [N s/m]
+    ======================  ==================================================================
     """
 
     record: Record

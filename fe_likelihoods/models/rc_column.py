@@ -97,7 +97,7 @@ class _Prepared(NamedTuple):
 class RCColumn(ThreadedModel):
     """Circular reinforced-concrete column; theta holds multiples of the nominal parameters.
 
-    Attributes
+    Parameters
     ----------
     loading : Record or DisplacementHistory
         Base acceleration, or lateral displacement of the top.
@@ -130,7 +130,7 @@ class RCColumn(ThreadedModel):
         Design and Retrofit of Bridges, 1996). With 2 elements of 3 points it completes their plastic hinge,
         0.08 height + 0.022 fy d, because the end section of such an element represents height/12.
     parameters : tuple of str
-        Names out of `PARAMETERS` that make up theta, in this order.
+        Names of the parameters that make up theta, in this order (see the notes).
     n_elements, n_points : int
         Number of elements, and of Gauss-Lobatto points per element (2 to 7).
     mesh : int or Patches
@@ -142,7 +142,7 @@ class RCColumn(ThreadedModel):
     max_increment : float or None
         Largest increment of an imposed displacement [m]; larger ones are divided. None: height/5000.
     outputs : tuple of str or None
-        Names of the channels. None: all channels of the loading.
+        Names of the channels (see the notes). None: all channels of the loading.
     units : dict or tuple of pairs
         Display units of the channels, by name.
     tolerance, element_tolerance : float
@@ -154,6 +154,28 @@ class RCColumn(ThreadedModel):
     ------
     ValueError
         If an argument is out of range, or the arguments do not fit together.
+
+    Notes
+    -----
+    The channels are ``"acceleration"``, the absolute acceleration of the top [m/s²], and ``"displacement"``, that of
+    the top relative to the base [m], under a `Record`; ``"force"``, the lateral force at the top [N], under a
+    `DisplacementHistory`.
+
+    Each value of theta is a multiple of a nominal value (`nominal`). The parameters are:
+
+    ================  ============================================================
+    ``Ec``            modulus of concrete [Pa]
+    ``Es``            modulus of steel [Pa]
+    ``a0``            mass-proportional damping [1/s]
+    ``a1``            stiffness-proportional damping [s]
+    ``ft``            tensile strength of concrete [Pa]
+    ``fc``            compressive strength of concrete [Pa]
+    ``fy``            yield strength of steel [Pa]
+    ``fu``            ultimate strength of steel [Pa]
+    ``Esh``           hardening modulus of steel [Pa]
+    ``mass``          mass at the top [kg]
+    ``penetration``   length of strain penetration into the foundation [m]
+    ================  ============================================================
     """
 
     loading: Record | DisplacementHistory

@@ -9,7 +9,8 @@ import pytest
 from scipy.signal import lsim, lti
 
 from fe_likelihoods import Bearing, Damper, IsolatedBridge, Pier, Record, Rubber, SimulationFailed
-from fe_likelihoods.models.isolated_bridge_channels import CHANNEL_SETS
+from fe_likelihoods.models.isolated_bridge import PARAMETERS
+from fe_likelihoods.models.isolated_bridge_channels import CHANNEL_SETS, CHANNELS
 
 PART = Path(__file__).parents[1] / "kernels" / "data" / "isolated_bridge.npz"
 LIMIT = 1e-3
@@ -380,3 +381,8 @@ def test_parameters_of_the_wrong_length(rng):
         model.simulate_batch(np.ones(10))
     with pytest.raises(ValueError, match="measured"):
         model.misfit_batch(np.ones((1, 10)), np.zeros((2, 5)))
+
+
+def test_docstring_lists_every_parameter_and_channel():
+    for name in (*PARAMETERS, *CHANNELS):
+        assert f"``{name}``" in IsolatedBridge.__doc__ or f'``"{name}"``' in IsolatedBridge.__doc__, name

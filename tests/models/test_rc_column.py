@@ -730,3 +730,8 @@ def test_a_jump_of_the_steel_law_is_crossed(shared):
     finer = RCColumn.lhpost(record, substeps=2).history(theta).values[:2]
     error = np.sqrt(np.sum((response - finer) ** 2, axis=1) / np.sum(finer**2, axis=1))
     assert np.all(error < 0.02), error
+
+
+def test_docstring_lists_every_parameter_and_channel():
+    for name in (*PARAMETERS, *("acceleration", "displacement", "force")):
+        assert f"``{name}``" in RCColumn.__doc__ or f'``"{name}"``' in RCColumn.__doc__, name

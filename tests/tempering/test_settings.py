@@ -1,5 +1,6 @@
 """A setting changes the run or is refused: it is never ignored."""
 
+import re
 from dataclasses import fields, replace
 
 import emcee
@@ -52,6 +53,18 @@ ACTS = {
     "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "fast_sweeps", "check_draws"},
     "leaders, recycling": {"burn_in", "fast_sweeps", "recycle", "recycling", "check_draws"},
 }
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_docstring_lists_every_setting_with_its_default(Sampler):
+    entries = re.findall(r"^ {4}(\w+) : (.*)$", Sampler.__doc__, re.MULTILINE)
+    stated = {
+        name: None if kind.endswith(", optional") else eval(kind.split(", default ")[1])
+        for name, kind in entries
+        if name in CHANGES
+    }
+    usable = set(CHANGES) - set(Sampler.unused_settings) - ({"recycle"} if Sampler is TMCMCSampler else set())
+    assert stated == {field.name: field.default for field in fields(Settings) if field.name in usable}
 
 
 class Target(Gaussian):
