@@ -80,7 +80,12 @@ def response_spectrum(
         If the samples are not a one-dimensional finite array, the step is not positive, the periods are not
         one-dimensional, finite and long enough, or the damping ratio is out of range.
     """
-    acceleration, dt = check_samples(acceleration, "acceleration", "the motion"), check_step(dt, "the motion")
+    try:
+        acceleration, dt = check_samples(acceleration, "acceleration", "the motion"), check_step(dt, "the motion")
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; for a Record use record.spectrum(), or pass record.acceleration and record.dt"
+        ) from None
     if periods is None:
         periods = np.geomspace(max(0.02, 2.0 * dt), max(10.0, 4.0 * dt), 120)
     periods = np.array(periods, dtype=float)

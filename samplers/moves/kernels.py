@@ -192,7 +192,7 @@ class StudentTMove(_FittedMove):
 
 
 class MixtureMove(MHMove):
-    """Three kernels from one mixture of Student t fitted to the stage; each sweep draws one of them at random.
+    """Three kernels from one mixture of Student t fitted to the stage; each sweep chooses one of them at random.
 
     independence
         Draws from the mixture (`samplers.proposals.mixture`). They cross between modes, and replace most of the
@@ -208,7 +208,8 @@ class MixtureMove(MHMove):
         One step in ten is the whole difference, which leads from mode to mode. The two points come from the stage that
         the move was calibrated on, so a step does not depend on the ensemble that is being moved.
 
-    The scales of the last two kernels are adapted by ``tune`` to reach the acceptance `target`.
+    The first sweep after each calibration uses the independence kernel. The scales of the last two kernels are adapted
+    by ``tune`` to reach the acceptance `target`.
 
     Parameters
     ----------

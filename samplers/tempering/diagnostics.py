@@ -106,6 +106,7 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> N
     if check.reliable and abs(log_evidence - check.log_evidence) > 3.0 * joint + 1e-6:
         warn(
             f"the stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
-            f"points gives {check.log_evidence:.2f} +- {check.error:.2f}. The posterior may still be right; for the "
-            "evidence use more walkers or more moves"
+            f"points gives {check.log_evidence:.2f} +- {check.error:.2f}. The posterior may still be right. "
+            "Check first that log_prior is normalised, which only the second estimate depends on; otherwise use more "
+            "walkers or more moves for the evidence"
         )
