@@ -92,6 +92,11 @@ class SMCSampler(TemperedSampler):
         {"chains": _TMCMC, "burn_in": _TMCMC, "coefficient_of_variation": _TMCMC + ", or use ess_ratio"}
     )
 
+    how_to_recycle = (
+        f"use more walkers or pass recycle=True (it is on by default with {FEWEST_TO_RECYCLE} walkers or more and no "
+        "moves given)"
+    )
+
     @classmethod
     def _choose(cls, settings: Settings, moves: Any, nwalkers: int) -> tuple[bool, Any]:
         recycle = moves is None and nwalkers >= FEWEST_TO_RECYCLE if settings.recycle is None else settings.recycle

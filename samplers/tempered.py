@@ -88,14 +88,16 @@ class TemperedSampler(EnsembleSampler):
     Raises
     ------
     ValueError
-        For settings that cannot act or have impossible values, fewer than 2 ndim walkers, no log-prior, or a coarse
-        model without recycling.
+        For settings that cannot act or have impossible values, an `ndim` that is not ``log_prob_fn.ndim``, fewer than
+        2 ndim walkers, no log-prior, or a coarse model without recycling.
     TypeError
         For a keyword that is not a setting.
     """
 
     # settings that a sampler never uses, and what to do instead
     unused_settings: Mapping[str, str] = MappingProxyType({})
+    # what to do where recycling is needed and off
+    how_to_recycle = "pass recycle=True"
 
     def __init__(
         self,
@@ -126,6 +128,7 @@ class TemperedSampler(EnsembleSampler):
                 "annealing starts from the prior: pass log_prior_fn, or a log_prob_fn with a method log_prior (a "
                 f"posterior object itself, not its bound method); got {self.log_prior_fn!r}"
             )
+        self._optional.check_ndim(ndim)
         if ndim < 1 or nwalkers < 2 * ndim:
             raise ValueError(
                 "a population must span the parameters: at least 2 ndim walkers and one parameter are needed, some "
@@ -134,10 +137,12 @@ class TemperedSampler(EnsembleSampler):
         given = combine_settings(type(self).__name__, settings, overrides)
         recycle, moves = self._choose(given, moves, nwalkers)
         self.settings = replace(given, recycle=recycle)
-        if coarse_log_prob_fn is not None and not (callable(coarse_log_prob_fn) and recycle):
+        if coarse_log_prob_fn is not None and not callable(coarse_log_prob_fn):
+            raise ValueError(f"coarse_log_prob_fn must be callable; got {coarse_log_prob_fn!r}")
+        if coarse_log_prob_fn is not None and not recycle:
             raise ValueError(
-                "coarse_log_prob_fn must be callable, and requires recycling (the default of SMCSampler with 250 "
-                f"walkers or more and no moves given); got {coarse_log_prob_fn!r} with recycle={recycle}"
+                f"coarse_log_prob_fn needs recycling, which is off for this {type(self).__name__} with {nwalkers} "
+                f"walkers{' and recycle=False' if given.recycle is False else ''}: {self.how_to_recycle}"
             )
         self.coarse_log_prob_fn = coarse_log_prob_fn
 

@@ -84,6 +84,8 @@ class TMCMCSampler(TemperedSampler):
         }
     )
 
+    how_to_recycle = "TMCMCSampler does not recycle: use SMCSampler"
+
     @classmethod
     def _choose(cls, settings: Settings, moves: Any, nwalkers: int) -> tuple[bool, Any]:
         if settings.recycle:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..units import find_unit, from_si
 from .protocols import ChannelHistories, ChannelLike, RecordLike, ResidualChecksLike, SpectrumLike
-from .style import BLUE, GREY, ORANGE, channel_label, new_axes, select_names, set_time_axis, stack_axes
+from .style import BLUE, GREY, ORANGE, add_legend_row, channel_label, new_axes, select_names, set_time_axis, stack_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -182,9 +182,7 @@ def plot_histories(
             text = label + (f", RRMSE {100 * errors[name]:.3g} %" if name in errors else "")
             axes.plot(response.time, from_si(response.channel(name), unit), color=BLUE, linewidth=0.8, label=text)
         if measured and simulated:
-            axes.legend(frameon=False, fontsize="small", ncols=2, loc="upper right", borderaxespad=0.1)
-            low, high = axes.get_ylim()
-            axes.set_ylim(low, high + 0.22 * (high - low))  # room for the legend
+            add_legend_row(axes, 2)
         axes.set_ylabel(channel_label(known[name]))
         axes.grid(alpha=0.25)
     set_time_axis(rows, max(source.time[-1] for source in sources), time_label)

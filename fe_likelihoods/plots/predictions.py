@@ -9,7 +9,7 @@ import numpy as np
 
 from ..units import from_si
 from .protocols import ChannelHistories, FragilityLike, PredictionLike
-from .style import BLUE, GREY, ORANGE, channel_label, select_names, set_time_axis, stack_axes
+from .style import BLUE, GREY, ORANGE, add_legend_row, channel_label, select_names, set_time_axis, stack_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def plot_bands(
         axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
         axes.set_ylabel(channel_label(channel))
         axes.grid(alpha=0.25)
-    rows[0].legend(frameon=False, fontsize="small", ncols=3, loc="upper right")
+    add_legend_row(rows[0], 3)
     set_time_axis(rows, time[-1])
     return figure
 

@@ -13,7 +13,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["BLUE", "GREY", "ORANGE", "channel_label", "new_axes", "select_names", "set_time_axis", "stack_axes"]
+__all__ = [
+    "BLUE",
+    "GREY",
+    "ORANGE",
+    "add_legend_row",
+    "channel_label",
+    "new_axes",
+    "select_names",
+    "set_time_axis",
+    "stack_axes",
+]
 
 BLUE = "#1f5a8c"
 ORANGE = "#d9822b"
@@ -41,6 +51,13 @@ def set_time_axis(rows: np.ndarray, end: float, label: str = "time [s]") -> None
     """Label the common horizontal axis of stacked axes and let it run from 0 to `end`."""
     rows[-1].set_xlabel(label)
     rows[-1].set_xlim(0.0, end if end > 0.0 else None)
+
+
+def add_legend_row(axes: Axes, n_columns: int) -> None:
+    """Add a legend of one row at the upper right, and extend the vertical axis so that it covers no curve."""
+    axes.legend(frameon=False, fontsize="small", ncols=n_columns, loc="upper right", borderaxespad=0.1)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.22 * (high - low))
 
 
 def channel_label(channel: ChannelLike) -> str:

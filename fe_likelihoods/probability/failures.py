@@ -64,9 +64,9 @@ class FailureLog:
         if not self.count:
             logger.warning(
                 "A simulation failed (%s) at %s; its log-likelihood is -inf. Further failures are counted without a "
-                "message, see report()",
+                "message, see posterior.report()",
                 reason,
-                parameters,
+                ", ".join(f"{name} = {value:.4g}" for name, value in parameters.items()),
             )
         self.count += 1
         if len(self.records) < _MAX_RECORDS:

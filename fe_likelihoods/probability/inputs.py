@@ -10,7 +10,9 @@ from ..signals.sampling import same_step
 from ..simulation.model import Model
 from .noise import Noise, noise_channels
 
-__all__ = ["as_points", "check_noise_channels", "match_measurements"]
+__all__ = ["as_points", "check_model", "check_noise_channels", "match_measurements"]
+
+_MODEL_MEMBERS = ("parameter_names", "channels", "dt", "n_steps", "fingerprint", "simulate")
 
 
 def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
@@ -44,6 +46,17 @@ def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
             f"({len(names)},) or (n, {len(names)}); got shape {points.shape}"
         )
     return points
+
+
+def check_model(model: Model) -> None:
+    """Raise ValueError, with the names of the missing members, if an object is not a model."""
+    # the class first, so that no property is computed
+    missing = [name for name in _MODEL_MEMBERS if not (hasattr(type(model), name) or hasattr(model, name))]
+    if missing:
+        raise ValueError(
+            f"{type(model).__name__} is not a model, because it has no {', '.join(missing)}; a model needs "
+            f"{', '.join(_MODEL_MEMBERS)} (see fe_likelihoods.simulation.model.Model)"
+        )
 
 
 def check_noise_channels(model: Model, noise: Noise) -> None:

@@ -29,7 +29,7 @@ from ..simulation.model import (
 )
 from ..simulation.source_digest import simulation_fingerprint
 from .failures import FailureLog
-from .inputs import as_points, check_noise_channels, match_measurements
+from .inputs import as_points, check_model, check_noise_channels, match_measurements
 from .noise import GaussianNoise, Noise, noise_statistic
 
 __all__ = ["FELikelihood"]
@@ -91,9 +91,9 @@ class FELikelihood:
     Raises
     ------
     ValueError
-        If the channels, time step or length of model and measurements differ, or the channels of the noise, if
-        parameter names repeat, if `pool` is neither a number nor has ``map`` or ``gather``, if the model cannot be sent
-        to its processes, or if the file of the cache cannot be used.
+        If a member of `Model` is missing, if the channels, time step or length of model and measurements differ, or the
+        channels of the noise, if parameter names repeat, if `pool` is neither a number nor has ``map`` or ``gather``,
+        if the model cannot be sent to its processes, or if the file of the cache cannot be used.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class FELikelihood:
         cache: SimulationCache | str | os.PathLike | None = None,
         max_failure_share: float = 1.0,
     ) -> None:
+        check_model(model)
         self._failures = FailureLog(model.parameter_names, max_failure_share)
         self.model = model
         self.measurements = match_measurements(model, measurements)

@@ -113,21 +113,21 @@ class Distribution(ABC):
         """Inverse survival function, ``ppf(1 - q)``, which `nautilus.Prior` expects of a distribution."""
         return self.ppf(1.0 - np.asarray(q, dtype=float))
 
-    def rvs(self, size: int | tuple[int, ...] = 1, rng: RandomState = None) -> np.ndarray:
+    def rvs(self, size: int | tuple[int, ...] = 1, random_state: RandomState = None) -> np.ndarray:
         """Independent draws.
 
         Parameters
         ----------
         size : int or tuple of int
             Shape of the result.
-        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+        random_state : int, numpy.random.Generator, numpy.random.RandomState or None
             A seed, a generator, or None for NumPy's global stream.
 
         Returns
         -------
         ndarray of shape `size`
         """
-        return np.asarray(self.ppf(_uniform_numbers(size, rng)))
+        return np.asarray(self.ppf(_uniform_numbers(size, random_state)))
 
 
 def _set_finite(distribution: Distribution, **values: float) -> None:

@@ -81,11 +81,18 @@ def read_table(path: str | Path) -> Table:
                 rows.append((number, cells))
     if not rows:
         raise ValueError(f"{file}: expected rows of numbers, found none")
-    width = len(names) or len(rows[0][1])
+    first = names or rows[0][1]
+    width = len(first)
+    advice = "; separate cells by commas (the first line contains ';')" if ";" in "".join(first) else ""
     for number, cells in rows:
         if len(cells) != width:
-            raise ValueError(f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}")
-    values = np.array([[parse_number(cell, f"{file}, line {number}") for cell in cells] for number, cells in rows])
+            raise ValueError(
+                f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}{advice}"
+            )
+    try:
+        values = np.array([[parse_number(cell, f"{file}, line {number}") for cell in cells] for number, cells in rows])
+    except ValueError as error:
+        raise ValueError(f"{error}{advice}") from None
     decimals = tuple(max(_decimals(cells[i]) for _, cells in rows) for i in range(width))
     return Table(file, names, values, tuple(number for number, _ in rows), decimals, "\n".join(comments))
 

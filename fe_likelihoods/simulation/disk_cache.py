@@ -92,7 +92,8 @@ class SimulationCache:
     ------
     ValueError
         If a bound is not positive, or if the path is a folder or in no existing folder, or if the file cannot be read
-        or created, belongs to another program, or has the layout of another release. Such a file is not changed.
+        or created, is not a cache, belongs to another program, or has the layout of another release. Such a file is
+        not changed.
 
     Examples
     --------
@@ -448,7 +449,7 @@ class SimulationCache:
                     break
                 try:
                     self.file.set_aside(str(failure))
-                except OSError as error:
+                except (OSError, ValueError) as error:
                     failure = error
                     break
             if what not in self.retry_times:

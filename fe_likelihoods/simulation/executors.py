@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .local_pool import LocalPool, Outcome
-from .processes import PickledFunction, TemporaryFolder
+from .processes import PickledFunction, TemporaryFolder, local_definition
 
 __all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 
@@ -80,11 +80,16 @@ def _check_picklable(model: Any, executor: Any) -> None:
             pickled.script()
     except ValueError as error:
         name, value = _culprit(model)
+        kind = type(model).__name__
+        if not name:
+            raise ValueError(f"with this pool the model must be sent to other processes. {error}") from error
+        if local := local_definition(value):
+            raise ValueError(
+                f"the {name} of {kind} cannot be sent to other processes (it is {local}): define it at the top level "
+                "of a module"
+            ) from error
         raise ValueError(
-            f"with this pool the model {type(model).__name__} must be sent to other processes, which its attribute "
-            f"{name} = {value!r} prevents. {error}"
-            if name
-            else f"with this pool the model must be sent to other processes. {error}"
+            f"the {name} of {kind}, of type {type(value).__name__}, cannot be sent to other processes. {error}"
         ) from error
 
 

@@ -12,6 +12,7 @@ import json
 import os
 import pickle
 import pickletools
+import re
 import shutil
 import signal
 import subprocess
@@ -40,6 +41,7 @@ __all__ = [
     "WorkerReply",
     "describe_exit",
     "last_lines",
+    "local_definition",
     "serve",
 ]
 
@@ -195,6 +197,19 @@ def describe_exit(exit_code: int, who: str) -> str:
     return f"{who} died (signal {-exit_code})" if exit_code < 0 else f"{who} ended with exit code {exit_code}"
 
 
+def local_definition(thing: Any) -> str:
+    """What prevents a function, or an instance of a class, from being found by its name; empty if nothing does."""
+    if not hasattr(thing, "__qualname__"):
+        return "an object of a local class" if "<locals>" in type(thing).__qualname__ else ""
+    if "<lambda>" in thing.__qualname__:
+        return "a lambda"
+    return "a local function or class" if "<locals>" in thing.__qualname__ else ""
+
+
+def _without_addresses(message: str) -> str:
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", message)
+
+
 class PickledFunction(NamedTuple):
     """A function as it is sent to workers.
 
@@ -215,9 +230,12 @@ class PickledFunction(NamedTuple):
         try:
             payload = pickle.dumps(function, protocol=5)
         except Exception as error:
+            name = getattr(function, "__qualname__", type(function).__qualname__)
+            local = local_definition(function)
+            why = f"it is {local}" if local else f"{type(error).__name__}: {_without_addresses(str(error))}"
             raise ValueError(
-                f"{repr(function)[:200]} cannot be sent to another process: {type(error).__name__}: {error}. Define "
-                "functions and classes at the top level of a module, without open files, locks and connections"
+                f"{name} cannot be sent to another process ({why}). Define functions and classes at the top level of a "
+                "module, without open files, locks and connections"
             ) from error
         return cls(payload, blake2b(payload, digest_size=16).digest())
 

@@ -41,6 +41,9 @@ LAYOUT = (
 )
 CHECK_SECONDS = 2.0  # limit of the integrity check on opening; rows have checksums of their own
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+SQLITE_SIGNATURE = b"SQLite format 3\0"
+ID_START = 68  # place of the application id in SQLite's header [bytes]
+PAGE_SIZE = 4096  # SQLite's default [bytes]
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
 _files_lock = threading.Lock()
@@ -116,6 +119,7 @@ class CacheFile:
         self.writable = True
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
+        self._inode_of_cache: tuple[int, int] | None = None  # of the last file that was identified as a cache
         with _files_lock:
             _files.add(self)
 
@@ -126,13 +130,13 @@ class CacheFile:
     def check(self) -> None:
         """Open the file and check its integrity, before any costly work.
 
-        A damaged file is moved aside with a warning, and a new one is created.
+        A damaged cache is moved aside with a warning, and a new one is created.
 
         Raises
         ------
         ValueError
-            If the path is a folder or in no existing folder, or if the file cannot be read or created, belongs to
-            another program, or has the layout of another release.
+            If the path is a folder or in no existing folder, or if the file cannot be read or created, is not a cache,
+            belongs to another program, or has the layout of another release. Such a file is not changed.
         """
         folder = self.path.parent
         if self.path.is_dir():
@@ -156,11 +160,6 @@ class CacheFile:
                 self.close()
                 if not is_damage(error):
                     raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
-                if self._starts_with(HDF5_SIGNATURE):
-                    raise ValueError(
-                        f"{self.path} is an HDF5 file, not a cache; give another path, and read a file that "
-                        "SimulationCache.export_hdf5 wrote with import_hdf5"
-                    ) from None
                 self._replace(error)
 
     def _replace(self, error: Exception) -> None:
@@ -191,7 +190,7 @@ class CacheFile:
                     os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK | os.X_OK)
                 )
                 self._connection = self._open() if self.writable else self._open_to_read()
-                self._inode = self._inode_now()
+                self._inode = self._inode_of_cache = self._inode_now()
         return self._connection
 
     def close(self) -> None:
@@ -206,6 +205,8 @@ class CacheFile:
 
         Raises
         ------
+        ValueError
+            If the file is not known to be a cache; it is not changed.
         OSError
             If it cannot be renamed.
         """
@@ -213,6 +214,8 @@ class CacheFile:
             self.close()
             if self._inode is None or self._inode_now() != self._inode:
                 return
+            if self._inode != self._inode_of_cache:
+                self._refuse_other_files()
             n = 1
             while (aside := self.path.with_name(f"{self.path.name}.damaged-{n}")).exists():
                 n += 1
@@ -359,10 +362,26 @@ class CacheFile:
         if answer != "ok":
             raise _Damaged(answer)
 
-    def _starts_with(self, signature: bytes) -> bool:
-        """Whether the file starts with these bytes."""
-        try:
-            with open(self.path, "rb") as file:
-                return file.read(len(signature)) == signature
-        except FileNotFoundError:  # another process has moved it aside
-            return False
+    def _refuse_other_files(self) -> None:
+        """ValueError if a damaged file need not be a cache, but may be a file of the user, such as a table.
+
+        Its first page shows what it is: a cache has the header of SQLite with the application id, of which a truncated
+        file has the beginning. A first page of zeros, in a file of whole pages, is a page that was never written.
+        """
+        size = self.path.stat().st_size
+        with open(self.path, "rb") as file:
+            page = file.read(PAGE_SIZE)
+        identity = page[ID_START : ID_START + 4]
+        if page.startswith(SQLITE_SIGNATURE) and APPLICATION_ID.to_bytes(4).startswith(identity):
+            return
+        if size % PAGE_SIZE == 0 and not any(page):
+            return
+        if page.startswith(HDF5_SIGNATURE):
+            raise ValueError(
+                f"{self.path} is an HDF5 file, not a cache; give another path, and read a file that "
+                "SimulationCache.export_hdf5 wrote with import_hdf5"
+            ) from None
+        raise ValueError(
+            f"{self.path} is not a cache of simulations, and is not changed; give another path, such as "
+            "'cache.sqlite'. If it is a cache with a damaged header, remove it"
+        ) from None

@@ -7,6 +7,7 @@ counts as -inf, and its reason is recorded.
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,18 +36,37 @@ class OptionalAttributes(NamedTuple):
         Function that returns a dictionary, such as ``{"simulations": 120}``.
     fast_parameters : sequence of int
         Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
+    ndim : int, optional
+        Number of parameters.
+    parameter_names : sequence of str
+        Names of the parameters.
     """
 
     log_prior: Callable | None
     sample_prior: Callable | None
     report: Callable[[], Mapping[str, Any]] | None
     fast_parameters: Sequence[int]
+    ndim: int | None
+    parameter_names: Sequence[str]
 
     @classmethod
     def of(cls, log_prob_fn: Callable) -> "OptionalAttributes":
         """Read the attributes of a function."""
         found = (getattr(log_prob_fn, name, None) for name in ("log_prior", "sample_prior", "report"))
-        return cls(*found, getattr(log_prob_fn, "fast_parameters", ()))
+        return cls(
+            *found,
+            getattr(log_prob_fn, "fast_parameters", ()),
+            getattr(log_prob_fn, "ndim", None),
+            getattr(log_prob_fn, "parameter_names", ()),
+        )
+
+    def check_ndim(self, ndim: int) -> None:
+        """Raise ValueError if the function states another number of parameters than `ndim`."""
+        if isinstance(self.ndim, Integral) and self.ndim != ndim:
+            names = f" ({', '.join(map(str, self.parameter_names))})" if self.parameter_names else ""
+            raise ValueError(
+                f"ndim is {ndim}, but log_prob_fn has {self.ndim} parameters{names}: pass ndim={self.ndim}"
+            )
 
 
 class Failures:

@@ -289,7 +289,11 @@ def without_a_table(path):
     connection.close()
 
 
-DAMAGES = [no_database, zeros, cut_off, overwritten_in_the_middle, another_column, without_a_table]
+def cut_to_its_header(path):
+    os.truncate(path, 50)
+
+
+DAMAGES = [zeros, cut_off, cut_to_its_header, overwritten_in_the_middle, another_column, without_a_table]
 
 
 @pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
@@ -310,7 +314,7 @@ def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, b
     assert (again.simulations, again.disk_hits) == (0, len(thetas))
 
 
-@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
 def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog, damage):
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas[:50]), expected[:50])
@@ -321,6 +325,20 @@ def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog,
     again = likelihood_of(filled)
     np.testing.assert_array_equal(again.misfit(thetas), expected)
     assert again.disk_hits + likelihood.disk_hits >= len(thetas)
+
+
+def test_another_file_that_takes_the_place_of_the_cache_during_the_run(filled, thetas, expected, caplog, tmp_path):
+    """It is not changed, and the run continues without a cache."""
+    likelihood = likelihood_of(filled, memory_rows=0)
+    likelihood.misfit(thetas[:50])
+    likelihood.cache.close()
+    table_of_the_user(tmp_path / "floors.csv")
+    data = (tmp_path / "floors.csv").read_bytes()
+    (tmp_path / "floors.csv").replace(filled)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    assert filled.read_bytes() == data
+    assert not list(filled.parent.glob("*.damaged-*"))
+    assert warnings_of(caplog, "is not a cache of simulations, and is not changed") > 0
 
 
 @pytest.mark.parametrize("attempts", [10, pytest.param(200, marks=pytest.mark.slow)])
@@ -408,7 +426,7 @@ def test_a_damaged_response_is_missing(path, thetas):
 
 def test_programs_that_find_a_damaged_file_at_once(filled):
     """It is set aside once, and all use the new one."""
-    no_database(filled)
+    zeros(filled)
     data = filled.read_bytes()
 
     def begin(number):
@@ -423,7 +441,7 @@ def test_programs_that_find_a_damaged_file_at_once(filled):
 
 
 def test_a_damaged_file_that_another_program_sets_aside_at_that_moment(filled, monkeypatch):
-    no_database(filled)
+    zeros(filled)
     opens = CacheFile._open
 
     def opens_and_loses_it(self):
@@ -674,9 +692,34 @@ def hdf5_file(path):
         file["chain"] = np.arange(3)
 
 
+def table_of_the_user(path):
+    path.write_text("time_s,floor1_g,roof_g\n" + "".join(f"{0.01 * k:.2f},0.1,0.2\n" for k in range(1000)))
+
+
+def short_text(path):
+    path.write_text("to be measured\n")
+
+
+def raw_numbers(path):
+    """They start with zeros, as a record before the motion."""
+    path.write_bytes(np.concatenate([np.zeros(600), np.ones(3)]).tobytes())
+
+
+def damaged_database(path):
+    """A database of another program, damaged where SQLite detects it before the application id is read."""
+    foreign_identity(path)
+    foreign_tables(path)
+    data = path.read_bytes()
+    path.write_bytes(data[:100] + b"\xa5" * 300 + data[400:])
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (table_of_the_user, "is not a cache of simulations, and is not changed; give another path"),
+        (short_text, "is not a cache of simulations"),
+        (raw_numbers, "is not a cache of simulations"),
+        (damaged_database, "is not a cache of simulations"),
         (foreign_tables, "another program's SQLite file .*indices simulations"),
         (foreign_identity, "another program's SQLite file .*0x3039"),
         (foreign_in_wal_mode, "another program's SQLite file .*indices precious"),
@@ -725,7 +768,7 @@ def test_a_link_leads_to_one_cache(tmp_path, thetas):
     likelihood.misfit(thetas)
     assert likelihood.simulations == 0
     likelihood.cache.close()
-    no_database(real)
+    zeros(real)
     SimulationCache(link)
     assert link.is_symlink() and list(real.parent.glob("*.damaged-1"))
 

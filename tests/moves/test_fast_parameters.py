@@ -319,6 +319,13 @@ def test_invalid_indices(fast):
         SMCSampler(50, 3, posterior)
 
 
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler, TemperedSampler])
+def test_a_wrong_ndim_is_refused_with_the_number_of_parameters(Sampler):
+    posterior = Gaussian(3)
+    with pytest.raises(ValueError, match=r"ndim is 2, but log_prob_fn has 3 parameters \(x0, x1, x2\): pass ndim=3"):
+        Sampler(50, 2, posterior, vectorize=True)
+
+
 def test_invalid_fast_sweeps():
     with pytest.raises(ValueError, match="sweeps must be at least 1"):
         WithFastSweeps(RandomWalkMove(), [0], sweeps=0)

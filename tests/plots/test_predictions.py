@@ -49,6 +49,9 @@ def test_bands(posterior, samples):
         band = axes.collections[0].get_paths()[0].vertices[:, 1]
         assert band.min() == pytest.approx(factor * prediction.quantile(0.05)[k].min())
         assert band.max() == pytest.approx(factor * prediction.quantile(0.95)[k].max())
+        if k == 0:  # the legend, of this height in all figures, covers no curve
+            low, high = axes.get_ylim()
+            assert max(band.max(), *(line.get_ydata().max() for line in axes.lines)) < low + 0.85 * (high - low)
         assert shows(axes, axes.lines) and axes.get_ylim()[0] <= band.min() <= band.max() <= axes.get_ylim()[1]
 
 

@@ -299,6 +299,17 @@ def test_a_likelihood_is_callable(oscillator, measurements):
 # failures ------------------------------------------------------------------------------------------------------------
 
 
+def test_an_object_that_is_no_model_is_refused_with_the_missing_members(oscillator, measurements):
+    class Incomplete:
+        parameter_names, channels = oscillator.parameter_names, oscillator.channels
+        dt, n_steps = oscillator.dt, oscillator.n_steps
+
+    with pytest.raises(ValueError, match="Incomplete is not a model, because it has no fingerprint, simulate; a model"):
+        FELikelihood(Incomplete(), measurements)
+    with pytest.raises(ValueError, match="function is not a model, because it has no parameter_names, channels, dt"):
+        FELikelihood(lambda theta: theta, measurements)
+
+
 @pytest.mark.parametrize("threads", [0, 2])
 def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     model = Polynomial()
@@ -327,7 +338,8 @@ def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     assert report["cache_hits"] == 0
     assert report["seconds"] > 0.0
     assert len(caplog.records) == 1  # only the first failure is logged
-    assert "no convergence at step 3" in caplog.text
+    assert "(no convergence at step 3) at offset = 1, slope = 0.1; its log-likelihood" in caplog.text
+    assert "see posterior.report()" in caplog.text
     assert posterior(x[0]) == -np.inf
     assert type(posterior.log_likelihood(x[0])) is float
     assert len(caplog.records) == 1

@@ -183,6 +183,13 @@ def test_prior_has_the_attributes_that_clients_expect(prior):
     assert prior.rvs(0).shape == (0, prior.dim)
 
 
+def test_priors_and_distributions_name_the_seed_alike(prior):
+    """As `scipy.stats`."""
+    distribution = Uniform(0.0, 1.0)
+    np.testing.assert_array_equal(distribution.rvs(size=3, random_state=1), distribution.rvs(3, 1))
+    np.testing.assert_array_equal(prior.rvs(size=3, random_state=1), prior.rvs(3, 1))
+
+
 def test_draws_depend_on_the_seed_only(prior):
     def draws(random_state):
         return prior.rvs(5, random_state)

@@ -147,6 +147,13 @@ class TestCSV:
             ("time_s,acc_g\n0,1\n1,\n", {}, "line 3: expected a number, got ''"),
             ("time_s,acc_g\n0,1\n1,two\n", {}, "line 3: expected a number, got 'two'"),
             ("time_s,acc_g\n0,1\n1\n", {}, "line 3: expected 2 cells"),
+            (
+                "time_s;acc_g\n0,0;1,0\n",
+                {},
+                r"1 cells .* got 3; separate cells by commas \(the first line contains ';'",
+            ),
+            ("time_s;acc_g\n0.0;1.0\n", {}, r"a number, got '0.0;1.0'; separate cells by commas"),
+            ("0.0;1.0\n0.1;2.0\n", {}, r"a number, got '0.1;2.0'; separate cells by commas"),
             ("time_s,acc_g\n", {}, "expected rows of numbers, found none"),
             ("time_s,acc_g\n1,1\n0,2\n", {}, "times that increase"),
             ("0,1\n1,2\n", {}, "2 columns and no header line"),

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import problems
+from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.records import Record
@@ -200,10 +201,24 @@ def test_temporary_files_are_removed_with_the_executor():
     "make", [lambda: 2, lambda: ProcessPoolExecutor(1), lambda: LocalPool(1)], ids=["2", "executor", "pool"]
 )
 def test_model_that_cannot_be_pickled_is_refused_with_the_attribute(make):
-    with pytest.raises(
-        ValueError, match=r"Unpicklable must be sent to other processes, which its attribute solver\.lock ="
-    ):
+    with pytest.raises(ValueError, match=r"the solver\.lock of Unpicklable, of type lock, cannot be sent") as error:
         posterior_of(Unpicklable(), pool=make())
+    assert "without open files, locks and connections" in str(error.value) and " at 0x" not in str(error.value)
+
+
+@pytest.mark.parametrize("make", [lambda: 2, lambda: ProcessPoolExecutor(1)], ids=["2", "executor"])
+def test_model_of_a_local_function_is_refused_with_the_advice(make):
+    def simulate(theta):
+        return np.zeros((2, 8))
+
+    for function, kind in ((lambda theta: np.zeros((2, 8)), "a lambda"), (simulate, "a local function or class")):
+        model = FunctionModel(function, ("a", "b"), Treacherous().channels, 0.1, 8)
+        with pytest.raises(ValueError) as error:
+            as_executor(make(), model)
+        assert str(error.value) == (
+            f"the function of FunctionModel cannot be sent to other processes (it is {kind}): define it at the top "
+            "level of a module"
+        )
 
 
 def test_model_that_cannot_be_pickled_runs_in_threads():
@@ -230,7 +245,7 @@ def test_local_pool_maps_any_function_and_raises_its_exceptions():
         with pytest.raises(TypeError, match="bad operand"):
             pool.map(abs, [1, "two", 3])
         assert pool.map(str, [1, 2]) == ["1", "2"]
-        with pytest.raises(ValueError, match="cannot be sent to another process"):
+        with pytest.raises(ValueError, match=r"cannot be sent to another process \(it is a lambda\)"):
             pool.map(lambda x: x, [1])
 
 

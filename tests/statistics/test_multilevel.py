@@ -135,18 +135,17 @@ def test_points_one_by_one_and_blobs(seed):
 
 def test_what_cannot_work_is_refused():
     posterior = Gaussian(3)
-    for Sampler, n, settings in (
-        (SMCSampler, 100, {}),
-        (SMCSampler, 300, {"recycle": False}),
-        (SMCSampler, 300, {"moves": emcee.moves.StretchMove()}),
-        (TemperedSampler, 300, {}),
+    for Sampler, n, settings, message in (
+        (SMCSampler, 100, {}, "SMCSampler with 100 walkers: use more walkers or pass recycle=True"),
+        (SMCSampler, 300, {"recycle": False}, "walkers and recycle=False: use more walkers or pass recycle=True"),
+        (SMCSampler, 300, {"moves": emcee.moves.StretchMove()}, "pass recycle=True .* no moves given"),
+        (TemperedSampler, 300, {}, "TemperedSampler with 300 walkers: pass recycle=True"),
+        (TMCMCSampler, 300, {}, "TMCMCSampler does not recycle: use SMCSampler"),
     ):
-        with pytest.raises(ValueError, match="coarse_log_prob_fn .* recycl"):
+        with pytest.raises(ValueError, match=f"coarse_log_prob_fn needs recycling, .*{message}"):
             Sampler(n, 3, posterior, vectorize=True, coarse_log_prob_fn=posterior, **settings)
     with pytest.raises(ValueError, match="coarse_log_prob_fn must be callable"):
         SMCSampler(300, 3, posterior, vectorize=True, coarse_log_prob_fn=3.0)
-    with pytest.raises(ValueError, match="coarse_log_prob_fn .* recycl"):
-        TMCMCSampler(300, 3, posterior, vectorize=True, coarse_log_prob_fn=posterior)
 
 
 # ---------------------------------------------------------------- going on with a killed run
