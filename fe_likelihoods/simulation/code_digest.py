@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from .source_digest import class_digest, source_digest
+from .source_digest import object_digest, source_digest
 
 __all__ = ["code_digest"]
 
@@ -194,7 +194,7 @@ class _Digest:
         fingerprint = getattr(thing, "fingerprint", None)
         if isinstance(fingerprint, str):
             # a fingerprint describes values; the source files determine what the class does with them
-            return ["fingerprint", fingerprint, class_digest(type(thing))]
+            return ["fingerprint", fingerprint, object_digest(thing)]
         if isinstance(thing, enum.Enum):
             state = {thing.name: thing.value}
         elif is_dataclass(thing):

@@ -1,9 +1,10 @@
 """Digest of the library's source files that a simulation depends on.
 
 A fingerprint describes the inputs of a model, not what its code does with them. Cached results therefore also depend
-on the source files of the library that the code of the model is in: the file of the model's class, the files that it
-imports, the files that these import, and so on. Imports inside functions count. Imports for type checkers only
-(``if TYPE_CHECKING:``) and everything in the folder `plots` do not count, because they cannot change a response.
+on the source files of the library that the code of the model is in: the files of the model's class and of the classes
+of its attributes (such as the parts of a structure), the files that these import, and so on. Imports inside functions
+count. Imports for type checkers only (``if TYPE_CHECKING:``) and everything in the folder `plots` do not count, because
+they cannot change a response.
 
 The digest is one of bytes: a changed comment in one of these files changes it as well, a change in any other file does
 not.
@@ -17,7 +18,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-__all__ = ["class_digest", "imported_files", "simulation_fingerprint", "source_digest"]
+__all__ = ["imported_files", "object_digest", "simulation_fingerprint", "source_digest"]
 
 LIBRARY = __name__.split(".")[0]
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,30 +40,51 @@ def simulation_fingerprint(model: Any, statistic: Any = None) -> str:
     -------
     str
     """
-    modules = [f"{LIBRARY}.simulation.model", *_modules_of(type(model))]
+    modules = [f"{LIBRARY}.simulation.model", *_modules_of(model)]
     if statistic is not None and statistic.__module__.split(".")[0] == LIBRARY:
         modules.append(statistic.__module__)
     return f"{model.fingerprint} {source_digest(*modules)}"
 
 
-def class_digest(cls: type) -> str:
-    """Digest of the source files that the methods of a class depend on, those of its base classes included."""
-    return source_digest(*_modules_of(cls))
+def object_digest(thing: Any) -> str:
+    """Digest of the source files that an object depends on: of its class, the base classes, and its attributes."""
+    return source_digest(*_modules_of(thing))
 
 
-def _modules_of(cls: type) -> list[str]:
-    """Modules of the library in which a class and its bases are defined.
+def _modules_of(thing: Any) -> list[str]:
+    """Modules of the library in which the class of an object, its bases and the classes of its attributes are defined.
 
     A class of the user may use any model of the library, so all models stand in for its own modules.
     """
     modules = set()
-    for base in cls.__mro__:
+    for base in type(thing).__mro__:
         top = base.__module__.split(".")[0]
         if top == LIBRARY:
             modules.add(base.__module__)
         elif top not in sys.stdlib_module_names:
             modules.add(MODELS)
-    return sorted(modules)
+    return sorted(modules | _modules_of_attributes(thing))
+
+
+def _modules_of_attributes(thing: Any) -> set[str]:
+    """Modules of the library's classes among the attributes of an object and, recursively, among their attributes."""
+    modules: set[str] = set()
+    seen = {id(thing)}
+    waiting = list(getattr(thing, "__dict__", {}).values())
+    while waiting:
+        value = waiting.pop()
+        if id(value) in seen:
+            continue
+        seen.add(id(value))
+        found = {base.__module__ for base in type(value).__mro__ if base.__module__.split(".")[0] == LIBRARY}
+        modules |= found
+        if found:
+            waiting += getattr(value, "__dict__", {}).values()
+        if isinstance(value, tuple | list):
+            waiting += value
+        elif isinstance(value, dict):
+            waiting += value.values()
+    return modules
 
 
 @functools.cache

@@ -5,7 +5,17 @@ import shutil
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FunctionModel, IsolatedBridge, LinearOscillator, RCColumn, Record, from_si
+from fe_likelihoods import (
+    Channel,
+    FunctionModel,
+    IsolatedBridge,
+    LinearOscillator,
+    LinearStructure,
+    RCColumn,
+    Record,
+    ShearFrame,
+    from_si,
+)
 from fe_likelihoods.probability.residuals import lag_one_sums
 from fe_likelihoods.simulation import source_digest
 from fe_likelihoods.simulation.cache_rows import simulation_keys
@@ -34,10 +44,15 @@ class OwnColumn:
         self.fingerprint = "own " + self.column.fingerprint
 
 
+def structure():
+    return LinearStructure(ShearFrame({"top": 1}, (1.0,), (100.0,)), RECORD)
+
+
 MODELS = {
     "column": lambda: RCColumn.lhpost(RECORD),
     "bridge": lambda: IsolatedBridge(RECORD),
     "oscillator": lambda: LinearOscillator(RECORD),
+    "structure": structure,
     "function": lambda: FunctionModel(respond, ("x",), CHANNELS, 0.1, 5),
     "late": lambda: FunctionModel(late, ("x",), CHANNELS, 0.1, 5),
     "own": OwnColumn,
@@ -88,6 +103,9 @@ def test_a_plot_changes_no_key(edit, file):
         ("models/rc_column.py", {"column", "own", "late"}),
         ("models/circular_section.py", {"column", "own", "late"}),
         ("models/linear_oscillator.py", {"oscillator", "own", "late"}),
+        ("models/linear_structure.py", {"structure", "own", "late"}),
+        ("models/linear_structure_parts.py", {"structure", "own", "late"}),  # imports the model, not the reverse
+        ("kernels/complex_modes.py", {"structure", "own", "late"}),
         ("models/isolated_bridge_parts.py", {"bridge", "own", "late"}),
         ("models/function.py", {"function", "own", "late"}),
         ("signals/sdof.py", set(MODELS)),
@@ -117,6 +135,17 @@ def test_a_model_that_a_function_uses_is_part_of_its_key(edit):
     edit("models/isolated_bridge.py")
     assert code_digest(shifted) == before
     edit("models/rc_column.py")
+    assert code_digest(shifted) != before
+
+
+def test_the_parts_of_a_structure_that_a_function_uses_are_part_of_its_key(edit):
+    model = structure()
+
+    def shifted(theta):
+        return model.simulate(theta) + 1.0
+
+    before = code_digest(shifted)
+    edit("models/linear_structure_parts.py")
     assert code_digest(shifted) != before
 
 
