@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from emcee import EnsembleSampler, State
 from emcee.ensemble import walkers_independent
+from emcee.moves import RedBlueMove
 from emcee.pbar import get_progress_bar
 
 from .moves.fast_parameters import with_fast_sweeps
@@ -41,7 +42,7 @@ from .tempering.genealogy import standard_error_of_mean
 from .tempering.mutation import MoveSchedule
 from .tempering.population import Population, Stage, Sweep
 from .tempering.results import AnnealingResult
-from .tempering.settings import Settings, combine_settings, refuse_unused
+from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
 
 __all__ = ["TemperedSampler"]
 
@@ -89,7 +90,8 @@ class TemperedSampler(EnsembleSampler):
     ------
     ValueError
         For settings that cannot act or have impossible values, an `ndim` that is not ``log_prob_fn.ndim``, fewer than
-        2 ndim walkers, no log-prior, or a coarse model without recycling.
+        2 ndim walkers, no log-prior, a coarse model without recycling, or moves of emcee that need several walkers with
+        ``chains="leaders"``.
     TypeError
         For a keyword that is not a setting.
     """
@@ -128,6 +130,7 @@ class TemperedSampler(EnsembleSampler):
                 "annealing starts from the prior: pass log_prior_fn, or a log_prob_fn with a method log_prior (a "
                 f"posterior object itself, not its bound method); got {self.log_prior_fn!r}"
             )
+        nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         self._optional.check_ndim(ndim)
         if ndim < 1 or nwalkers < 2 * ndim:
             raise ValueError(
@@ -165,6 +168,12 @@ class TemperedSampler(EnsembleSampler):
             parameter_names=parameter_names,
         )
         own_moves, _ = get_moves(self)
+        red_blue = [type(move).__name__ for move in own_moves if isinstance(move, RedBlueMove)]
+        if red_blue and given.chains == "leaders":
+            raise ValueError(
+                f'{", ".join(red_blue)} cannot move with chains="leaders": red-blue moves of emcee need several '
+                'walkers, and a chain is moved alone or with few others. Use chains="equal", or moves such as RandomWalkMove'
+            )
         fast = self._optional.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(own_moves, fast, ndim, self.settings.fast_sweeps)
         set_moves(self, followed)

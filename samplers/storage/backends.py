@@ -9,6 +9,7 @@ written first, and a chain that does not agree with it is rebuilt from it. The j
 beside the file. The group names its run, so that the journal of another run has no effect.
 """
 
+import itertools
 import logging
 import os
 import secrets
@@ -31,6 +32,8 @@ DATASET = "ladder"
 CHECK = "evidence_check"
 RUN = "run"
 SECONDS_BETWEEN_WRITES = 0.25
+# Superblock of HDF5, version 0 (file format specification, section II.A): signature, version, and the end of the file
+SIGNATURE, END_OF_FILE, EMPTY_SIZE = b"\x89HDF\r\n\x1a\n\0", slice(40, 48), 2048
 STAGE_DTYPE = np.dtype(
     [(name, np.int64 if kind is int else np.float64) for name, kind in Stage.__annotations__.items()]
 )
@@ -55,7 +58,8 @@ class JournaledBackend(HDFBackend):
         Raises
         ------
         ValueError
-            If the file is damaged and cannot be rebuilt, or the journal is damaged.
+            If the file is damaged and cannot be rebuilt, the journal is damaged, or another process is writing to the
+            file.
         """
         self = cls.__new__(cls)
         self.__dict__.update(backend.__dict__)
@@ -175,20 +179,30 @@ class JournaledBackend(HDFBackend):
                     return None
                 contents = read_journal(self.journal_path)
                 if contents is None or contents.header[RUN] != run:
-                    logger.info("%s: the journal of the run is missing", self.filename)
+                    logger.info("%s: the journal of the run is missing or has no start", self.filename)
                     return None
                 self._run = run
                 if holds_steps(file[self.name], contents.steps):
                     return contents
+        except BlockingIOError as error:  # locked, not damaged
+            raise ValueError(
+                f"another run is writing to {self.filename}: wait for it or stop it, or give this run another file"
+            ) from error
         except (OSError, KeyError, RuntimeError) as error:
             contents = read_journal(self.journal_path)
-            if contents is None:
+            if contents is None and not _is_unfinished(self.filename):
                 raise ValueError(
                     f"{self.filename} is damaged or not an HDF5 file ({error}), and there is no journal at "
                     f"{self.journal_path} to rebuild it from: restore it from a copy, or give another file"
                 ) from error
-            aside = f"{self.filename}.damaged"
-            os.replace(self.filename, aside)
+            aside = _set_aside(self.filename)
+            if contents is None:
+                logger.warning(
+                    "%s contains nothing, since a process died while it created the file: set aside as %s",
+                    self.filename,
+                    aside,
+                )
+                return None
             logger.warning("%s is damaged: set aside as %s and rebuilt from its journal", self.filename, aside)
         self._rebuild(contents)
         return contents
@@ -204,6 +218,31 @@ class JournaledBackend(HDFBackend):
             self.grow(len(contents.steps), contents.steps[0].blobs)
             self._pending = list(contents.steps)
             self.flush()
+
+
+def _is_unfinished(filename: str) -> bool:
+    """Whether a process died while it created an HDF5 file: nothing is in it, or its header is still of an empty file.
+
+    HDF5 writes the header of an empty file first, then the content, and the header with the end of the file last.
+    """
+    try:
+        with open(filename, "rb") as file:
+            header = file.read(END_OF_FILE.stop)
+    except OSError:  # a folder, or a file that may not be read
+        return False
+    return not header or (
+        header.startswith(SIGNATURE)
+        and len(header) == END_OF_FILE.stop
+        and int.from_bytes(header[END_OF_FILE], "little") <= EMPTY_SIZE
+    )
+
+
+def _set_aside(filename: str) -> str:
+    """Rename a damaged file to a name that is not in use, and return the name."""
+    names = itertools.chain([f"{filename}.damaged"], (f"{filename}.damaged-{i}" for i in itertools.count(2)))
+    aside = next(name for name in names if not os.path.exists(name))
+    os.replace(filename, aside)
+    return aside
 
 
 def write_stage(backend: Backend, index: int, stage: Stage) -> None:

@@ -71,12 +71,28 @@ def append_steps(group: h5py.Group, steps: Sequence[Step]) -> None:
 
 
 def holds_steps(group: h5py.Group, steps: Sequence[Step]) -> bool:
-    """Whether the chain in a group consists of these steps."""
+    """Whether the chain in a group consists of these steps, and has their blobs and the last random state."""
     if group.attrs["iteration"] != len(steps):
         return False
     if not steps:
         return True
+    if ("blobs" in group) != (steps[0].blobs is not None):
+        return False
+    if steps[0].blobs is not None:
+        blobs = group["blobs"][: len(steps)]
+        if not _equal(blobs, np.stack([step.blobs for step in steps]).astype(blobs.dtype)):
+            return False
+    stored_random = (group.attrs.get(f"random_state_{i}") for i in range(len(steps[-1].random_state)))
+    if not all(np.array_equal(a, b) for a, b in zip(stored_random, steps[-1].random_state, strict=True)):
+        return False
     stored = group["chain"][: len(steps)], group["log_prob"][: len(steps)], group["accepted"][...]
     coords, log_prob = np.stack([step.coords for step in steps]), np.stack([step.log_prob for step in steps])
     expected = coords.astype(stored[0].dtype), log_prob.astype(stored[1].dtype), sum(step.accepted for step in steps)
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(stored, expected, strict=True))
+    return all(_equal(a, b) for a, b in zip(stored, expected, strict=True))
+
+
+def _equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two arrays of the same dtype are equal, where NaN equals NaN; fields are compared one by one."""
+    if a.dtype.names is not None:
+        return all(_equal(a[name], b[name]) for name in a.dtype.names)
+    return np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")

@@ -114,7 +114,7 @@ class Contents(NamedTuple):
     ----------
     header : dict
         As given to `Journal.create`.
-    start : RunStart, or None
+    start : RunStart
         Start of the last annealing.
     evaluated : list of EvaluatedBatch
         All evaluations.
@@ -135,7 +135,7 @@ class Contents(NamedTuple):
     """
 
     header: dict
-    start: RunStart | None
+    start: RunStart
     evaluated: list[EvaluatedBatch]
     before_last: int
     steps: list[Step]
@@ -308,7 +308,7 @@ def _damaged(path: Path, what: str) -> str:
 
 
 def read_journal(path: Path) -> Contents | None:
-    """Read a journal; None if there is none, or if nothing had been entered when the process died.
+    """Read a journal; None if there is none, or if the process died before it had entered the start of the annealing.
 
     Raises
     ------
@@ -351,6 +351,6 @@ def read_journal(path: Path) -> Contents | None:
             steps = []
         else:
             raise ValueError(_damaged(path, f"it has a block of unknown kind {kind!r}"))
-    if not header:
+    if start is None:
         return None
     return Contents(header, start, evaluated, before_last, steps, last, wanted, made, len(data), whole)

@@ -5,11 +5,41 @@ Every default is written here, once. A setting that cannot act on the chosen pat
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from numbers import Integral
 from typing import Any
+
+import numpy as np
 
 from .resampling import RESAMPLING
 
-__all__ = ["RecyclingSettings", "Settings", "changed_settings", "combine_settings", "refuse_unused"]
+__all__ = [
+    "RecyclingSettings",
+    "Settings",
+    "as_whole_number",
+    "changed_settings",
+    "combine_settings",
+    "refuse_unused",
+]
+
+
+def as_whole_number(name: str, value: Any) -> int:
+    """A value as int: a NumPy integer is converted, so that it can be stored as JSON.
+
+    Parameters
+    ----------
+    name : str
+        What the value is called in the message.
+    value : int or NumPy integer
+        The value.
+
+    Raises
+    ------
+    ValueError
+        If the value is a bool or not of an integer type; 60.0 is refused too.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise ValueError(f"{name} must be a whole number (int); got {value!r}")
+    return int(value)
 
 
 @dataclass(frozen=True)
@@ -81,9 +111,10 @@ class RecyclingSettings:
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1]; got {value}")
         for name in ("max_components", "patience", "max_rounds", "max_checks"):
-            value = vars(self)[name]
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1; got {value!r}")
+            value = as_whole_number(name, vars(self)[name])
+            if value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1; got {value}")
+            object.__setattr__(self, name, value)
         if not self.points_per_dimension > 0.0:
             raise ValueError(f"points_per_dimension must be positive; got {self.points_per_dimension}")
         if not self.max_evidence_difference >= 0.0:
@@ -151,6 +182,12 @@ class Settings:
     max_failure_share: float = 0.5
 
     def __post_init__(self):
+        for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps", "check_draws"):
+            if name != "check_draws" or self.check_draws is not None:
+                object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
+        if self.recycle is not None and not isinstance(self.recycle, bool | np.bool_):
+            raise ValueError(f"recycle must be True, False or None; got {self.recycle!r}")
+        object.__setattr__(self, "recycle", None if self.recycle is None else bool(self.recycle))
         if not 0.0 < self.ess_ratio < 1.0:
             raise ValueError(f"ess_ratio must lie between 0 and 1 (both excluded); got {self.ess_ratio}")
         if self.ess_rule not in ("constant", "declining"):
@@ -168,13 +205,13 @@ class Settings:
             raise ValueError(f"max_correlation must lie in (0, 1]; got {self.max_correlation}")
         if self.chains not in ("equal", "leaders"):
             raise ValueError(f'chains must be "equal" or "leaders"; got {self.chains!r}')
-        if not self.burn_in >= 0:
+        if self.burn_in < 0:
             raise ValueError(f"burn_in must not be negative; got {self.burn_in}")
-        if not isinstance(self.fast_sweeps, int) or self.fast_sweeps < 0:
-            raise ValueError(f"fast_sweeps must be a whole number, 0 for none; got {self.fast_sweeps!r}")
+        if self.fast_sweeps < 0:
+            raise ValueError(f"fast_sweeps must be a whole number, 0 for none; got {self.fast_sweeps}")
         if not isinstance(self.recycling, RecyclingSettings):
             raise ValueError(f"recycling must be a RecyclingSettings; got {self.recycling!r}")
-        if self.check_draws is not None and not self.check_draws >= 0:
+        if self.check_draws is not None and self.check_draws < 0:
             raise ValueError(f"check_draws must not be negative; got {self.check_draws}")
         if not 0.0 <= self.max_failure_share <= 1.0:
             raise ValueError(f"max_failure_share must lie in [0, 1]; got {self.max_failure_share}")

@@ -108,6 +108,10 @@ def test_emcees_file_is_written_as_emcee_writes_it(posterior, tmp_path):
         assert holds_steps(other["mcmc"], steps)
         assert not holds_steps(other["mcmc"], steps[:2])
         assert not holds_steps(other["mcmc"], [*steps[:2], steps[2]._replace(log_prob=steps[1].log_prob)])
+        assert not holds_steps(other["mcmc"], [*steps[:2], steps[2]._replace(random_state=steps[1].random_state)])
+        if states[0].blobs is not None:
+            assert not holds_steps(other["mcmc"], [steps[0], steps[1]._replace(blobs=steps[0].blobs), steps[2]])
+            assert not holds_steps(other["mcmc"], [step._replace(blobs=None) for step in steps])
 
 
 @every

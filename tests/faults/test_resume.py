@@ -155,13 +155,13 @@ def test_a_damaged_journal_is_refused(finished, place):
         make(path, "smc")
 
 
-@pytest.mark.parametrize("damage", ["truncated", "overwritten", "a step lost", "acceptance"])
+@pytest.mark.parametrize("damage", ["truncated", "overwritten", "a step lost", "acceptance", "blobs", "random state"])
 def test_a_damaged_chain_is_rebuilt(finished, damage, caplog):
     """Damage that a process can leave when it dies inside HDF5."""
     import h5py
 
     path, whole = finished
-    chain = whole.get_chain()
+    chain, blobs = whole.get_chain(), whole.get_blobs()
     if damage == "truncated":
         os.truncate(path, path.stat().st_size // 2)
     elif damage == "overwritten":
@@ -170,10 +170,15 @@ def test_a_damaged_chain_is_rebuilt(finished, damage, caplog):
         with h5py.File(path, "a") as file:
             if damage == "a step lost":
                 file["mcmc"].attrs["iteration"] = STEPS - 1
-            else:
+            elif damage == "acceptance":
                 file["mcmc/accepted"][0] += 1
+            elif damage == "blobs":
+                file["mcmc/blobs"][2, 3] += 1.0
+            else:
+                file["mcmc"].attrs["random_state_2"] += 1
     sampler = make(path, "smc")
-    assert np.array_equal(sampler.get_chain(), chain)
+    assert np.array_equal(sampler.get_chain(), chain) and np.array_equal(sampler.get_blobs(), blobs)
+    assert np.all(sampler.backend.random_state[2] == whole.random_state[2])
     sampler.run_mcmc(None, 2)
     assert np.array_equal(sampler.get_chain()[:STEPS], chain)
     if damage in ("truncated", "overwritten"):
@@ -186,6 +191,70 @@ def test_a_damaged_file_without_a_journal_is_refused(finished):
     os.truncate(path, path.stat().st_size // 2)
     with pytest.raises(ValueError, match="is damaged"):
         make(path, "smc")
+
+
+@pytest.mark.parametrize("chain", ["empty", "finished"])
+def test_killed_before_the_start_was_in_the_journal(finished, chain, tmp_path):
+    """The journal then has only its header: there is no run yet, and an existing chain is kept."""
+    path, whole = finished
+    data = journal_of(path).read_bytes()
+    journal_of(path).write_bytes(data[: data.index(b"INIT")])
+    if chain == "empty":
+        import h5py
+
+        run = read_run(path)
+        emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+        with h5py.File(path, "a") as file:
+            file["mcmc"].attrs["run"] = run
+        sampler = make(path, "smc")
+        sampler.run_mcmc(None, STEPS)
+        assert same(sampler, whole)
+        assert read_journal(journal_of(path)).steps
+    else:
+        sampler = make(path, "smc")
+        assert np.array_equal(sampler.get_chain(), whole.get_chain())
+        sampler.run_mcmc(None, 2)
+        assert sampler.iteration == STEPS + 2 and sampler.ladder == whole.ladder
+
+
+def read_run(path):
+    import h5py
+
+    with h5py.File(path) as file:
+        return file["mcmc"].attrs["run"]
+
+
+@pytest.mark.parametrize("written", ["nothing", "header", "content"])
+def test_killed_while_the_file_was_created(written, tmp_path, caplog):
+    """HDF5 writes the header of an empty file, the content, and then the header again."""
+    path = tmp_path / "run.h5"
+    emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+    data = path.read_bytes()
+    header = data[:40] + (2048).to_bytes(8, "little") + data[48:96]
+    left = {"nothing": b"", "header": header, "content": header + data[96:]}[written]
+    for number in (1, 2):  # it may happen again
+        path.write_bytes(left)
+        sampler = make(path, "smc")
+        assert sampler.iteration == 0
+        aside = path.with_name(path.name + (".damaged" if number == 1 else ".damaged-2"))
+        assert aside.read_bytes() == left and "contains nothing" in caplog.text
+    sampler.run_mcmc(None, 2)
+    assert sampler.iteration == 2
+
+
+def test_a_file_that_another_process_writes_is_not_set_aside(finished):
+    """It is locked, which is no damage."""
+    path, whole = finished
+    code = "import h5py, sys\nwith h5py.File(sys.argv[1], 'a'):\n    print('open', flush=True)\n    sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "open\n"
+        with pytest.raises(ValueError, match="another run is writing"):
+            make(path, "smc")
+        other.communicate("")
+    assert not path.with_name(path.name + ".damaged").exists()
+    assert np.array_equal(make(path, "smc").get_chain(), whole.get_chain())
 
 
 def test_a_missing_or_reset_file_starts_a_new_run(finished):

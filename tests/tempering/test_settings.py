@@ -202,6 +202,74 @@ def test_more_that_cannot_act(settings, match):
         SMCSampler(60, 3, Gaussian(), vectorize=True, **settings)
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"check_draws": 2.5},
+        {"check_draws": True},
+        {"burn_in": 1.5},
+        {"min_moves": 2.0},
+        {"max_moves": 5.5},
+        {"fast_sweeps": True},
+        {"recycling": {"patience": True}},
+        {"recycle": "no"},
+        {"recycle": 1},
+    ],
+    ids=str,
+)
+def test_a_setting_of_another_type_is_refused(settings):
+    name = next(iter(settings))
+    with pytest.raises(ValueError, match="patience" if name == "recycling" else name):
+        Settings(**{k: RecyclingSettings(**v) if k == "recycling" else v for k, v in settings.items()})
+
+
+@pytest.mark.parametrize(("nwalkers", "ndim"), [(60.0, 3), (60, 3.0), (60, True), ("60", 3)])
+def test_the_size_of_the_ensemble_is_whole_numbers(nwalkers, ndim):
+    posterior = Gaussian()
+    with pytest.raises(ValueError, match="must be a whole number"):
+        SMCSampler(nwalkers, ndim, posterior)
+    assert posterior.calls == 0
+
+
+def test_numpy_numbers_are_settings(tmp_path):
+    """They are stored in the journal too, which is JSON."""
+    whole = np.int64
+    sampler = SMCSampler(
+        whole(60),
+        whole(3),
+        Gaussian(),
+        vectorize=True,
+        min_moves=whole(2),
+        max_moves=np.uint8(5),
+        check_draws=whole(30),
+        recycle=np.False_,
+        backend=emcee.backends.HDFBackend(str(tmp_path / "run.h5")),
+    )
+    sampler.run_mcmc(None, 1)
+    assert sampler.settings == Settings(max_moves=5, check_draws=30, recycle=False)
+    assert type(sampler.settings.max_moves) is int and sampler.settings.recycle is False
+
+
+@pytest.mark.parametrize(
+    "moves",
+    [
+        emcee.moves.StretchMove(),
+        [emcee.moves.GaussianMove(0.01), emcee.moves.DEMove()],
+        [(emcee.moves.GaussianMove(0.01), 0.9), (emcee.moves.DESnookerMove(), 0.1)],
+    ],
+    ids=["stretch", "list", "weighted"],
+)
+def test_chains_from_leaders_refuse_moves_of_several_walkers(moves):
+    with pytest.raises(ValueError, match='need several walkers.*chains="equal"'):
+        TMCMCSampler(60, 3, Gaussian(), chains="leaders", moves=moves)
+    TMCMCSampler(60, 3, Gaussian(), moves=moves)
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_chains_from_leaders_take_other_moves_of_emcee():
+    outcome(TMCMCSampler, chains="leaders", moves=emcee.moves.GaussianMove(1e-4))
+
+
 def test_settings_as_an_object_as_keywords_and_as_a_preset():
     expected = outcome(SMCSampler, ess_ratio=0.7, max_moves=4)
     assert outcome(SMCSampler, settings=Settings(ess_ratio=0.7, max_moves=4)) == expected
