@@ -172,7 +172,7 @@ class TemperedSampler(EnsembleSampler):
         if red_blue and given.chains == "leaders":
             raise ValueError(
                 f'{", ".join(red_blue)} cannot move with chains="leaders": red-blue moves of emcee need several '
-                'walkers, and a chain is moved alone or with few others. Use chains="equal", or moves such as RandomWalkMove'
+                'walkers, and chains from leaders are moved in small groups. Use chains="equal" or RandomWalkMove'
             )
         fast = self._optional.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(own_moves, fast, ndim, self.settings.fast_sweeps)
