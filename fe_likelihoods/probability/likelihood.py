@@ -18,6 +18,7 @@ import numpy as np
 from ..signals.channels import Measurements
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
+from ..simulation.fingerprint import simulation_fingerprint
 from ..simulation.memory_cache import MemoryCache, distinct_keys
 from ..simulation.model import (
     Model,
@@ -27,7 +28,6 @@ from ..simulation.model import (
     misfit_of_responses,
     simulate_batch,
 )
-from ..simulation.source_digest import simulation_fingerprint
 from .failures import FailureLog
 from .inputs import as_points, check_model, check_noise_channels, match_measurements
 from .noise import GaussianNoise, Noise, noise_statistic

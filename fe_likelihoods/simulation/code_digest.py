@@ -27,15 +27,13 @@ from typing import Any
 
 import numpy as np
 
-from .source_digest import object_digest, source_digest
+from .source_digest import LIBRARY, inherits_fingerprint, object_digest, source_digest
 
 __all__ = ["code_digest"]
 
-_LIBRARY = __name__.split(".")[0]
-
 
 def code_digest(function: Callable) -> str:
-    """Digest of a function and of everything it uses.
+    """Digest of a function, or a class, and of everything it uses.
 
     Parameters
     ----------
@@ -136,7 +134,9 @@ class _Digest:
             return ["compiled", _version("numba"), self.of(thing.py_func)]
         if isinstance(thing, types.BuiltinFunctionType | np.ufunc | type(len)):
             owner = getattr(thing, "__module__", None) or type(thing).__module__
-            return ["builtin", owner, thing.__name__, _version(owner)]
+            bound = getattr(thing, "__self__", None)  # the array of array.dot; the module of a function of a module
+            values = [] if bound is None or isinstance(bound, types.ModuleType) else [self.of(bound)]
+            return ["builtin", owner, thing.__name__, _version(owner), *values]
         if isinstance(thing, type):
             return self._class(thing)
         return self._object(thing)
@@ -180,11 +180,11 @@ class _Digest:
         parts: list[str | bytes] = ["class", thing.__qualname__]
         if self._known_by_version(thing.__module__):
             return [*parts, thing.__module__, _version(thing.__module__)]
-        if issubclass(thing, tuple) and hasattr(thing, "_fields"):
-            return [*parts, *thing._fields]
         skipped = {"__doc__", "__module__", "__dict__", "__weakref__", "__annotations__", "__static_attributes__"}
         skipped |= {"__firstlineno__", "__annotations_cache__", "__annotate_func__", "__dataclass_fields__"}
-        skipped |= {"__dataclass_params__", "__match_args__"}
+        skipped |= {"__dataclass_params__", "__match_args__", "__orig_bases__", "_abc_impl"}
+        if issubclass(thing, tuple) and "_fields" in vars(thing):  # the generated members of a named tuple
+            skipped |= {"__new__", *thing._fields}
         for name, member in vars(thing).items():
             if name not in skipped and not isinstance(member, types.MemberDescriptorType | types.GetSetDescriptorType):
                 parts += [name, self.of(member)]
@@ -194,7 +194,8 @@ class _Digest:
         fingerprint = getattr(thing, "fingerprint", None)
         if isinstance(fingerprint, str):
             # a fingerprint describes values; the source files determine what the class does with them
-            return ["fingerprint", fingerprint, object_digest(thing)]
+            code = [self.of(type(thing))] if inherits_fingerprint(type(thing)) else []
+            return ["fingerprint", fingerprint, object_digest(thing), *code]
         if isinstance(thing, enum.Enum):
             state = {thing.name: thing.value}
         elif is_dataclass(thing):
@@ -218,7 +219,7 @@ class _Digest:
     def _known_by_version(self, module: str) -> bool:
         """Whether a module is represented by a version: neither in the function's package nor a file of the user."""
         top = module.split(".")[0]
-        return top != self.package and (top == _LIBRARY or not _is_own(top))
+        return top != self.package and (top == LIBRARY or not _is_own(top))
 
 
 @functools.cache
@@ -226,6 +227,8 @@ def _is_own(top: str) -> bool:
     """Whether a module is neither installed nor in the standard library, so that it changes without a version."""
     if top in sys.stdlib_module_names:
         return False
+    if top == "__main__":  # a notebook has no file
+        return True
     module = sys.modules.get(top)
     try:
         spec = module.__spec__ if module else importlib.util.find_spec(top)
@@ -238,7 +241,7 @@ def _is_own(top: str) -> bool:
 
 def _version(module: str) -> str:
     """Digest of the source files for a module of this library, otherwise the version of the package."""
-    return source_digest(module) if module.split(".")[0] == _LIBRARY else _package_version(module)
+    return source_digest(module) if module.split(".")[0] == LIBRARY else _package_version(module)
 
 
 @functools.cache

@@ -36,8 +36,8 @@ from .cache_rows import (
     pack_row,
     simulation_keys,
 )
+from .fingerprint import simulation_fingerprint
 from .model import Model
-from .source_digest import simulation_fingerprint
 from .sqlite_file import CacheFile, is_damage
 
 __all__ = ["SimulationCache"]

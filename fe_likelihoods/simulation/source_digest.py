@@ -12,13 +12,14 @@ not.
 
 import ast
 import functools
+import importlib.util
 import sys
 from collections.abc import Iterator
 from hashlib import blake2b
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
-__all__ = ["imported_files", "object_digest", "simulation_fingerprint", "source_digest"]
+__all__ = ["LIBRARY", "imported_files", "inherits_fingerprint", "object_digest", "source_digest"]
 
 LIBRARY = __name__.split(".")[0]
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,32 +27,35 @@ EXCLUDED = "plots"
 MODELS = f"{LIBRARY}.models"
 
 
-def simulation_fingerprint(model: Any, statistic: Any = None) -> str:
-    """Fingerprint of a model together with the digest of the source files that its results depend on.
+def object_digest(thing: Any, *modules: str) -> str:
+    """Digest of the source files that an object depends on, and of further modules.
 
     Parameters
     ----------
-    model : Model
-        Its class may be defined outside the library.
-    statistic : function, optional
-        The statistic of the residuals that is stored, where it is not the sum of squares.
+    thing : object
+        The files are those of its class, of the base classes, and of the classes of its attributes.
+    *modules : str
+        Full names of further modules of the library.
 
     Returns
     -------
     str
+        As from `source_digest`.
     """
-    modules = [f"{LIBRARY}.simulation.model", *_modules_of(model)]
-    if statistic is not None and statistic.__module__.split(".")[0] == LIBRARY:
-        modules.append(statistic.__module__)
-    return f"{model.fingerprint} {source_digest(*modules)}"
+    return source_digest(*sorted({*modules, *_modules_of(thing)}))
 
 
-def object_digest(thing: Any) -> str:
-    """Digest of the source files that an object depends on: of its class, the base classes, and its attributes."""
-    return source_digest(*_modules_of(thing))
+def inherits_fingerprint(cls: type) -> bool:
+    """Whether a class of the user has the fingerprint of a class of the library, which does not know its methods."""
+    for base in cls.__mro__:
+        if base.__module__.split(".")[0] == LIBRARY:
+            return base is not cls
+        if "fingerprint" in vars(base):
+            return False
+    return False
 
 
-def _modules_of(thing: Any) -> list[str]:
+def _modules_of(thing: Any) -> set[str]:
     """Modules of the library in which the class of an object, its bases and the classes of its attributes are defined.
 
     A class of the user may use any model of the library, so all models stand in for its own modules.
@@ -63,7 +67,7 @@ def _modules_of(thing: Any) -> list[str]:
             modules.add(base.__module__)
         elif top not in sys.stdlib_module_names:
             modules.add(MODELS)
-    return sorted(modules | _modules_of_attributes(thing))
+    return modules | _modules_of_attributes(thing)
 
 
 def _modules_of_attributes(thing: Any) -> set[str]:
@@ -98,9 +102,9 @@ def source_digest(*modules: str) -> str:
         its modules except the plots.
     """
     digest = blake2b(digest_size=16)
-    for path in sorted(imported_files(*modules)):
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(ROOT).as_posix()}\0{len(content)}\0".encode() + content)
+    for name, file in sorted(_closure(*modules).items()):
+        content = file.read_bytes()
+        digest.update(f"{name.as_posix()}\0{len(content)}\0".encode() + content)
     return digest.hexdigest()
 
 
@@ -117,31 +121,57 @@ def imported_files(*modules: str) -> set[Path]:
     set of Path
         Without the plots.
     """
-    found: set[Path] = set()
-    waiting = [file for module in modules for file in _files(tuple(module.split(".")[1:]))]
+    return set(_closure(*modules).values())
+
+
+def _closure(*modules: str) -> dict[PurePath, Path]:
+    """Files of modules and of all that they import; the keys are the places of the files in the library."""
+    found: dict[PurePath, Path] = {}
+    waiting = [item for module in modules for item in _files(tuple(module.split(".")[1:]))]
     while waiting:
-        file = waiting.pop()
-        if file not in found:
-            found.add(file)
-            waiting += _imports(file)
+        name, file = waiting.pop()
+        if name not in found:
+            found[name] = file
+            waiting += _imports(name, file)
     return found
 
 
-def _files(parts: tuple[str, ...]) -> list[Path]:
-    """Files of a module of the library given by the parts of its name, all files of a folder; none for a plot."""
+def _files(parts: tuple[str, ...]) -> list[tuple[PurePath, Path]]:
+    """Places in the library and files of a module given by the parts of its name; all of a folder; none for a plot."""
     if parts[:1] == (EXCLUDED,):
         return []
-    file = ROOT.joinpath(*parts).with_suffix(".py") if parts else ROOT
-    if file.is_file():
-        return [file]
     folder = ROOT.joinpath(*parts)
-    return [path for path in folder.rglob("*.py") if path.relative_to(ROOT).parts[0] != EXCLUDED]
+    file = folder.with_suffix(".py") if parts else folder
+    if not file.is_file() and not folder.is_dir():  # a folder that an editable installation reads from elsewhere
+        file = _origin(parts)
+        if file is None:
+            name = ".".join((LIBRARY, *parts))
+            raise ValueError(
+                f"the digest of the code needs the source file of the module {name}, which was not found; reinstall "
+                f"{LIBRARY}"
+            )
+        folder = file.parent
+        file = folder if file.name == "__init__.py" else file
+    if file.is_file():
+        return [(PurePath(*parts).with_suffix(".py"), file)]
+    names = [(path.relative_to(folder), path) for path in folder.rglob("*.py")]
+    return [(PurePath(*parts) / name, path) for name, path in names if parts or name.parts[0] != EXCLUDED]
 
 
-def _imports(file: Path) -> list[Path]:
-    """Files of the library's modules that a file imports."""
-    package = file.relative_to(ROOT).parts[:-1]
-    found = []
+@functools.cache
+def _origin(parts: tuple[str, ...]) -> Path | None:
+    """Source file of a module of the library, as Python would import it; None if there is none."""
+    try:
+        spec = importlib.util.find_spec(".".join((LIBRARY, *parts)))
+    except (ImportError, ValueError):
+        return None
+    return Path(spec.origin) if spec and spec.origin and Path(spec.origin).suffix == ".py" else None
+
+
+def _imports(place: PurePath, file: Path) -> list[tuple[PurePath, Path]]:
+    """Places and files of the library's modules that a file imports."""
+    package = place.parts[:-1]
+    found: list[tuple[PurePath, Path]] = []
     for node in _statements(ast.parse(file.read_bytes())):
         if isinstance(node, ast.Import):
             names = [tuple(alias.name.split(".")) for alias in node.names]
@@ -157,13 +187,13 @@ def _imports(file: Path) -> list[Path]:
             parts = [base + (alias.name,) if _is_module(base + (alias.name,)) else base for alias in node.names]
         else:
             continue
-        found += [path for one in parts for path in _files(one)]
+        found += [item for one in parts for item in _files(one)]
     return found
 
 
 def _is_module(parts: tuple[str, ...]) -> bool:
     path = ROOT.joinpath(*parts)
-    return path.is_dir() or path.with_suffix(".py").is_file()
+    return path.is_dir() or path.with_suffix(".py").is_file() or (len(parts) == 1 and _origin(parts) is not None)
 
 
 def _statements(node: ast.AST) -> Iterator[ast.stmt]:

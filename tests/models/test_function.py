@@ -266,6 +266,41 @@ def test_methods_and_callable_objects():
     assert code_digest(Spring(1.0)) != code_digest(Spring(1.0).respond)
 
 
+TUPLE = """
+from typing import NamedTuple
+class Storey(NamedTuple):
+    mass: float = 3.0
+    def half(self):
+        return self.mass / 2
+    @property
+    def double(self):
+        return self.mass * 2
+def f(theta):
+    return theta[0] * Storey().half() * Storey().double
+"""
+
+
+@pytest.mark.parametrize(("old", "new"), [("3.0", "4.0"), ("/ 2", "/ 3"), ("* 2", "* 4"), ("mass", "load")])
+def test_defaults_and_methods_of_a_named_tuple_enter_the_digest(old, new):
+    assert code_digest(defined(TUPLE)) == code_digest(defined(TUPLE))
+    assert code_digest(defined(TUPLE)) != code_digest(defined(TUPLE.replace(old, new)))
+
+
+def test_defaults_of_a_named_tuple_made_by_a_call_enter_the_digest():
+    code = (
+        "from collections import namedtuple\nS = namedtuple('S', 'mass', defaults=(3.0,))\ndef f(x):\n    return S()\n"
+    )
+    assert code_digest(defined(code)) == code_digest(defined(code))
+    assert code_digest(defined(code)) != code_digest(defined(code.replace("3.0", "4.0")))
+
+
+def test_the_object_of_a_bound_method_of_a_compiled_type_enters_the_digest():
+    code = "apply = (1.0 * np.eye(2)).dot\nfirst = {1: 2.0}.get\ndef f(x): return apply(first(1)), dict.fromkeys(x)\n"
+    assert code_digest(defined(code)) == code_digest(defined(code))
+    for old, new in (("1.0", "2.0"), ("2.0}", "3.0}")):
+        assert code_digest(defined(code)) != code_digest(defined(code.replace(old, new)))
+
+
 def test_an_object_without_stable_digest_needs_a_version():
     with pytest.raises(ValueError, match="give version=, a text"):
         model_of(Counting().respond)

@@ -1,6 +1,7 @@
 """A cache key depends on the source files that the response depends on, and on no others."""
 
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ from fe_likelihoods.probability.residuals import lag_one_sums
 from fe_likelihoods.simulation import source_digest
 from fe_likelihoods.simulation.cache_rows import simulation_keys
 from fe_likelihoods.simulation.code_digest import code_digest
-from fe_likelihoods.simulation.source_digest import imported_files, simulation_fingerprint
+from fe_likelihoods.simulation.fingerprint import simulation_fingerprint
+from fe_likelihoods.simulation.source_digest import imported_files
 
 CHANNELS = (Channel("a", "displacement", "m"),)
 RECORD = Record("pulse", 0.01, np.sin(np.arange(20) / 3))
@@ -162,3 +164,48 @@ def test_imports_for_type_checkers_do_not_count(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(source_digest, "ROOT", tmp_path)
     assert {path.stem for path in imported_files("fe_likelihoods.a")} == {"a", "b", "d", "e"}
+
+
+def test_a_module_of_an_editable_installation_has_its_own_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(source_digest, "ROOT", tmp_path)  # has no folder data
+    files = imported_files("fe_likelihoods.data.ground_motion")
+    assert "ground_motion" in {file.stem for file in files}
+    assert source_digest.source_digest("fe_likelihoods.data") != source_digest.source_digest()
+
+
+def test_a_module_without_a_file_has_no_digest():
+    with pytest.raises(ValueError, match="source file of the module fe_likelihoods.nothing"):
+        source_digest.source_digest("fe_likelihoods.nothing")
+
+
+OVERRIDDEN = """
+class Scaled(LinearOscillator):
+    def _respond(self, theta):
+        return 1.0 * super()._respond(theta)
+def using(model):
+    return lambda theta: model.simulate(theta)
+"""
+
+
+def defined(code, **names):
+    space = {"__name__": "someones_model", "LinearOscillator": LinearOscillator, **names}
+    exec(code, space)
+    return space
+
+
+def test_the_code_of_a_subclass_is_part_of_the_key():
+    one, same, two = (defined(OVERRIDDEN.replace("1.0", number))["Scaled"](RECORD) for number in ("1.0", "1.0", "2.0"))
+    assert simulation_fingerprint(one) == simulation_fingerprint(same)
+    assert len({simulation_fingerprint(model) for model in (one, two, LinearOscillator(RECORD))}) == 3
+
+    using = defined(OVERRIDDEN)["using"]
+    assert code_digest(using(one)) == code_digest(using(same))
+    assert len({code_digest(using(model)) for model in (one, two, LinearOscillator(RECORD))}) == 3
+
+
+def test_a_subclass_without_digest_needs_its_own_fingerprint():
+    code = OVERRIDDEN.replace("1.0", "file.fileno()").split("def using")[0]
+    with pytest.raises(ValueError, match="Scaled: no digest .* define a property `fingerprint`.* uses file"):
+        simulation_fingerprint(defined(code, file=sys.stdout)["Scaled"](RECORD))
+    code += "    fingerprint = property(lambda self: 'version 1')\n"
+    assert simulation_fingerprint(defined(code, file=sys.stdout)["Scaled"](RECORD)).startswith("version 1 ")
