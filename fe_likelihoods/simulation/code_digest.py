@@ -149,7 +149,7 @@ class _Digest:
         parts += [self._joined(self._code(function.__code__))]
         parts += map(self.of, (function.__defaults__, function.__kwdefaults__, closed_over))
         names = sorted(set(_names(function.__code__)))
-        for name in names:
+        for name in sorted(set(_global_names(function.__code__))):
             if name in function.__globals__:
                 parts += self._named(name, function.__globals__[name], names, function)
         for name in sorted(set(_imports(function))):
@@ -282,6 +282,16 @@ def _contents(cell: types.CellType) -> Any:
         return cell.cell_contents
     except ValueError:
         return None
+
+
+def _global_names(code: types.CodeType) -> Iterator[str]:
+    """Names of globals, without attributes, that a code object and the functions defined in it read."""
+    for step in dis.get_instructions(code):
+        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"):
+            yield step.argval
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _global_names(constant)
 
 
 def _names(code: types.CodeType) -> Iterator[str]:

@@ -309,6 +309,12 @@ def test_an_object_without_stable_digest_needs_a_version():
     assert first.fingerprint != second.fingerprint
 
 
+def test_a_global_with_the_name_of_an_attribute_does_not_enter_the_digest():
+    code = "def f(x):\n    return x.scale * G\nscale, G = 1.0, 2.0\n"
+    assert code_digest(defined(code)) == code_digest(defined(code.replace("1.0", "3.0")))
+    assert code_digest(defined(code)) != code_digest(defined(code.replace("2.0", "3.0")))
+
+
 def test_recursive_functions_have_a_digest():
     assert code_digest(defined("def f(n):\n    return f(n - 1) if n else h(n)\ndef h(n):\n    return f(n)\n"))
 
