@@ -246,8 +246,8 @@ class DaskExecutor(PoolExecutor):
     A task costs dask about 2 ms of all processors, so short simulations are sent in groups. The groups are large at
     first and single items at last, so that the workers finish together. No group takes longer than about a second, by
     the duration of earlier simulations, so that little is repeated if a worker dies. dask retries a group whose worker
-    died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). The items of the group are
-    then run one by one, and an item that kills its worker again gets ``(None, reason)``.
+    died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). The items of such groups are
+    then run alone, one after the other, and an item that kills its worker again gets ``(None, reason)``.
 
     Parameters
     ----------
@@ -277,11 +277,13 @@ class DaskExecutor(PoolExecutor):
         seconds = sum(answer.seconds for answer in answers if answer is not None)
         done = sum(len(answer.outcomes) for answer in answers if answer is not None)
         self._seconds = seconds / done if done else None
-        lost = [group for group, answer in zip(groups, answers, strict=True) if answer is None and len(group) > 1]
-        singles = iter(self._answers(function, [[item] for group in lost for item in group]))
+        lost = [item for group, answer in zip(groups, answers, strict=True) if answer is None for item in group]
+        # dask also counts the death of a worker against the groups that wait on it: only an item that runs alone and
+        # loses its worker is the cause
+        singles = iter([None] if len(lost) == 1 else [self._answers(function, [[item]])[0] for item in lost])
         outcomes = []
         for group, answer in zip(groups, answers, strict=True):
-            tried = [answer] if answer is not None or len(group) == 1 else [next(singles) for _ in group]
+            tried = [answer] if answer is not None else [next(singles) for _ in group]
             for one in tried:
                 outcomes += [(None, _DIED)] if one is None else one.outcomes
         return outcomes
