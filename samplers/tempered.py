@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from emcee import EnsembleSampler, State
 from emcee.ensemble import walkers_independent
-from emcee.moves import RedBlueMove
 from emcee.pbar import get_progress_bar
 
 from .moves.fast_parameters import with_fast_sweeps
@@ -39,7 +38,7 @@ from .tempering.anneal import anneal
 from .tempering.diagnostics import check_evidence, warn
 from .tempering.evidence_check import EvidenceCheck
 from .tempering.genealogy import standard_error_of_mean
-from .tempering.mutation import MoveSchedule
+from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, Stage, Sweep
 from .tempering.results import AnnealingResult
 from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
@@ -168,12 +167,7 @@ class TemperedSampler(EnsembleSampler):
             parameter_names=parameter_names,
         )
         own_moves, _ = get_moves(self)
-        red_blue = [type(move).__name__ for move in own_moves if isinstance(move, RedBlueMove)]
-        if red_blue and given.chains == "leaders":
-            raise ValueError(
-                f'{", ".join(red_blue)} cannot move with chains="leaders": red-blue moves of emcee need several '
-                'walkers, and chains from leaders are moved in small groups. Use chains="equal" or RandomWalkMove'
-            )
+        check_moves(own_moves, given.chains)
         fast = self._optional.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(own_moves, fast, ndim, self.settings.fast_sweeps)
         set_moves(self, followed)

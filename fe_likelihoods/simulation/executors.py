@@ -246,8 +246,8 @@ class DaskExecutor(PoolExecutor):
     A task costs dask about 2 ms of all processors, so short simulations are sent in groups. The groups are large at
     first and single items at last, so that the workers finish together. No group takes longer than about a second, by
     the duration of earlier simulations, so that little is repeated if a worker dies. dask retries a group whose worker
-    died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). The items of such groups are
-    then run alone, one after the other, and an item that kills its worker again gets ``(None, reason)``.
+    died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). The items of such groups
+    are then run alone, one after the other, and an item that kills its worker again gets ``(None, reason)``.
 
     Parameters
     ----------

@@ -11,14 +11,32 @@ from typing import NamedTuple
 import numpy as np
 from emcee import State
 from emcee.model import Model
-from emcee.moves import Move
+from emcee.moves import Move, RedBlueMove
 
 from .population import Density, Population, Sweep
 from .settings import Settings
 
-__all__ = ["MoveSchedule", "Mutated", "StartCorrelation", "grow_chains", "move_together", "tempered_log_prob"]
+__all__ = [
+    "MoveSchedule",
+    "Mutated",
+    "StartCorrelation",
+    "check_moves",
+    "grow_chains",
+    "move_together",
+    "tempered_log_prob",
+]
 
 STALL_SWEEPS = 3
+
+
+def check_moves(moves: Sequence[Move], chains: str) -> None:
+    """Raise ValueError for moves that cannot move chains from leaders (setting `chains`)."""
+    red_blue = [type(move).__name__ for move in moves if isinstance(move, RedBlueMove)]
+    if red_blue and chains == "leaders":
+        raise ValueError(
+            f'{", ".join(red_blue)} cannot move with chains="leaders": red-blue moves of emcee need several '
+            'walkers, and chains from leaders are moved in small groups. Use chains="equal" or RandomWalkMove'
+        )
 
 
 class MoveSchedule(NamedTuple):
