@@ -490,12 +490,8 @@ class TemperedSampler(EnsembleSampler):
                 if isinstance(report, Sweep):
                     show_progress(shown, population, report, self.evaluations, self._optional.report)
         if coarse is not None and coarse.failures.count:
-            logger.warning(
-                "%d of %d evaluations of the coarse model failed and count as impossible (%s)",
-                coarse.failures.count,
-                coarse.evaluations,
-                coarse.failures.most_common(),
-            )
+            failed = coarse.failures.count, coarse.evaluations, coarse.failures.most_common()
+            logger.warning("%d of %d evaluations of the coarse model failed and count as impossible (%s)", *failed)
         if self._result.check is not None:
             check_evidence(self.log_evidence_ladder, self.ladder[-1].log_evidence_error, self._result.check)
         log_prob, blobs = self._evaluator.unpack(population.records)
