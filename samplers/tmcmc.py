@@ -20,6 +20,7 @@ from .tempering.settings import Settings
 
 __all__ = ["TMCMCSampler"]
 
+_NO_RECYCLING = "TMCMCSampler does not recycle: use SMCSampler"
 _COV = "TMCMCSampler chooses beta by the coefficient of variation: pass coefficient_of_variation"
 
 
@@ -80,14 +81,14 @@ class TMCMCSampler(TemperedSampler):
     unused_settings: Mapping[str, str] = MappingProxyType(
         {
             **dict.fromkeys(("ess_ratio", "ess_rule", "ess_floor"), _COV),
-            "recycling": "TMCMCSampler does not recycle: use SMCSampler",
+            "recycling": _NO_RECYCLING,
         }
     )
 
-    how_to_recycle = "TMCMCSampler does not recycle: use SMCSampler"
+    how_to_recycle = _NO_RECYCLING
 
     @classmethod
     def _choose(cls, settings: Settings, moves: Any, nwalkers: int) -> tuple[bool, Any]:
         if settings.recycle:
-            raise ValueError("recycle=True cannot act here: TMCMCSampler does not recycle: use SMCSampler")
+            raise ValueError(f"recycle=True cannot act here: {_NO_RECYCLING}")
         return False, MixtureMove() if moves is None else moves

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..signals.channels import Channel, Measurements, plot_response
 from ..signals.records import DisplacementHistory, Record
+from ..signals.sampling import array_digest
 from .validation import check_theta
 
 if TYPE_CHECKING:
@@ -129,5 +130,5 @@ def _text(value: object) -> str:
     if isinstance(value, Record | DisplacementHistory):
         return value.fingerprint
     if isinstance(value, np.ndarray):
-        return hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()
+        return array_digest(value)
     return repr(value)

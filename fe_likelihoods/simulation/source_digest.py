@@ -48,7 +48,7 @@ def object_digest(thing: Any, *modules: str) -> str:
 def inherits_fingerprint(cls: type) -> bool:
     """Whether a class of the user has the fingerprint of a class of the library, which does not know its methods."""
     for base in cls.__mro__:
-        if base.__module__.split(".")[0] == LIBRARY:
+        if _top(base) == LIBRARY:
             return base is not cls
         if "fingerprint" in vars(base):
             return False
@@ -60,14 +60,20 @@ def _modules_of(thing: Any) -> set[str]:
 
     A class of the user may use any model of the library, so all models stand in for its own modules.
     """
-    modules = set()
-    for base in type(thing).__mro__:
-        top = base.__module__.split(".")[0]
-        if top == LIBRARY:
-            modules.add(base.__module__)
-        elif top not in sys.stdlib_module_names:
-            modules.add(MODELS)
-    return modules | _modules_of_attributes(thing)
+    modules = _library_modules(thing) | _modules_of_attributes(thing)
+    if any(_top(base) not in {LIBRARY, *sys.stdlib_module_names} for base in type(thing).__mro__):
+        modules.add(MODELS)
+    return modules
+
+
+def _library_modules(thing: Any) -> set[str]:
+    """Modules of the library in which the class of an object and its bases are defined."""
+    return {base.__module__ for base in type(thing).__mro__ if _top(base) == LIBRARY}
+
+
+def _top(cls: type) -> str:
+    """Name of the package in which a class is defined."""
+    return cls.__module__.split(".")[0]
 
 
 def _modules_of_attributes(thing: Any) -> set[str]:
@@ -80,7 +86,7 @@ def _modules_of_attributes(thing: Any) -> set[str]:
         if id(value) in seen:
             continue
         seen.add(id(value))
-        found = {base.__module__ for base in type(value).__mro__ if base.__module__.split(".")[0] == LIBRARY}
+        found = _library_modules(value)
         modules |= found
         if found:
             waiting += getattr(value, "__dict__", {}).values()

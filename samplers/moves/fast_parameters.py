@@ -21,7 +21,7 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import Move
 
-from .kernels import Inside, RandomWalkMove
+from .kernels import Inside, RandomWalkMove, calibrate_move
 
 __all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
 
@@ -108,9 +108,8 @@ class WithFastSweeps(Move):
         return float(np.mean(self._accepted)) if len(self._accepted) else float("nan")
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit the walk, and the wrapped move if it has ``calibrate``, to points (n, ndim) with weights (n,)."""
-        if hasattr(self.move, "calibrate"):  # emcee's own moves have none
-            self.move.calibrate(coords, weights, inside)
+        """Fit the walk, and the wrapped move if it can be fitted, to points (n, ndim) with weights (n,)."""
+        calibrate_move(self.move, coords, weights, inside)
         self._walk.calibrate(coords, weights, inside)
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:

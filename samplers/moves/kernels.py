@@ -31,7 +31,7 @@ from ..proposals.mixture import (
 )
 from ..proposals.support_bounds import SupportBounds, find_support_bounds, log_abs_det_jacobian
 
-__all__ = ["MixtureMove", "RandomWalkMove", "StudentTMove", "describe"]
+__all__ = ["MixtureMove", "RandomWalkMove", "StudentTMove", "calibrate_move", "describe"]
 
 # Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
 KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
@@ -72,6 +72,17 @@ def describe(move: Move) -> dict:
     return {"class": type(move).__name__, **settings}
 
 
+def calibrate_move(move: Move, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
+    """Fit a move to points (n, ndim) with normalised weights (n,), if it can be fitted; emcee's own moves cannot."""
+    if hasattr(move, "calibrate"):
+        move.calibrate(coords, weights, inside)
+
+
+def _fit_to_ensemble(move: Move, coords: np.ndarray) -> None:
+    """Fit a move to the current walkers (n, ndim), for a plain EnsembleSampler, which does not call ``calibrate``."""
+    move.calibrate(coords, np.full(len(coords), 1.0 / len(coords)))
+
+
 class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points."""
 
@@ -104,9 +115,8 @@ class _FittedMove(MHMove):
         accepted : ndarray of bool, shape (nwalkers,)
             Which proposals were accepted.
         """
-        if self._root is None:  # a plain EnsembleSampler does not call calibrate: fit to the current ensemble
-            n = len(state.coords)
-            self.calibrate(state.coords, np.full(n, 1.0 / n))
+        if self._root is None:
+            _fit_to_ensemble(self, state.coords)
         return super().propose(model, state)
 
 
@@ -268,9 +278,8 @@ class MixtureMove(MHMove):
         accepted : ndarray of bool, shape (nwalkers,)
             Which proposals were accepted.
         """
-        if self._mixture is None:  # a plain EnsembleSampler does not call calibrate: fit to the current ensemble
-            n = len(state.coords)
-            self.calibrate(state.coords, np.full(n, 1.0 / n))
+        if self._mixture is None:
+            _fit_to_ensemble(self, state.coords)
         # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
         shares = KERNEL_PROBABILITIES_IF_ACCEPTED if self._independence_accepted else KERNEL_PROBABILITIES
         self._current = 0 if self._current is None else model.random.choice(len(self._kernels), p=shares)

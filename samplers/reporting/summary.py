@@ -180,7 +180,7 @@ def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
 def ladder_table(sampler: Any) -> str:
     """Table of the tempering stages, followed by the evidence and the two estimates it was chosen from.
 
-    The columns are the fields of `samplers.tempering.weights.Stage`: exponent, effective sample size, acceptance,
+    The columns are the fields of `samplers.tempering.population.Stage`: exponent, effective sample size, acceptance,
     sweeps of the ensemble, distinct points after the resampling, increment of the log-evidence, evaluations, and wall
     time [s].
 

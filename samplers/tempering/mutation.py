@@ -13,6 +13,7 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import Move, RedBlueMove
 
+from ..moves.kernels import calibrate_move
 from .population import Density, Population, Sweep
 from .settings import Settings
 
@@ -62,9 +63,7 @@ class MoveSchedule(NamedTuple):
     ) -> None:
         """Fit the moves that can be fitted to points (n, ndim) with normalised weights (n,)."""
         for move in self.moves:
-            calibrate = getattr(move, "calibrate", None)  # emcee's own moves have none
-            if calibrate is not None:
-                calibrate(coords, weights, inside)
+            calibrate_move(move, coords, weights, inside)
 
 
 class Mutated(NamedTuple):

@@ -7,6 +7,7 @@ tested column and options of the model, under base acceleration and imposed disp
 import numpy as np
 import pytest
 
+from fe_likelihoods import rrmse
 from fe_likelihoods.models.rc_column import Patches, RCColumn
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
 from fe_likelihoods.signals.records import DisplacementHistory
@@ -36,10 +37,6 @@ def opensees():
 def record():
     """The first six seconds of the bundled record, which include the peak."""
     return bridge_column_data().record.trim(0.0, 6.0)
-
-
-def rrmse(values, reference):
-    return np.sqrt(np.sum((values - reference) ** 2, axis=-1) / np.sum(reference**2, axis=-1))
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from fe_likelihoods import rrmse
 from fe_likelihoods.kernels import concrete04
 from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from fe_likelihoods.kernels.static import Iteration
@@ -52,10 +53,6 @@ def column():
 def motion():
     """The first seconds of the synthetic ground motion of the reference runs [in/s²], step 1/256 s."""
     return golden.load(golden.BUNDLED, "dynamic")["record50"]
-
-
-def rrmse(values, reference):
-    return np.sqrt(((values - reference) ** 2).sum(axis=1) / (reference**2).sum(axis=1))
 
 
 # --- reference runs ---

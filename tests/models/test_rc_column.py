@@ -27,6 +27,7 @@ from fe_likelihoods import (
     Steel,
     TruncatedNormal,
     read_csv,
+    rrmse,
     to_si,
 )
 from fe_likelihoods.kernels import concrete04, reinforcing_steel
@@ -44,10 +45,6 @@ PAPER = np.array(list(BRIDGE_COLUMN_MEANS.values()))
 PUSHED = ("Ec", "Es", "ft")  # parameters that act under imposed displacement
 REFERENCE_THETA = np.array([3320.0, 28400.0, 0.737, 0.0002016, 0.306])  # ksi, 1/s, s
 TIGHT = dict(tolerance=1e-11, element_tolerance=1e-12 * KIP * INCH)
-
-
-def rrmse(values, reference):
-    return np.sqrt(np.sum((values - reference) ** 2, axis=-1) / np.sum(reference**2, axis=-1))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods import problems
+from fe_likelihoods import problems, rrmse
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import TruncatedNormal
 from fe_likelihoods.signals.readers import read_csv
@@ -83,14 +83,6 @@ def sample(posterior: Posterior, seed: int) -> Run:
         f"importance sampling {run.check.log_evidence:.2f} +- {run.check.log_evidence_error:.2f}"
     )
     return run
-
-
-def rrmse(posterior: Posterior, theta: np.ndarray) -> np.ndarray:
-    """Of the response to the measurement, per channel."""
-    measured = posterior.likelihood.measurements.values
-    return np.sqrt(
-        np.sum((posterior.likelihood.model.simulate(theta) - measured) ** 2, axis=1) / np.sum(measured**2, 1)
-    )
 
 
 # ------------------------------------------------------------------ the posteriors
@@ -197,7 +189,8 @@ def test_the_prior_pulls_the_damping_and_so_does_the_mesh(run):
 )
 def test_updating_explains_the_response(run, make, before, after):
     posterior, samples = run(make).posterior, run(make).samples
-    nominal, updated = rrmse(posterior, np.ones(5)), rrmse(posterior, samples.mean(axis=0)[:5])
+    model, measured = posterior.likelihood.model, posterior.likelihood.measurements.values
+    nominal, updated = (rrmse(model.simulate(theta), measured) for theta in (np.ones(5), samples.mean(axis=0)[:5]))
     print(f"RRMSE before {nominal}, after {updated}")
     assert np.all(nominal > before)
     assert np.all(updated < after)

@@ -267,7 +267,8 @@ def test_chains_from_leaders_refuse_moves_of_several_walkers(moves):
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_chains_from_leaders_take_other_moves_of_emcee():
-    outcome(TMCMCSampler, chains="leaders", moves=emcee.moves.GaussianMove(1e-4))
+    _, stages, _ = outcome(TMCMCSampler, chains="leaders", moves=emcee.moves.GaussianMove(1e-4))
+    assert stages[-1].beta == 1.0
 
 
 def test_settings_as_an_object_as_keywords_and_as_a_preset():
