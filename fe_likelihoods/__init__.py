@@ -95,6 +95,13 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.autoregressive_noise import (
         AutoregressiveNoise,
     )
+    from .probability.distributions import (
+        Distribution,
+        HalfNormal,
+        LogNormal,
+        TruncatedNormal,
+        Uniform,
+    )
     from .probability.failures import (
         TooManyFailures,
     )
@@ -113,12 +120,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         Posterior,
     )
     from .probability.priors import (
-        Distribution,
-        HalfNormal,
-        LogNormal,
         Prior,
-        TruncatedNormal,
-        Uniform,
     )
     from .probability.residuals import (
         ResidualChecks,
@@ -317,6 +319,13 @@ _EXPORTS = {
         "exceedance",
     ),
     "probability.autoregressive_noise": ("AutoregressiveNoise",),
+    "probability.distributions": (
+        "Distribution",
+        "HalfNormal",
+        "LogNormal",
+        "TruncatedNormal",
+        "Uniform",
+    ),
     "probability.failures": ("TooManyFailures",),
     "probability.likelihood": ("FELikelihood",),
     "probability.marginal_noise": ("MarginalNoise",),
@@ -326,14 +335,7 @@ _EXPORTS = {
         "SharedGaussianNoise",
     ),
     "probability.posterior": ("Posterior",),
-    "probability.priors": (
-        "Distribution",
-        "HalfNormal",
-        "LogNormal",
-        "Prior",
-        "TruncatedNormal",
-        "Uniform",
-    ),
+    "probability.priors": ("Prior",),
     "probability.residuals": (
         "ResidualChecks",
         "effective_samples",

@@ -32,10 +32,11 @@ import numpy as np
 
 from .models.isolated_bridge_channels import CHANNEL_SETS
 from .probability.autoregressive_noise import AutoregressiveNoise
+from .probability.distributions import HalfNormal, TruncatedNormal, Uniform
 from .probability.likelihood import FELikelihood
 from .probability.noise import GaussianNoise, SharedGaussianNoise
 from .probability.posterior import Posterior
-from .probability.priors import HalfNormal, Prior, TruncatedNormal, Uniform
+from .probability.priors import Prior
 from .signals.channels import Channel, Measurements
 from .signals.datasets import Dataset, read_dataset
 from .signals.records import Record

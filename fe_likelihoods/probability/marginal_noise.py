@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .distributions import Distribution, RandomState, Uniform
 from .noise import GaussianNoise, SharedGaussianNoise
-from .priors import Distribution, Prior, RandomState, Uniform
+from .priors import Prior
 
 __all__ = ["MarginalNoise"]
 

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from .distributions import Distribution, RandomState
 from .inputs import as_points
 from .likelihood import FELikelihood
 from .marginal_noise import MarginalNoise
-from .priors import Distribution, Prior, RandomState
+from .priors import Prior
 
 __all__ = ["Posterior"]
 

@@ -14,9 +14,10 @@ from fe_likelihoods.prediction.averaging import average_predictions
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
 from fe_likelihoods.prediction.streaming import RunningMoments
+from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, Prior, TruncatedNormal
+from fe_likelihoods.probability.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import DisplacementHistory, Record
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed

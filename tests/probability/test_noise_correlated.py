@@ -11,9 +11,9 @@ from fe_likelihoods import AutoregressiveNoise, GaussianNoise, SharedGaussianNoi
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.accumulator import SampleNoise
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
+from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.residuals import effective_samples, lag_one_sums
 from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements

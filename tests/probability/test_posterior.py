@@ -13,10 +13,11 @@ import pytest
 from scipy import optimize, stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import SharedGaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, LogNormal, Prior, TruncatedNormal, Uniform
+from fe_likelihoods.probability.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import MisfitBatch, SimulationBatch, SimulationFailed, misfit_batch, simulate_batch

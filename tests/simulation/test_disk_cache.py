@@ -16,9 +16,9 @@ import pytest
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record

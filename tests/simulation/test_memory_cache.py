@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.distributions import Distribution, HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import Distribution, HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.memory_cache import MemoryCache
