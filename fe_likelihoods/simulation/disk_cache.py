@@ -248,29 +248,32 @@ class SimulationCache:
                 rows.append((key, len(single), len(data), zlib.crc32(key + data), data))
         self._write(STORE_RESPONSE, rows)
 
-    def response(self, model: Model, theta: np.ndarray) -> np.ndarray | None:
-        """Stored response of a model.
+    def look_up_responses(self, model: Model, thetas: np.ndarray) -> list[np.ndarray | None]:
+        """Look up responses of a model.
 
         Parameters
         ----------
         model : Model
-        theta : (n_structural,) float
+        thetas : (n, n_structural) float
             Structural parameters.
 
         Returns
         -------
-        (n_channels, n_steps) float32 or None
-            [SI]; None if it is not stored.
+        list of n (n_channels, n_steps) float32, or None
+            [SI]; None where the response is not stored.
         """
-        (key,) = simulation_keys(simulation_fingerprint(model), np.atleast_2d(np.asarray(theta, dtype=float)))
-        query = "SELECT n_channels, crc, response FROM responses WHERE key = ?"
+        shape = len(model.channels), model.n_steps
+        keys = simulation_keys(simulation_fingerprint(model), thetas)
+        query = "key, crc, response FROM responses"
+        found, bad = {}, []
         with self.file.lock:
-            found = self._try("read", lambda connection: connection.execute(query, (key,)).fetchall(), [])
-            for n_channels, crc, data in found:
-                if isinstance(data, bytes) and crc == zlib.crc32(key + data):
-                    return np.frombuffer(data, dtype="<f4").reshape(n_channels, -1).copy()
-                self._drop("responses", [key])
-        return None
+            for key, crc, data in self._try("read", lambda connection: self._select(connection, keys, query), []):
+                if isinstance(data, bytes) and crc == zlib.crc32(key + data) and len(data) == 4 * shape[0] * shape[1]:
+                    found[key] = np.frombuffer(data, dtype="<f4").reshape(shape).copy()
+                else:
+                    bad.append(key)
+            self._drop("responses", bad)
+        return [found.get(key) for key in keys]
 
     def info(self) -> CacheInfo:
         """State of the cache, and counts of this object."""
@@ -376,12 +379,14 @@ class SimulationCache:
             yield [row[1:-1] for row in page if is_undamaged(*row[1:])]
 
     @staticmethod
-    def _select(connection: sqlite3.Connection, keys: list[bytes]) -> list[tuple]:
+    def _select(
+        connection: sqlite3.Connection, keys: list[bytes], columns: str = f"{COLUMNS} FROM simulations"
+    ) -> list[tuple]:
         found = []
         for start in range(0, len(keys), KEYS_PER_QUERY):
             part = keys[start : start + KEYS_PER_QUERY]
             marks = ",".join("?" * len(part))
-            found += connection.execute(f"SELECT {COLUMNS} FROM simulations WHERE key IN ({marks})", part).fetchall()
+            found += connection.execute(f"SELECT {columns} WHERE key IN ({marks})", part).fetchall()
         return found
 
     def _insert(self, connection: sqlite3.Connection, statement: str, rows: list[tuple]) -> None:

@@ -418,9 +418,9 @@ def test_rows_under_each_others_key_are_missing(filled, thetas, expected):
 def test_a_damaged_response_is_missing(path, thetas):
     likelihood = likelihood_of(SimulationCache(path, responses=True))
     likelihood.misfit([[1.0, 1.0]])
-    assert likelihood.cache.response(MODEL, [1.0, 1.0]) is not None
+    assert likelihood.cache.look_up_responses(MODEL, [[1.0, 1.0]])[0] is not None
     likelihood.cache.file.connection().execute("UPDATE responses SET response = zeroblob(160)")
-    assert likelihood.cache.response(MODEL, [1.0, 1.0]) is None
+    assert likelihood.cache.look_up_responses(MODEL, [[1.0, 1.0]]) == [None]
     assert (likelihood.cache.damaged, likelihood.cache.info().responses) == (1, 0)
 
 

@@ -364,7 +364,7 @@ def test_invalid_bounds(path, name, value):
 
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.likelihood._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
     for model in (Line(), Batched()):
         likelihood = likelihood_of(model, path.with_name(type(model).__name__))
         np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(type(model)()).misfit(thetas))
@@ -373,7 +373,7 @@ def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.likelihood._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
         def simulate(self, theta):
@@ -408,7 +408,7 @@ class Pool:
     ids=str,
 )
 def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attributes, sizes):
-    monkeypatch.setattr("fe_likelihoods.probability.likelihood._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
     pool = Pool(**attributes)
     likelihood_of(Line(), path, pool=pool).misfit(thetas[:100])
     assert pool.sizes == sizes
@@ -553,8 +553,8 @@ def test_responses_are_stored_in_addition_to_the_sums(path, rng, model):
     np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(model, data=0.1).misfit(thetas))
     again = SimulationCache(path)
     kept = 0
-    for theta, failed in zip(thetas, np.isnan(likelihood.misfit(thetas)).any(axis=1), strict=True):
-        response = again.response(model, theta)
+    failures = np.isnan(likelihood.misfit(thetas)).any(axis=1)
+    for theta, failed, response in zip(thetas, failures, again.look_up_responses(model, thetas), strict=True):
         if failed:
             assert response is None
         else:
@@ -562,8 +562,8 @@ def test_responses_are_stored_in_addition_to_the_sums(path, rng, model):
             assert response.dtype == np.float32
             np.testing.assert_array_equal(response, simulate_batch(model, theta[None]).response[0].astype("f4"))
     assert again.info().responses == kept > 0
-    assert again.response(model, thetas[0] + 1e-9) is None
-    assert again.response(Line(fingerprint="another"), thetas[0]) is None
+    assert again.look_up_responses(model, thetas[:1] + 1e-9) == [None]
+    assert again.look_up_responses(Line(fingerprint="another"), thetas[:1, :2]) == [None]
 
 
 def test_responses_are_bounded(path, rng):
@@ -574,7 +574,7 @@ def test_responses_are_bounded(path, rng):
     likelihood.misfit(thetas[:14])
     likelihood.misfit(thetas[14:])
     assert (cache.info().responses, cache.info().response_bytes) == (10, 10 * bytes_each)
-    kept = [cache.response(Batched(), theta) is not None for theta in thetas]
+    kept = [response is not None for response in cache.look_up_responses(Batched(), thetas)]
     assert kept == [False] * 15 + [True] * 10
     assert cache.info().simulations == 25
 

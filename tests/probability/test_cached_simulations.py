@@ -1,0 +1,280 @@
+"""Responses that are simulated on request: their statistics are cached as those of a log-likelihood are."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.models.linear_structure import LinearStructure
+from fe_likelihoods.models.linear_structure_parts import ShearFrame
+from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.models.steel_coupon import SteelCoupon
+from fe_likelihoods.probability.autoregressive_noise import AutoregressiveNoise
+from fe_likelihoods.probability.failures import TooManyFailures
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.problems import isolated_bridge
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
+
+RECORD = Record("pulse", 0.01, np.sin(np.arange(40) / 3))
+
+
+class Line:
+    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one; counts its runs."""
+
+    parameter_names = ("offset", "slope")
+    channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
+    dt = 0.5
+    n_steps = 8
+    fingerprint = "line"
+
+    def __init__(self):
+        self.runs = 0
+
+    def simulate(self, theta):
+        self.runs += 1
+        if theta[1] > 1.0:
+            raise SimulationFailed("too steep after 2 s")
+        line = theta[0] + theta[1] * self.dt * np.arange(self.n_steps) / 3.0
+        return np.vstack([line, -line])
+
+
+class Batched(Line):
+    """The same model with a batch method."""
+
+    def simulate_batch(self, thetas):
+        batch = [Line().simulate(np.append(theta[:1], min(theta[1], 1.0))) for theta in thetas]
+        self.runs += len(thetas)
+        return SimulationBatch(np.array(batch), ["too steep" if slope > 1.0 else "" for slope in thetas[:, 1]])
+
+
+def line(theta):
+    return theta[0] + theta[1] * np.arange(20.0)[None]
+
+
+def models():
+    strains = np.concatenate([np.linspace(0.0, 0.01, 20), np.linspace(0.01, -0.005, 20)])
+    column = RCColumn.lhpost(RECORD, mesh=10)
+    return [
+        Line(),
+        Batched(),
+        FunctionModel(line, ("a", "b"), [Channel("y", "displacement", "m")], 0.1, 20),
+        LinearOscillator(RECORD),
+        LinearStructure(ShearFrame({"top": 2}, (1.0, 1.0), (900.0, 900.0)), RECORD),
+        SteelCoupon(strains, column.steel),
+        column,
+        isolated_bridge().likelihood.model,
+    ]
+
+
+def likelihood_of(model, noise=None, **kwargs):
+    measured = 0.1 * np.sin(np.arange(len(model.channels) * model.n_steps)).reshape(len(model.channels), -1)
+    return FELikelihood(model, Measurements(model.channels, model.dt, measured), noise, **kwargs)
+
+
+def points(likelihood, thetas):
+    """With noise parameters."""
+    return np.column_stack([thetas, np.full((len(thetas), likelihood.ndim - thetas.shape[1]), 0.3)])
+
+
+@pytest.fixture
+def thetas(rng):
+    """Forty points, of which a few fail."""
+    return np.column_stack([rng.normal(size=40), rng.uniform(0.0, 1.2, size=40)])
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cache.sqlite"
+
+
+def assert_same_log_likelihood(likelihood, thetas, expected_runs):
+    """The log-likelihood needs no simulation, and has the bits of one that has never seen a response."""
+    x = points(likelihood, thetas)
+    values = likelihood.log_likelihood(x)
+    assert likelihood.simulations == expected_runs
+    fresh = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise)
+    np.testing.assert_array_equal(values, fresh.log_likelihood(x))
+
+
+@pytest.mark.parametrize("model", models(), ids=lambda model: type(model).__name__)
+@pytest.mark.parametrize("correlated", [False, True])
+def test_responses_and_then_log_likelihoods(model, correlated, rng):
+    noise = AutoregressiveNoise(model.channels) if correlated else None
+    likelihood = likelihood_of(model, noise)
+    thetas = rng.uniform(0.7, 0.95, size=(6, len(model.parameter_names)))
+    batch = likelihood.simulate(thetas)
+    expected = simulate_batch(model, thetas)
+    np.testing.assert_array_equal(batch.response, expected.response)
+    assert batch.reasons == expected.reasons
+    assert np.isfinite(batch.response[:, 0, 0]).any()
+    assert likelihood.failure_count == sum(map(bool, batch.reasons))
+    assert_same_log_likelihood(likelihood, thetas, 6)
+
+
+def test_duplicates_and_rows_that_are_not_finite():
+    likelihood = likelihood_of(Line())
+    thetas = np.array([[0.0, 0.5], [np.nan, 0.5], [-0.0, 0.5], [1.0, 0.5], [0.0, 0.5], [1.0, 2.0], [1.0, 2.0]])
+    batch = likelihood.simulate(thetas)
+    assert likelihood.simulations == likelihood.model.runs == 3
+    np.testing.assert_array_equal(batch.response[0], batch.response[4])
+    np.testing.assert_array_equal(batch.response[3], Line().simulate(thetas[3]))
+    assert np.isnan(batch.response[[1, 5, 6]]).all()
+    reasons = ["", "the parameters are not finite", "", "", "", "too steep after 2 s", "too steep after 2 s"]
+    assert batch.reasons == reasons
+    assert likelihood.failure_reasons == {"too steep": 1}
+    assert likelihood.simulate(thetas[1:2]).reasons == reasons[1:2]
+    assert likelihood.simulate(thetas[3]).response.shape == (1, 2, 8)
+    empty = likelihood.simulate(np.empty((0, 2)))
+    assert empty.response.shape == (0, 2, 8)
+    with pytest.raises(ValueError, match="one value for each of the 2 parameters"):
+        likelihood.simulate(np.zeros((2, 4)))
+
+
+def test_a_response_is_simulated_again_and_a_failure_is_not(thetas):
+    likelihood = likelihood_of(Line())
+    likelihood.misfit(thetas)
+    failed = np.isnan(likelihood.misfit(thetas)).any(axis=1)
+    assert 0 < failed.sum() == likelihood.failure_count
+    runs, hits = likelihood.simulations, likelihood.cache_hits
+    batch = likelihood.simulate(thetas)
+    assert likelihood.simulations == runs + (~failed).sum() == likelihood.model.runs
+    assert likelihood.cache_hits == hits + failed.sum()
+    assert likelihood.failure_count == failed.sum()
+    assert [bool(reason) for reason in batch.reasons] == failed.tolist()
+    assert np.isnan(batch.response[failed]).all()
+    assert np.isfinite(batch.response[~failed]).all()
+
+
+def test_without_a_memory_cache(thetas):
+    likelihood = likelihood_of(Line(), memory_rows=0)
+    batch = likelihood.simulate(thetas)
+    assert sum(map(bool, batch.reasons)) == likelihood.failure_count
+    likelihood.misfit(thetas)
+    assert likelihood.simulations == 80
+
+
+@pytest.mark.parametrize("model", [Line, Batched])
+@pytest.mark.parametrize("responses", [False, True])
+def test_the_disk_cache_has_the_rows_of_statistics(model, responses, path, thetas):
+    first = likelihood_of(model(), cache=SimulationCache(path, responses=responses))
+    batch = first.simulate(thetas)
+    assert first.cache.info().simulations == 40
+    assert first.cache.info().responses == (40 - first.failure_count if responses else 0)
+    assert_same_log_likelihood(first, thetas, 40)
+    second = likelihood_of(model(), cache=path)
+    assert_same_log_likelihood(second, thetas, 0)
+    assert second.failures == first.failures
+    third = likelihood_of(model(), cache=SimulationCache(path, responses=responses))
+    again = third.simulate(thetas)
+    np.testing.assert_array_equal(again.response, batch.response)
+    assert again.reasons == batch.reasons
+    good = 40 - first.failure_count
+    assert third.simulations == third.model.runs == (0 if responses else good)
+    assert third.disk_hits == third.cache_hits == (40 if responses else 40 - good)
+    assert third.failure_count == first.failure_count
+    assert_same_log_likelihood(third, thetas, third.simulations)
+
+
+def test_responses_of_a_cache_are_rounded_also_when_they_are_new(path, thetas):
+    exact = likelihood_of(Line()).simulate(thetas).response
+    likelihood = likelihood_of(Line(), cache=SimulationCache(path, responses=True))
+    new = likelihood.simulate(thetas).response
+    assert new.dtype == np.float64
+    np.testing.assert_array_equal(new, exact.astype(np.float32))
+    assert (new != exact).any()
+    huge = likelihood.simulate([[1e60, 0.5], [1.0, 0.5]])  # beyond single precision: not stored, and not rounded
+    assert huge.reasons == ["", ""]
+    np.testing.assert_array_equal(huge.response[0], Line().simulate([1e60, 0.5]))
+    np.testing.assert_array_equal(huge.response[1], Line().simulate([1.0, 0.5]).astype(np.float32))
+
+
+def test_a_response_that_is_no_longer_stored_is_simulated_again(path, thetas):
+    good = thetas[thetas[:, 1] < 1.0]
+    cache = SimulationCache(path, responses=True, max_response_bytes=10 * 2 * 8 * 4)
+    expected = likelihood_of(Line(), cache=cache).simulate(good).response
+    likelihood = likelihood_of(Line(), cache=SimulationCache(path, responses=True))
+    np.testing.assert_array_equal(likelihood.simulate(good).response, expected)
+    assert likelihood.simulations == len(good) - 10
+    assert_same_log_likelihood(likelihood, good, len(good) - 10)
+
+
+def test_a_damaged_response_is_simulated_again(path, thetas):
+    expected = likelihood_of(Line(), cache=SimulationCache(path, responses=True)).simulate(thetas).response
+    cache = SimulationCache(path, responses=True)
+    cache.file.connection().execute("UPDATE responses SET response = x'00' WHERE id <= 5")
+    cache.file.connection().execute("UPDATE responses SET response = 'text' WHERE id = 6")
+    likelihood = likelihood_of(Line(), cache=cache)
+    np.testing.assert_array_equal(likelihood.simulate(thetas).response, expected)
+    assert likelihood.simulations == cache.damaged == 6
+    assert cache.info().responses == np.isfinite(expected[:, 0, 0]).sum()
+
+
+def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkeypatch):
+    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+
+    class Interrupted(Line):
+        def simulate(self, theta):
+            if self.runs == 25:
+                raise KeyboardInterrupt
+            return super().simulate(theta)
+
+    first = likelihood_of(Interrupted(), cache=path)
+    first.model.runs = 0
+    with pytest.raises(KeyboardInterrupt):
+        first.simulate(thetas)
+    assert first.cache.info().simulations == first.simulations == 25
+    second = likelihood_of(Interrupted(), cache=path)
+    second.misfit(thetas[:25])
+    assert second.model.runs == 0
+
+
+def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
+    expected = likelihood_of(Line()).simulate(thetas)
+    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    batch = likelihood_of(Line(), cache=path).simulate(thetas)
+    np.testing.assert_array_equal(batch.response, expected.response)
+    assert batch.reasons == expected.reasons
+
+
+def test_too_many_failures(thetas):
+    likelihood = likelihood_of(Line(), max_failure_share=0.1)
+    thetas[:, 1] += 0.5
+    likelihood.simulate(thetas)
+    with pytest.raises(TooManyFailures, match="simulations failed"):
+        likelihood.simulate(thetas + 10.0)
+    likelihood.log_likelihood(points(likelihood, thetas))  # finished simulations are kept
+    assert likelihood.simulations == 40
+
+
+def test_a_pool_changes_nothing(thetas):
+    expected = likelihood_of(Line()).simulate(thetas)
+    likelihood = likelihood_of(Line(), pool=2)
+    try:
+        batch = likelihood.simulate(thetas)
+        np.testing.assert_array_equal(batch.response, expected.response)
+        assert batch.reasons == expected.reasons
+        assert likelihood.model.runs == 0  # all in the workers
+        assert_same_log_likelihood(likelihood, thetas, 40)
+    finally:
+        likelihood.pool.close()
+
+
+def test_known_statistics_are_recalled_without_a_simulation(thetas):
+    first = likelihood_of(Line())
+    batch, statistics = first.simulate(thetas), first.statistics(thetas)
+    second = likelihood_of(Line())
+    rows = np.r_[0, 0, 1:40]
+    second.recall(thetas[rows], statistics[rows], [batch.reasons[row] for row in rows])
+    assert_same_log_likelihood(second, thetas, 0)
+    assert second.simulations == 0
+    assert second.failures == first.failures
+    second.recall(thetas, np.zeros_like(statistics), batch.reasons)  # cached rows are not changed
+    np.testing.assert_array_equal(second.statistics(thetas), statistics)
+    assert second.failure_count == first.failure_count
+    with pytest.raises(ValueError, match=r"statistics of shape \(40, 2\) and 40 reasons; got \(40, 2\) and 39"):
+        second.recall(thetas, statistics, batch.reasons[1:])
+    with pytest.raises(ValueError, match="for the same noise"):
+        second.recall(thetas, statistics[:, :1], batch.reasons)
