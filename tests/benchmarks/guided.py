@@ -1,0 +1,187 @@
+"""One run of a sampler with few simulations, and its errors against a reference.
+
+A run is judged by what it says: its errors must lie within its own standard errors (with those of the reference), or
+its verdict must be "not usable".
+"""
+
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from samplers import SMCSampler
+
+__all__ = ["Errors", "Outcome", "compare", "run"]
+
+WALKERS = 100
+LIMIT = 3.5  # standard errors beyond which a result is wrong: one of 2000 correct ones
+ROUNDING = 0.02  # of log Z, and of a mean in standard deviations of the reference: errors below it do not matter
+
+
+class Outcome(NamedTuple):
+    """Result and cost of a run.
+
+    Attributes
+    ----------
+    log_evidence, log_evidence_error : float
+        As reported by the sampler.
+    mean, mean_error, sd : (ndim,) float
+        Of the chain.
+    samples : (n, ndim) float
+        The chain.
+    effective_sample_size : float
+        Of the verdict.
+    simulations : float
+        Simulations of the whole record (parts count as fractions).
+    status, reasons : str
+        The verdict.
+    seconds, overhead : float
+        Wall time, and CPU time of this process outside simulations [s].
+    warnings : list of str
+        Messages of the sampler.
+    failed : str
+        Exception that ended the run, empty if there was none.
+    """
+
+    log_evidence: float = np.nan
+    log_evidence_error: float = np.nan
+    mean: Any = None
+    mean_error: Any = None
+    sd: Any = None
+    samples: Any = None
+    effective_sample_size: float = 0.0
+    simulations: float = 0.0
+    status: str = ""
+    reasons: str = ""
+    seconds: float = 0.0
+    overhead: float = 0.0
+    warnings: tuple[str, ...] = ()
+    failed: str = ""
+
+
+class Errors(NamedTuple):
+    """Errors of a run.
+
+    Attributes
+    ----------
+    log_evidence, log_evidence_z : float
+        Error of log Z, absolute and in standard errors.
+    mean, mean_z : float
+        Largest error of a mean, in standard deviations of the reference and in standard errors.
+    sd : float
+        Largest relative error of a standard deviation.
+    share : float
+        Largest error of the share of a mode.
+    judgement : str
+        "right", "refused" (the verdict is "not usable"), "WRONG", or the exception that ended the run.
+    """
+
+    log_evidence: float
+    log_evidence_z: float
+    mean: float
+    mean_z: float
+    sd: float
+    share: float
+    judgement: str
+
+
+def run(posterior: Any, seed: int, budget: float | None, *, guided: bool = True, **settings: Any) -> Outcome:
+    """Run `SMCSampler` with the posterior's guide and a budget, or the default sampler.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    seed : int
+        Seed of the sampler.
+    budget : float or None
+        Largest number of simulations.
+    guided : bool
+        False: the default sampler, with 1 sweep more than the annealing.
+    **settings
+        Other arguments of `SMCSampler`.
+
+    Returns
+    -------
+    Outcome
+    """
+    walkers = settings.pop("nwalkers", WALKERS)
+    if guided:
+        settings |= {"guide": posterior.guide()}
+    if budget is not None:
+        settings |= {"max_simulations": budget}
+    start, cpu = time.perf_counter(), time.process_time()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            sampler = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=seed, **settings)
+            sampler.run_mcmc(None, 1)
+        except Exception as error:  # reported in the table
+            message = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            return Outcome(failed=message, seconds=time.perf_counter() - start)
+    report, verdict = posterior.report(), sampler.verdict
+    in_this_process = posterior.likelihood.pool is None and not getattr(posterior.likelihood.model, "isolated", False)
+    samples = sampler.get_chain(flat=True)
+    return Outcome(
+        log_evidence=float(sampler.log_evidence),
+        log_evidence_error=float(sampler.log_evidence_error),
+        mean=samples.mean(axis=0),
+        mean_error=sampler.mean_error(),
+        sd=samples.std(axis=0),
+        samples=samples,
+        effective_sample_size=float(verdict.effective_sample_size),
+        simulations=float(verdict.simulations),
+        status=verdict.status,
+        reasons="; ".join(verdict.reasons),
+        seconds=time.perf_counter() - start,
+        overhead=max(0.0, time.process_time() - cpu - in_this_process * report["seconds"]),
+        warnings=tuple(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)),
+    )
+
+
+def compare(outcome: Outcome, reference: Any, labels: Callable[[np.ndarray], np.ndarray] | None = None) -> Errors:
+    """Errors of a run, and whether they lie within what the run says.
+
+    Parameters
+    ----------
+    outcome : Outcome
+    reference : object
+        With the attributes log_evidence, mean, sd, shares and, of each, ``..._error``.
+    labels : callable, optional
+        Function of samples (n, ndim) that returns the number of the mode (n,).
+
+    Returns
+    -------
+    Errors
+    """
+    if outcome.failed:
+        return Errors(*[np.nan] * 6, outcome.failed)
+    evidence = outcome.log_evidence - reference.log_evidence
+    evidence_se = np.hypot(outcome.log_evidence_error, reference.log_evidence_error)
+    mean = np.abs(outcome.mean - reference.mean)
+    mean_se = np.hypot(outcome.mean_error, reference.mean_error)
+    n = max(outcome.effective_sample_size, 1.0)
+    sd = np.abs(outcome.sd / reference.sd - 1.0)
+    share = share_z = 0.0
+    if labels is not None:
+        found = np.mean(labels(outcome.samples)[:, None] == np.arange(len(reference.shares)), axis=0)
+        error = np.hypot(np.sqrt(reference.shares * (1.0 - reference.shares) / n), reference.shares_error)
+        differences = np.abs(found - reference.shares)
+        share, share_z = differences.max(), (np.maximum(differences - ROUNDING, 0.0) / np.maximum(error, 1e-9)).max()
+    wrong = (
+        abs(evidence) > LIMIT * evidence_se + ROUNDING
+        or np.any(mean > LIMIT * mean_se + ROUNDING * reference.sd)
+        or np.any(sd > LIMIT / np.sqrt(n) + 2.0 * ROUNDING)  # also for tails heavier than Gaussian
+        or share_z > LIMIT
+    )
+    judgement = "refused" if outcome.status == "not usable" else "WRONG" if wrong else "right"
+    return Errors(
+        float(evidence),
+        float(evidence / evidence_se),
+        float((mean / reference.sd).max()),
+        float((mean / mean_se).max()),
+        float(sd.max()),
+        float(share),
+        judgement,
+    )

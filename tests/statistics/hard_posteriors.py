@@ -1,0 +1,433 @@
+"""Small posteriors on which a sampler that spends few simulations must be right, or refuse.
+
+Every case is a cheap Python function behind a `FunctionModel`, so that a posterior takes seconds. Most responses are
+linear combinations of smooth shapes over time, with nonlinear functions of the parameters as coefficients
+(*features*). With n samples, noise sigma and shapes of mean square one, a feature has the standard deviation
+sigma / sqrt(n). `reference` gives evidence, moments and mode shares of a case by brute force, with their errors.
+
+No model can be shortened (there is no method ``first``), and most have one channel. The cases are those in which a
+search from few starts, a smooth emulator or a Gaussian approximation goes wrong: several modes, bounds, failing
+simulations, likelihoods with jumps, curved and flat posteriors, few samples, noisy runs.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    Distribution,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    HalfNormal,
+    LogNormal,
+    Measurements,
+    Posterior,
+    SimulationFailed,
+    TruncatedNormal,
+    Uniform,
+)
+
+__all__ = ["CASES", "HardPosterior", "hash_uniform"]
+
+DT = 0.02  # s
+Features = Callable[[np.ndarray], np.ndarray]
+
+
+def hash_uniform(x: np.ndarray, salt: int = 0) -> np.ndarray:
+    """Numbers in [0, 1), one per row of x (n, d): equal rows give equal numbers, others look independent."""
+    bits = np.ascontiguousarray(x, dtype=float).view(np.uint64)
+    state = np.full(len(bits), 0x9E3779B97F4A7C15 + salt, dtype=np.uint64)
+    for column in bits.T:  # the finaliser of SplitMix64, once per column
+        state = state ^ column
+        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        state = state ^ (state >> np.uint64(31))
+    return (state >> np.uint64(11)) / 2.0**53
+
+
+def _combine(features: Features, shapes: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Responses (n, n_channels, n_steps) from features (n, k) and shapes (k, n_channels, n_steps)."""
+    return np.tensordot(features(theta), shapes, axes=1)
+
+
+class _OneRun:
+    """One simulation: a row of the responses, or `SimulationFailed` where it is NaN."""
+
+    def __init__(self, respond: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.respond = respond
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        response = self.respond(theta[None])[0]
+        if np.isnan(response).any():
+            raise SimulationFailed("the solution did not converge")
+        return response
+
+
+@dataclass(frozen=True)
+class HardPosterior:
+    """A small posterior that is hard in one way.
+
+    Attributes
+    ----------
+    what : str
+        What makes it hard.
+    prior : dict of str to Distribution
+        Priors of the structural parameters.
+    features : callable, optional
+        Function of theta (n, d) that returns the coefficients (n, k) of the shapes; NaN where a simulation fails.
+    target : (k,) array_like
+        Features of the noise-free data; need not be features of any theta.
+    respond : callable, optional
+        Function of theta (n, d) that returns (n, n_channels, n_steps), instead of `features`.
+    truth : (d,) array_like, optional
+        Parameters of the noise-free data where `respond` is given.
+    noise : float
+        Standard deviation of the noise of the data.
+    n_steps, n_channels : int
+        Size of the data.
+    error_model : {"marginal", "white", "autoregressive"}
+        White noise with sigmas integrated out, or with sigmas as parameters, or autoregressive noise.
+    label : callable, optional
+        Function of theta (n, d) that returns the number of the mode (n,), from 0.
+    n_modes : int
+        Number of modes.
+    balanced : bool
+        Whether the noise has no component along the shapes, so that it does not change the shares of the modes.
+    """
+
+    what: str
+    prior: Mapping[str, Distribution]
+    features: Features | None = None
+    target: Any = None
+    respond: Callable[[np.ndarray], np.ndarray] | None = None
+    truth: Any = None
+    noise: float = 0.05
+    n_steps: int = 200
+    n_channels: int = 1
+    error_model: str = "marginal"
+    label: Callable[[np.ndarray], np.ndarray] | None = None
+    n_modes: int = 1
+    balanced: bool = False
+
+    @property
+    def shapes(self) -> np.ndarray:
+        """Shapes of the features over time (k, n_channels, n_steps), of mean square one per channel."""
+        t = (np.arange(self.n_steps) + 0.5) / self.n_steps
+        k, c = np.arange(len(self.target))[:, None, None], np.arange(self.n_channels)[:, None]
+        return np.sqrt(2.0) * np.sin(np.pi * (k + 1 + c) * t)
+
+    def responses(self, theta: np.ndarray) -> np.ndarray:
+        """Responses of many parameter sets (n, d) at once: (n, n_channels, n_steps), NaN where a simulation fails."""
+        if self.respond is not None:
+            return self.respond(theta)
+        return _combine(self.features, self.shapes, theta)
+
+    def labels(self, theta: np.ndarray) -> np.ndarray:
+        """Number of the mode (n,) of every point (n, ndim)."""
+        return np.zeros(len(theta), dtype=int) if self.label is None else self.label(theta)
+
+    def data(self, seed: int) -> np.ndarray:
+        """Noise-free response plus white noise of a seed: (n_channels, n_steps)."""
+        if self.respond is not None:
+            clean = self.respond(np.array([self.truth], dtype=float))[0]
+        else:
+            clean = np.tensordot(np.asarray(self.target, dtype=float), self.shapes, axes=1)
+        noise = np.random.default_rng([seed, 7]).standard_normal(clean.shape)
+        if self.balanced:
+            rows = self.shapes.reshape(len(self.target), -1)
+            along = np.linalg.lstsq(rows.T, noise.ravel(), rcond=None)[0]
+            noise -= (along @ rows).reshape(noise.shape)
+        return clean + self.noise * noise
+
+    def posterior(self, seed: int, name: str = "hard") -> Posterior:
+        """Posterior given the data of a seed, with a model that runs one simulation per call."""
+        channels = tuple(Channel(f"c{i + 1}", "displacement", "m") for i in range(self.n_channels))
+        model = FunctionModel(_OneRun(self.responses), tuple(self.prior), channels, DT, self.n_steps, version=name)
+        measurements = Measurements(channels, DT, self.data(seed), f"SYNTHETIC, {name}, seed {seed}")
+        prior = dict(self.prior) | {f"sigma_{channel.name}": HalfNormal(0.5) for channel in channels}
+        if self.error_model == "autoregressive":
+            prior |= {f"rho_{channel.name}": Uniform(-1.0, 1.0) for channel in channels}
+            return Posterior(FELikelihood(model, measurements, AutoregressiveNoise(channels)), prior)
+        posterior = Posterior(FELikelihood(model, measurements, GaussianNoise(channels)), prior)
+        return posterior.marginal() if self.error_model == "marginal" else posterior
+
+
+def _three(mean: float = 1.0, sd: float = 0.4) -> dict[str, Distribution]:
+    return {name: TruncatedNormal(mean, sd) for name in ("a", "b", "c")}
+
+
+# ------------------------------------------------------------------ features
+
+
+def _smooth(x):
+    a, b, c = x.T
+    return np.stack([a * b, b**1.5, c / (1.0 + 0.3 * a)], axis=1)
+
+
+def _two_modes(x):
+    a, b, c = x.T
+    # a exp(1 - a) has the value 0.729 at a = 0.4 and at a = 2.02, with slopes of ratio three
+    return np.stack([a * np.exp(1.0 - a) * b, b, c * (1.0 + 0.2 * a)], axis=1)
+
+
+def _three_modes(x):
+    a, b, c = x.T
+    return np.stack([(a - 0.4) * (a - 0.9) * (a - 2.0) * b, b, c * (1.0 + 0.2 * a)], axis=1)
+
+
+def _far(width, gain, x):
+    a, b, c = x.T
+    dip = 2.4 * np.exp(-0.5 * ((a - 2.4) / width) ** 2)
+    # the last feature is an effect that only the narrow modes have: it gives them a share of about one half
+    return np.stack([(a - dip) * b, b, c, gain / (1.0 + np.exp(-40.0 * (a - 1.8)))], axis=1)
+
+
+def _at_bounds(x):
+    a, b, c, d = x.T
+    return np.stack([a + 0.1 * b, b * (1.0 + 0.3 * a), b * c, d], axis=1)
+
+
+def _failing_region(x):
+    return np.where((x[:, 0] + x[:, 1] > 2.476)[:, None], np.nan, _smooth(x))
+
+
+def _failing_scattered(x):
+    return np.where((hash_uniform(x) < 0.2)[:, None], np.nan, _smooth(x))
+
+
+def _failing_mean(x):
+    return np.where((np.abs(x[:, :2] - 1.0) < 0.25).all(axis=1)[:, None], np.nan, _smooth(x))
+
+
+def _rough(size, x):
+    cells = np.floor(x[:, :2] / np.array([0.004, 0.003]))
+    jumps = np.stack([hash_uniform(cells, salt) - 0.5 for salt in (1, 2)], axis=1)
+    features = _smooth(x)
+    features[:, :2] += 2.0 * size * 0.05 / np.sqrt(200.0) * jumps
+    return features
+
+
+def _banana(thickness, x):
+    a, b, c = x.T
+    return np.stack([(b - a**2) * 0.0035 / thickness, 0.02 * a, c], axis=1)
+
+
+def _unidentified(x):
+    return _smooth(x[:, :3])
+
+
+def _product(x):
+    a, b, c = x.T
+    return np.stack([a * b, c * np.sqrt(a * b)], axis=1)
+
+
+def _noisy_runs(x):
+    features = _smooth(x)
+    errors = np.stack([hash_uniform(x, salt) - 0.5 for salt in range(3)], axis=1)
+    return features * (1.0 + 2e-6 * errors)
+
+
+def _uninformative(x):
+    return 0.01 * _smooth(x)
+
+
+def _four(x):
+    a, b, c, d = x.T
+    return np.stack([a * b, b + 0.3 * c**2, c * d, np.sqrt(a) - 0.5 * d], axis=1)
+
+
+class _Partial:
+    """A function of features with its first arguments given; a plain object, so that it has a readable name."""
+
+    def __init__(self, function, *first):
+        self.function, self.first = function, first
+
+    def __call__(self, x):
+        return self.function(*self.first, x)
+
+
+# ------------------------------------------------------------------ responses over time
+
+
+def _pushover(x, n_steps=200):
+    """Force of a bilinear spring under a growing displacement up to one: the yield displacement may be beyond it."""
+    k, uy, hardening = x.T[:, :, None]
+    u = np.linspace(0.0, 1.0, n_steps)
+    return (k * (np.minimum(u, uy) + 0.1 * hardening * np.maximum(u - uy, 0.0)))[:, None]
+
+
+def _free_vibration(x, n_steps=400):
+    """Twenty cycles of a decaying vibration: the likelihood of the stiffness has a local maximum every few per cent."""
+    stiffness, damping, amplitude = x.T[:, :, None]
+    phase = 2.0 * np.pi * 20.0 * np.sqrt(stiffness) * np.linspace(0.0, 1.0, n_steps)
+    return (amplitude * np.exp(-0.02 * damping * phase) * np.cos(phase))[:, None]
+
+
+def _small_or_large(x):
+    return (x[:, 0] > 1.0).astype(int)
+
+
+def _thirds(x):
+    return np.searchsorted([0.636, 1.564], x[:, 0])  # the extrema between the three roots
+
+
+def _near_or_far(x):
+    return np.searchsorted([1.5, 2.4], x[:, 0])
+
+
+def _spring_prior():
+    return {"k": TruncatedNormal(1.0, 0.3), "uy": LogNormal(1.5, 0.4), "hardening": TruncatedNormal(1.0, 0.5)}
+
+
+_WIDE = {"a": Uniform(0.0, 3.0), "b": TruncatedNormal(1.0, 0.3), "c": TruncatedNormal(1.0, 0.4)}
+
+CASES = {
+    "smooth": HardPosterior("nothing: a mildly curved posterior, for comparison", _three(), _smooth, [0.9, 1.1, 0.7]),
+    "two_modes": HardPosterior(
+        "two modes, one three times as wide as the other",
+        {"a": TruncatedNormal(1.2, 0.7), "b": TruncatedNormal(1.0, 0.3), "c": TruncatedNormal(1.0, 0.4)},
+        _two_modes,
+        [0.729, 1.0, 1.08],
+        label=_small_or_large,
+        n_modes=2,
+    ),
+    "three_modes": HardPosterior(
+        "three modes with widths of 1, 1.5 and 0.5",
+        {"a": Uniform(0.0, 2.6), "b": TruncatedNormal(1.0, 0.3), "c": TruncatedNormal(1.0, 0.4)},
+        _three_modes,
+        [0.0, 1.0, 1.2],
+        label=_thirds,
+        n_modes=3,
+    ),
+    "far": HardPosterior(
+        "two narrow modes with half the mass, in a region that holds a tenth of the prior, far from the wide mode",
+        _WIDE,
+        _Partial(_far, 0.15, 0.0063),
+        [0.8, 1.0, 1.0, 0.0063],
+        label=_near_or_far,
+        n_modes=3,
+        balanced=True,
+    ),
+    "farther": HardPosterior(
+        "as the case far, in a region that holds three per cent of the prior: no start may find it",
+        _WIDE,
+        _Partial(_far, 0.045, 0.0083),
+        [0.8, 1.0, 1.0, 0.0083],
+        label=_near_or_far,
+        n_modes=3,
+        balanced=True,
+    ),
+    "bounds": HardPosterior(
+        "three of four parameters at a bound of their prior",
+        {
+            "a": Uniform(0.0, 2.0),
+            "b": TruncatedNormal(1.0, 0.4),
+            "c": TruncatedNormal(1.0, 0.5),
+            "d": Uniform(0.0, 2.0),
+        },
+        _at_bounds,
+        [0.1 - 0.004, 1.0, 0.0, 2.01],
+    ),
+    "failing_region": HardPosterior(
+        "simulations fail in a region with 20 % of the prior and half of the posterior that would be there without it",
+        _three(),
+        _failing_region,
+        [1.3 * 1.176, 1.176**1.5, 1.0 / 1.39],
+    ),
+    "failing_scattered": HardPosterior(
+        "one simulation in five fails, at points without any pattern", _three(), _failing_scattered, [0.9, 1.1, 0.7]
+    ),
+    "failing_mean": HardPosterior(
+        "simulations fail around the mean of the prior", _three(), _failing_mean, [1.3, 0.7, 0.7]
+    ),
+    "rough_mild": HardPosterior(
+        "a log-likelihood with jumps of up to one", _three(), _Partial(_rough, 0.5), [0.9, 1.1, 0.7]
+    ),
+    "rough": HardPosterior(
+        "a log-likelihood with jumps of one to three", _three(), _Partial(_rough, 1.5), [0.9, 1.1, 0.7]
+    ),
+    "banana": HardPosterior(
+        "a curved posterior, bent by several times its thickness",
+        {"a": TruncatedNormal(1.0, 0.5), "b": TruncatedNormal(1.0, 1.0), "c": TruncatedNormal(1.0, 0.4)},
+        _Partial(_banana, 0.02),
+        [0.0, 0.02, 1.0],
+    ),
+    "thin_banana": HardPosterior(
+        "a curved posterior, bent by thirty times its thickness",
+        {"a": TruncatedNormal(1.0, 0.5), "b": TruncatedNormal(1.0, 1.0), "c": TruncatedNormal(1.0, 0.4)},
+        _Partial(_banana, 0.0035),
+        [0.0, 0.02, 1.0],
+    ),
+    "unidentified": HardPosterior(
+        "a parameter without any effect",
+        _three() | {"d": LogNormal(1.0, 0.6)},
+        _unidentified,
+        [0.9, 1.1, 0.7],
+    ),
+    "product": HardPosterior("two parameters of which only the product has an effect", _three(), _product, [0.9, 0.95]),
+    "threshold": HardPosterior(
+        "two parameters that have no effect at the mean of the prior, where the bars do not yield",
+        _spring_prior(),
+        respond=_pushover,
+        truth=[1.1, 0.7, 1.4],
+        noise=0.02,
+    ),
+    "threshold_edge": HardPosterior(
+        "data that barely say whether the bars yield",
+        _spring_prior(),
+        respond=_pushover,
+        truth=[1.1, 0.9, 1.0],
+        noise=0.1,
+    ),
+    "few_samples": HardPosterior(
+        "30 samples for four parameters",
+        _three() | {"d": TruncatedNormal(1.0, 0.4)},
+        _four,
+        [1.0, 1.3, 1.0, 0.5],
+        noise=0.3,
+        n_steps=30,
+    ),
+    "noisy_runs": HardPosterior(
+        "runs with a relative noise of 1e-6, and a precise measurement",
+        _three(),
+        _noisy_runs,
+        [0.9, 1.1, 0.7],
+        noise=0.001,
+    ),
+    "side_lobes": HardPosterior(
+        "a frequency: local maxima of the likelihood every few per cent, a model that cannot be shortened",
+        {
+            "stiffness": TruncatedNormal(1.0, 0.3),
+            "damping": LogNormal(1.0, 0.5),
+            "amplitude": TruncatedNormal(1.0, 0.3),
+        },
+        respond=_free_vibration,
+        truth=[1.23, 0.8, 1.1],
+        noise=0.2,
+        n_steps=400,
+    ),
+    "sampled_noise": HardPosterior(
+        "standard deviations of the noise as parameters, two channels",
+        _three(),
+        _smooth,
+        [0.9, 1.1, 0.7],
+        n_channels=2,
+        error_model="white",
+    ),
+    "correlated_noise": HardPosterior(
+        "autoregressive noise with two parameters, one channel",
+        _three(),
+        _smooth,
+        [0.9, 1.1, 0.7],
+        error_model="autoregressive",
+    ),
+    "uninformative": HardPosterior(
+        "data that say almost nothing", _three(), _uninformative, [0.009, 0.011, 0.007], noise=0.1
+    ),
+}
+"""All cases by name."""
