@@ -138,6 +138,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         read_dataset,
         write_dataset,
     )
+    from .signals.durations import (
+        growing_durations,
+    )
     from .signals.error_measures import (
         rrmse,
     )
@@ -229,6 +232,7 @@ __all__ = [
     "fit_measures",
     "fragility",
     "from_si",
+    "growing_durations",
     "innovations",
     "nautilus_prior",
     "peak",
@@ -352,6 +356,7 @@ _EXPORTS = {
         "read_dataset",
         "write_dataset",
     ),
+    "signals.durations": ("growing_durations",),
     "signals.error_measures": ("rrmse",),
     "signals.readers": (
         "ImposedTest",

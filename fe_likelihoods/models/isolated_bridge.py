@@ -31,7 +31,7 @@ from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Sl
 from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, step_isolated
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sampling import same_sampling
+from ..signals.sampling import same_sampling, sample_window
 from ..simulation.model import SimulationFailed
 from .base import History
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS, channel_matrix
@@ -240,6 +240,29 @@ class IsolatedBridge(ThreadedModel):
     def with_record(self, record: Record) -> IsolatedBridge:
         """Return the same bridge under another acceleration of the table, without vertical acceleration."""
         return replace(self, record=record, vertical=None)
+
+    def first(self, seconds: float) -> IsolatedBridge:
+        """Return the same bridge under the first part of its records.
+
+        Parameters
+        ----------
+        seconds : float
+            Time of the last sample of the response [s]; between two samples, the earlier one is the last.
+
+        Returns
+        -------
+        IsolatedBridge
+            Its response is the first part of the response of this model.
+
+        Raises
+        ------
+        ValueError
+            If the time is not within the response, or fewer than two samples remain.
+        """
+        last = sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
+        stop = last * self.every * self.record.dt
+        vertical = None if self.vertical is None else self.vertical.trim(0.0, stop)
+        return replace(self, record=self.record.trim(0.0, stop), vertical=vertical)
 
     def history(self, theta: np.ndarray) -> BridgeHistory:
         """Simulate and return states, hysteretic variables and all channels.

@@ -76,6 +76,26 @@ class LinearOscillator(StructuralModel):
             raise ValueError(f"LinearOscillator: expected a Record as excitation; got {type(record).__name__}")
         return type(self)(record, self.period, self.damping_ratio)
 
+    def first(self, seconds: float) -> LinearOscillator:
+        """Return the same oscillator under the first part of its record.
+
+        Parameters
+        ----------
+        seconds : float
+            Time of the last sample of the response [s]; between two samples, the earlier one is the last.
+
+        Returns
+        -------
+        LinearOscillator
+            Its response is the first part of the response of this model.
+
+        Raises
+        ------
+        ValueError
+            If the time is not within the response, or fewer than two samples remain.
+        """
+        return self.with_record(self.record.trim(0.0, seconds))
+
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         stiffness, damping = theta.tolist()
         damping_ratio = damping * self.damping_ratio

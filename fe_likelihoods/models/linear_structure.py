@@ -282,6 +282,28 @@ class LinearStructure(ExternalModel):
         """Return the same structure under other accelerations of its supports; errors as for a new one."""
         return type(self)(self.parts, record, self.unit, self.lead)
 
+    def first(self, seconds: float) -> LinearStructure:
+        """Return the same structure under the first part of its records.
+
+        Parameters
+        ----------
+        seconds : float
+            Time of the last sample of the response [s], which starts after the lead; between two samples, the earlier
+            one is the last.
+
+        Returns
+        -------
+        LinearStructure
+            Its response is the first part of the response of this model.
+
+        Raises
+        ------
+        ValueError
+            If the time is not within the response, or fewer than two samples remain.
+        """
+        last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
+        return self.with_record([support.trim(0.0, last * self.dt) for support in self.supports])
+
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         system = self.parts.assemble(theta)
         modes = _modes(system)

@@ -35,6 +35,7 @@ from ..kernels.newmark import Dynamics
 from ..kernels.static import Iteration
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
+from ..signals.sampling import sample_window
 from ..units import G0, find_unit
 from .circular_section import Confinement, gauss_lobatto
 from .rc_column_analysis import BaseMotion, ColumnHistory, ImposedMotion, check_physical_values, set_materials
@@ -293,6 +294,30 @@ class RCColumn(ThreadedModel):
                 "build a new RCColumn for another type, because the channels depend on it",
             )
         return replace(self, loading=record)
+
+    def first(self, seconds: float) -> RCColumn:
+        """Return the same column under the first part of its loading.
+
+        Parameters
+        ----------
+        seconds : float
+            Time of the last sample of the response [s]; between two samples, the earlier one is the last. Under a
+            `DisplacementHistory`, the number of the last step.
+
+        Returns
+        -------
+        RCColumn
+            Its response is the first part of the response of this model.
+
+        Raises
+        ------
+        ValueError
+            If the time is not within the response, or fewer than two samples remain.
+        """
+        window = sample_window("the response", self.n_steps, self.dt, 0.0, seconds)
+        if isinstance(self.loading, Record):
+            return self.with_record(self.loading.trim(0.0, seconds))
+        return self.with_record(replace(self.loading, displacement=self.loading.displacement[window]))
 
     def history(self, theta: np.ndarray) -> ColumnHistory:
         """Simulate and return all histories that the kernels record: displacements, forces and energies.

@@ -16,6 +16,7 @@ import numpy as np
 from ..kernels import reinforcing_steel
 from ..kernels.jit import KERNEL_HASH
 from ..signals.channels import Channel
+from ..signals.sampling import sample_window
 from ..simulation.model import SimulationFailed
 from .base import BuiltInModel
 from .rc_column_parts import Steel
@@ -105,6 +106,26 @@ class SteelCoupon(BuiltInModel):
     def with_record(self, strain: np.ndarray) -> SteelCoupon:
         """Return the same steel under other strains (n_steps,), starting again from the unloaded bar."""
         return replace(self, strain=strain)
+
+    def first(self, seconds: float) -> SteelCoupon:
+        """Return the same steel under the first part of its strains.
+
+        Parameters
+        ----------
+        seconds : float
+            Number of the last step, which the response has instead of time.
+
+        Returns
+        -------
+        SteelCoupon
+            Its response is the first part of the response of this model.
+
+        Raises
+        ------
+        ValueError
+            If the time is not within the response, or fewer than two samples remain.
+        """
+        return self.with_record(self.strain[sample_window("the response", self.n_steps, self.dt, 0.0, seconds)])
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         v = self.physical_values(theta)

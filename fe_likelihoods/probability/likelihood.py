@@ -109,6 +109,35 @@ class FELikelihood(CachedSimulations):
         """Number of parameters."""
         return len(self.parameter_names)
 
+    def first(self, seconds: float) -> "FELikelihood":
+        """The likelihood of the first part of the measurements, if the model has a method ``first(seconds)``.
+
+        Noise, pool, cache on disk and limits are kept; counts and the cache in memory start empty.
+
+        Parameters
+        ----------
+        seconds : float
+            Time of the last sample [s]; between two samples, the earlier one is the last.
+
+        Returns
+        -------
+        FELikelihood
+
+        Raises
+        ------
+        ValueError
+            If the model cannot be shortened, or the time is not within the measurements.
+        """
+        if not hasattr(self.model, "first"):
+            raise ValueError(
+                f"{type(self.model).__name__} cannot be shortened: it needs a method first(seconds) that returns the "
+                "same model under the first part of its excitation"
+            )
+        measurements = self.measurements.trim(0.0, seconds)
+        # the time of a sample, which leaves no doubt about the length of the response
+        model = self.model.first((measurements.n_steps - 1) * measurements.dt)
+        return self._with(model, measurements, self.noise)
+
     def residuals(self, theta: np.ndarray) -> np.ndarray:
         """Measured minus simulated response at one point: one simulation, which is neither counted nor cached.
 
@@ -179,9 +208,12 @@ class FELikelihood(CachedSimulations):
 
         Model, measurements, pool, cache on disk and limits are kept; counts and the cache in memory start empty.
         """
+        return self._with(self.model, self.measurements, noise)
+
+    def _with(self, model: Model, measurements: Measurements, noise: Noise) -> "FELikelihood":
         other = FELikelihood(
-            self.model,
-            self.measurements,
+            model,
+            measurements,
             noise,
             memory_rows=self.memory_cache.rows,
             cache=self.cache,

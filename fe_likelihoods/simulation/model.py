@@ -107,6 +107,11 @@ class Model(Protocol):
     A model may also have ``simulate_batch(thetas) -> SimulationBatch`` and
     ``misfit_batch(thetas, measured) -> MisfitBatch``, whose rows must be the results of `simulate`, and
     ``with_record(record)``, which returns the same model under another excitation, for predictions.
+
+    With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
+    returns the same model under the first part of its excitation. The response of that model must be the first samples
+    of the response of this one, up to and including the given time [s], which is that of a sample, and its fingerprint
+    must be another one.
     """
 
     @property

@@ -1,0 +1,109 @@
+"""Models under the first part of their excitation: the response is the first part of the whole response."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.models.linear_structure import LinearStructure
+from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
+from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.models.steel_coupon import SteelCoupon
+from fe_likelihoods.probability.autoregressive_noise import AutoregressiveNoise
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.problems import bridge_column, isolated_bridge
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.durations import growing_durations
+from fe_likelihoods.signals.records import DisplacementHistory, Record
+
+RECORD = bridge_column(every=2, duration=8.0).likelihood.model.loading
+TABLE = Record("table", 0.005, 3.0 * np.sin(np.arange(400) / 20.0))
+THETA = {"frequency": 3.7, "damping": 0.05, "share": 0.8, "shape": 0.3}
+
+
+def cases():
+    column = RCColumn.lhpost(RECORD, mesh=10)
+    imposed = DisplacementHistory("cycles", np.array([0.0, 0.05, -0.05, 0.1, -0.1]))
+    bridge = isolated_bridge(data="means").likelihood.model
+    vertical = bridge.with_record(TABLE)
+    strain = np.concatenate([np.linspace(0.0, 0.02, 60), np.linspace(0.02, -0.01, 60)])
+    supports = [RECORD, RECORD.scale(0.9), RECORD.scale(1.1)]
+    return {
+        "oscillator": (LinearOscillator(RECORD), 5.003),
+        "column": (column, 5.003),
+        "column, substeps": (RCColumn.lhpost(RECORD, mesh=10, substeps=2), 5.003),
+        "column, imposed": (RCColumn.lhpost(imposed, mesh=10, parameters=("Ec", "ft")), 3.2),
+        "bridge": (vertical, 1.2321),
+        "bridge, vertical, every third": (
+            type(bridge)(TABLE, vertical=TABLE.scale(0.5), every=3, outputs=bridge.outputs),
+            1.2321,
+        ),
+        "coupon": (SteelCoupon(strain, column.steel), 70.0),
+        "frame": (LinearStructure(ShearFrame({"top": 2}, (1.0, 1.0), (900.0, 900.0)), RECORD), 5.003),
+        "deck": (LinearStructure(BridgeDeck("m", "a", "b"), supports), 5.003),
+        "deck, lead": (LinearStructure(BridgeDeck("m"), supports, lead=2.0), 5.003),
+    }
+
+
+@pytest.mark.parametrize(("model", "seconds"), cases().values(), ids=cases().keys())
+def test_the_response_is_the_first_part_bit_for_bit(model, seconds, rng):
+    part = model.first(seconds)
+    measured = Measurements(model.channels, model.dt, np.zeros((len(model.channels), model.n_steps)))
+    n_steps = measured.trim(0.0, seconds).n_steps  # the same rule for models and measurements
+    assert 2 < n_steps < model.n_steps
+    assert (part.n_steps, part.dt, part.parameter_names) == (n_steps, model.dt, model.parameter_names)
+    assert [channel.name for channel in part.channels] == [channel.name for channel in model.channels]
+    nominal = [THETA.get(name, 0.05 if name.startswith("damping_") else 1.0) for name in model.parameter_names]
+    for _ in range(3):
+        theta = np.array(nominal) * rng.uniform(0.9, 1.1, size=len(nominal))
+        np.testing.assert_array_equal(part.simulate(theta), model.simulate(theta)[:, :n_steps])
+
+
+@pytest.mark.parametrize(("model", "seconds"), cases().values(), ids=cases().keys())
+def test_fingerprints_of_parts(model, seconds):
+    part, end = model.first(seconds), (model.n_steps - 1) * model.dt
+    assert part.fingerprint != model.fingerprint
+    assert part.fingerprint == model.first(seconds).fingerprint
+    assert part.fingerprint == model.first(end).first(seconds).fingerprint
+    assert model.first(end).n_steps == model.n_steps
+    for wrong in (0.0, -1.0, 1e6, 0.5 * model.dt, np.nan):
+        with pytest.raises(ValueError, match=r"expected 0 <= start|fewer than 2 samples"):
+            model.first(wrong)
+
+
+@pytest.mark.parametrize("pool", [None, 2])
+def test_the_likelihood_of_the_first_part(pool, rng, tmp_path):
+    model = LinearOscillator(RECORD)
+    values = model.simulate([1.0, 1.0]) + 0.01 * rng.normal(size=(2, model.n_steps))
+    measurements = Measurements(model.channels, model.dt, values)
+    whole = FELikelihood(
+        model, measurements, AutoregressiveNoise(model.channels), pool=pool, cache=tmp_path / "cache.sqlite"
+    )
+    part = whole.first(5.003)
+    expected = FELikelihood(model.first(5.003), measurements.trim(0.0, 5.003), whole.noise)
+    x = np.array([[1.02, 0.9, 0.01, 0.02, 0.1, 0.2], [0.98, 1.1, 0.01, 0.02, 0.1, 0.2]])
+    np.testing.assert_array_equal(part.log_likelihood(x), expected.log_likelihood(x))
+    assert (part.log_likelihood(x) != whole.log_likelihood(x)).all()
+    assert (part.simulations, whole.simulations) == (2, 2)
+    assert part.fingerprint == expected.fingerprint != whole.fingerprint
+    assert whole.cache.info().simulations == 4
+    if pool is not None:
+        whole.pool.close()
+
+
+def straight(theta):
+    return theta * np.arange(10.0)[None]
+
+
+def test_a_model_that_cannot_be_shortened():
+    model = FunctionModel(straight, ("a",), [Channel("y", "displacement", "m")], 0.1, 10)
+    likelihood = FELikelihood(model, Measurements(model.channels, 0.1, np.ones((1, 10))))
+    with pytest.raises(ValueError, match=r"FunctionModel cannot be shortened: it needs a method first\(seconds\)"):
+        likelihood.first(0.5)
+
+
+def test_the_parts_of_the_record_of_the_column():
+    record = bridge_column().likelihood.model.loading
+    durations = growing_durations(record.acceleration, record.dt)
+    np.testing.assert_allclose(durations, [7.6, 14.2, 20.8, 33.0, 50.0], atol=0.1)
+    assert durations[-1] == record.duration
