@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
     from . import presets
+    from .moves.guided import (
+        GuideMove,
+    )
     from .moves.kernels import (
         MixtureMove,
         RandomWalkMove,
@@ -49,10 +52,16 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .tempering.evidence_check import (
         EvidenceCheck,
     )
+    from .tempering.guide import (
+        Guide,
+        GuideSession,
+    )
     from .tempering.population import (
+        GuidedRound,
         Stage,
     )
     from .tempering.settings import (
+        GuidedSettings,
         RecyclingSettings,
         Settings,
     )
@@ -63,6 +72,11 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
 __all__ = [
     "CHING_CHEN_2007",
     "EvidenceCheck",
+    "Guide",
+    "GuideMove",
+    "GuideSession",
+    "GuidedRound",
+    "GuidedSettings",
     "MixtureMove",
     "ModelComparison",
     "RAMANCHA_2022_CONSTANT",
@@ -89,6 +103,7 @@ __all__ = [
 ]
 
 _EXPORTS = {
+    "moves.guided": ("GuideMove",),
     "moves.kernels": (
         "MixtureMove",
         "RandomWalkMove",
@@ -119,8 +134,16 @@ _EXPORTS = {
     "tempered": ("TemperedSampler",),
     "tempering.diagnostics": ("SamplingWarning",),
     "tempering.evidence_check": ("EvidenceCheck",),
-    "tempering.population": ("Stage",),
+    "tempering.guide": (
+        "Guide",
+        "GuideSession",
+    ),
+    "tempering.population": (
+        "GuidedRound",
+        "Stage",
+    ),
     "tempering.settings": (
+        "GuidedSettings",
         "RecyclingSettings",
         "Settings",
     ),

@@ -38,6 +38,10 @@ class SMCSampler(TemperedSampler):
     coarse_log_prob_fn : callable, optional
         A cheaper `log_prob_fn` to anneal on first, such as ``posterior.coarse``. The result is that of `log_prob_fn`; a
         `SamplingWarning` says where the coarse model did not help. Requires recycling.
+    guide : Guide, optional
+        An object that proposes draws near the posterior, such as ``posterior.guide()`` (`samplers.tempering.guide`).
+        Its weighted draws replace the annealing, and the sweeps at beta = 1 are proposals of the guide. Where its draws
+        cannot be trusted, recycling starts from them, with a `SamplingWarning`.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator (``np.random.seed``). The random state of
         a backend that contains a chain takes precedence.
@@ -47,6 +51,8 @@ class SMCSampler(TemperedSampler):
         mode can be lost unnoticed, and recycling often fails.
     recycling : RecyclingSettings, default RecyclingSettings()
         Constants of the recycling.
+    guided : GuidedSettings, default GuidedSettings()
+        Constants of the rounds of a guide; with `guide` only.
     ess_ratio : float, default 0.5
         Effective sample size wanted of each stage, as a share of the number of walkers (`ess_rule` "constant") or of
         the previous stage's target ("declining"); between 0 and 1. Without recycling only, as the next three settings.

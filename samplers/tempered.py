@@ -26,7 +26,9 @@ from emcee.ensemble import walkers_independent
 from emcee.pbar import get_progress_bar
 
 from .moves.fast_parameters import with_fast_sweeps
+from .moves.guided import GuideMove
 from .moves.kernels import RandomWalkMove
+from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import header
 from .storage.emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
@@ -35,11 +37,12 @@ from .storage.journal import RunStart
 from .storage.recording import record, show_progress
 from .storage.returned_values import ErrorCapturing
 from .tempering.anneal import anneal
+from .tempering.budget import Budget
 from .tempering.diagnostics import check_evidence, warn
-from .tempering.evidence_check import EvidenceCheck
-from .tempering.genealogy import standard_error_of_mean
+from .tempering.guide import AdaptedGuide, Guide, GuideSession, check_guide
+from .tempering.guided import Guidance
 from .tempering.mutation import MoveSchedule, check_moves
-from .tempering.population import Population, Stage, Sweep
+from .tempering.population import Population, Sweep
 from .tempering.results import AnnealingResult
 from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
 
@@ -48,7 +51,7 @@ __all__ = ["TemperedSampler"]
 logger = logging.getLogger(__name__)
 
 
-class TemperedSampler(EnsembleSampler):
+class TemperedSampler(RunResults, EnsembleSampler):
     """emcee's ensemble sampler, preceded by annealing from the prior to the posterior.
 
     Parameters
@@ -69,6 +72,10 @@ class TemperedSampler(EnsembleSampler):
         (`samplers.tempering.multilevel`); a posterior may provide one as ``posterior.coarse``. Chain and evidence are
         those of `log_prob_fn` in any case. Blobs of the coarse model are not kept, and its failures count as -inf. A
         run that is continued from its journal evaluates the coarse model again. Requires recycling.
+    guide : Guide, optional
+        An object that proposes draws near the posterior (`samplers.tempering.guide`). Its weighted draws replace the
+        annealing, and the sweeps at beta = 1 are proposals of the guide. Where the draws cannot be trusted, recycling
+        starts from them, with a `SamplingWarning`.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
         the run, and two samplers never share a stream. The random state of a backend that contains a chain takes
@@ -116,6 +123,7 @@ class TemperedSampler(EnsembleSampler):
         *,
         log_prior_fn: Callable | None = None,
         coarse_log_prob_fn: Callable | None = None,
+        guide: Guide | None = None,
         seed: int | None = None,
         settings: Settings | None = None,
         **overrides: Any,
@@ -147,6 +155,9 @@ class TemperedSampler(EnsembleSampler):
                 f"walkers{' and recycle=False' if given.recycle is False else ''}: {self.how_to_recycle}"
             )
         self.coarse_log_prob_fn = coarse_log_prob_fn
+        self._given_guide, self._guide = guide, None
+        if guide is not None:
+            check_guide(guide, vectorize)
 
         self._checkpoint = Checkpoint(backend)
         self._result = AnnealingResult()
@@ -171,7 +182,9 @@ class TemperedSampler(EnsembleSampler):
         fast = self._optional.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(own_moves, fast, ndim, self.settings.fast_sweeps)
         set_moves(self, followed)
-        refuse_unused(given, recycle, followed != list(own_moves), self.unused_settings)
+        self._moves_of_annealing = MoveSchedule(*get_moves(self))
+        self._fast = fast
+        refuse_unused(given, recycle, followed != list(own_moves), self.unused_settings, guide is not None)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
 
@@ -182,6 +195,7 @@ class TemperedSampler(EnsembleSampler):
             convention,
             self._checkpoint,
             FailureLimit(self.settings.max_failure_share, nwalkers, ndim),
+            budget=Budget(self._optional.fast_parameters),
         )
         self._coarse_evaluator = None
         if coarse_log_prob_fn is not None:
@@ -200,77 +214,15 @@ class TemperedSampler(EnsembleSampler):
         # emcee removes the pool from the living sampler here; remove it from the copy only
         return {**self.__dict__, "pool": None}
 
-    # ------------------------------------------------------------------ results
-
-    @property
-    def evaluations(self) -> int:
-        """Points for which `log_prob_fn` was called, by this object and by the interrupted run that it continues.
-
-        Includes those of sweeps over fast parameters.
-        """
-        return self._evaluator.evaluations
-
-    @property
-    def coarse_evaluations(self) -> int:
-        """Points for which `coarse_log_prob_fn` was called by this object."""
-        return 0 if self._coarse_evaluator is None else self._coarse_evaluator.evaluations
-
-    @property
-    def failure_count(self) -> int:
-        """Number of evaluations that failed, by an exception or by NaN, and counted as -inf."""
-        return self._evaluator.failures.count
-
-    @property
-    def failures(self) -> list[dict]:
-        """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failures."""
-        return list(self._evaluator.failures.kept)
-
-    @property
-    def ladder(self) -> tuple[Stage, ...]:
-        """Sequence of tempering stages of the last annealing; empty before it."""
-        return self._result.ladder
-
-    @property
-    def log_evidence(self) -> float:
-        """Log-evidence: of `log_evidence_ladder` and `log_evidence_check` the one with the smaller error."""
-        return self._result.evidence[0]
-
-    @property
-    def log_evidence_error(self) -> float:
-        """Standard error of `log_evidence`, from this run alone.
-
-        At least half the difference of the two estimates if they differ by more than three times their joint error.
-        """
-        return self._result.evidence[1]
-
-    @property
-    def log_evidence_ladder(self) -> float:
-        """Log-evidence by tempering: the sum of the increments of all stages."""
-        return self._result.log_evidence_ladder
-
-    @property
-    def log_evidence_check(self) -> EvidenceCheck | None:
-        """The evidence by importance sampling after the annealing; None with ``check_draws=0``."""
-        self._result.require_finished()
-        return self._result.check
-
-    def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
-        """Monte Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
-
-        Copies made by the latest resamplings and the autocorrelation of the chain are accounted for
-        (`samplers.tempering.genealogy`). A chain that another sampler continues without the journal has lost the record
-        of its resampling: each walker then counts as independent. The dependence between walkers that some moves
-        introduce, such as emcee's stretch move, is not accounted for. A single run cannot detect a mode that it lost,
-        or moves that did not move: after a `SamplingWarning` the errors are too small.
-        """
-        founders = self._result.founders
-        chain = self.get_chain(discard=discard, thin=thin)
-        return standard_error_of_mean(chain, np.arange(self.nwalkers) if founders is None else founders)
-
     def reset(self):
         """Clear the chain, as in emcee. Ladder and state at beta = 1 are kept: burn in, reset, continue."""
         super().reset()
         self._checkpoint.store_result(self._result)
+
+    @property
+    def guide(self) -> Guide | None:
+        """The guide in use, a copy of the given one that has learned from this run; None before it or without one."""
+        return None if self._guide is None else self._guide.guide
 
     # ------------------------------------------------------------------ running
 
@@ -417,7 +369,7 @@ class TemperedSampler(EnsembleSampler):
     def _header(self) -> dict:
         """What this run is started with."""
         functions = self.log_prob_fn.f, self.coarse_log_prob_fn
-        return header(self.nwalkers, self.ndim, *functions, self.settings, *get_moves(self))
+        return header(self.nwalkers, self.ndim, *functions, self.settings, *self._moves_of_annealing, self._given_guide)
 
     def _resume(self, state: State, iterations: int | None, bar: dict) -> tuple[State, int]:
         """Continue the interrupted run: repeat the annealing without evaluations, and go to the last stored step.
@@ -475,14 +427,24 @@ class TemperedSampler(EnsembleSampler):
             records = self._evaluator.pack(state.log_prob, log_prior, state.blobs)
         return Population(0.0, coords, records, float(self.nwalkers))
 
+    def _lend_to_guide(self) -> Guidance | None:
+        """A fresh copy of the guide, and what it is lent; None without a guide."""
+        if self._given_guide is None:
+            return None
+        self._guide, budget = AdaptedGuide(self._given_guide, self.ndim), self._evaluator.budget
+        budget.guide, budget.refused = self._guide, False
+        session = GuideSession(get_random(self), self._checkpoint.remember, budget.fits, lambda: budget.remaining)
+        return Guidance(self._guide, session, budget)
+
     def _anneal(self, state: State, skip_check: bool, bar: dict) -> State:
         """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
         self._result = AnnealingResult()
         population, coarse = self._start(state, skip_check), self._coarse_evaluator
         if coarse is not None:
             coarse.pool = self.pool
-        schedule = MoveSchedule(*get_moves(self))
-        steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse)
+        schedule, guidance = self._moves_of_annealing, self._lend_to_guide()
+        set_moves(self, *schedule)
+        steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse, guidance)
         labels = {"desc": "ladder", "unit": " sweeps", **(bar["progress_kwargs"] or {})}
         with get_progress_bar(bar["progress"], None, **labels) as shown:
             for result, population, report in record(steps, self._evaluator, self._checkpoint):
@@ -494,5 +456,10 @@ class TemperedSampler(EnsembleSampler):
             logger.warning("%d of %d evaluations of the coarse model failed and count as impossible (%s)", *failed)
         if self._result.check is not None:
             check_evidence(self.log_evidence_ladder, self.ladder[-1].log_evidence_error, self._result.check)
+        if self._result.start is not None and self._result.start.used:
+            followed = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
+            set_moves(self, followed, np.ones(1))
+            equal = np.full(self.nwalkers, 1.0 / self.nwalkers)
+            MoveSchedule(followed, np.ones(1)).calibrate(population.coords, equal, None)
         log_prob, blobs = self._evaluator.unpack(population.records)
         return State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)

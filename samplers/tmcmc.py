@@ -34,6 +34,10 @@ class TMCMCSampler(TemperedSampler):
     log_prior_fn : callable, optional
         Log-density of the normalised prior, called like `log_prob_fn` but without `args` and `kwargs`, always in this
         process. By default ``log_prob_fn.log_prior``.
+    guide : Guide, optional
+        An object that proposes draws near the posterior, such as ``posterior.guide()`` (`samplers.tempering.guide`).
+        Its weighted draws replace the annealing, and the sweeps at beta = 1 are proposals of the guide. Where its draws
+        cannot be trusted, recycling starts from them, with a `SamplingWarning`.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator (``np.random.seed``). The random state of
         a backend that contains a chain takes precedence.
@@ -58,6 +62,8 @@ class TMCMCSampler(TemperedSampler):
     fast_sweeps : int, default 2
         Sweeps over the fast parameters after every move, where `log_prob_fn` has an attribute ``fast_parameters``; 0
         for none.
+    guided : GuidedSettings, default GuidedSettings()
+        Constants of the rounds of a guide; with `guide` only.
     check_draws : int, optional
         Evaluations for an estimate of the evidence that is independent of the annealing. By default as many as there
         are walkers; 0 for no such estimate.
@@ -81,7 +87,7 @@ class TMCMCSampler(TemperedSampler):
     unused_settings: Mapping[str, str] = MappingProxyType(
         {
             **dict.fromkeys(("ess_ratio", "ess_rule", "ess_floor"), _COV),
-            "recycling": _NO_RECYCLING,
+            "recycling": _NO_RECYCLING + ", or pass guide=",
         }
     )
 

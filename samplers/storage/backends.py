@@ -14,6 +14,7 @@ import logging
 import os
 import secrets
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,11 @@ class JournaledBackend(HDFBackend):
         """Enter a batch of evaluated points in the journal."""
         if self._journal is not None:
             self._journal.evaluated(batch)
+
+    def remembered(self, key: str, arrays: Sequence[np.ndarray]) -> None:
+        """Enter arrays that a guide stores in the journal."""
+        if self._journal is not None:
+            self._journal.remembered(key, arrays)
 
     def call(self, nsteps: int) -> None:
         """Enter the number of steps that a call asks for in the journal."""

@@ -5,6 +5,8 @@ repeated from the start in the journal, and every evaluation that the journal co
 The chain then continues from the last stored step.
 """
 
+import itertools
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -16,41 +18,51 @@ from .backends import JournaledBackend, read_check, read_ladder, write_check, wr
 from .compatibility import differences
 from .journal import Contents, EvaluatedBatch, RunStart
 
-__all__ = ["Checkpoint", "ReplayedEvaluations"]
+__all__ = ["Checkpoint", "Replay"]
 
 
-class ReplayedEvaluations:
-    """Evaluations of an interrupted run, found by their points, which must be equal to the last bit.
+class Replay:
+    """Evaluations and stored arrays of an interrupted run, found by their points and keys.
+
+    Points must be equal to the last bit.
 
     Parameters
     ----------
-    batches : sequence of EvaluatedBatch
-        The evaluations in the journal.
+    contents : Contents
+        Contents of the journal.
     """
 
-    def __init__(self, batches: Sequence[EvaluatedBatch]):
-        self._batches = batches
+    def __init__(self, contents: Contents):
+        self._batches = contents.evaluated
         self._place = {
             row.tobytes(): (number, index)
-            for number, batch in enumerate(batches)
+            for number, batch in enumerate(contents.evaluated)
             for index, row in enumerate(batch.coords)
         }
+        self._remembered: dict[str, deque[list[np.ndarray]]] = {}
+        for key, arrays in contents.remembered:
+            self._remembered.setdefault(key, deque()).append(arrays)
 
-    def find(self, coords: np.ndarray) -> EvaluatedBatch | None:
-        """The evaluations of points (n, ndim), or None unless all of them are known."""
+    def recall(self, key: str) -> list[np.ndarray] | None:
+        """The arrays stored under a key, those stored first coming first; None if there are no more."""
+        stored = self._remembered.get(key)
+        return stored.popleft() if stored else None
+
+    def find(self, coords: np.ndarray) -> list[tuple[slice, EvaluatedBatch | None]]:
+        """Consecutive parts of the points (n, ndim): those of one batch with its evaluations, or unknown ones."""
         found = [self._place.get(row.tobytes()) for row in np.ascontiguousarray(coords)]
-        if None in found:
-            return None
-        log_prob = np.array([self._batches[number].log_prob[index] for number, index in found])
-        reasons = {
-            row: self._batches[number].reasons[index]
-            for row, (number, index) in enumerate(found)
-            if index in self._batches[number].reasons
-        }
-        blobs = None
-        if self._batches[found[0][0]].blobs is not None:
-            blobs = np.stack([self._batches[number].blobs[index] for number, index in found])
-        return EvaluatedBatch(coords, log_prob, blobs, reasons)
+        parts = []
+        for number, group in itertools.groupby(range(len(found)), lambda i: None if found[i] is None else found[i][0]):
+            places = list(group)
+            rows = slice(places[0], places[-1] + 1)
+            parts.append((rows, None if number is None else self._part(number, [found[i][1] for i in places])))
+        return parts
+
+    def _part(self, number: int, indices: list[int]) -> EvaluatedBatch:
+        batch = self._batches[number]
+        reasons = {row: batch.reasons[index] for row, index in enumerate(indices) if index in batch.reasons}
+        blobs = None if batch.blobs is None else batch.blobs[indices]
+        return EvaluatedBatch(batch.coords[indices], batch.log_prob[indices], blobs, reasons)
 
 
 class Checkpoint:
@@ -74,7 +86,7 @@ class Checkpoint:
             backend = JournaledBackend.of(backend)
         self.backend = Backend() if backend is None else backend
         self._journaled = self.backend if isinstance(self.backend, JournaledBackend) else None
-        self._replayed: ReplayedEvaluations | None = None
+        self._replayed: Replay | None = None
         self._earlier_stages: tuple[Stage, ...] = ()
 
     # ------------------------------------------------------------------ the ladder
@@ -151,18 +163,27 @@ class Checkpoint:
                 " Use the settings and functions that it was started with, or another file"
             )
         self._journaled.continue_run(contents)
-        self._replayed = ReplayedEvaluations(contents.evaluated)
+        self._replayed = Replay(contents)
         self._earlier_stages = read_ladder(self.backend)
         return contents
 
-    def find(self, coords: np.ndarray) -> EvaluatedBatch | None:
-        """Evaluations of points (n, ndim) by the interrupted run, or None unless all of them are known."""
-        return None if self._replayed is None else self._replayed.find(coords)
+    def find(self, coords: np.ndarray) -> list[tuple[slice, EvaluatedBatch | None]]:
+        """Consecutive parts of the points (n, ndim), with their evaluations if the interrupted run has made them."""
+        return [(slice(None), None)] if self._replayed is None else self._replayed.find(coords)
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter a batch of evaluated points."""
         if self._journaled is not None:
             self._journaled.evaluated(batch)
+
+    def remember(self, key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
+        """Arrays that ``compute()`` returns, or that it returned for this key in the interrupted run."""
+        if self._replayed is not None and (arrays := self._replayed.recall(key)) is not None:
+            return arrays
+        arrays = [np.asarray(array) for array in compute()]
+        if self._journaled is not None:
+            self._journaled.remembered(key, arrays)
+        return arrays
 
     def begin_call(self, nsteps: int) -> None:
         """Enter the number of steps that a call asks for."""

@@ -9,6 +9,7 @@ import numpy as np
 from emcee.moves import Move
 
 from ..moves.kernels import describe
+from ..tempering.guide import Guide, guide_fingerprint
 from ..tempering.settings import Settings
 from .journal import Contents, EvaluatedBatch
 
@@ -25,6 +26,7 @@ def header(
     settings: Settings,
     moves: Sequence[Move],
     probabilities: Sequence[float],
+    guide: Guide | None = None,
 ) -> dict:
     """What a run is started with, in the form in which JSON returns it.
 
@@ -40,6 +42,8 @@ def header(
         The moves.
     probabilities : sequence of float
         Probability of each move to be chosen.
+    guide : Guide, optional
+        The guide; identified by its attribute ``fingerprint``, or else by its class.
     """
     described = {"nwalkers": nwalkers, "ndim": ndim, "log_prob_fn": _fingerprint(log_prob_fn)}
     described |= {name: _plain(value) for name, value in asdict(settings).items()}
@@ -47,7 +51,8 @@ def header(
     coarse = None
     if coarse_log_prob_fn is not None:
         coarse = _fingerprint(coarse_log_prob_fn) or "one without a fingerprint"
-    return json.loads(json.dumps(described | {"coarse_log_prob_fn": coarse}))
+    described |= {"coarse_log_prob_fn": coarse, "guide": None if guide is None else guide_fingerprint(guide)}
+    return json.loads(json.dumps(described))
 
 
 def _fingerprint(function: Callable) -> str | None:

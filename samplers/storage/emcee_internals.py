@@ -34,9 +34,11 @@ def get_moves(sampler: EnsembleSampler) -> tuple[Sequence[Move], np.ndarray]:
     return sampler._moves, sampler._weights
 
 
-def set_moves(sampler: EnsembleSampler, moves: Sequence[Move]) -> None:
-    """Replace the moves of a sampler; their probabilities stay."""
+def set_moves(sampler: EnsembleSampler, moves: Sequence[Move], probabilities: np.ndarray | None = None) -> None:
+    """Replace the moves of a sampler; their probabilities stay unless they are given."""
     sampler._moves = moves
+    if probabilities is not None:
+        sampler._weights = probabilities
 
 
 def get_previous_state(sampler: EnsembleSampler) -> State | None:

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
 
+from ..tempering.budget import Budget, BudgetExhausted
 from .checkpoint import Checkpoint
-from .journal import EvaluatedBatch
+from .journal import EvaluatedBatch, merge_batches
 from .returned_values import ErrorCapturing, log_probabilities, outcomes
 
 __all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures", "OptionalAttributes"]
@@ -210,9 +211,15 @@ class Evaluator:
         When failures stop the run; never by default.
     keep_blobs : bool
         Whether the records contain the blobs.
+    budget : Budget, optional
+        Counts simulations and limits them; no limit by default.
 
     Attributes
     ----------
+    budget : Budget
+        See above.
+    evaluates_parts : bool
+        Whether the first points of a batch that does not fit into the limit of simulations are evaluated.
     evaluations : int
         Number of points evaluated so far, including those of the interrupted run that is continued.
     failures : Failures
@@ -229,10 +236,13 @@ class Evaluator:
         checkpoint: Checkpoint | None = None,
         limit: FailureLimit | None = None,
         keep_blobs: bool = True,
+        budget: Budget | None = None,
     ):
         self._function, self._log_prior_fn, self._convention = function, log_prior_fn, convention
         self._checkpoint, self._limit, self._keep_blobs = checkpoint, limit, keep_blobs
         self._records = EvaluationRecords()
+        self.budget = Budget() if budget is None else budget
+        self.evaluates_parts = True
         self.pool: Any = None
         self.reset()
 
@@ -242,6 +252,7 @@ class Evaluator:
     def reset(self) -> None:
         """Forget evaluations and failures."""
         self.evaluations, self.failures = 0, Failures()
+        self.budget.reset()
 
     @property
     def map(self) -> Callable:
@@ -265,6 +276,16 @@ class Evaluator:
         ------
         ValueError
             If a coordinate is not finite.
+        BudgetExhausted
+            If the points do not fit into the limit of simulations. With `evaluates_parts`, the first of them that fit
+            are evaluated.
+        """
+        return self.evaluate_observed(coords, None)
+
+    def evaluate_observed(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None) -> np.ndarray:
+        """As `evaluate`, but `observe` is called with the points directly before they are evaluated.
+
+        It is called for points of the interrupted run as well, in the same parts as in that run.
         """
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
@@ -273,15 +294,38 @@ class Evaluator:
         if not inside.any():
             return self._records.pack_batch(log_prior, inside, None)
         points = coords[inside]
-        batch = None if self._checkpoint is None else self._checkpoint.find(points)
-        if batch is None:
-            batch = self.compute(points)
-            if self._limit is not None:
-                self._limit.check(batch, self.evaluations, self.failures.count)
-            if self._checkpoint is not None:
-                self._checkpoint.evaluated(batch)
-        self.count(batch)
-        return self._records.pack_batch(log_prior, inside, batch)
+        parts = [(slice(None), None)] if self._checkpoint is None else self._checkpoint.find(points)
+        batches: list[EvaluatedBatch] = []
+        for rows, known in parts:
+            wanted = points[rows]
+            if known is None:
+                fitting = self.budget.fitting(wanted)
+                part = wanted if fitting == len(wanted) else wanted[: fitting if self.evaluates_parts else 0]
+            else:
+                part = wanted
+            if observe is not None and len(part) > 0:
+                observe(part)
+            if len(part) > 0:
+                batches.append(self._compute_and_store(part) if known is None else known)
+                self.count(batches[-1])
+            if len(part) < len(wanted):
+                raise BudgetExhausted(self._first_records(log_prior, inside, batches))
+        return self._records.pack_batch(log_prior, inside, merge_batches(batches))
+
+    def _compute_and_store(self, coords: np.ndarray) -> EvaluatedBatch:
+        batch = self.compute(coords)
+        if self._limit is not None:
+            self._limit.check(batch, self.evaluations, self.failures.count)
+        if self._checkpoint is not None:
+            self._checkpoint.evaluated(batch)
+        return batch
+
+    def _first_records(self, log_prior: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
+        """Records of the points before the first one that was not evaluated."""
+        done = sum(len(batch.coords) for batch in batches)
+        first = slice(0, int(np.flatnonzero(inside)[done]))
+        batch = merge_batches(batches) if batches else None
+        return self._records.pack_batch(log_prior[first], inside[first], batch)
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""
@@ -293,6 +337,7 @@ class Evaluator:
         """Count the evaluations of a batch and its failures."""
         self.evaluations += len(batch.coords)
         self.failures.add(batch)
+        self.budget.count(batch.coords)
 
     def pack(self, log_prob: np.ndarray, log_prior: np.ndarray, blobs: np.ndarray | None) -> np.ndarray:
         """Records (n,) of points whose log-probabilities, log-priors and blobs are known."""

@@ -8,6 +8,7 @@ then dropped. Arrays are stored in NumPy's own format, texts as JSON; nothing is
     INIT  start of the annealing: draws of the prior, their log-prior, state of the random generator
     EVAL  points, and what ``log_prob_fn`` returned for them (NaN where it failed)
     FAIL  why evaluations failed (JSON), for the block before
+    MEMO  arrays that a guide has stored, after their key
     CALL  number of steps at beta = 1 that a call asks for (JSON)
     STEP  a stored step: points, log-probabilities, acceptance, blobs, state of the random generator
     DONE  the call is complete
@@ -33,7 +34,7 @@ try:
 except ImportError:  # without such locks, two runs on one file are not detected
     lockf = None
 
-__all__ = ["Contents", "EvaluatedBatch", "Journal", "RunStart", "Step", "read_journal"]
+__all__ = ["Contents", "EvaluatedBatch", "Journal", "RunStart", "Step", "merge_batches", "read_journal"]
 
 MAGIC = b"samplers journal 1\n"
 HEADER = struct.Struct("<4sQI")
@@ -107,6 +108,25 @@ class EvaluatedBatch(NamedTuple):
     reasons: dict[int, str]
 
 
+def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
+    """Several batches as one; at least one is needed."""
+    if len(batches) == 1:
+        return batches[0]
+    coords, log_prob = (np.concatenate([batch[field] for batch in batches]) for field in (0, 1))
+    with_blobs = [batch.blobs for batch in batches if batch.blobs is not None]
+    blobs = None
+    if with_blobs:
+        like = with_blobs[0]
+        blobs = np.concatenate(
+            [np.zeros((len(b.coords), *like.shape[1:]), like.dtype) if b.blobs is None else b.blobs for b in batches]
+        )
+    reasons, place = {}, 0
+    for batch in batches:
+        reasons |= {place + row: reason for row, reason in batch.reasons.items()}
+        place += len(batch.coords)
+    return EvaluatedBatch(coords, log_prob, blobs, reasons)
+
+
 class Contents(NamedTuple):
     """Contents of a journal.
 
@@ -118,6 +138,8 @@ class Contents(NamedTuple):
         Start of the last annealing.
     evaluated : list of EvaluatedBatch
         All evaluations.
+    remembered : list of (str, list of array)
+        Arrays that a guide has stored, with their keys.
     before_last : int
         Number of batches that had been evaluated when `last` was stored.
     steps : list of Step
@@ -137,6 +159,7 @@ class Contents(NamedTuple):
     header: dict
     start: RunStart
     evaluated: list[EvaluatedBatch]
+    remembered: list[tuple[str, list[np.ndarray]]]
     before_last: int
     steps: list[Step]
     last: Step | None
@@ -263,6 +286,10 @@ class Journal:
         if batch.reasons:
             self._append(b"FAIL", json.dumps(list(batch.reasons.items())).encode())
 
+    def remembered(self, key: str, arrays: Sequence[np.ndarray]) -> None:
+        """Enter arrays that a guide stores."""
+        self._append(b"MEMO", _pack_arrays([np.frombuffer(key.encode(), dtype=np.uint8), *arrays]))
+
     def call(self, nsteps: int) -> None:
         """Enter the number of steps that a call asks for."""
         self._append(b"CALL", json.dumps(int(nsteps)).encode())
@@ -323,7 +350,7 @@ def read_journal(path: Path) -> Contents | None:
         return None
     if not data.startswith(MAGIC):
         raise ValueError(_damaged(path, "it does not start like a journal"))
-    header, start, evaluated, steps, last = {}, None, [], [], None
+    header, start, evaluated, remembered, steps, last = {}, None, [], [], [], None
     before_last, wanted, made, whole = 0, None, 0, len(MAGIC)
     for kind, content, end in _blocks(data, path):
         whole = end
@@ -337,6 +364,9 @@ def read_journal(path: Path) -> Contents | None:
             evaluated.append(EvaluatedBatch(coords, log_prob, blobs[0] if blobs else None, {}))
         elif kind == b"FAIL":
             evaluated[-1].reasons.update({row: reason for row, reason in json.loads(content)})
+        elif kind == b"MEMO":
+            key, *arrays = _unpack_arrays(content)
+            remembered.append((key.tobytes().decode(), arrays))
         elif kind == b"CALL":
             wanted, made = json.loads(content), 0
         elif kind == b"DONE":
@@ -353,4 +383,4 @@ def read_journal(path: Path) -> Contents | None:
             raise ValueError(_damaged(path, f"it has a block of unknown kind {kind!r}"))
     if start is None:
         return None
-    return Contents(header, start, evaluated, before_last, steps, last, wanted, made, len(data), whole)
+    return Contents(header, start, evaluated, remembered, before_last, steps, last, wanted, made, len(data), whole)

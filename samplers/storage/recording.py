@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from ..tempering.evidence_check import EvidenceCheck
-from ..tempering.population import Population, Report, Restart, Stage, Sweep
+from ..tempering.population import GuidedRound, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from ..tempering.results import AnnealingResult
 from .checkpoint import Checkpoint
 from .evaluation import Evaluator
@@ -48,7 +48,13 @@ def record(
             evaluations += report.evaluations  # these belong to no stage
             result = result._replace(check=report)
         elif isinstance(report, Restart):
-            result = AnnealingResult()
+            result = AnnealingResult(rounds=result.rounds, start=result.start)
+        elif isinstance(report, GuidedRound):
+            result = result._replace(rounds=(*result.rounds, report))
+        elif isinstance(report, GuidedStart):
+            result = result._replace(start=report)
+        elif isinstance(report, Halt):
+            result = result._replace(halt=report)
         if result.finished and population.founders:
             result = result._replace(founders=population.founders[0])
         yield result, population, report

@@ -30,9 +30,12 @@ import numpy as np
 
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
+from .budget import BudgetExhausted
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights
 from .population import Density, Population, Report, Stage, Sweep
+from .rounds import tail_variance
 from .settings import RecyclingSettings
+from .stopping import StoppedEarly
 from .weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
 
 __all__ = ["Recycled", "StartingDensity", "recycle"]
@@ -216,7 +219,12 @@ def recycle(
         mixture = _with_even_share(fitted, settings.even_share)
         finished = beta == 1.0 and effective >= size
         new, made = draw_inside(mixture, size if finished else int(round(2.0 * target)), random, density.inside)
-        new_records = density.evaluate(new)
+        try:
+            new_records = density.evaluate(new)
+        except BudgetExhausted as stop:
+            if (few := len(stop.records)) > 0:
+                archive.add(mixture, made * few / len(new), new[:few], stop.records)
+            raise _stopped(archive, beta, sum(increments), inherited) from None
         new_weights = _weights_against(mixture, new_records, new, start, beta)
         fresh_size = effective_sample_size(new_weights)
         fresh += fresh_size
@@ -243,6 +251,16 @@ def recycle(
                 sum(increments),
                 evaluations_below_one,
             )
+
+
+def _stopped(archive: _Archive, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
+    """All points, weighted by the posterior over the mixture of their densities."""
+    log_weights = archive.log_weights(1.0)
+    n, effective = len(log_weights), effective_sample_size(log_weights)
+    known = Population(1.0, archive.coords, archive.records, effective, (), log_weights)
+    log_evidence = float(log_mean_weight(log_weights) + np.log(n))
+    variance = max(1.0 / effective - 1.0 / n, 0.0) + inherited + tail_variance(log_weights)
+    return StoppedEarly(known, log_evidence, float(np.sqrt(variance)), beta, of_stages)
 
 
 def _with_even_share(mixture: Mixture, share: float) -> Mixture:

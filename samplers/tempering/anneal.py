@@ -4,7 +4,12 @@ Annealing by moves is Sequential Monte Carlo: choose the next beta, weigh, resam
 adaptive importance sampling (`samplers.tempering.adaptive_importance`); its weighted draws are resampled to as many
 points as there are walkers, which then are moved. Both end with an estimate of the evidence from draws that were not
 used for the annealing. With a cheaper (coarse) model, recycling on that model comes first, and recycling on the fine
-model starts from its proposals instead of from the prior (`samplers.tempering.multilevel`).
+model starts from its proposals instead of from the prior (`samplers.tempering.multilevel`). With a guide, its weighted
+draws replace the annealing (`samplers.tempering.guided`), and only where they cannot be trusted does recycling start
+from them.
+
+A limit of simulations ends the annealing wherever it is exceeded. The points known by then are weighted by the
+posterior and resampled (`StoppedEarly`).
 
 `anneal` is a generator of pairs (population, report). It keeps no reference to whoever consumes it: storing, timing and
 showing are up to the consumer.
@@ -18,14 +23,17 @@ import numpy as np
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
 from .adaptive_importance import Recycled, StartingDensity, recycle
+from .budget import BudgetExhausted
 from .diagnostics import check_annealing, check_stages, warn
-from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights
+from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights, pareto_shape
 from .genealogy import trace_founders
+from .guided import Guidance, RoundsOfGuide, draw_rounds, start_from_guide
 from .multilevel import draw_start
 from .mutation import MoveSchedule, Mutated, grow_chains, move_together
-from .population import Density, Population, Report, Restart, Stage, Sweep
+from .population import Density, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from .resampling import systematic
 from .settings import Settings
+from .stopping import StoppedEarly, stop_at
 from .weights import (
     EvidenceError,
     coarse_weights,
@@ -54,6 +62,7 @@ def anneal(
     schedule: MoveSchedule,
     settings: Settings,
     coarse: Density | None = None,
+    guidance: Guidance | None = None,
 ) -> Steps:
     """Carry draws of the prior to beta = 1.
 
@@ -71,23 +80,148 @@ def anneal(
         How to anneal.
     coarse : Density, optional
         A cheaper version of the posterior, to recycle on first.
+    guidance : Guidance, optional
+        A guide to start from.
 
     Yields
     ------
     population : Population
         The points as they are now.
-    report : Sweep, Stage, Restart or EvidenceCheck
+    report : Report
         `Sweep`: the points have been moved once. `Stage`: a stage is finished. `Restart`: all stages so far are void.
-        `EvidenceCheck`: the independent estimate of the evidence (at most one, before or after the last stage). The
-        population of the last pair is at beta = 1, equally weighted.
+        `EvidenceCheck`: the independent estimate of the evidence (at most one, before or after the last stage).
+        `GuidedRound`, `GuidedStart`: a round of a guide, and what all rounds are worth. `Halt`: the limit of
+        simulations has ended the annealing. The population of the last pair is at beta = 1, equally weighted.
     """
+    try:
+        yield from _without_limit(population, density, random, schedule, settings, coarse, guidance)
+    except StoppedEarly as stop:
+        yield from _finish_early(stop, len(population.coords), random)
+
+
+def _without_limit(
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+    coarse: Density | None,
+    guidance: Guidance | None,
+) -> Steps:
+    """The annealing; raises `StoppedEarly` where it exceeds the limit of simulations."""
+    if guidance is not None and (yield from _from_guide(population, density, random, schedule, settings, guidance)):
+        return
     if coarse is not None and (yield from _from_coarse(population, density, coarse, random, schedule, settings)):
         return
     if population.records is None:
-        population = population._replace(records=density.evaluate(population.coords))
+        population = population._replace(records=_evaluate_all(population.coords, density))
     if settings.recycle and (yield from _by_recycling(population, density, random, schedule, settings)).trusted:
         return
     yield from _by_moves(population, density, random, schedule, settings)
+
+
+def _evaluate_all(coords: np.ndarray, density: Density) -> np.ndarray:
+    """Records of draws of the prior."""
+    try:
+        return density.evaluate(coords)
+    except BudgetExhausted as stop:
+        few = coords[: len(stop.records)]
+        raise stop_at(Population(0.0, few, stop.records, float(len(few))), 0.0, 0.0) from None
+
+
+def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState) -> Steps:
+    """Resample the points that are known to `size` points at beta = 1."""
+    population = stop.population
+    if stop.complete:
+        yield population, Halt(1.0, len(population.coords), population.effective_sample_size, float("-inf"))
+        return
+    log_weights = population.log_weights
+    if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
+        raise ValueError(
+            f"the limit of simulations (max_simulations) ended the run after {len(log_weights)} evaluated points, none "
+            "of which has a finite log-probability: there is nothing to report. Call run_mcmc again with a larger "
+            "limit; the simulations made so far are kept"
+        )
+    ancestors = systematic(normalised_weights(log_weights), random, size)
+    effective = effective_sample_size(log_weights)
+    known = len(log_weights)
+    population = Population(1.0, population.coords[ancestors], population.records[ancestors], effective, (ancestors,))
+    yield population, Halt(stop.beta, known, effective, pareto_shape(log_weights))
+    yield (
+        population,
+        Stage(
+            beta=1.0,
+            effective_sample_size=effective,
+            acceptance=effective / known,
+            moves=0,
+            distinct_ancestors=len(np.unique(ancestors)),
+            log_evidence_increment=stop.log_evidence - stop.log_evidence_of_stages,
+            log_evidence_error=stop.error,
+        ),
+    )
+
+
+def _from_guide(
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+    guidance: Guidance,
+) -> Generator[tuple[Population, Report], None, bool]:
+    """Draws of a guide, or recycling that starts from them; returns whether the result can be trusted."""
+    size = len(population.coords)
+    found = yield from draw_rounds(population, density, random, guidance, settings.guided)
+    if found.stopped:
+        raise _stopped_rounds(found)
+    shape, concerns = found.pooled.pareto_shape, guidance.guide.concerns
+    if not found.doubt:
+        weights = normalised_weights(found.pooled.log_weights)
+        ancestors = systematic(weights, random, size)
+        schedule.calibrate(found.pooled.coords, coarse_weights(found.pooled.log_weights), density.inside)
+        effective = found.pooled.effective_sample_size
+        coords, records = found.pooled.coords[ancestors], found.pooled.records[ancestors]
+        population = Population(1.0, coords, records, effective, (ancestors,))
+        yield population, GuidedStart("", found.shortfall, shape, concerns)
+        yield (
+            population,
+            Stage(
+                beta=1.0,
+                effective_sample_size=effective,
+                acceptance=found.last.effective_share,
+                moves=0,
+                distinct_ancestors=len(np.unique(ancestors)),
+                log_evidence_increment=found.pooled.log_evidence,
+                log_evidence_error=found.pooled.log_evidence_error,
+            ),
+        )
+        return True
+    warn(
+        f"the draws of the guide are not close enough to the posterior ({found.doubt}), so the run goes on by "
+        "recycling, which starts from them and needs more simulations. Use a better guide, or none"
+    )
+    yield population, GuidedStart(found.doubt, "", shape, concerns)
+    try:
+        started, start = start_from_guide(found.last, population, density, guidance.guide)
+    except BudgetExhausted:
+        raise _stopped_rounds(found) from None
+    try:
+        recycled = yield from _by_recycling(started, density, random, schedule, settings, start, size)
+    except StoppedEarly as stop:
+        rounds = _stopped_rounds(found)
+        better = stop.effective_sample_size >= rounds.effective_sample_size
+        raise (stop if better else rounds) from None
+    return recycled.trusted
+
+
+def _stopped_rounds(found: RoundsOfGuide) -> StoppedEarly:
+    """All rounds of a guide, as the points from which the limit of simulations makes a population."""
+    if found.pooled is None:
+        nothing = Population(1.0, np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))
+        return StoppedEarly(nothing, float("-inf"), float("inf"), 1.0)
+    pooled = found.pooled
+    known = Population(1.0, pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights)
+    return StoppedEarly(known, pooled.log_evidence, pooled.log_evidence_error, 1.0)
 
 
 def _by_moves(
@@ -119,6 +253,9 @@ def _by_moves(
         distinct = len(np.unique(population.coords, axis=0))
         mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
         population = mutated.population
+        if mutated.stopped:
+            finished = sum(stage.log_evidence_increment for stage in stages)
+            raise stop_at(population, finished + log_mean_weight(log_weights), standard_error, finished)
         stages.append(
             Stage(
                 beta=beta,
@@ -134,7 +271,11 @@ def _by_moves(
         check_stages(stages, n, ndim)
     check_annealing(stages, n, ndim, mutated.correlation)
     if settings.check_draws != 0:
-        yield population, _check_evidence(population.coords, density, random, settings.check_draws)
+        try:
+            check = _check_evidence(population.coords, density, random, settings.check_draws)
+        except BudgetExhausted:
+            raise StoppedEarly(population, 0.0, 0.0, 1.0, complete=True) from None
+        yield population, check
 
 
 def _by_recycling(
@@ -173,6 +314,8 @@ def _by_recycling(
             log_evidence_error=found.log_evidence_error,
         ),
     )
+    if mutated.stopped:
+        raise StoppedEarly(mutated.population, 0.0, 0.0, 1.0, complete=True)
     return found
 
 
@@ -198,7 +341,7 @@ def _from_coarse(
         return False
     coarse_cost = few + sum(made for made, _ in found.proposals)
     drawn, start = draw_start(found.proposals, coords, few, random, density.inside)
-    population = population._replace(coords=drawn, records=density.evaluate(drawn))
+    population = population._replace(coords=drawn, records=_evaluate_start(drawn, start, density))
     found = yield from _by_recycling(population, density, random, schedule, settings, start, n)
     if not found.trusted:
         warn(
@@ -212,6 +355,16 @@ def _from_coarse(
             "coarse model may be worth its cost"
         )
     return found.trusted
+
+
+def _evaluate_start(coords: np.ndarray, start: StartingDensity, density: Density) -> np.ndarray:
+    """Records of draws of a starting density."""
+    try:
+        return density.evaluate(coords)
+    except BudgetExhausted as stop:
+        records, few = stop.records, coords[: len(stop.records)]
+        log_start = start.log_density(few, records)
+        raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0, log_start=log_start) from None
 
 
 def _only_sweeps(

@@ -14,6 +14,7 @@ from emcee.model import Model
 from emcee.moves import Move, RedBlueMove
 
 from ..moves.kernels import calibrate_move
+from .budget import BudgetExhausted
 from .population import Density, Population, Sweep
 from .settings import Settings
 
@@ -78,13 +79,16 @@ class Mutated(NamedTuple):
     moves : int
         Number of sweeps.
     correlation : float
-        Largest correlation left with the resampled population (`StartCorrelation`).
+        Largest correlation left with the resampled population (`StartCorrelation`); 1 if no sweep was made.
+    stopped : bool
+        Whether the limit of simulations ended the moves.
     """
 
     population: Population
     acceptance: float
     moves: int
     correlation: float
+    stopped: bool = False
 
 
 def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
@@ -188,7 +192,11 @@ def move_together(
     acceptance = []
     while not correlation.is_low_enough(settings):
         move = schedule.choose(random)
-        state, accepted = move.propose(model, state)
+        try:
+            state, accepted = move.propose(model, state)
+        except BudgetExhausted:
+            share, left = (np.mean(acceptance), correlation.values[-1]) if acceptance else (0.0, 1.0)
+            return Mutated(population, float(share), len(acceptance), left, True)
         move.tune(state, accepted)
         correlation.update(state.coords, state.blobs)
         acceptance.append(float(np.mean(accepted)))
@@ -242,7 +250,10 @@ def grow_chains(
         growing = np.flatnonzero(counts > length)
         move = schedule.choose(random)
         state = State(chains.coords[growing], log_prob=chains.log_prob[growing], blobs=chains.blobs[growing])
-        state, accepted = move.propose(model, state)
+        try:
+            state, accepted = move.propose(model, state)
+        except BudgetExhausted:
+            return Mutated(population, accepted_steps / max(steps, 1), 0, 1.0, True)
         move.tune(state, accepted)
         chains.coords[growing], chains.log_prob[growing] = state.coords, state.log_prob
         chains.blobs[growing] = state.blobs

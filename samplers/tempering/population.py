@@ -11,7 +11,7 @@ import numpy as np
 
 from .evidence_check import EvidenceCheck
 
-__all__ = ["Density", "Population", "Report", "Restart", "Stage", "Sweep"]
+__all__ = ["Density", "GuidedRound", "GuidedStart", "Halt", "Population", "Report", "Restart", "Stage", "Sweep"]
 
 
 class Density(Protocol):
@@ -32,6 +32,12 @@ class Density(Protocol):
 
     def evaluate(self, coords: np.ndarray) -> np.ndarray:
         """Records (n,) of points (n, ndim), with the fields log_prob, log_prior and, where there are any, blobs."""
+
+    def evaluate_observed(self, coords: np.ndarray, observe: Callable[[np.ndarray], None]) -> np.ndarray:
+        """As `evaluate`, but `observe` is called with the points directly before they are evaluated.
+
+        Needed only for a guide with a method `observe`.
+        """
 
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior: (n,) bool."""
@@ -125,4 +131,76 @@ class Restart(NamedTuple):
     reason: str
 
 
-Report = Stage | Sweep | Restart | EvidenceCheck
+class GuidedRound(NamedTuple):
+    """A round of draws of a guide.
+
+    Attributes
+    ----------
+    draws : int
+        Number of draws.
+    effective_share : float
+        Effective sample size of their weights divided by their number.
+    pareto_shape : float
+        Pareto shape of their largest weights; inf for too few weights.
+    log_evidence, log_evidence_error : float
+        Log-evidence of all rounds so far, and its standard error.
+    effective_sample_size : float
+        Of the weights of all rounds so far.
+    """
+
+    draws: int
+    effective_share: float
+    pareto_shape: float
+    log_evidence: float
+    log_evidence_error: float
+    effective_sample_size: float
+
+
+class GuidedStart(NamedTuple):
+    """Result of the rounds of a guide.
+
+    Attributes
+    ----------
+    doubt : str
+        Why the draws of the guide are not used as draws of the posterior; empty if they are.
+    shortfall : str
+        What the rounds did not reach although their draws are used; empty if they reached all.
+    pareto_shape : float
+        Pareto shape of the largest weights of all rounds.
+    concerns : tuple of str
+        Reasons of the guide why parts of the posterior may be missing.
+    """
+
+    doubt: str
+    shortfall: str
+    pareto_shape: float
+    concerns: tuple[str, ...]
+
+    @property
+    def used(self) -> bool:
+        """Whether the population consists of draws of the guide."""
+        return not self.doubt
+
+
+class Halt(NamedTuple):
+    """The limit of simulations ended the annealing.
+
+    Attributes
+    ----------
+    beta : float
+        Tempering exponent of the points from which the population was made; 1 after a complete annealing.
+    points : int
+        Number of points from which the population was made.
+    effective_sample_size : float
+        Of their weights at beta = 1.
+    pareto_shape : float
+        Pareto shape of the largest of these weights.
+    """
+
+    beta: float
+    points: int
+    effective_sample_size: float
+    pareto_shape: float
+
+
+Report = Stage | Sweep | Restart | EvidenceCheck | GuidedRound | GuidedStart | Halt

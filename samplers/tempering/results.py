@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .evidence_check import EvidenceCheck
-from .population import Stage
+from .population import GuidedRound, GuidedStart, Halt, Stage
 
 __all__ = ["AnnealingResult"]
 
@@ -22,11 +22,20 @@ class AnnealingResult(NamedTuple):
         The independent estimate of the evidence.
     founders : (nwalkers,) int, optional
         Founder of each walker (`samplers.tempering.genealogy`); None where it is not known.
+    rounds : tuple of GuidedRound
+        Rounds of the guide.
+    start : GuidedStart, optional
+        What they are worth; None without a guide.
+    halt : Halt, optional
+        Where the limit of simulations ended the annealing; None if it did not.
     """
 
     ladder: tuple[Stage, ...] = ()
     check: EvidenceCheck | None = None
     founders: np.ndarray | None = None
+    rounds: tuple[GuidedRound, ...] = ()
+    start: GuidedStart | None = None
+    halt: Halt | None = None
 
     @property
     def finished(self) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from .resampling import RESAMPLING
 
 __all__ = [
+    "GuidedSettings",
     "RecyclingSettings",
     "Settings",
     "as_whole_number",
@@ -122,6 +123,70 @@ class RecyclingSettings:
 
 
 @dataclass(frozen=True)
+class GuidedSettings:
+    """Constants of the rounds of a guide (`samplers.tempering.guided`).
+
+    The *effective share* of a round is the effective sample size of its weights divided by the number of its draws.
+    Values without a reference are our choice, from trials on posteriors with known answers.
+
+    Attributes
+    ----------
+    first_round_share : float
+        Draws of the first round, as a share of the number of walkers: few, since the guide may still be poor.
+    round_share : float
+        Draws of each later round, as a share of the number of walkers. After a trusted round, a round has as many draws
+        as are expected to suffice.
+    fewest_draws : int
+        Smallest number of draws of a round. The Pareto shape cannot be estimated from fewer than 25.
+    trusted_share : float
+        Smallest effective share of a round that is trusted.
+    largest_pareto_shape : float
+        The Pareto shape of the weights of a trusted round is below this value: then their variance is finite.
+    short_tail_share : float
+        Effective share at which a round of fewer than 100 draws is trusted whatever its Pareto shape, which is
+        uncertain for so few draws.
+    most_rounds : int
+        Largest number of rounds.
+    hopeless_rounds : int
+        The guide is given up when the mean effective share of this number of rounds is below `hopeless_share`.
+    hopeless_share : float
+        See `hopeless_rounds`.
+    usable_share : float
+        After the last round, the draws are used in spite of rounds that were not trusted if the last round has at least
+        this effective share, all rounds together have an effective sample size of the number of walkers, and the Pareto
+        shape of their weights is below 0.7 (Vehtari et al. 2024, JMLR 25(72)).
+    """
+
+    first_round_share: float = 0.3
+    round_share: float = 0.6
+    fewest_draws: int = 25
+    trusted_share: float = 0.5
+    largest_pareto_shape: float = 0.5
+    short_tail_share: float = 0.75
+    most_rounds: int = 10
+    hopeless_rounds: int = 4
+    hopeless_share: float = 0.03
+    usable_share: float = 0.1
+
+    def __post_init__(self):
+        for name in ("first_round_share", "round_share", "trusted_share", "short_tail_share", "usable_share"):
+            if not 0.0 < vars(self)[name] <= 1.0:
+                raise ValueError(f"{name} must lie in (0, 1]; got {vars(self)[name]}")
+        for name in ("fewest_draws", "most_rounds", "hopeless_rounds"):
+            value = as_whole_number(name, vars(self)[name])
+            if value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1; got {value}")
+            object.__setattr__(self, name, value)
+        if not 0.0 <= self.hopeless_share <= 1.0:
+            raise ValueError(f"hopeless_share must lie in [0, 1]; got {self.hopeless_share}")
+        if not 0.0 < self.largest_pareto_shape <= 0.7:
+            raise ValueError(
+                f"largest_pareto_shape must lie in (0, 0.7], since weights of a larger shape have no useful mean; got "
+                f"{self.largest_pareto_shape}"
+            )
+
+
+@dataclass(frozen=True)
 class Settings:
     """Settings of a tempered sampler.
 
@@ -157,6 +222,8 @@ class Settings:
         by moves only where its result cannot be trusted. None leaves the choice to the sampler.
     recycling : RecyclingSettings
         Constants of the recycling.
+    guided : GuidedSettings
+        Constants of the rounds of a guide.
     check_draws : int, optional
         Evaluations for an estimate of the evidence that is independent of the annealing. None: as many as there are
         walkers; 0: no such estimate.
@@ -178,6 +245,7 @@ class Settings:
     fast_sweeps: int = 2
     recycle: bool | None = None
     recycling: RecyclingSettings = RecyclingSettings()
+    guided: GuidedSettings = GuidedSettings()
     check_draws: int | None = None
     max_failure_share: float = 0.5
 
@@ -211,6 +279,8 @@ class Settings:
             raise ValueError(f"fast_sweeps must be a whole number, 0 for none; got {self.fast_sweeps}")
         if not isinstance(self.recycling, RecyclingSettings):
             raise ValueError(f"recycling must be a RecyclingSettings; got {self.recycling!r}")
+        if not isinstance(self.guided, GuidedSettings):
+            raise ValueError(f"guided must be a GuidedSettings; got {self.guided!r}")
         if self.check_draws is not None and self.check_draws < 0:
             raise ValueError(f"check_draws must not be negative; got {self.check_draws}")
         if not 0.0 <= self.max_failure_share <= 1.0:
@@ -263,7 +333,9 @@ def changed_settings(settings: Settings) -> tuple[str, ...]:
     return tuple(field.name for field in fields(settings) if vars(settings)[field.name] != field.default)
 
 
-def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unused: Mapping[str, str]) -> None:
+def refuse_unused(
+    settings: Settings, recycles: bool, fast_sweeps_act: bool, unused: Mapping[str, str], guided: bool = False
+) -> None:
     """Raise an error for a setting that differs from its default but cannot act on the chosen path.
 
     With recycling, the settings that only its fallback on moves would use are refused as well: a run should not depend
@@ -279,6 +351,8 @@ def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unu
         Whether there are fast parameters to sweep over.
     unused : mapping of str to str
         Names of settings that the sampler never uses, with what to do.
+    guided : bool
+        Whether there is a guide.
 
     Raises
     ------
@@ -303,6 +377,10 @@ def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unu
             "log_prob_fn has no fast_parameters beside slow ones, or a pool without vectorize=True evaluates it in "
             "workers that cache nothing",
         )
+    if guided:
+        reasons.pop("recycling", None)
+    else:
+        reasons.setdefault("guided", "it belongs to a guide: pass guide= too")
     if recycles:
         for name in ("ess_ratio", "ess_rule", "ess_floor", "coefficient_of_variation", "resampling"):
             reasons.setdefault(
@@ -315,7 +393,7 @@ def refuse_unused(settings: Settings, recycles: bool, fast_sweeps_act: bool, unu
                 "check_draws",
                 "the check of recycling takes as many draws as there are walkers: pass 0 for none, or recycle=False",
             )
-    else:
+    elif not guided:
         reasons.setdefault("recycling", "the annealing is by moves: pass recycle=True")
     for name in changed_settings(settings):
         if name in reasons:

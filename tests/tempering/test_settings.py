@@ -10,6 +10,7 @@ import pytest
 from samplers import (
     CHING_CHEN_2007,
     RAMANCHA_2022_LITERAL,
+    GuidedSettings,
     MixtureMove,
     RecyclingSettings,
     Settings,
@@ -41,6 +42,7 @@ CHANGES = {
     "fast_sweeps": (4, {}),
     "recycle": (None, {}),  # the other value than that of the path
     "recycling": (RecyclingSettings(target_share=0.6), {}),
+    "guided": (GuidedSettings(trusted_share=0.6), {}),
     "check_draws": (0, {}),
     "max_failure_share": (0.0, {}),
 }

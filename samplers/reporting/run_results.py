@@ -1,0 +1,99 @@
+"""Results of a tempered run: evaluations, failures, the stages, the evidence and Monte Carlo errors."""
+
+import numpy as np
+
+from ..storage.evaluation import Evaluator
+from ..tempering.evidence_check import EvidenceCheck
+from ..tempering.genealogy import standard_error_of_mean
+from ..tempering.population import GuidedRound, Stage
+from ..tempering.results import AnnealingResult
+
+__all__ = ["RunResults"]
+
+
+class RunResults:
+    """Base class of `samplers.tempered.TemperedSampler`: what a user reads after a run."""
+
+    nwalkers: int
+    _evaluator: Evaluator
+    _coarse_evaluator: Evaluator | None
+    _result: AnnealingResult
+
+    @property
+    def evaluations(self) -> int:
+        """Points for which `log_prob_fn` was called, by this object and by the interrupted run that it continues.
+
+        Includes those of sweeps over fast parameters.
+        """
+        return self._evaluator.evaluations
+
+    @property
+    def coarse_evaluations(self) -> int:
+        """Points for which `coarse_log_prob_fn` was called by this object."""
+        return 0 if self._coarse_evaluator is None else self._coarse_evaluator.evaluations
+
+    @property
+    def failure_count(self) -> int:
+        """Number of evaluations that failed, by an exception or by NaN, and counted as -inf."""
+        return self._evaluator.failures.count
+
+    @property
+    def failures(self) -> list[dict]:
+        """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failures."""
+        return list(self._evaluator.failures.kept)
+
+    @property
+    def ladder(self) -> tuple[Stage, ...]:
+        """Sequence of tempering stages of the last annealing; empty before it."""
+        return self._result.ladder
+
+    @property
+    def log_evidence(self) -> float:
+        """Log-evidence: of `log_evidence_ladder` and `log_evidence_check` the one with the smaller error."""
+        return self._result.evidence[0]
+
+    @property
+    def log_evidence_error(self) -> float:
+        """Standard error of `log_evidence`, from this run alone.
+
+        At least half the difference of the two estimates if they differ by more than three times their joint error.
+        """
+        return self._result.evidence[1]
+
+    @property
+    def log_evidence_ladder(self) -> float:
+        """Log-evidence by tempering: the sum of the increments of all stages."""
+        return self._result.log_evidence_ladder
+
+    @property
+    def log_evidence_check(self) -> EvidenceCheck | None:
+        """The evidence by importance sampling after the annealing; None with ``check_draws=0``."""
+        self._result.require_finished()
+        return self._result.check
+
+    def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
+        """Monte Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
+
+        Copies made by the latest resamplings and the autocorrelation of the chain are accounted for
+        (`samplers.tempering.genealogy`). A chain that another sampler continues without the journal has lost the record
+        of its resampling: each walker then counts as independent. The dependence between walkers that some moves
+        introduce, such as emcee's stretch move, is not accounted for. A single run cannot detect a mode that it lost,
+        or moves that did not move: after a `SamplingWarning` the errors are too small.
+        """
+        founders = self._result.founders
+        chain = self.get_chain(discard=discard, thin=thin)
+        return standard_error_of_mean(chain, np.arange(self.nwalkers) if founders is None else founders)
+
+    @property
+    def rounds(self) -> tuple[GuidedRound, ...]:
+        """Rounds of the guide in the last annealing of this object; empty without a guide."""
+        return self._result.rounds
+
+    @property
+    def simulations(self) -> float:
+        """Simulations of this run: distinct evaluated points in the slow parameters, and those made by the guide.
+
+        Points that differ only in ``log_prob_fn.fast_parameters`` count once. Includes the interrupted run that is
+        continued. A cache of `log_prob_fn` can make some of them unnecessary.
+        """
+        return self._evaluator.budget.simulations

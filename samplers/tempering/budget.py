@@ -1,0 +1,116 @@
+"""Simulations of a run: how many there were, and whether more fit into a limit.
+
+An evaluation needs a simulation unless only fast parameters differ from an earlier point. Therefore distinct points in
+the slow parameters are counted, and the simulations that a guide made by itself are added.
+
+A limit never changes what a run does: it only ends it. So a run that is continued with a larger limit repeats the same
+steps and goes on.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+__all__ = ["Budget", "BudgetExhausted", "CountsSimulations"]
+
+
+class BudgetExhausted(Exception):
+    """A batch does not fit into the limit of simulations.
+
+    Parameters
+    ----------
+    records : (m,) structured array
+        Records of the first m points of the batch, which were evaluated.
+
+    Attributes
+    ----------
+    records : (m,) structured array
+        See above.
+    """
+
+    def __init__(self, records: np.ndarray):
+        super().__init__("the limit of simulations (max_simulations) does not allow this batch")
+        self.records = records
+
+
+class CountsSimulations(Protocol):
+    """An object that makes simulations by itself, such as a guide.
+
+    Attributes
+    ----------
+    simulations : float
+        Simulations made so far.
+    """
+
+    simulations: float
+
+
+class Budget:
+    """Counts simulations and compares them with a limit.
+
+    Parameters
+    ----------
+    fast : sequence of int
+        Indices of the fast parameters.
+    limit : float, optional
+        Largest number of simulations; no limit by default.
+
+    Attributes
+    ----------
+    limit : float, or None
+        The limit.
+    guide : object with an attribute simulations, or None
+        The guide of the run.
+    refused : bool
+        Whether `fits` has returned False.
+    """
+
+    def __init__(self, fast: Sequence[int] = (), limit: float | None = None):
+        self._fast = np.asarray(fast, dtype=int)
+        self.limit = limit
+        self.guide: CountsSimulations | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all points."""
+        self._seen: set[int] = set()
+        self.refused = False
+
+    def _keys(self, coords: np.ndarray) -> list[int]:
+        slow = np.setdiff1d(np.arange(coords.shape[1]), self._fast)
+        rows = np.ascontiguousarray(coords[:, slow] if len(slow) > 0 else coords)
+        return [int.from_bytes(hashlib.blake2b(row, digest_size=8).digest(), "little") for row in rows]
+
+    @property
+    def simulations(self) -> float:
+        """Distinct points in the slow parameters, and the simulations of the guide."""
+        return len(self._seen) + (0.0 if self.guide is None else self.guide.simulations)
+
+    @property
+    def remaining(self) -> float:
+        """Simulations left; inf without a limit."""
+        return np.inf if self.limit is None else max(self.limit - self.simulations, 0.0)
+
+    def fits(self, simulations: float) -> bool:
+        """Whether that many more simulations fit; a refusal is noted in `refused`."""
+        fit = simulations <= self.remaining
+        self.refused = self.refused or not fit
+        return fit
+
+    def count(self, coords: np.ndarray) -> None:
+        """Enter evaluated points (n, ndim)."""
+        self._seen.update(self._keys(coords))
+
+    def fitting(self, coords: np.ndarray) -> int:
+        """How many of the first points (n, ndim) fit."""
+        if self.limit is None:
+            return len(coords)
+        remaining, new = self.remaining, set()
+        for number, key in enumerate(self._keys(coords)):
+            if key not in self._seen:
+                new.add(key)
+                if len(new) > remaining:
+                    return number
+        return len(coords)

@@ -1,0 +1,169 @@
+"""Guides: objects that know where the posterior is, and propose independent draws there.
+
+A sampler with a guide needs no sequence of tempering stages (`samplers.tempering.guided`). A guide may be anything with
+a normalised density: a Laplace approximation, a normalising flow, a mixture fitted to an earlier run, or an emulator of
+the model. It need not be exact, since every draw is evaluated and weighted.
+"""
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+__all__ = ["AdaptedGuide", "Guide", "GuideSession", "check_guide", "guide_fingerprint"]
+
+
+class GuideSession(NamedTuple):
+    """What a sampler lends to its guide.
+
+    Attributes
+    ----------
+    random : RandomState
+        The sampler's random generator.
+    remember : callable
+        ``remember(key, compute)`` returns the list of arrays that ``compute()`` returns, and stores it in the journal
+        of the run under `key` (str). Where a run is resumed, the stored arrays are returned, and `compute` is not
+        called. For equal keys, the arrays that were stored first are returned first.
+    fits : callable
+        ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; where
+        it returns False, the guide makes none and returns.
+    remaining : callable
+        ``remaining()``: simulations left, inf without a limit. For information: no decision except to stop may depend
+        on it, otherwise a run that is continued with a larger limit cannot repeat its first part.
+    """
+
+    random: np.random.RandomState
+    remember: Callable[[str, Callable[[], Sequence[np.ndarray]]], list[np.ndarray]]
+    fits: Callable[[float], bool]
+    remaining: Callable[[], float]
+
+
+class Guide(Protocol):
+    """Independent draws near the posterior, with their density.
+
+    `draw`, `log_density` and `refine` are required. A guide may have these members as well:
+
+    ``prepare(session)``
+        A generator that makes a costly search before the first draw; each item advances the progress bar.
+    ``observe(coords, session)``
+        Called with points (n, ndim) directly before they are evaluated, so that a guide can simulate and keep what
+        `log_prob_fn` does not return. Requires ``vectorize=True``.
+    ``fresh()``
+        A new guide in the state before `prepare`. A sampler works on it and never changes the guide that it was given;
+        without this method, it works on a deep copy.
+    ``simulations`` : float
+        Simulations made by `prepare` and `refine`; parts of a simulation count as fractions.
+    ``log_density_error`` : float
+        Standard error of the logarithm of the normalising constant of the density.
+    ``concerns`` : sequence of str
+        Reasons why parts of the posterior may be missing.
+    ``fingerprint`` : str
+        Identity of the guide: a run is resumed only with an equal one.
+    """
+
+    def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Independent draws (n, ndim), all inside the support of the prior."""
+
+    def log_density(self, coords: np.ndarray) -> np.ndarray:
+        """Logarithm (n,) of the normalised density of `draw` at points (n, ndim); -inf is allowed."""
+
+    def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Iterator[None] | None:
+        """Learn from the latest draws (n, ndim) and their log-probabilities (n,), -inf where an evaluation failed.
+
+        Later draws and densities may change. May be a generator; each item advances the progress bar.
+        """
+
+
+class AdaptedGuide:
+    """A user's guide, with defaults for the members that it does not have.
+
+    Parameters
+    ----------
+    guide : Guide
+        The user's guide; a fresh copy of it is used.
+    ndim : int
+        Number of parameters.
+
+    Attributes
+    ----------
+    guide : Guide
+        The copy in use.
+    """
+
+    def __init__(self, guide: Guide, ndim: int):
+        fresh = getattr(guide, "fresh", None)
+        self.guide = copy.deepcopy(guide) if fresh is None else fresh()
+        self._ndim = ndim
+
+    def _optional(self, name: str, default: Any) -> Any:
+        return getattr(self.guide, name, default)
+
+    @property
+    def simulations(self) -> float:
+        """Simulations that the guide made by itself."""
+        return float(self._optional("simulations", 0.0))
+
+    @property
+    def log_density_error(self) -> float:
+        """Standard error of the logarithm of the normalising constant."""
+        return float(self._optional("log_density_error", 0.0))
+
+    @property
+    def concerns(self) -> tuple[str, ...]:
+        """Why parts of the posterior may be missing."""
+        return tuple(self._optional("concerns", ()))
+
+    @property
+    def observe(self) -> Callable[[np.ndarray, GuideSession], None] | None:
+        """The guide's method `observe`, or None."""
+        return self._optional("observe", None)
+
+    def prepare(self, session: GuideSession) -> Iterator[None]:
+        """The search before the first draw."""
+        prepare = self._optional("prepare", None)
+        yield from () if prepare is None else (prepare(session) or ())
+
+    def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (n, ndim); ValueError for any other shape."""
+        coords = np.asarray(self.guide.draw(n, random), dtype=float)
+        if coords.shape != (n, self._ndim) or not np.all(np.isfinite(coords)):
+            raise ValueError(
+                f"guide.draw({n}, random) must return {n} finite points of {self._ndim} parameters; got shape "
+                f"{coords.shape}{'' if coords.shape != (n, self._ndim) else ' with infinite or NaN numbers'}"
+            )
+        return coords
+
+    def log_density(self, coords: np.ndarray) -> np.ndarray:
+        """Log-density (n,); ValueError for any other shape, NaN or +inf."""
+        values = np.asarray(self.guide.log_density(coords), dtype=float)
+        if values.shape != (len(coords),) or np.any(np.isnan(values) | (values == np.inf)):
+            raise ValueError(
+                f"guide.log_density must return one number per point, {len(coords)} in all, neither NaN nor +inf; got "
+                f"shape {values.shape}{'' if values.shape != (len(coords),) else ' with NaN or +inf'}"
+            )
+        return values
+
+    def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Iterator[None]:
+        """Let the guide learn from the latest draws."""
+        yield from self.guide.refine(coords, log_prob, session) or ()
+
+
+def check_guide(guide: Any, vectorize: bool) -> None:
+    """Raise ValueError if an object lacks a method that every guide needs, or cannot observe without `vectorize`."""
+    missing = [name for name in ("draw", "log_density", "refine") if not callable(getattr(guide, name, None))]
+    if missing:
+        raise ValueError(
+            f"a guide needs the methods draw(n, random), log_density(coords) and refine(coords, log_prob, session); "
+            f"{type(guide).__name__} has no {', '.join(missing)}"
+        )
+    if getattr(guide, "observe", None) is not None and not vectorize:
+        raise ValueError(
+            "this guide simulates the points before they are evaluated (it has a method observe), so they must be "
+            "evaluated in this process: pass vectorize=True, and a pool to the posterior instead of to the sampler"
+        )
+
+
+def guide_fingerprint(guide: Guide) -> str:
+    """Identity of a guide: its attribute `fingerprint`, or else the name of its class."""
+    return str(getattr(guide, "fingerprint", type(guide).__name__))

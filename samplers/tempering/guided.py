@@ -1,0 +1,245 @@
+"""Start from a guide: rounds of draws that are evaluated, weighted and used to refine the guide.
+
+The density of a round is fixed before its draws are made, and each draw is weighted by it
+(`samplers.tempering.rounds`). The rounds end with one that is *trusted*: its effective share and the Pareto shape of
+its weights are good enough, although its draws had no part in the density that they are weighted with. All rounds
+together must then have an effective sample size of the number of walkers.
+
+A part of the posterior that a guide never proposes is not seen by its own draws. Guides with a share of the prior in
+their density can find it; others rest on their search (`concerns`).
+"""
+
+from collections.abc import Generator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .adaptive_importance import StartingDensity
+from .budget import Budget, BudgetExhausted
+from .guide import AdaptedGuide, GuideSession
+from .population import Density, GuidedRound, Population, Report, Sweep
+from .rounds import PooledRounds, Round, pool_rounds
+from .settings import GuidedSettings
+
+__all__ = ["LARGEST_USABLE_SHAPE", "Guidance", "RoundsOfGuide", "draw_rounds", "start_from_guide", "trusted"]
+
+LARGEST_USABLE_SHAPE = 0.7
+FEW_DRAWS = 100
+
+
+class Guidance(NamedTuple):
+    """A guide, and what it is lent.
+
+    Attributes
+    ----------
+    guide : AdaptedGuide
+        The guide.
+    session : GuideSession
+        What it is lent.
+    budget : Budget
+        Simulations so far, and their limit.
+    """
+
+    guide: AdaptedGuide
+    session: GuideSession
+    budget: Budget
+
+
+class RoundsOfGuide(NamedTuple):
+    """Result of `draw_rounds`.
+
+    Attributes
+    ----------
+    doubt : str
+        Why the draws cannot be used; empty if they can.
+    shortfall : str
+        What was not reached although the draws can be used; empty if all was.
+    pooled : PooledRounds, or None
+        All draws; None if the limit of simulations did not allow one.
+    last : Round, or None
+        The last round.
+    stopped : bool
+        Whether the limit of simulations ended the rounds.
+    """
+
+    doubt: str
+    shortfall: str
+    pooled: PooledRounds | None
+    last: Round | None
+    stopped: bool = False
+
+
+def trusted(latest: Round, settings: GuidedSettings) -> bool:
+    """Whether a fresh round shows that the guide describes the posterior."""
+    share = latest.effective_share
+    if share < settings.trusted_share:
+        return False
+    few = len(latest.log_weights) < FEW_DRAWS
+    return latest.pareto_shape < settings.largest_pareto_shape or (few and share >= settings.short_tail_share)
+
+
+def draw_rounds(
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    guidance: Guidance,
+    settings: GuidedSettings,
+) -> Generator[tuple[Population, Report], None, RoundsOfGuide]:
+    """Let the guide search, then draw, evaluate and refine until a fresh round is trusted.
+
+    Parameters
+    ----------
+    population : Population
+        Draws of the prior, as many as there are walkers. They are not evaluated.
+    density : Density
+        The posterior.
+    random : RandomState
+        Source of random numbers.
+    guidance : Guidance
+        The guide.
+    settings : GuidedSettings
+        Constants.
+
+    Yields
+    ------
+    Population, Sweep or GuidedRound
+        A tick of the progress bar, or a round.
+
+    Returns
+    -------
+    RoundsOfGuide
+    """
+    guide, session, budget = guidance
+    size, rounds = len(population.coords), []
+    for _ in guide.prepare(session):
+        yield population, Sweep(0.0)
+    while True:
+        coords = guide.draw(_next_size(rounds, size, settings, guide), random)
+        latest, complete = _evaluate_round(coords, density, guide, session)
+        if latest is not None:
+            rounds.append(latest)
+        if not rounds:
+            return RoundsOfGuide("", "", None, None, True)
+        pooled = pool_rounds(rounds, guide.log_density_error)
+        last = rounds[-1]
+        population = population._replace(effective_sample_size=pooled.effective_sample_size)
+        yield (
+            population,
+            GuidedRound(
+                len(last.coords),
+                last.effective_share,
+                last.pareto_shape,
+                pooled.log_evidence,
+                pooled.log_evidence_error,
+                pooled.effective_sample_size,
+            ),
+        )
+        yield population, Sweep(last.effective_share)
+        if not complete or budget.refused:
+            return RoundsOfGuide("", "", pooled, last, True)
+        enough = pooled.effective_sample_size >= size
+        if enough and trusted(last, settings):
+            return RoundsOfGuide("", "", pooled, last)
+        if doubt := _hopeless(rounds, settings):
+            return RoundsOfGuide(doubt, "", pooled, last)
+        if len(rounds) >= settings.most_rounds:
+            shortfall = _describe(last, settings)
+            usable = last.effective_share >= settings.usable_share and pooled.pareto_shape < LARGEST_USABLE_SHAPE
+            return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
+        for _ in guide.refine(last.coords, last.records["log_prob"].copy(), session):
+            yield population, Sweep(last.effective_share)
+        if budget.refused:
+            return RoundsOfGuide("", "", pooled, last, True)
+
+
+def _next_size(rounds: Sequence[Round], size: int, settings: GuidedSettings, guide: AdaptedGuide) -> int:
+    """Number of draws of the next round."""
+    first = max(settings.fewest_draws, int(np.ceil(settings.first_round_share * size)))
+    if not rounds:
+        return first
+    last = rounds[-1]
+    if trusted(last, settings):
+        missing = size - pool_rounds(rounds, guide.log_density_error).effective_sample_size
+        return int(np.clip(np.ceil(missing / last.effective_share), first, max(size, first)))
+    return max(settings.fewest_draws, int(np.ceil(settings.round_share * size)))
+
+
+def _evaluate_round(
+    coords: np.ndarray, density: Density, guide: AdaptedGuide, session: GuideSession
+) -> tuple[Round | None, bool]:
+    """Evaluate draws; None if the limit of simulations allows not one, and whether it allowed all."""
+    log_density = guide.log_density(coords)
+    if np.any(log_density == -np.inf):
+        raise ValueError(
+            f"guide.log_density is -inf at {int(np.sum(log_density == -np.inf))} of {len(coords)} draws of the guide: "
+            "it must return the logarithm of the density that guide.draw draws from"
+        )
+    complete, observe = True, guide.observe
+    try:
+        if observe is None:
+            records = density.evaluate(coords)
+        else:
+            records = density.evaluate_observed(coords, lambda points: observe(points, session))
+    except BudgetExhausted as stop:
+        records, complete = stop.records, False
+    n = len(records)
+    if n == 0:
+        return None, complete
+    log_prob = records["log_prob"]
+    alive = log_prob > -np.inf
+    log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density[:n], -np.inf)
+    return Round(coords[:n], records, log_weights), complete
+
+
+def _hopeless(rounds: Sequence[Round], settings: GuidedSettings) -> str:
+    """Why to give up; empty if there is no reason."""
+    recent = [r.effective_share for r in rounds[-settings.hopeless_rounds :]]
+    if len(recent) < settings.hopeless_rounds or np.mean(recent) >= settings.hopeless_share:
+        return ""
+    return f"the effective sample size of the last {len(recent)} rounds is {100 * np.mean(recent):.2g} % of their draws"
+
+
+def _describe(last: Round, settings: GuidedSettings) -> str:
+    """What the last round lacks."""
+    found = (
+        f"after {settings.most_rounds} rounds, the effective sample size of fresh draws is "
+        f"{100 * last.effective_share:.2g} % of their number, and the Pareto shape of their weights is "
+        f"{last.pareto_shape:.2g}"
+    )
+    needed = f"at least {100 * settings.trusted_share:g} % and below {settings.largest_pareto_shape:g} are needed"
+    return f"{found} ({needed})"
+
+
+def start_from_guide(
+    last: Round, prior: Population, density: Density, guide: AdaptedGuide
+) -> tuple[Population, StartingDensity]:
+    """Points to start recycling from: the last round of the guide and as many draws of the prior.
+
+    Parameters
+    ----------
+    last : Round
+        Draws of the guide as it is now.
+    prior : Population
+        Draws of the prior.
+    density : Density
+        The posterior.
+    guide : AdaptedGuide
+        The guide, which must not change any more.
+
+    Returns
+    -------
+    population : Population
+        The points.
+    start : StartingDensity
+        The mixture that they were drawn from.
+    """
+    few = prior.coords[: max(len(last.coords), prior.coords.shape[1] + 2)]
+    coords = np.concatenate([last.coords, few])
+    records = np.concatenate([last.records, density.evaluate(few)])
+    made = len(coords)
+    log_share, log_rest = np.log(len(last.coords) / made), np.log(len(few) / made)
+
+    def log_density(points: np.ndarray, records: np.ndarray) -> np.ndarray:
+        return np.logaddexp(log_share + guide.log_density(points), log_rest + records["log_prior"])
+
+    return Population(0.0, coords, records, float(made)), StartingDensity(made, log_density)

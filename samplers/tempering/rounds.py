@@ -1,0 +1,168 @@
+r"""Rounds of importance sampling whose proposal changes from round to round: weights, evidence and its error.
+
+Round r has :math:`n_r` independent draws of a density :math:`q_r` that was fixed before they were made. Each draw is
+weighted by its own density, :math:`w_i = \pi(\theta_i) / q_r(\theta_i)` with the posterior density :math:`\pi` before
+normalisation. The mean of these weights, :math:`\hat Z_r`, is an unbiased estimate of the evidence whatever the earlier
+rounds were like. The rounds are combined as :math:`\hat Z = \sum_r \alpha_r \hat Z_r`.
+
+The shares :math:`\alpha_r` must not depend on the weights of the same round: a round with one very large weight has a
+small effective sample size, and a smaller share for it would make the evidence too small on average. Therefore
+:math:`\alpha_r` is proportional to the number of draws times the effective share (effective sample size / number of
+draws) of the *previous* round. Only the first round has no previous one and takes its own.
+
+The equations are in ``docs/theory/guided``.
+
+References
+----------
+Owen, A. B. & Zhou, Y. (2020), The square root rule for adaptive importance sampling, ACM Transactions on Modeling and
+Computer Simulation 30(2), doi:10.1145/3350426 (unbiased combinations of rounds)
+Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72) (Pareto shape)
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .evidence_check import pareto_shape
+from .weights import effective_sample_size, log_mean_weight, normalised_weights
+
+__all__ = ["PooledRounds", "Round", "pool_rounds", "round_shares", "tail_variance"]
+
+
+# Pareto shape that is assumed for fewer weights than an estimate needs
+SHAPE_OF_FEW = 0.7
+
+
+class Round(NamedTuple):
+    """Draws of one proposal density.
+
+    Attributes
+    ----------
+    coords : (n, ndim) float
+        The draws.
+    records : (n,) structured array
+        Their records (log_prob, log_prior and, where there are any, blobs).
+    log_weights : (n,) float
+        Log-probability minus log-density of the proposal; -inf for impossible points.
+    """
+
+    coords: np.ndarray
+    records: np.ndarray
+    log_weights: np.ndarray
+
+    @property
+    def effective_sample_size(self) -> float:
+        """Of the weights."""
+        return effective_sample_size(self.log_weights)
+
+    @property
+    def effective_share(self) -> float:
+        """Effective sample size divided by the number of draws."""
+        return self.effective_sample_size / len(self.log_weights)
+
+    @property
+    def pareto_shape(self) -> float:
+        """Pareto shape of the largest weights; inf for too few weights."""
+        return pareto_shape(self.log_weights)
+
+
+class PooledRounds(NamedTuple):
+    """All draws of several rounds.
+
+    Attributes
+    ----------
+    coords : (n, ndim) float
+        The draws.
+    records : (n,) structured array
+        Their records.
+    log_weights : (n,) float
+        Log-weights, whose sum of exponentials is the evidence.
+    log_evidence, log_evidence_error : float
+        Log-evidence and its standard error.
+    effective_sample_size : float
+        Of the weights.
+    pareto_shape : float
+        Of the largest weights.
+    """
+
+    coords: np.ndarray
+    records: np.ndarray
+    log_weights: np.ndarray
+    log_evidence: float
+    log_evidence_error: float
+    effective_sample_size: float
+    pareto_shape: float
+
+
+def round_shares(sizes: Sequence[int], effective_shares: Sequence[float]) -> np.ndarray:
+    """Share of each round in the evidence, with sum 1.
+
+    Parameters
+    ----------
+    sizes : sequence of int
+        Number of draws per round.
+    effective_shares : sequence of float
+        Effective sample size of each round divided by its number of draws. That of the last round has no effect unless
+        it is the only round.
+    """
+    lagged = [effective_shares[0], *effective_shares[:-1]]
+    # a round after one without a single effective draw still counts as one point
+    shares = np.maximum(np.asarray(sizes) * np.asarray(lagged), 1.0)
+    return shares / shares.sum()
+
+
+def tail_variance(log_weights: np.ndarray) -> float:
+    r"""Variance of the log-evidence due to weights larger than all that were drawn.
+
+    If the largest weights have a Pareto shape :math:`0 < k < 1`, the mean excess over the largest normalised weight
+    :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error. It is infinite for
+    :math:`k \ge 1`. Where there are too few weights for an estimate, k is 0.7.
+
+    Parameters
+    ----------
+    log_weights : (n,) float
+        Logarithms of the weights, at least one of them finite.
+    """
+    shape = pareto_shape(log_weights)
+    shape = SHAPE_OF_FEW if shape == np.inf else shape
+    if shape >= 1.0:
+        return float("inf")
+    largest = float(np.max(normalised_weights(log_weights)))
+    return (largest * max(shape, 0.0) / (1.0 - shape)) ** 2
+
+
+def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> PooledRounds:
+    r"""Combine rounds.
+
+    The variance of the log-evidence is the sum of three parts: the variance of the mean weights of the rounds,
+    :math:`\sum_r \alpha_r^2 s_r^2 / (n_r \hat Z^2)` with the sample variance :math:`s_r^2` of the weights;
+    `tail_variance`; and the squared error of the normalising constant of the proposal density.
+
+    Parameters
+    ----------
+    rounds : sequence of Round
+        At least one, in order.
+    log_density_error : float
+        Standard error of the logarithm of the normalising constant of the proposal density.
+
+    Returns
+    -------
+    PooledRounds
+    """
+    sizes = [len(r.log_weights) for r in rounds]
+    shares = round_shares(sizes, [r.effective_share for r in rounds])
+    parts = [r.log_weights + np.log(share / n) for r, share, n in zip(rounds, shares, sizes, strict=True)]
+    log_weights = np.concatenate(parts)
+    log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
+    shape = pareto_shape(log_weights)
+    coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
+    if log_evidence == -np.inf:
+        return PooledRounds(coords, records, log_weights, log_evidence, float("inf"), 0.0, shape)
+    variance = log_density_error**2
+    for part, n in zip(parts, sizes, strict=True):
+        weights = np.exp(part - log_evidence)
+        variance += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
+    variance += tail_variance(log_weights)
+    effective = effective_sample_size(log_weights)
+    return PooledRounds(coords, records, log_weights, log_evidence, float(np.sqrt(variance)), effective, shape)

@@ -1,0 +1,89 @@
+"""What is known when the limit of simulations ends an annealing: points with their weights at beta = 1."""
+
+import numpy as np
+
+from .population import Population
+from .rounds import tail_variance
+from .weights import effective_sample_size, log_mean_weight
+
+__all__ = ["StoppedEarly", "stop_at"]
+
+
+class StoppedEarly(Exception):
+    """The limit of simulations has ended an annealing.
+
+    Parameters
+    ----------
+    population : Population
+        The points that are known, with log-weights at beta = 1 unless `complete`.
+    log_evidence, error : float
+        Log-evidence of these weights, and its standard error.
+    beta : float
+        Tempering exponent that the points were made for.
+    log_evidence_of_stages : float
+        Part of the log-evidence that is in stages already reported.
+    complete : bool
+        Whether beta = 1 was reached and its stage reported; the population is then equally weighted.
+    """
+
+    def __init__(
+        self,
+        population: Population,
+        log_evidence: float,
+        error: float,
+        beta: float,
+        log_evidence_of_stages: float = 0.0,
+        complete: bool = False,
+    ):
+        super().__init__("the limit of simulations (max_simulations) ended the annealing")
+        self.population, self.log_evidence, self.error, self.beta = population, log_evidence, error, beta
+        self.log_evidence_of_stages, self.complete = log_evidence_of_stages, complete
+
+    @property
+    def effective_sample_size(self) -> float:
+        """Of the weights at beta = 1."""
+        if self.population.log_weights is None:
+            return self.population.effective_sample_size
+        return effective_sample_size(self.population.log_weights)
+
+
+def stop_at(
+    population: Population,
+    log_evidence: float,
+    error: float,
+    log_evidence_of_stages: float = 0.0,
+    log_start: np.ndarray | None = None,
+) -> StoppedEarly:
+    """Weigh equally weighted points at some beta by the posterior.
+
+    Parameters
+    ----------
+    population : Population
+        Equally weighted points at `population.beta`.
+    log_evidence : float
+        Log-evidence at this beta.
+    error : float
+        Its standard error.
+    log_evidence_of_stages : float
+        Part of it that is in stages already reported.
+    log_start : (n,) float, optional
+        Log-density at beta = 0; that of the prior by default.
+
+    Returns
+    -------
+    StoppedEarly
+        To be raised.
+    """
+    records = population.records
+    alive = records["log_prob"] > -np.inf
+    base = records["log_prior"] if log_start is None else log_start
+    ratio = np.where(alive, records["log_prob"], 0.0) - np.where(alive, base, 0.0)
+    log_weights = np.where(alive, (1.0 - population.beta) * ratio, -np.inf)
+    population = population._replace(log_weights=log_weights)
+    if not alive.any():
+        return StoppedEarly(population, float("-inf"), float("inf"), population.beta, log_evidence_of_stages)
+    increment = log_mean_weight(log_weights)
+    effective = effective_sample_size(log_weights)
+    variance = error**2 + 1.0 / effective - 1.0 / len(log_weights) + tail_variance(log_weights)
+    total = log_evidence + increment
+    return StoppedEarly(population, total, float(np.sqrt(variance)), population.beta, log_evidence_of_stages)

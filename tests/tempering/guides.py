@@ -1,0 +1,95 @@
+"""Guides for tests: a t distribution with an optional share of the prior, and a mixture that learns from the draws."""
+
+import numpy as np
+from scipy import stats
+
+from samplers.proposals.mixture import draw, fit_mixture, log_density
+from samplers.tempering.weights import coarse_weights, effective_sample_size
+
+
+class FixedGuide:
+    """Multivariate t distributions of given weights, and a share of the prior; draws outside the support are repeated.
+
+    The density is normalised over the support by the share of the draws that lie inside it, from many draws.
+    """
+
+    dof = 6.0
+
+    def __init__(self, posterior, means, covariances, weights=None, prior_share=0.0):
+        self.posterior, self.prior_share = posterior, prior_share
+        self.parts = [
+            stats.multivariate_t(mean, np.asarray(c) * (self.dof - 2.0) / self.dof, df=self.dof)
+            for mean, c in zip(np.atleast_2d(means), np.atleast_3d(covariances), strict=True)
+        ]
+        self.weights = np.full(len(self.parts), 1.0 / len(self.parts)) if weights is None else np.asarray(weights)
+        self._normalise()
+
+    def _normalise(self):
+        self.log_inside = float(np.log(np.mean(self._inside(self._draw_parts(20_000, np.random.RandomState(0))))))
+
+    def _inside(self, coords):
+        return np.asarray(self.posterior.log_prior(coords)) > -np.inf
+
+    def _draw_parts(self, n, random):
+        part = random.choice(len(self.parts), size=n, p=self.weights)
+        coords = np.stack([np.atleast_2d(p.rvs(size=n, random_state=random)).reshape(n, -1) for p in self.parts])
+        return coords[part, np.arange(n)]
+
+    def draw(self, n, random):
+        found = np.empty((0, self.posterior.ndim))
+        while len(found) < n:
+            coords = self._draw_parts(n, random)
+            found = np.concatenate([found, coords[self._inside(coords)]])
+        from_prior = random.uniform(size=n) < self.prior_share
+        return np.where(from_prior[:, None], self.posterior.sample_prior(n, random), found[:n])
+
+    def _log_parts(self, coords):
+        logs = [np.log(w) + np.atleast_1d(p.logpdf(coords)) for w, p in zip(self.weights, self.parts, strict=True)]
+        return np.logaddexp.reduce(logs)
+
+    def log_density(self, coords):
+        total = self._log_parts(coords) - self.log_inside
+        if self.prior_share == 0.0:
+            return total
+        prior = np.log(self.prior_share) + self.posterior.log_prior(coords)
+        return np.logaddexp(np.log1p(-self.prior_share) + total, prior)
+
+    def refine(self, coords, log_prob, session):
+        pass
+
+
+class LearningGuide(FixedGuide):
+    """Starts as a `FixedGuide`; a mixture fitted to all draws then replaces most of it.
+
+    The draws are weighted by the densities that they came from. One draw in five still comes from the start.
+    """
+
+    start_share = 0.2
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.mixture, self.coords, self.log_weights, self.refinements = None, [], [], 0
+
+    def _draw_parts(self, n, random):
+        start = super()._draw_parts(n, random)
+        if self.__dict__.get("mixture") is None:
+            return start
+        return np.where((random.uniform(size=n) < self.start_share)[:, None], start, draw(self.mixture, n, random))
+
+    def _log_parts(self, coords):
+        start = super()._log_parts(coords)
+        if self.mixture is None:
+            return start
+        fitted = np.log1p(-self.start_share) + log_density(self.mixture, coords)
+        return np.logaddexp(fitted, np.log(self.start_share) + start)
+
+    def refine(self, coords, log_prob, session):
+        self.refinements += 1
+        alive = log_prob > -np.inf
+        self.coords.append(coords[alive])
+        self.log_weights.append(log_prob[alive] - self.log_density(coords[alive]))
+        points, log_weights = np.concatenate(self.coords), np.concatenate(self.log_weights)
+        if effective_sample_size(log_weights) > 3 * (points.shape[1] + 1):
+            self.mixture = fit_mixture(points, coarse_weights(log_weights))
+            self._normalise()
+        yield

@@ -1,0 +1,182 @@
+"""Runs with a guide: rounds of weighted draws instead of annealing, and independence sweeps at beta = 1."""
+
+import pickle
+import warnings
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import GuideMove, SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.tempering.rounds import Round, pool_rounds, round_shares
+from tests.contract.targets import Gaussian
+from tests.tempering.guides import FixedGuide, LearningGuide
+
+N = 100
+
+
+def laplace(posterior, scale=1.0, shift=0.0, guide=FixedGuide, **more):
+    """A guide about the mode of a Gaussian target; `scale` and `shift` in units of its standard deviation."""
+    covariance = np.diag((scale * posterior.sd) ** 2)
+    return guide(posterior, posterior.mean + shift * posterior.sd, [covariance], **more)
+
+
+def run(posterior, guide, steps=1, Sampler=SMCSampler, nwalkers=N, seed=1, **kwargs):
+    sampler = Sampler(nwalkers, posterior.ndim, posterior, vectorize=True, seed=seed, guide=guide, **kwargs)
+    sampler.run_mcmc(None, steps)
+    return sampler
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_a_good_guide_replaces_the_annealing(Sampler):
+    posterior = Gaussian(5, sd=0.02)
+    sampler = run(posterior, laplace(posterior), Sampler=Sampler)
+    assert posterior.calls == sampler.evaluations == sampler.simulations < 2.6 * N
+    assert [stage.beta for stage in sampler.ladder] == [1.0]
+    assert sampler.ladder[0].evaluations == sum(r.draws for r in sampler.rounds) < 1.6 * N
+    assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error < 0.3
+    chain = sampler.get_chain(flat=True)
+    assert chain.shape == (N, 5)
+    assert np.all(np.abs(chain.mean(axis=0) - posterior.mean) < 4.0 * sampler.mean_error())
+    assert np.all(np.abs(chain.std(axis=0) / posterior.sd - 1.0) < 0.35)
+
+
+def test_adding_a_constant_adds_it_to_the_evidence():
+    runs = [run(Gaussian(offset=c), laplace(Gaussian(offset=c), guide=LearningGuide, scale=2.0)) for c in (0.0, 4096.0)]
+    assert np.array_equal(runs[0].get_chain(), runs[1].get_chain())
+    assert runs[1].log_evidence - runs[0].log_evidence == pytest.approx(4096.0, abs=1e-9)
+
+
+def test_the_guide_that_was_given_is_not_changed():
+    posterior = Gaussian()
+    guide = laplace(posterior, scale=2.0, guide=LearningGuide)
+    sampler = run(posterior, guide)
+    assert guide.refinements == 0 and sampler.guide.refinements == len(sampler.rounds) - 1 > 0
+    again = run(posterior, guide)
+    assert np.array_equal(sampler.get_chain(), again.get_chain())
+
+
+def test_each_walker_is_evaluated_once_per_sweep():
+    posterior = Gaussian()
+    sampler = run(posterior, laplace(posterior), steps=0)
+    before = sampler.evaluations
+    sampler.run_mcmc(None, 7)
+    assert sampler.evaluations - before == 7 * N
+    assert 0.6 < np.mean(sampler.acceptance_fraction) <= 1.0
+
+
+def test_sweeps_of_a_guide_leave_the_posterior_unchanged(rng):
+    """Exact draws stay exact, even with a guide that is far too wide and shifted."""
+    posterior = Gaussian(2)
+    n = 4000
+    start = posterior.mean + posterior.sd * rng.standard_normal((n, 2))
+    move = GuideMove(laplace(posterior, scale=1.5, shift=0.7))
+    sampler = emcee.EnsembleSampler(n, 2, posterior, moves=move, vectorize=True)
+    sampler.run_mcmc(start, 5)
+    z = (sampler.get_chain()[-1] - posterior.mean) / posterior.sd
+    assert np.all(np.abs(z.mean(axis=0)) < 4.0 / np.sqrt(n))
+    assert np.all(np.abs(z.var(axis=0) - 1.0) < 4.0 * np.sqrt(2.0 / n))
+
+
+def test_control_a_density_that_is_not_that_of_the_draws_shows(rng):
+    """Negative control of the test above: the draws of one guide with the density of another."""
+    posterior = Gaussian(2)
+    n = 4000
+    wrong = laplace(posterior, scale=1.5, shift=0.7)
+    wrong.log_density = laplace(posterior, scale=1.5).log_density
+    start = posterior.mean + posterior.sd * rng.standard_normal((n, 2))
+    sampler = emcee.EnsembleSampler(n, 2, posterior, moves=GuideMove(wrong), vectorize=True)
+    sampler.run_mcmc(start, 5)
+    z = (sampler.get_chain()[-1] - posterior.mean) / posterior.sd
+    assert np.any(np.abs(z.mean(axis=0)) > 8.0 / np.sqrt(n))
+
+
+def test_a_useless_guide_leads_to_recycling_with_a_warning():
+    posterior = Gaussian(2)
+    with pytest.warns(SamplingWarning, match="the draws of the guide are not close enough"):
+        sampler = run(posterior, laplace(posterior, scale=0.3, shift=4.0))
+    assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
+
+
+def test_what_a_guide_must_be():
+    posterior = Gaussian()
+
+    class Observes(FixedGuide):
+        def observe(self, coords, session):
+            pass
+
+    guide = Observes(posterior, posterior.mean, [np.diag(posterior.sd**2)])
+    with pytest.raises(ValueError, match="pass vectorize=True"):
+        SMCSampler(N, 3, posterior, guide=guide)
+    with pytest.raises(ValueError, match="has no log_density, refine"):
+        SMCSampler(N, 3, posterior, guide=type("Draws", (), {"draw": lambda self, n, random: None})())
+    for name, wrong, match in (
+        ("draw", lambda n, random: np.zeros((n, 2)), "must return 30 finite points of 3"),
+        ("log_density", lambda x: np.full(len(x), np.nan), "neither NaN nor"),
+        ("log_density", lambda x: np.full(len(x), -np.inf), "-inf at 30 of 30 draws"),
+    ):
+        guide = laplace(posterior)
+        setattr(guide, name, wrong)
+        with pytest.raises(ValueError, match=match):
+            run(posterior, guide)
+
+
+def test_points_are_observed_once_before_they_are_evaluated():
+    posterior = Gaussian()
+
+    class Observes(LearningGuide):
+        seen = 0
+
+        def observe(self, coords, session):
+            assert posterior.calls == self.seen
+            self.seen += len(coords)
+
+    posterior.calls = 0
+    sampler = run(posterior, laplace(posterior, scale=2.0, guide=Observes), steps=0)
+    assert sampler.guide.seen == sampler.evaluations == posterior.calls
+
+
+def test_points_that_differ_in_fast_parameters_are_one_simulation():
+    posterior = Gaussian()
+    posterior.fast_parameters = (2,)
+    sampler = run(posterior, laplace(posterior), steps=2)
+    draws = sum(r.draws for r in sampler.rounds)
+    assert sampler.simulations <= draws + 2 * N < sampler.evaluations
+
+
+def test_guided_runs_are_pickled():
+    posterior = Gaussian()
+    sampler = run(posterior, laplace(posterior, scale=2.0, guide=LearningGuide))
+    again = pickle.loads(pickle.dumps(sampler))
+    for s in (sampler, again):
+        s.run_mcmc(None, 3)
+    assert np.array_equal(sampler.get_chain(), again.get_chain())
+
+
+def test_shares_of_rounds_depend_on_earlier_rounds_only():
+    shares = round_shares([30, 60, 60], [0.1, 0.5, 0.9])
+    assert np.allclose(shares, np.array([3.0, 6.0, 30.0]) / 39.0)
+    assert np.array_equal(round_shares([30, 60, 60], [0.1, 0.5, 0.01]), shares)
+
+
+@pytest.mark.parametrize("spread", [0.3, 0.7, 1.0])
+def test_the_evidence_of_rounds_is_unbiased_and_its_error_covers(spread, rng):
+    """Lognormal weights with mean 1: the evidence is 1."""
+    values, covered = [], []
+    for _ in range(600):
+        rounds = []
+        for n in (30, 60, 60):
+            log_weights = spread * rng.standard_normal(n) - 0.5 * spread**2
+            rounds.append(Round(np.zeros((n, 1)), np.zeros(n), log_weights))
+        pooled = pool_rounds(rounds)
+        values.append(np.exp(pooled.log_evidence))
+        covered.append(abs(pooled.log_evidence) < 2.0 * pooled.log_evidence_error)
+    error = np.std(values) / np.sqrt(len(values))
+    assert abs(np.mean(values) - 1.0) < 4.0 * error + 0.002
+    assert np.mean(covered) > 0.9
+
+
+def test_no_warning_with_a_good_guide():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(Gaussian(), laplace(Gaussian()))
