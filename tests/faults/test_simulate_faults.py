@@ -1,0 +1,103 @@
+"""Responses on request: killed programs and workers lose no finished simulation and change no result."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.signals.channels import Measurements
+from fe_likelihoods.simulation.disk_cache import SimulationCache
+from tests.faults import cached_run
+from tests.faults import treacherous as bad
+from tests.faults.treacherous import CHANNELS, DT, DiesOnce, Treacherous, line
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = """
+import sys
+from fe_likelihoods import SimulationCache
+from tests.faults import cached_run, test_simulate_faults
+
+path, responses = sys.argv[1:]
+posterior = cached_run.make(SimulationCache(path, responses=bool(int(responses))), 0.01)[1]
+posterior.likelihood.simulate(test_simulate_faults.requested())
+"""
+
+
+def requested():
+    """Structural parameters of 300 oscillators, of which about 30 fail because their damping is negative."""
+    random = np.random.default_rng(5)
+    return np.column_stack([random.uniform(0.5, 1.5, 300), random.uniform(-0.1, 1.0, 300)])
+
+
+@pytest.mark.parametrize("responses", [False, True])
+def test_a_killed_program_has_stored_what_it_finished(tmp_path, responses):
+    path = tmp_path / "killed.sqlite"
+    command = [sys.executable, "-c", PROGRAM, str(path), str(int(responses))]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        watched = None
+        while watched is None or watched.info().simulations < 20:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+            if watched is None and path.exists():
+                watched = SimulationCache(path)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    stored = watched.info()
+    assert 20 <= stored.simulations < 300
+
+    thetas = requested()
+    whole = cached_run.make(SimulationCache(tmp_path / "whole.sqlite", responses=responses))[1].likelihood
+    expected = whole.simulate(thetas)
+    again = cached_run.make(SimulationCache(path, responses=responses))[1].likelihood
+    batch = again.simulate(thetas)
+    np.testing.assert_array_equal(batch.response, expected.response)
+    assert batch.reasons == expected.reasons
+    assert 10 < again.failure_count == sum(map(bool, batch.reasons))
+    known = stored.failures + (stored.responses if responses else 0)
+    assert again.simulations == again.model.runs == 300 - known
+    np.testing.assert_array_equal(again.statistics(thetas), whole.statistics(thetas))
+    assert again.model.runs == 300 - known
+
+
+def test_a_point_that_kills_its_worker_fails_alone(tmp_path):
+    offset = np.linspace(0.1, 0.9, 12)
+    thetas = np.column_stack([bad.FINE + offset, np.full(12, 0.1)])
+    thetas[[3, 8], 0] += bad.CRASHES - bad.FINE
+    model = Treacherous()
+    measured = Measurements(CHANNELS, DT, np.zeros((len(CHANNELS), model.n_steps)))
+    likelihood = FELikelihood(model, measured, pool=2, cache=tmp_path / "cache.sqlite")
+    try:
+        batch = likelihood.simulate(thetas)
+        fine = np.setdiff1d(np.arange(12), [3, 8])
+        np.testing.assert_array_equal(batch.response[fine], [line(theta) for theta in thetas[fine]])
+        assert np.isnan(batch.response[[3, 8]]).all()
+        assert likelihood.failure_reasons == {"the worker process died (signal 11)": 2}
+        assert likelihood.simulations == likelihood.cache.info().simulations == 12
+        again = likelihood.simulate(thetas)  # the failures are not repeated
+        assert likelihood.simulations == 22
+        np.testing.assert_array_equal(again.response, batch.response)
+        assert np.isfinite(likelihood.statistics(thetas)[fine]).all()
+        assert likelihood.simulations == 22
+    finally:
+        likelihood.pool.close()
+
+
+def test_points_of_killed_workers_are_run_again(tmp_path):
+    offset = np.linspace(0.1, 0.9, 4)
+    thetas = np.column_stack([np.append(bad.KILLED + offset, bad.FINE + offset), np.full(8, 0.1)])
+    (tmp_path / "deaths").mkdir()
+    model = DiesOnce(tmp_path / "deaths")
+    measured = Measurements(CHANNELS, DT, np.zeros((len(CHANNELS), model.n_steps)))
+    likelihood = FELikelihood(model, measured, pool=2)
+    try:
+        batch = likelihood.simulate(thetas)
+    finally:
+        likelihood.pool.close()
+    assert batch.reasons == [""] * 8
+    assert (likelihood.simulations, likelihood.failure_count) == (8, 0)
+    np.testing.assert_array_equal(batch.response, [line(theta) for theta in thetas])
