@@ -111,6 +111,7 @@ class CachedSimulations:
         self.cache_hits = 0
         self.disk_hits = 0
         self.seconds = 0.0
+        self._outcomes = 0  # simulations of which is known whether they failed: run here, read from disk, or recalled
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"pool": None}
@@ -194,8 +195,8 @@ class CachedSimulations:
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses of the model; their statistics are cached, so that `log_likelihood` needs no further simulation.
 
-        Duplicates are simulated once. A simulation whose statistics are cached is run again, because only its response
-        is needed, unless it failed or the cache on disk has its response.
+        Duplicates are simulated once. The statistics of a point may be cached without its response. Such a point is
+        simulated again, unless its simulation failed.
 
         Parameters
         ----------
@@ -233,7 +234,8 @@ class CachedSimulations:
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache statistics that are known from an earlier run in memory, without a simulation.
 
-        Failures are recorded. Rows that are cached already are not changed. Nothing is written to the cache on disk.
+        Failures are recorded, and all rows count for `max_failure_share`. Rows that are cached already are not changed.
+        Nothing is written to the cache on disk.
 
         Parameters
         ----------
@@ -260,6 +262,7 @@ class CachedSimulations:
         for place, row in dict(zip(distinct, range(len(thetas)), strict=True)).items():
             if not known[place] and np.isfinite(thetas[row]).all():
                 self.memory_cache.store([keys[place]], statistics[[row]])
+                self._outcomes += 1
                 if reasons[row]:
                     self._failures.add(thetas[row], reasons[row])
 
@@ -328,6 +331,7 @@ class CachedSimulations:
             nothing = np.full((len(keys), self._width), np.nan)
             return CachedRows(nothing, [""] * len(keys), np.zeros(len(keys), dtype=bool))
         stored = self.cache.look_up(self._key, thetas, self._width, self.measurements.n_steps)
+        self._outcomes += int(stored.known.sum())
         for row in np.flatnonzero(stored.known):
             if stored.reasons[row]:
                 self._failures.add(thetas[row], stored.reasons[row])
@@ -365,7 +369,7 @@ class CachedSimulations:
     def _simulate(self, thetas: np.ndarray, responses: bool) -> _Simulated:
         """Results of new simulations, which are counted, recorded if they fail, and stored on disk."""
         # checked before a batch and not after it, so that finished simulations are stored
-        self._failures.check(self.simulations + self.disk_hits)
+        self._failures.check(self._outcomes)
         start = time.perf_counter()
         measured = self.measurements.values
         batch = None
@@ -377,6 +381,7 @@ class CachedSimulations:
         seconds = time.perf_counter() - start
         self.seconds += seconds
         self.simulations += len(thetas)
+        self._outcomes += len(thetas)
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self._failures.add(theta, reason)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..signals.channels import Measurements
 from ..simulation.disk_cache import SimulationCache
-from ..simulation.model import Model, SimulationFailed, simulate_batch
+from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
 from .cached_simulations import CachedSimulations
 from .inputs import as_points, check_model, check_noise_channels
 from .noise import GaussianNoise, Noise, noise_statistic
@@ -110,7 +110,7 @@ class FELikelihood(CachedSimulations):
         return len(self.parameter_names)
 
     def first(self, seconds: float) -> "FELikelihood":
-        """The likelihood of the first part of the measurements, if the model has a method ``first(seconds)``.
+        """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).
 
         Noise, pool, cache on disk and limits are kept; counts and the cache in memory start empty.
 
@@ -128,14 +128,9 @@ class FELikelihood(CachedSimulations):
         ValueError
             If the model cannot be shortened, or the time is not within the measurements.
         """
-        if not hasattr(self.model, "first"):
-            raise ValueError(
-                f"{type(self.model).__name__} cannot be shortened: it needs a method first(seconds) that returns the "
-                "same model under the first part of its excitation"
-            )
         measurements = self.measurements.trim(0.0, seconds)
         # the time of a sample, which leaves no doubt about the length of the response
-        model = self.model.first((measurements.n_steps - 1) * measurements.dt)
+        model = first_part(self.model, (measurements.n_steps - 1) * measurements.dt)
         return self._with(model, measurements, self.noise)
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:

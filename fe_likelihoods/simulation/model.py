@@ -26,6 +26,7 @@ __all__ = [
     "SimulationBatch",
     "SimulationFailed",
     "Statistic",
+    "first_part",
     "has_batch_method",
     "misfit_batch",
     "misfit_of_responses",
@@ -111,7 +112,8 @@ class Model(Protocol):
     With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
     returns the same model under the first part of its excitation. The response of that model must be the first samples
     of the response of this one, up to and including the given time [s], which is that of a sample, and its fingerprint
-    must be another one.
+    must be another one. A model with ``with_record`` and its excitation in the attribute ``record``, a `Record`, can be
+    shortened without this method (`first_part`).
     """
 
     @property
@@ -141,6 +143,36 @@ class Model(Protocol):
 def has_batch_method(model: Model) -> bool:
     """Whether a model has a batch method of its own."""
     return hasattr(model, "misfit_batch") or hasattr(model, "simulate_batch")
+
+
+def first_part(model: Model, seconds: float) -> Model:
+    """The same model under the first part of its excitation.
+
+    Parameters
+    ----------
+    model : Model
+        With a method ``first(seconds)``, or with ``with_record`` and a `Record` in the attribute ``record``.
+    seconds : float
+        Time of the last sample of the response [s].
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    ValueError
+        If the model has neither, or the time is not within its response.
+    """
+    if hasattr(model, "first"):
+        return model.first(seconds)
+    record = getattr(model, "record", None)
+    if hasattr(model, "with_record") and hasattr(record, "trim"):
+        return model.with_record(record.trim(0.0, seconds))
+    raise ValueError(
+        f"{type(model).__name__} cannot be shortened: it needs a method first(seconds) that returns the same model "
+        "under the first part of its excitation, or a method with_record(record) and its Record in the attribute record"
+    )
 
 
 def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:

@@ -91,6 +91,32 @@ def test_the_likelihood_of_the_first_part(pool, rng, tmp_path):
         whole.pool.close()
 
 
+class Building:
+    """A user's model with a record, but without `first`."""
+
+    parameter_names = ("stiffness", "damping")
+    channels = (Channel("roof", "displacement", "mm"),)
+
+    def __init__(self, record):
+        self.record = record
+        self.dt, self.n_steps = record.dt, record.n_steps
+        self.fingerprint = f"building {record.fingerprint}"
+
+    def with_record(self, record):
+        return Building(record)
+
+    def simulate(self, theta):
+        return LinearOscillator(self.record).simulate(theta)[1:]
+
+
+def test_a_model_with_a_record_can_be_shortened():
+    whole = FELikelihood(Building(RECORD), Measurements(Building.channels, RECORD.dt, np.ones((1, RECORD.n_steps))))
+    part = whole.first(5.003)
+    assert part.fingerprint != whole.fingerprint
+    response = whole.model.simulate([1.0, 1.0])[:, : part.measurements.n_steps]
+    np.testing.assert_array_equal(part.model.simulate([1.0, 1.0]), response)
+
+
 def straight(theta):
     return theta * np.arange(10.0)[None]
 

@@ -249,6 +249,25 @@ def test_too_many_failures(thetas):
     assert likelihood.simulations == 40
 
 
+@pytest.mark.parametrize("source", ["disk", "disk, responses", "recalled"])
+def test_known_failures_are_compared_with_all_known_simulations(source, path, thetas, monkeypatch):
+    """Failures of an earlier run must not stop a run that has simulated little itself."""
+    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    thetas = np.concatenate([thetas, thetas + [10.0, 0.4], thetas + [20.0, 0.4]])
+    new = np.column_stack([np.arange(40.0), np.full(40, 0.5)])
+    first = likelihood_of(Line(), cache=None if source == "recalled" else path)
+    batch = first.simulate(thetas)
+    assert 30 < first.failure_count < 0.5 * len(thetas)
+    second = likelihood_of(Line(), cache=first.cache, max_failure_share=0.5)
+    if source == "recalled":
+        second.recall(thetas, first.statistics(thetas), batch.reasons)
+    request = second.simulate if source == "disk, responses" else second.statistics
+    request(np.concatenate([thetas, new[:25]]))
+    request(new)
+    assert second.failure_count == first.failure_count
+    assert second.statistics(new).shape == (40, 2)
+
+
 def test_a_pool_changes_nothing(thetas):
     expected = likelihood_of(Line()).simulate(thetas)
     likelihood = likelihood_of(Line(), pool=2)
