@@ -147,6 +147,25 @@ def _refit(x, weights, labels, rng) -> list[_Component]:
     return components
 
 
+def _soften(log_weights: np.ndarray, wanted: float) -> np.ndarray:
+    """Weights to the power of the largest beta, up to one, whose effective sample size is the wanted one.
+
+    A few large weights must not decide a fit.
+    """
+
+    def weights(beta: float) -> np.ndarray:
+        w = np.where(log_weights > -np.inf, np.exp(beta * (log_weights - log_weights.max())), 0.0)
+        return w / w.sum()
+
+    low, high = 0.0, 1.0
+    if 1.0 / np.square(weights(1.0)).sum() >= wanted:
+        return weights(1.0)
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if 1.0 / np.square(weights(middle)).sum() > wanted else (low, middle)
+    return weights(low)
+
+
 def by_importance(
     posterior: Any,
     starts: np.ndarray,
@@ -195,9 +214,8 @@ def by_importance(
         ess = weights.sum() ** 2 / (weights**2).sum()
         log_evidence = float(log_weights.max() + np.log(weights.mean()))
         inform(f"  round {number + 1}: {len(points)} draws, effective {ess:.0f}, log Z {log_evidence:.3f}")
-        # a few large weights must not decide the fit
-        clipped = np.minimum(weights, np.sort(weights)[-max(3, int(ess) // 10)])
-        fitted = _refit(points, clipped / clipped.sum(), label(points), rng)
+        softened = _soften(log_weights, max(60.0, 10.0 * posterior.ndim))
+        fitted = _refit(points, softened, label(points), rng)
         components = fitted or components
     w = weights / weights.sum()
     mean = w @ points
