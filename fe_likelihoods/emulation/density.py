@@ -1,0 +1,217 @@
+"""The emulated posterior: its density, its evidence and independent draws, without simulations.
+
+Each mode has a region with an emulator of its own. A point belongs to the region whose centre is nearest, in the
+whitened coordinates of the region; the density there is the prior times the likelihood of the emulated statistics, and
+zero beyond the reach of the emulator. A mixture of t distributions is fitted to this density by adaptive importance
+sampling in memory; a large sample of weighted points (the pool) from it gives the evidence of the emulated posterior,
+and draws after a few independence Metropolis steps.
+
+References
+----------
+Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .emulator import ResponseEmulator
+from .student import StudentMixture, draw_mixture, mixture_log_density
+from .target import ResponseTarget
+
+__all__ = ["EmulatedPosterior", "Region", "effective_sample_size"]
+
+_FREEDOM = 6.0
+_ROUNDS = 6
+_DRAWS = 3000  # per round of the adaptation
+_POOL = 20_000
+_ENOUGH_PER_DIMENSION = 6.0  # effective points per dimension for a covariance
+_WIDENED = 1.1  # variances of a fitted component, as multiples of those of its points
+_CURVED = 0.15  # share of effective points in the pool below which kernels are used
+_KERNELS = 300
+_KERNEL_SHARE = 0.7
+_KERNEL_FREEDOM = 8.0
+_STEPS = 6  # independence Metropolis steps of a draw
+_RIDGE = 1e-9
+
+
+class Region(NamedTuple):
+    """A part of the posterior around one mode.
+
+    Attributes
+    ----------
+    centre : (ndim,) float
+        Mean, or the mode as long as the mean is not known.
+    covariance : (ndim, ndim) float
+        Covariance of the part.
+    emulator : ResponseEmulator, optional
+        Emulator of the response; None before there are enough runs.
+    log_evidence : float
+        Evidence of the part; of the Laplace approximation before there is an emulator.
+    """
+
+    centre: np.ndarray
+    covariance: np.ndarray
+    emulator: ResponseEmulator | None
+    log_evidence: float
+
+
+def effective_sample_size(log_weights: np.ndarray) -> float:
+    """(sum w)^2 / sum w^2 of weights given by their logarithms; 0 if all weights are zero."""
+    top = log_weights.max(initial=-np.inf)
+    if top == -np.inf:
+        return 0.0
+    weights = np.exp(log_weights - top)
+    return float(weights.sum() ** 2 / np.square(weights).sum())
+
+
+def _normalised(log_weights: np.ndarray) -> np.ndarray:
+    weights = np.exp(log_weights - log_weights.max())
+    return weights / weights.sum()
+
+
+def _log_mean(log_weights: np.ndarray) -> float:
+    top = log_weights.max()
+    return float(top + np.log(np.exp(log_weights - top).mean()))
+
+
+class EmulatedPosterior:
+    """Density of the emulated posterior and a weighted sample of it.
+
+    Parameters
+    ----------
+    target : ResponseTarget
+        The posterior.
+    regions : sequence of Region
+        Regions with emulators.
+    random : RandomState
+        Source of random numbers.
+
+    Attributes
+    ----------
+    log_evidence : float
+        Logarithm of the integral of the emulated density.
+    log_evidence_error : float
+        Its standard error, that of the importance sampling in memory.
+    """
+
+    def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
+        self._target, self._regions = target, tuple(regions)
+        self._adapt(random)
+
+    def log_density(self, coords: np.ndarray) -> np.ndarray:
+        """Logarithm of prior times emulated likelihood (n,) at coordinates (n, ndim); not normalised."""
+        d = self._target.n_structural
+        structural, noise = coords[:, :d], coords[:, d:]
+        squared = np.stack([region.emulator.squared_distance(structural) for region in self._regions])
+        nearest = self._assign(squared)
+        result = np.full(len(coords), -np.inf)
+        for k, region in enumerate(self._regions):
+            rows = np.flatnonzero((nearest == k) & (squared[k] <= region.emulator.reach))
+            if len(rows):
+                statistics = region.emulator.statistics(structural[rows])
+                result[rows] = self._target.log_likelihood(statistics, noise[rows])
+        return np.where(np.isnan(result), -np.inf, result) + self._target.log_prior(coords)
+
+    @staticmethod
+    def _assign(squared: np.ndarray) -> np.ndarray:
+        return np.argmin(squared, axis=0)
+
+    def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (n, ndim) of the emulated posterior that are practically independent."""
+        coords = self._pool[random.choice(len(self._pool), n, p=self._weights)]
+        ratio = self.log_density(coords) - mixture_log_density(self._mixture, coords)
+        for _ in range(_STEPS):
+            proposed = draw_mixture(self._mixture, n, random)
+            other = self.log_density(proposed) - mixture_log_density(self._mixture, proposed)
+            accepted = np.log(random.random_sample(n)) < other - ratio
+            coords[accepted], ratio[accepted] = proposed[accepted], other[accepted]
+        return coords
+
+    def moments(self) -> list[Region]:
+        """The regions with the mean, covariance and evidence that the pool gives them, where it suffices."""
+        d = self._target.n_structural
+        squared = np.stack([region.emulator.squared_distance(self._pool[:, :d]) for region in self._regions])
+        nearest, updated = self._assign(squared), []
+        for k, region in enumerate(self._regions):
+            rows = nearest == k
+            share = self._weights[rows].sum()
+            if share > 0.0:
+                region = region._replace(log_evidence=self.log_evidence + float(np.log(share)))
+            fitted = self._fit(self._pool[rows], np.log(self._weights[rows] + 1e-300))
+            if fitted is not None:
+                region = region._replace(centre=fitted[0], covariance=fitted[1])
+            updated.append(region)
+        return updated
+
+    def _fit(self, coords: np.ndarray, log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Weighted mean and covariance, or None with too few effective points."""
+        if effective_sample_size(log_weights) < _ENOUGH_PER_DIMENSION * coords.shape[1]:
+            return None
+        weights = _normalised(log_weights)
+        mean = weights @ coords
+        apart = coords - mean
+        covariance = (apart * weights[:, None]).T @ apart
+        return mean, covariance + _RIDGE * np.diag(np.diag(covariance))
+
+    def _mixture_of(self, regions: Sequence[Region], log_shares: np.ndarray) -> StudentMixture:
+        weights = 0.9 * _normalised(log_shares) + 0.1 / len(regions)
+        factors = [np.linalg.cholesky(_WIDENED * region.covariance) for region in regions]
+        return StudentMixture(weights, np.array([region.centre for region in regions]), np.array(factors), _FREEDOM)
+
+    def _adapt(self, random: np.random.RandomState) -> None:
+        d = self._target.n_structural
+        regions = list(self._regions)
+        shares = np.array([region.log_evidence for region in regions])
+        mixture = self._mixture_of(regions, shares)
+        enough = _ENOUGH_PER_DIMENSION * self._target.ndim
+        for _ in range(_ROUNDS):
+            coords = draw_mixture(mixture, _DRAWS, random)
+            log_weights = self.log_density(coords) - mixture_log_density(mixture, coords)
+            squared = np.stack([region.emulator.squared_distance(coords[:, :d]) for region in self._regions])
+            nearest = self._assign(squared)
+            for k, region in enumerate(regions):
+                rows = np.flatnonzero((nearest == k) & (log_weights > -np.inf))
+                if len(rows) <= enough:
+                    continue
+                own = log_weights[rows]
+                shares[k] = np.logaddexp.reduce(own)
+                power = 1.0
+                while power > 1e-4 and effective_sample_size(power * own) < 1.5 * enough:
+                    power *= 0.7  # too few effective points: a smaller step towards the target
+                fitted = self._fit(coords[rows], power * own)
+                if fitted is not None:
+                    regions[k] = region._replace(centre=fitted[0], covariance=fitted[1])
+            mixture = self._mixture_of(regions, shares)
+        self._fill(mixture, random)
+        if effective_sample_size(self._log_weights) < _CURVED * _POOL:
+            self._fill(self._kernels(regions, random), random)
+
+    def _kernels(self, regions: Sequence[Region], random: np.random.RandomState) -> StudentMixture:
+        """The components, and narrower ones around weighted points: for a posterior that no ellipsoid covers."""
+        d, ndim = self._target.n_structural, self._target.ndim
+        centres = self._pool[random.choice(len(self._pool), _KERNELS, p=self._weights)]
+        width = (4.0 / (ndim + 2.0)) ** (1.0 / (ndim + 4.0)) * _KERNELS ** (-1.0 / (ndim + 4.0))
+        squared = np.stack([region.emulator.squared_distance(centres[:, :d]) for region in self._regions])
+        narrow = [width * np.linalg.cholesky(region.covariance) for region in regions]
+        weights = np.concatenate(
+            [(1.0 - _KERNEL_SHARE) * self._mixture.weights, np.full(_KERNELS, _KERNEL_SHARE / _KERNELS)]
+        )
+        return StudentMixture(
+            weights,
+            np.concatenate([self._mixture.centres, centres]),
+            np.concatenate([self._mixture.factors, [narrow[k] for k in self._assign(squared)]]),
+            _KERNEL_FREEDOM,
+        )
+
+    def _fill(self, mixture: StudentMixture, random: np.random.RandomState) -> None:
+        """Draw the pool."""
+        self._mixture = mixture
+        self._pool = draw_mixture(mixture, _POOL, random)
+        self._log_weights = self.log_density(self._pool) - mixture_log_density(mixture, self._pool)
+        self._weights = _normalised(self._log_weights)
+        self.log_evidence = _log_mean(self._log_weights)
+        effective = effective_sample_size(self._log_weights)
+        self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / _POOL, 0.0)))
+        self.effective_share = effective / _POOL

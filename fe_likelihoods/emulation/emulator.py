@@ -1,0 +1,224 @@
+"""Emulator of the response near a mode: principal components of simulated responses, a Gaussian process for each.
+
+The response at structural coordinates z is R(z) = R_0 + sum_k c_k(w) P_k, with the mean R_0 of the training responses,
+their principal components P_k in units of the noise of each channel, and coefficients c_k that a Gaussian process
+predicts from the whitened coordinates w (`fe_likelihoods.emulation.gaussian_process`). A response is a smooth function
+of the parameters where its misfit, summed over thousands of samples, is a narrow and curved one; and the same emulator
+serves every noise.
+
+With means m_k and variances v_k of the coefficients, the expected statistics of the residuals are, in closed form,
+
+    E S = S(y - R_0) - 2 sum_k m_k B(y - R_0, P_k) + sum_kl m_k m_l B(P_k, P_l) + sum_k v_k B(P_k, P_k),
+
+where B is the bilinear form of the statistics. Where the emulator is uncertain, the misfit therefore is larger.
+
+References
+----------
+D. Higdon, J. Gattiker, B. Williams, M. Rightley (2008), "Computer model calibration using high-dimensional output",
+Journal of the American Statistical Association 103, 570-583, doi:10.1198/016214507000000888 (principal components and
+Gaussian processes).
+"""
+
+import hashlib
+from typing import NamedTuple
+
+import numpy as np
+
+from ..simulation.model import SimulationBatch, SimulationFailed
+from .gaussian_process import GaussianProcess, fit_process, left_out_errors, predict
+from .quadratic import bilinear_form
+from .target import ResponseTarget
+
+__all__ = ["ResponseEmulator", "TrainingSet", "fit_emulator"]
+
+_MAX_COMPONENTS = 60
+_NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
+_SMALLEST_SHARE = 1e-10  # of the leading component
+_REACH = 1.2  # squared distance up to which the emulator is used, as a multiple of the largest of the training points
+_ROWS = 4096  # points evaluated at once
+
+
+class TrainingSet(NamedTuple):
+    """Simulations that an emulator is fitted to.
+
+    Attributes
+    ----------
+    coords : (m, d) float
+        Structural coordinates.
+    responses : (m, n_channels, n_steps) float32
+        Responses [SI].
+    """
+
+    coords: np.ndarray
+    responses: np.ndarray
+
+
+class _Forms(NamedTuple):
+    """What the expected statistics are computed from."""
+
+    constant: np.ndarray
+    linear: np.ndarray
+    quadratic: np.ndarray
+
+
+class ResponseEmulator:
+    """A model that predicts responses instead of simulating them, near the points that it was fitted to.
+
+    It has the members of `fe_likelihoods.simulation.model.Model`. Make one with `fit_emulator`.
+
+    Attributes
+    ----------
+    centre : (d,) float
+        Origin of the whitened coordinates.
+    reach : float
+        Largest squared distance from `centre`, in whitened coordinates, at which the emulator is used.
+    process : GaussianProcess
+        Predicts the coefficients of the components.
+    left_out : (m, k) float
+        Errors of the coefficients of every training run, predicted from the other runs.
+    """
+
+    def __init__(
+        self,
+        target: ResponseTarget,
+        centre: np.ndarray,
+        whitening: np.ndarray,
+        process: GaussianProcess,
+        mean: np.ndarray,
+        components: np.ndarray,
+        coefficients: np.ndarray,
+    ) -> None:
+        self._target, self.centre, self._whitening, self.process = target, centre, whitening, process
+        self._mean, self._components = mean, components
+        self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
+        self.left_out = left_out_errors(process)
+        self._coefficients = coefficients
+        self._forms = self._bilinear(target.measured)
+
+    def _bilinear(self, measured: np.ndarray) -> _Forms:
+        statistic, origin = self._target.statistic, measured - self._mean
+        return _Forms(
+            statistic(origin),
+            bilinear_form(statistic, self._components, origin[None])[:, 0],
+            bilinear_form(statistic, self._components),
+        )
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the structural parameters, those of the emulated model."""
+        return tuple(self._target.model.parameter_names)
+
+    @property
+    def channels(self) -> tuple:
+        """Channels of the emulated model."""
+        return tuple(self._target.model.channels)
+
+    @property
+    def dt(self) -> float:
+        """Time step [s]."""
+        return self._target.model.dt
+
+    @property
+    def n_steps(self) -> int:
+        """Number of samples."""
+        return self._target.model.n_steps
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the emulated model and of the runs that the emulator was fitted to."""
+        inputs = self.process.inputs.tobytes() + self._coefficients.tobytes()
+        return hashlib.blake2b(self._target.model.fingerprint.encode() + inputs, digest_size=16).hexdigest()
+
+    def whitened(self, coords: np.ndarray) -> np.ndarray:
+        """Whitened coordinates (n, d) of structural coordinates (n, d)."""
+        return (coords - self.centre) @ self._whitening
+
+    def squared_distance(self, coords: np.ndarray) -> np.ndarray:
+        """Squared distance (n,) of structural coordinates (n, d) from the centre, in whitened coordinates."""
+        return np.square(self.whitened(coords)).sum(axis=1)
+
+    def statistics(self, coords: np.ndarray) -> np.ndarray:
+        """Expected statistics (n, n_numbers) of the residuals at structural coordinates (n, d)."""
+        parts = [self._statistics(coords[k : k + _ROWS]) for k in range(0, len(coords), _ROWS)]
+        return np.concatenate(parts) if parts else np.empty((0, len(self._forms.constant)))
+
+    def _statistics(self, coords: np.ndarray) -> np.ndarray:
+        return self._expected(*predict(self.process, self.whitened(coords)))
+
+    def _expected(self, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        constant, linear, quadratic = self._forms
+        columns = [
+            constant[a]
+            - 2.0 * mean @ linear[:, a]
+            + ((mean @ quadratic[:, :, a]) * mean).sum(axis=1)
+            + variance @ np.diag(quadratic[:, :, a])
+            for a in range(len(constant))
+        ]
+        return np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
+
+    def left_out_statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Statistics (m, n_numbers) of the training runs as predicted from the other runs, and of their own."""
+        nothing = np.zeros_like(self._coefficients)
+        return self._expected(self._coefficients - self.left_out, nothing), self._expected(self._coefficients, nothing)
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        """Predicted response (n_channels, n_steps) [SI]; `SimulationFailed` away from the training points."""
+        batch = self.simulate_batch(np.asarray(theta, dtype=float)[None])
+        if batch.reasons[0]:
+            raise SimulationFailed(batch.reasons[0])
+        return batch.response[0]
+
+    def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
+        """Predicted responses of parameters (n, d)."""
+        coords = self._target.structural_coordinates(np.asarray(thetas, dtype=float))
+        inside = self.squared_distance(coords) <= self.reach
+        mean, _ = predict(self.process, self.whitened(np.where(inside[:, None], coords, self.centre)))
+        response = self._mean + np.einsum("nk,kct->nct", mean, self._components, optimize=True)
+        response[~inside] = np.nan
+        reason = "the parameters are outside the region that the emulator was fitted to"
+        return SimulationBatch(response, ["" if good else reason for good in inside])
+
+
+def fit_emulator(
+    target: ResponseTarget,
+    training: TrainingSet,
+    centre: np.ndarray,
+    covariance: np.ndarray,
+    scales: np.ndarray,
+    earlier: ResponseEmulator | None = None,
+) -> ResponseEmulator:
+    """Fit an emulator to simulated responses.
+
+    Parameters
+    ----------
+    target : ResponseTarget
+        The posterior.
+    training : TrainingSet
+        Simulations, at least d + 4.
+    centre, covariance : (d,) float, (d, d) float
+        About the mean and covariance of the posterior, for whitening.
+    scales : (n_channels,) float
+        Standard deviations of the noise [SI]; components are in these units.
+    earlier : ResponseEmulator, optional
+        Earlier fit, whose length scales are the start of the search.
+
+    Returns
+    -------
+    ResponseEmulator
+    """
+    mean = training.responses.mean(axis=0, dtype=float)
+    scaled = ((training.responses - mean) / scales[:, None]).reshape(len(training.coords), -1)
+    values, vectors = np.linalg.eigh(scaled @ scaled.T)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    left_out = values.sum() - np.cumsum(values)
+    enough = 1 + int(np.argmax(left_out < _NEGLIGIBLE_VARIANCE * len(values)))
+    k = max(1, min(enough, _MAX_COMPONENTS, int((values > _SMALLEST_SHARE * values[0]).sum()), len(values) - 1))
+    lengths = np.sqrt(values[:k])
+    components = ((vectors[:, :k] / lengths).T @ scaled).reshape(k, *mean.shape) * scales[:, None]
+    coefficients = vectors[:, :k] * lengths
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T
+    inputs = (training.coords - centre) @ whitening
+    importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
+    log_scales = None if earlier is None else earlier.process.log_scales
+    process = fit_process(inputs, coefficients, importance, log_scales)
+    return ResponseEmulator(target, centre, whitening, process, mean, components, coefficients)

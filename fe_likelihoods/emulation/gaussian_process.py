@@ -1,0 +1,179 @@
+"""Gaussian process for several outputs that share their inputs and length scales.
+
+Each output is a linear function of the inputs plus a Gaussian process with squared exponential covariance
+
+    y_k(w) = b_k0 + b_k . w + f_k(w) + e_k,    cov f_k = s_k^2 exp(-|(w - w') / l|^2 / 2),    var e_k = s_k^2 g_k,
+
+with one length scale l per input, common to all outputs, and a variance s_k^2 and a nugget g_k per output. The linear
+part is integrated out with a flat prior (restricted maximum likelihood, [1]_ section 2.7 with an infinitely wide
+prior). With N an orthonormal basis of the contrasts (the vectors that the linear part cannot explain), N'KN = U D U'
+is decomposed once per length scale; every nugget and output then costs a sum.
+
+References
+----------
+.. [1] C. E. Rasmussen, C. K. I. Williams (2006), "Gaussian Processes for Machine Learning", MIT Press.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, qr
+from scipy.optimize import minimize
+
+__all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict"]
+
+_NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
+_LOG_SCALES = -1.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs
+_FIRST_LOG_SCALE = 1.2
+_TINY = 1e-300
+
+
+class _Level(NamedTuple):
+    """Outputs with the same nugget: their indices and what their variance needs."""
+
+    outputs: np.ndarray
+    nugget: float
+    factor: tuple
+    solved: np.ndarray
+    gram: tuple
+
+
+class GaussianProcess(NamedTuple):
+    """A fitted process.
+
+    Attributes
+    ----------
+    inputs : (m, d) float
+        Training inputs.
+    log_scales : (d,) float
+        Logarithms of the length scales.
+    linear : (1 + d, k) float
+        Coefficients of the linear part.
+    weights : (m, k) float
+        Coefficients of the covariances with the training inputs.
+    variances : (k,) float
+        s_k^2.
+    levels : tuple
+        Groups of outputs of equal nugget, for the variance.
+    """
+
+    inputs: np.ndarray
+    log_scales: np.ndarray
+    linear: np.ndarray
+    weights: np.ndarray
+    variances: np.ndarray
+    levels: tuple[_Level, ...]
+
+
+def _basis(inputs: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.ones(len(inputs)), inputs])
+
+
+def _covariance(first: np.ndarray, second: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    a, b = first / np.exp(log_scales), second / np.exp(log_scales)
+    squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1)[None] - 2.0 * a @ b.T
+    return np.exp(-0.5 * np.maximum(squared, 0.0))
+
+
+def _restricted(log_scales: np.ndarray, inputs: np.ndarray, contrasts: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Minus twice the restricted log-likelihood of every nugget and output, (n_nuggets, k), up to a constant."""
+    values, vectors = np.linalg.eigh(contrasts.T @ _covariance(inputs, inputs, log_scales) @ contrasts)
+    rotated = np.square(vectors.T @ targets)
+    spread = np.maximum(values, 0.0)[None] + _NUGGETS[:, None]
+    return np.log(spread).sum(axis=1)[:, None] + len(values) * np.log((1.0 / spread) @ rotated / len(values) + _TINY)
+
+
+def fit_process(
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    importance: np.ndarray,
+    log_scales: np.ndarray | None = None,
+    iterations: int = 8,
+) -> GaussianProcess:
+    """Fit a process by restricted maximum likelihood.
+
+    Parameters
+    ----------
+    inputs : (m, d) float
+        Training inputs of about unit spread, m >= d + 3.
+    outputs : (m, k) float
+        Training outputs.
+    importance : (k,) float
+        Weights of the outputs in the choice of the length scales.
+    log_scales : (d,) float, optional
+        Where the search for the length scales starts, such as those of an earlier fit.
+    iterations : int
+        Largest number of iterations of this search.
+
+    Returns
+    -------
+    GaussianProcess
+    """
+    m, d = inputs.shape
+    basis = _basis(inputs)
+    contrasts = qr(basis)[0][:, d + 1 :]
+    targets = contrasts.T @ outputs
+    share = importance / importance.sum()
+
+    def loss(parameters: np.ndarray) -> float:
+        return float(_restricted(parameters, inputs, contrasts, targets).min(axis=0) @ share)
+
+    start = np.full(d, _FIRST_LOG_SCALE) if log_scales is None else log_scales
+    if log_scales is None:  # one common scale first: cheap, and a good start for the others
+        start = min((np.full(d, scale) for scale in np.arange(0.2, 3.4, 0.4)), key=loss)
+    found = minimize(
+        loss, start, method="L-BFGS-B", bounds=[_LOG_SCALES] * d, options={"maxiter": iterations, "eps": 1e-3}
+    )
+    log_scales = found.x
+    nuggets = _NUGGETS[_restricted(log_scales, inputs, contrasts, targets).argmin(axis=0)]
+    covariance = _covariance(inputs, inputs, log_scales)
+    linear, weights = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs)
+    variances, levels = np.empty(outputs.shape[1]), []
+    for nugget in np.unique(nuggets):
+        members = np.flatnonzero(nuggets == nugget)
+        factor = cho_factor(covariance + nugget * np.eye(m), lower=True)
+        solved = cho_solve(factor, basis)
+        gram = cho_factor(basis.T @ solved)
+        linear[:, members] = cho_solve(gram, solved.T @ outputs[:, members])
+        rest = outputs[:, members] - basis @ linear[:, members]
+        weights[:, members] = cho_solve(factor, rest)
+        variances[members] = (rest * weights[:, members]).sum(axis=0) / (m - d - 1)
+        levels.append(_Level(members, float(nugget), factor, solved, gram))
+    return GaussianProcess(inputs, log_scales, linear, weights, variances, tuple(levels))
+
+
+def predict(process: GaussianProcess, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance of the outputs.
+
+    Parameters
+    ----------
+    process : GaussianProcess
+    inputs : (n, d) float
+
+    Returns
+    -------
+    mean, variance : (n, k) float
+        The variance includes the nugget and the uncertainty of the linear part.
+    """
+    covariance, basis = _covariance(inputs, process.inputs, process.log_scales), _basis(inputs)
+    mean = basis @ process.linear + covariance @ process.weights
+    variance = np.empty_like(mean)
+    for members, nugget, factor, solved, gram in process.levels:
+        explained = (covariance * cho_solve(factor, covariance.T).T).sum(axis=1)
+        gap = basis - covariance @ solved
+        unknown = (gap * cho_solve(gram, gap.T).T).sum(axis=1)
+        variance[:, members] = np.maximum(1.0 - explained + unknown, 0.0)[:, None] + nugget
+    return mean, variance * process.variances
+
+
+def left_out_errors(process: GaussianProcess) -> np.ndarray:
+    """Error (m, k) of every training output as predicted from the other training points, in closed form.
+
+    With P the inverse of the covariance after the linear part has been projected out, the error is (P y)_i / P_ii.
+    """
+    errors = np.empty_like(process.weights)
+    for members, _, factor, solved, gram in process.levels:
+        inverse = np.diag(cho_solve(factor, np.eye(len(process.inputs))))
+        projected = inverse - (solved * cho_solve(gram, solved.T).T).sum(axis=1)
+        errors[:, members] = process.weights[:, members] / np.maximum(projected, _TINY)[:, None]
+    return errors

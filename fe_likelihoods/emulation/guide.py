@@ -1,0 +1,257 @@
+"""A guide to the posterior: draws near it, and their density, from few simulations.
+
+`ResponseGuide` has the methods that a sampler of the package `samplers` expects of a guide. Its draws come from
+
+    q = (1 - a - b) q_e + a q_t + b prior,
+
+the emulated posterior q_e (`fe_likelihoods.emulation.density`), a wide t mixture q_t around the modes, and the prior.
+q_t and the prior bound the weights posterior / q where the emulator is wrong or does not reach. Before there are enough
+runs for an emulator, q_e is absent. Every simulation, also those of the search for modes, trains the emulators. A draw
+that is far more probable than expected, away from the known modes, starts another ascent.
+
+The equations are on the page ``docs/theory/guided.rst``.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from .density import EmulatedPosterior, Region
+from .emulator import ResponseEmulator, TrainingSet, fit_emulator
+from .modes import Mode, ModeSearch, draw_starts, search_from, search_modes
+from .student import StudentMixture, draw_mixture, mixture_log_density
+from .target import ResponseTarget
+
+__all__ = ["ResponseGuide"]
+
+_WIDE_SHARE, _PRIOR_SHARE = 0.10, 0.05
+_WIDE_SHARE_ALONE = 0.9  # before there is an emulator
+_WIDE_FREEDOM = 5.0
+_WIDENED = 1.5  # variances of the wide components, as multiples of those of their regions
+_SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
+_FEWEST_RUNS = 2.0, 6.0  # training runs that an emulator needs: per dimension, and in addition
+_MOST_RUNS = 300
+_WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
+_DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
+_ALWAYS = 5  # best runs per dimension that train in any case
+_SURPRISE = 10.0  # log-density above that of any known mode minus this, at which a far point starts an ascent
+_MOST_ASCENTS = 2  # of these, per refinement
+
+
+class ResponseGuide:
+    """Draws near the posterior of a likelihood whose responses are known.
+
+    Made by `Posterior.guide`.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Its noise must use statistics that are quadratic in the residuals.
+    starts : int
+        Starts of the search for modes: the median of the prior, and draws of it.
+
+    Attributes
+    ----------
+    search : ModeSearch, optional
+        Result of the search for modes; None before it.
+    emulators : tuple of ResponseEmulator
+        Emulators in use, one per mode.
+    simulations : float
+        Simulations run by the guide itself, parts of a record counted as fractions.
+    log_density_error : float
+        Standard error of the logarithm of the normalising constant of `log_density`.
+    concerns : tuple of str
+        Why parts of the posterior may be missing.
+    """
+
+    def __init__(self, posterior: Any, starts: int = 8) -> None:
+        if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
+            raise ValueError(f"starts must be a whole number of at least one; got {starts!r}")
+        self._target = ResponseTarget(posterior)
+        self._posterior, self._starts = posterior, int(starts)
+        self.search: ModeSearch | None = None
+        self.simulations = 0.0
+        self.concerns: tuple[str, ...] = ()
+        self._regions: list[Region] = []
+        self._modes: list[Mode] = []
+        self._emulated: EmulatedPosterior | None = None
+        self._wide: StudentMixture | None = None
+
+    @property
+    def emulators(self) -> tuple[ResponseEmulator, ...]:
+        return tuple(region.emulator for region in self._regions if region.emulator is not None)
+
+    @property
+    def log_density_error(self) -> float:
+        return 0.0 if self._emulated is None else self._emulated.log_evidence_error
+
+    # ------------------------------------------------------------------ what a sampler calls
+
+    def prepare(self, session: Any) -> Iterator[None]:
+        """Search for modes; each item is a batch of simulations."""
+        starts = draw_starts(self._target, self._starts, session.random)
+        search = search_modes(self._target, starts, session.remember, session.remaining)
+        while True:
+            try:
+                cost = next(search)
+            except StopIteration as end:
+                self.search = end.value
+                break
+            self.simulations += cost
+            yield
+        self._add_modes(self.search.modes)
+        if not self.search.finished:
+            self._add_concern("the budget ended the search for modes")
+        elif not self.search.modes:
+            self._add_concern("no start of the search led to a mode: the simulations of all starts fail")
+        elif not all(mode.converged for mode in self.search.modes):
+            self._add_concern("the search for modes ended before the top of a mode")
+
+    def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Independent draws (n, ndim) of the parameters, inside the support of the prior."""
+        wide, prior = self._shares()
+        parts = random.multinomial(n, [1.0 - wide - prior, wide, prior])
+        coords = [random.standard_normal((parts[2], self._target.ndim))]
+        if parts[1]:
+            coords.append(draw_mixture(self._wide, parts[1], random))
+        if parts[0]:
+            coords.append(self._emulated.draw(parts[0], random))
+        return self._target.parameters(random.permutation(np.concatenate(coords)))
+
+    def log_density(self, parameters: np.ndarray) -> np.ndarray:
+        """Normalised log-density (n,) of the draws at parameters (n, ndim)."""
+        coords = self._target.coordinates(parameters)
+        log_prior = np.atleast_1d(self._posterior.log_prior(parameters))
+        result = np.full(len(parameters), -np.inf)
+        inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
+        if inside.any():
+            result[inside] = self._log_density(coords[inside]) + log_prior[inside]
+            result[inside] -= self._target.log_prior(coords[inside])
+        return result
+
+    def observe(self, parameters: np.ndarray, session: Any) -> None:
+        """Simulate the responses of points (n, ndim) that are about to be evaluated, and keep them."""
+        structural = parameters[:, : self._target.n_structural]
+        coords = self._target.coordinates(parameters)[:, : self._target.n_structural]
+        self._target.run_parameters(structural, coords, session.remember)
+
+    def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Iterator[None]:
+        """Learn from evaluated points (n, ndim): ascents from surprising ones, and new emulators."""
+        yield from self._ascend_from_surprises(parameters, log_prob, session)
+        self._fit_emulators()
+        ready = [region for region in self._regions if region.emulator is not None]
+        if ready and len(ready) == len(self._regions):
+            self._emulated = EmulatedPosterior(self._target, self._regions, session.random)
+            self._regions = self._emulated.moments()
+            self._wide = self._wide_mixture()
+
+    # ------------------------------------------------------------------ parts
+
+    def _add_concern(self, text: str) -> None:
+        if text not in self.concerns:
+            self.concerns = (*self.concerns, text)
+
+    def _shares(self) -> tuple[float, float]:
+        """Shares of the wide mixture and of the prior in the draws."""
+        if self._wide is None:
+            return 0.0, 1.0
+        if self._emulated is None:
+            return _WIDE_SHARE_ALONE, 1.0 - _WIDE_SHARE_ALONE
+        return _WIDE_SHARE, _PRIOR_SHARE
+
+    def _log_density(self, coords: np.ndarray) -> np.ndarray:
+        wide, prior = self._shares()
+        total = np.log(prior) + self._target.log_prior(coords)
+        if self._wide is not None:
+            total = np.logaddexp(total, np.log(wide) + mixture_log_density(self._wide, coords))
+        if self._emulated is not None:
+            emulated = self._emulated.log_density(coords) - self._emulated.log_evidence
+            total = np.logaddexp(total, np.log(1.0 - wide - prior) + emulated)
+        return total
+
+    def _add_modes(self, modes: Any) -> None:
+        for mode in modes:
+            self._modes.append(mode)
+            self._regions.append(Region(mode.coords, mode.covariance, None, mode.log_evidence))
+        if self._regions:
+            self._wide = self._wide_mixture()
+
+    def _wide_mixture(self) -> StudentMixture:
+        shares = np.array([region.log_evidence for region in self._regions])
+        weights = np.exp(shares - shares.max())
+        weights = (1.0 - _SMALLEST_WEIGHT) * weights / weights.sum() + _SMALLEST_WEIGHT / len(weights)
+        factors = [np.linalg.cholesky(_WIDENED * region.covariance) for region in self._regions]
+        centres = np.array([region.centre for region in self._regions])
+        return StudentMixture(weights, centres, np.array(factors), _WIDE_FREEDOM)
+
+    def _far(self, coords: np.ndarray) -> np.ndarray:
+        """Whether structural coordinates (n, d) are away from all regions."""
+        return self._distances(coords).min(axis=0) > _WITHIN * self._target.n_structural
+
+    def _distances(self, coords: np.ndarray) -> np.ndarray:
+        """Squared Mahalanobis distances (n_regions, n) of structural coordinates (n, d)."""
+        d = self._target.n_structural
+        rows = []
+        for region in self._regions:
+            inverse = np.linalg.inv(np.linalg.cholesky(region.covariance[:d, :d]))
+            rows.append(np.square((coords - region.centre[:d]) @ inverse.T).sum(axis=1))
+        return np.array(rows)
+
+    def _ascend_from_surprises(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Iterator[None]:
+        """Ascents from points away from the known modes that are nearly as probable as these."""
+        alive = np.flatnonzero(np.isfinite(log_prob))
+        if not len(alive):
+            return
+        coords = self._target.coordinates(parameters[alive])
+        density = log_prob[alive] - self._posterior.log_prior(parameters[alive]) + self._target.log_prior(coords)
+        structural = coords[:, : self._target.n_structural]
+        if self._modes:
+            best = max(mode.log_density for mode in self._modes)
+            surprising = self._far(structural) & (density > best - _SURPRISE)
+        else:
+            surprising = density >= density.max()
+        for row in np.flatnonzero(surprising)[np.argsort(-density[surprising])][:_MOST_ASCENTS]:
+            search = search_from(self._target, structural[row], session.remember, session.remaining)
+            while True:
+                try:
+                    cost = next(search)
+                except StopIteration as end:
+                    found = end.value
+                    break
+                self.simulations += cost
+                yield
+            if found is None:
+                self._add_concern("the budget ended an ascent to a mode that the search had missed")
+            elif not self._modes or self._far(found.coords[None, : self._target.n_structural])[0]:
+                self._add_modes([found])
+                self._emulated = None
+
+    def _fit_emulators(self) -> None:
+        archive, d = self._target.archive, self._target.n_structural
+        if not self._regions or not len(archive):
+            return
+        coords, statistics = archive.coords, archive.statistics
+        distances = self._distances(coords)
+        nearest = np.argmin(distances, axis=0)
+        for k, region in enumerate(self._regions):
+            rows = np.flatnonzero((nearest == k) & (distances[k] < _WITHIN * d))
+            if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
+                continue
+            noise = self._modes[k].coords[d:]
+            density = self._target.log_likelihood(statistics[rows], np.repeat(noise[None], len(rows), axis=0))
+            density = density + self._target.log_prior(coords[rows])
+            order = np.argsort(-density)
+            good = density[order] > density[order[0]] - _DEPTH[0] - _DEPTH[1] * d
+            good[: _ALWAYS * d] = True
+            rows = rows[order[good][:_MOST_RUNS]]
+            if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
+                continue
+            best = rows[0]
+            residuals = self._target.measured - archive.responses[best]
+            scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max()
+            training = TrainingSet(coords[rows], np.array([archive.responses[row] for row in rows]))
+            emulator = fit_emulator(
+                self._target, training, region.centre[:d], region.covariance[:d, :d], scales, region.emulator
+            )
+            self._regions[k] = region._replace(emulator=emulator)

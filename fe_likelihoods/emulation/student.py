@@ -1,0 +1,52 @@
+"""Mixtures of multivariate Student-t distributions with one number of degrees of freedom."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaln
+
+__all__ = ["StudentMixture", "draw_mixture", "mixture_log_density"]
+
+
+class StudentMixture(NamedTuple):
+    """A mixture of t distributions.
+
+    Attributes
+    ----------
+    weights : (k,) float
+        Weights with sum 1.
+    centres : (k, d) float
+        Centres.
+    factors : (k, d, d) float
+        Lower Cholesky factors of the scale matrices.
+    freedom : float
+        Degrees of freedom.
+    """
+
+    weights: np.ndarray
+    centres: np.ndarray
+    factors: np.ndarray
+    freedom: float
+
+
+def draw_mixture(mixture: StudentMixture, n: int, random: np.random.RandomState) -> np.ndarray:
+    """Independent draws (n, d)."""
+    d = mixture.centres.shape[1]
+    component = random.choice(len(mixture.weights), n, p=mixture.weights)
+    normal = random.standard_normal((n, d))
+    stretch = np.sqrt(mixture.freedom / random.chisquare(mixture.freedom, n))
+    return mixture.centres[component] + stretch[:, None] * np.einsum("nij,nj->ni", mixture.factors[component], normal)
+
+
+def mixture_log_density(mixture: StudentMixture, coords: np.ndarray) -> np.ndarray:
+    """Logarithm of the density (n,) at points (n, d)."""
+    d, nu = mixture.centres.shape[1], mixture.freedom
+    constant = gammaln(0.5 * (nu + d)) - gammaln(0.5 * nu) - 0.5 * d * np.log(nu * np.pi)
+    total = np.full(len(coords), -np.inf)
+    for weight, centre, factor in zip(*mixture[:3], strict=True):
+        if weight > 0.0:
+            inverse = np.linalg.inv(factor)
+            squared = np.square((coords - centre) @ inverse.T).sum(axis=1)
+            one = np.log(weight) + constant - np.log(np.diag(factor)).sum() - 0.5 * (nu + d) * np.log1p(squared / nu)
+            total = np.logaddexp(total, one)
+    return total

@@ -1,0 +1,315 @@
+"""The posterior as modes and emulators need it: standard normal coordinates, responses, statistics, noise.
+
+In the coordinates z of `Prior.from_normal` the prior is the standard normal, so bounds need no attention, the prior is
+part of the least squares (its residuals are z), and every parameter has the same scale. The density of the posterior in
+these coordinates is
+
+    log p(z) = log phi(z) + log L(S(y - R(z)), eta(z)),
+
+with the response R at the structural parameters, the statistics S of the residuals, and the noise parameters eta.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from .quadratic import check_quadratic, sums_of_squares
+
+__all__ = ["Archive", "NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
+
+Remember = Callable[[str, Callable[[], Sequence[np.ndarray]]], Sequence[np.ndarray]]
+
+_HALF_LOG_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
+_WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise parameters are first searched
+_GRID = np.linspace(-1.0, 1.0, 41)
+_SLOPE_STEP = 1e-4
+_NEWTON_STEPS = 12
+_NEWTON_GAIN = 1e-4
+_NEWTON_DIFFERENCE = 1e-3
+_DAMPED = 0.0, 1.0, 10.0, 100.0
+
+
+class _Likelihood(Protocol):
+    """Part of `FELikelihood` that is used here."""
+
+    model: Any
+    measurements: Any
+    noise: Any
+    simulations: int
+
+    def simulate(self, thetas: np.ndarray) -> Any: ...
+    def statistics(self, thetas: np.ndarray) -> np.ndarray: ...
+    def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None: ...
+
+
+class _Posterior(Protocol):
+    """Part of `Posterior` that is used here."""
+
+    likelihood: Any
+    prior: Any
+    ndim: int
+
+
+class _Shortened(NamedTuple):
+    """A posterior of the first part of a record."""
+
+    likelihood: Any
+    prior: Any
+    ndim: int
+
+
+class Runs(NamedTuple):
+    """Simulations at points of the structural coordinates.
+
+    Attributes
+    ----------
+    residuals : (n, n_channels, n_steps) float
+        Measured minus simulated response [SI]; NaN where the simulation failed.
+    statistics : (n, n_numbers) float
+        Statistics of the residuals; NaN where the simulation failed.
+    failed : (n,) bool
+        Whether the simulation failed.
+    """
+
+    residuals: np.ndarray
+    statistics: np.ndarray
+    failed: np.ndarray
+
+
+class NoiseFit(NamedTuple):
+    """Noise parameters that fit given statistics best.
+
+    Attributes
+    ----------
+    coords : (n_noise,) float
+        Standard normal coordinates of the noise parameters; empty if they are integrated out.
+    log_density : float
+        Log-likelihood plus the log-prior of these coordinates.
+    """
+
+    coords: np.ndarray
+    log_density: float
+
+
+def run_at_once(_: str, compute: Callable[[], Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
+    """`Remember` that stores nothing."""
+    return compute()
+
+
+class Archive:
+    """All successful simulations of the whole record.
+
+    Attributes
+    ----------
+    coords : (n, n_structural) float
+        Structural coordinates.
+    responses : list of n (n_channels, n_steps) float32
+        Responses [SI].
+    statistics : (n, n_numbers) float
+        Statistics of the residuals.
+    """
+
+    def __init__(self) -> None:
+        self._coords: list[np.ndarray] = []
+        self._statistics: list[np.ndarray] = []
+        self.responses: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        return len(self.responses)
+
+    @property
+    def coords(self) -> np.ndarray:
+        return np.array(self._coords)
+
+    @property
+    def statistics(self) -> np.ndarray:
+        return np.array(self._statistics)
+
+    def add(self, coords: np.ndarray, responses: np.ndarray, statistics: np.ndarray) -> None:
+        """Add runs."""
+        self._coords += list(coords)
+        self.responses += list(responses)
+        self._statistics += list(statistics)
+
+
+class ResponseTarget:
+    """A posterior in standard normal coordinates.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Its noise must use statistics that are quadratic in the residuals.
+
+    Attributes
+    ----------
+    ndim, n_structural, n_noise : int
+        Numbers of coordinates: all, structural (the first ones), of the noise.
+    n_steps : int
+        Samples per channel.
+    archive : Archive
+        The simulations run through this object.
+
+    Raises
+    ------
+    ValueError
+        If the statistics of the noise are not quadratic in the residuals.
+    """
+
+    def __init__(self, posterior: _Posterior) -> None:
+        self.posterior = posterior
+        self._likelihood: _Likelihood = posterior.likelihood
+        self._prior = posterior.prior
+        self.model, self.noise = self._likelihood.model, self._likelihood.noise
+        self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)
+        self.n_noise = self.ndim - self.n_structural
+        self.measured = self._likelihood.measurements.values
+        self.n_steps = self.measured.shape[1]
+        self.statistic: Callable[[np.ndarray], np.ndarray] = getattr(self.noise, "statistic", None) or sums_of_squares
+        check_quadratic(self.statistic, self.measured)
+        self._median = self._prior.from_normal(np.zeros(self.ndim))
+        self.archive = Archive()
+
+    def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
+        """The same posterior for the first parts of the record, the shortest first; none if the model has no ``first``.
+
+        Parameters
+        ----------
+        shares : sequence of float
+            Shares of the Arias intensity at which the parts end.
+        """
+        durations = self._likelihood.growing_durations(shares)
+        return [
+            ResponseTarget(_Shortened(self._likelihood.first(seconds), self._prior, self.ndim)) for seconds in durations
+        ]
+
+    # ------------------------------------------------------------------ coordinates
+
+    def parameters(self, coords: np.ndarray) -> np.ndarray:
+        """Parameters (n, ndim) at coordinates (n, ndim)."""
+        return self._prior.from_normal(coords)
+
+    def coordinates(self, parameters: np.ndarray) -> np.ndarray:
+        """Coordinates (n, ndim) of parameters (n, ndim)."""
+        return self._prior.to_normal(parameters)
+
+    def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
+        """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
+        full = np.zeros((len(coords), self.ndim))
+        full[:, : self.n_structural] = coords
+        return self._prior.from_normal(full)[:, : self.n_structural]
+
+    def structural_coordinates(self, thetas: np.ndarray) -> np.ndarray:
+        """Coordinates (n, n_structural) of structural parameters (n, n_structural)."""
+        full = np.repeat(self._median[None], len(thetas), axis=0)
+        full[:, : self.n_structural] = thetas
+        return self._prior.to_normal(full)[:, : self.n_structural]
+
+    def log_prior(self, coords: np.ndarray) -> np.ndarray:
+        """Standard normal log-density (n,) of coordinates (n, k)."""
+        return -0.5 * np.square(coords).sum(axis=-1) - _HALF_LOG_TWO_PI * coords.shape[-1]
+
+    # ------------------------------------------------------------------ simulations
+
+    def run(self, coords: np.ndarray, remember: Remember = run_at_once) -> Runs:
+        """Simulate structural coordinates (n, n_structural)."""
+        return self.run_parameters(self.structural_parameters(coords), coords, remember)
+
+    def run_parameters(self, thetas: np.ndarray, coords: np.ndarray, remember: Remember = run_at_once) -> Runs:
+        """Simulate structural parameters (n, n_structural), whose coordinates are `coords`; the archive keeps the runs.
+
+        Responses are rounded to single precision, in which they are stored, so that a resumed run is the same.
+        """
+        computed = []
+
+        def compute() -> list[np.ndarray]:
+            batch = self._likelihood.simulate(thetas)
+            computed.append(True)
+            with np.errstate(over="ignore"):
+                response = batch.response.astype(np.float32)
+            reasons = np.frombuffer(json.dumps(list(batch.reasons)).encode(), dtype=np.uint8)
+            return [response, self._likelihood.statistics(thetas), reasons]
+
+        key = hashlib.blake2b(self.model.fingerprint.encode() + thetas.tobytes(), digest_size=16).hexdigest()
+        response, statistics, reasons = remember(key, compute)
+        if not computed:
+            self._likelihood.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
+        failed = ~(np.isfinite(response).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
+        self.archive.add(coords[~failed], response[~failed], statistics[~failed])
+        return Runs(self.measured - response, statistics, failed)
+
+    # ------------------------------------------------------------------ the noise
+
+    def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
+        """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
+        full = np.zeros((len(coords), self.ndim))
+        full[:, self.n_structural :] = coords
+        parameters = self._prior.from_normal(full)[:, self.n_structural :] if self.n_noise else coords
+        return self.noise.log_likelihood(statistics, self.n_steps, parameters)
+
+    def _noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
+        """Log-likelihood and log-prior (n,) of coordinates (n, n_noise) at the same statistics (n_numbers,)."""
+        repeated = np.broadcast_to(statistics, (len(coords), len(statistics)))
+        return self.log_likelihood(repeated, coords) + self.log_prior(coords)
+
+    def fit_noise(self, statistics: np.ndarray, start: np.ndarray | None = None) -> NoiseFit:
+        """Noise parameters that fit statistics (n_numbers,) best: nothing is simulated.
+
+        Parameters
+        ----------
+        statistics : (n_numbers,) float
+            Of the residuals.
+        start : (n_noise,) float, optional
+            Coordinates near the result, such as those for a neighbouring point. By default a grid is searched.
+        """
+        if not self.n_noise:
+            return NoiseFit(np.zeros(0), float(self._noise_density(statistics, np.zeros((1, 0)))[0]))
+        coords = np.zeros(self.n_noise) if start is None else start
+        if start is None:
+            for width in _WIDTHS:
+                for k in range(self.n_noise):
+                    trial = np.repeat(coords[None], len(_GRID), axis=0)
+                    trial[:, k] += width * _GRID
+                    coords = trial[np.argmax(self._noise_density(statistics, trial))]
+
+        best = NoiseFit(coords, float(self._noise_density(statistics, coords[None])[0]))
+        for _ in range(_NEWTON_STEPS):
+            improved = self._newton_step(statistics, best)
+            if improved.log_density < best.log_density + _NEWTON_GAIN:
+                break
+            best = improved
+        return best
+
+    def _newton_step(self, statistics: np.ndarray, at: NoiseFit) -> NoiseFit:
+        """The best of several damped Newton steps of the noise parameters, or the point itself."""
+        k = self.n_noise
+        unit = _NEWTON_DIFFERENCE * np.eye(k)
+        pairs = [(i, j) for i in range(k) for j in range(i)]
+        offsets = [unit, -unit]
+        if pairs:
+            offsets.append(np.array([unit[i] + unit[j] for i, j in pairs]))
+        values = self._noise_density(statistics, at.coords + np.concatenate(offsets))
+        if not np.isfinite(values).all():
+            return at
+        ahead, behind, both = values[:k], values[k : 2 * k], values[2 * k :]
+        gradient = (ahead - behind) / (2.0 * _NEWTON_DIFFERENCE)
+        hessian = np.diag((2.0 * at.log_density - ahead - behind) / _NEWTON_DIFFERENCE**2)
+        for (i, j), value in zip(pairs, both, strict=True):
+            mixed = -(value - ahead[i] - ahead[j] + at.log_density) / _NEWTON_DIFFERENCE**2
+            hessian[i, j] = hessian[j, i] = mixed
+        curvatures, vectors = np.linalg.eigh(hessian)
+        steps = [(vectors / (np.abs(curvatures) * (1.0 + damping) + 0.1)) @ vectors.T @ gradient for damping in _DAMPED]
+        trials = at.coords + np.clip(steps, -1.0, 1.0)
+        reached = self._noise_density(statistics, trials)
+        top = int(np.argmax(np.where(np.isfinite(reached), reached, -np.inf)))
+        return NoiseFit(trials[top], float(reached[top])) if reached[top] > at.log_density else at
+
+    def slopes(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
+        """Derivatives (n_numbers,) of the log-likelihood by the statistics, at fixed noise parameters."""
+        width = len(statistics)
+        steps = _SLOPE_STEP * np.maximum(np.abs(statistics), 1e-9 * np.abs(statistics).max())
+        shifted = np.concatenate([statistics + np.diag(steps), statistics - np.diag(steps)])
+        values = self.log_likelihood(shifted, np.broadcast_to(coords, (2 * width, self.n_noise)))
+        return (values[:width] - values[width:]) / (2.0 * steps)
