@@ -42,6 +42,7 @@ ORDER = {
         ("prediction",),
         ("models",),
         ("probability",),
+        ("emulation",),
         ("simulation",),
         ("signals",),
         ("plots",),

@@ -78,6 +78,15 @@ class ResponseGuide:
         self._emulated: EmulatedPosterior | None = None
         self._wide: StudentMixture | None = None
 
+    def fresh(self) -> "ResponseGuide":
+        """A guide of the same posterior that has not searched yet."""
+        return ResponseGuide(self._posterior, self._starts)
+
+    @property
+    def fingerprint(self) -> str:
+        """Identity of the guide: a sampler resumes a run only with an equal one."""
+        return f"{type(self).__name__}({self._posterior.fingerprint}, starts={self._starts})"
+
     @property
     def emulators(self) -> tuple[ResponseEmulator, ...]:
         return tuple(region.emulator for region in self._regions if region.emulator is not None)
@@ -91,7 +100,7 @@ class ResponseGuide:
     def prepare(self, session: Any) -> Iterator[None]:
         """Search for modes; each item is a batch of simulations."""
         starts = draw_starts(self._target, self._starts, session.random)
-        search = search_modes(self._target, starts, session.remember, session.remaining)
+        search = search_modes(self._target, starts, session.remember, session.fits)
         while True:
             try:
                 cost = next(search)
@@ -212,7 +221,7 @@ class ResponseGuide:
         else:
             surprising = density >= density.max()
         for row in np.flatnonzero(surprising)[np.argsort(-density[surprising])][:_MOST_ASCENTS]:
-            search = search_from(self._target, structural[row], session.remember, session.remaining)
+            search = search_from(self._target, structural[row], session.remember, session.fits)
             while True:
                 try:
                     cost = next(search)

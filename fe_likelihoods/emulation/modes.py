@@ -30,7 +30,18 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs, run_at_once
 
-__all__ = ["Ascent", "Mode", "ModeSearch", "ascend", "distinct_ends", "draw_starts", "find_modes", "laplace", "search_from", "search_modes"]
+__all__ = [
+    "Ascent",
+    "Mode",
+    "ModeSearch",
+    "ascend",
+    "distinct_ends",
+    "draw_starts",
+    "find_modes",
+    "laplace",
+    "search_from",
+    "search_modes",
+]
 
 _DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 _FIRST_DAMPING = 1e-2
@@ -44,6 +55,7 @@ _TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approx
 _MAX_ITERATIONS = 40
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
+_HOPELESS = 200.0  # an end of a short part whose log-density is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
 _ROUNDS_OF_STEPS = 4
@@ -191,7 +203,9 @@ def ascend(
         if slopes is None:
             slopes = yield from _difference(target, coords, residuals, differences)
             weights = target.slopes(statistics, noise.coords)
-            gradient = 2.0 * bilinear_form(target.statistic, slopes, residuals[None])[:, 0] @ weights - (coords - centre)
+            gradient = 2.0 * bilinear_form(target.statistic, slopes, residuals[None])[:, 0] @ weights - (
+                coords - centre
+            )
             hessian = -2.0 * bilinear_form(target.statistic, slopes) @ weights + np.eye(d)
             scale = np.diag(np.diag(hessian))
             whole = np.linalg.solve(hessian, gradient)
@@ -257,8 +271,8 @@ def _difference(
 class _Batches:
     """Runs generators of points side by side: their requests are simulated as one batch."""
 
-    def __init__(self, target: ResponseTarget, remember: Remember, remaining: Callable[[], float]) -> None:
-        self._target, self._remember, self._remaining = target, remember, remaining
+    def __init__(self, target: ResponseTarget, remember: Remember, fits: Callable[[float], bool]) -> None:
+        self._target, self._remember, self._fits = target, remember, fits
 
     def complete(
         self, ascents: Sequence[Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
@@ -282,7 +296,7 @@ class _Batches:
         while waiting:
             requests = list(waiting.items())
             points = np.concatenate([request for _, request in requests])
-            if len(points) > self._remaining():
+            if not self._fits(len(points)):
                 self.interrupted = True
                 return
             runs = self._target.run(points, self._remember)
@@ -331,9 +345,7 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
         steps = _THIRD / np.sqrt(curvature)
     pairs = [(i, j) for i in range(target.ndim) for j in range(i + 1)]
     corners = [
-        log_density(
-            np.array([at + a * steps[i] * unit[i] + b * steps[j] * unit[j] for i, j in pairs])
-        )
+        log_density(np.array([at + a * steps[i] * unit[i] + b * steps[j] * unit[j] for i, j in pairs]))
         for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))
     ]
     mixed = -(corners[0] - corners[1] - corners[2] + corners[3]) / 4.0
@@ -353,7 +365,7 @@ def search_modes(
     target: ResponseTarget,
     starts: np.ndarray,
     remember: Remember = run_at_once,
-    remaining: Callable[[], float] = lambda: np.inf,
+    fits: Callable[[float], bool] = lambda _: True,
 ) -> Generator[float, None, ModeSearch]:
     """Search from given starts, on growing parts of the record where the model offers them.
 
@@ -365,8 +377,8 @@ def search_modes(
         Starts, in standard normal coordinates.
     remember : callable, optional
         Stores responses for a resumed run.
-    remaining : callable, optional
-        Simulations that are left of a budget.
+    fits : callable, optional
+        ``fits(n)``: whether n more simulations of the whole record fit into the budget.
 
     Yields
     ------
@@ -393,14 +405,14 @@ def search_modes(
         tolerance = _TOLERANCE if whole else min(_TOLERANCE / share, _LOOSEST)
         origin = np.zeros(target.n_structural)
         ascents = [ascend(part, start, origin if whole else centre, ends, tolerance) for start, centre, _ in fronts]
-        batches = _Batches(part, remember, lambda share=share: (remaining() - spent) / share)
+        batches = _Batches(part, remember, lambda points, share=share: fits(share * points))
         for points in batches.complete(ascents, finish):
             spent += share * points
             yield share * points
         interrupted = batches.interrupted
         if not ends or interrupted:
             break
-        kept = distinct_ends(ends)
+        kept = [end for end in distinct_ends(ends) if end.log_density > max(e.log_density for e in ends) - _HOPELESS]
         fronts = [(end.coords, end.coords, end.starts) for end in kept]
     modes: list[Mode] = []
     if part is target and ends:
@@ -417,9 +429,7 @@ def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
     return np.concatenate([np.zeros((1, target.n_structural)), drawn])[:n]
 
 
-def find_modes(
-    posterior: Any, starts: int = 8, seed: Any = None, max_simulations: float | None = None
-) -> ModeSearch:
+def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulations: float | None = None) -> ModeSearch:
     """Find the modes of a posterior from the responses of its model.
 
     Parameters
@@ -456,16 +466,21 @@ def find_modes(
         raise ValueError(f"starts must be a whole number of at least one; got {starts!r}")
     target = ResponseTarget(posterior)
     budget = np.inf if max_simulations is None else float(max_simulations)
-    search = search_modes(target, draw_starts(target, starts, np.random.default_rng(seed)), remaining=lambda: budget)
+    spent = 0.0
+
+    def fits(simulations: float) -> bool:
+        return spent + simulations <= budget
+
+    search = search_modes(target, draw_starts(target, starts, np.random.default_rng(seed)), fits=fits)
     while True:
         try:
-            next(search)
+            spent += next(search)
         except StopIteration as end:
             return end.value
 
 
 def search_from(
-    target: ResponseTarget, start: np.ndarray, remember: Remember, remaining: Callable[[], float]
+    target: ResponseTarget, start: np.ndarray, remember: Remember, fits: Callable[[float], bool]
 ) -> Generator[float, None, Mode | None]:
     """One ascent on the whole record from a point (n_structural,); returns the mode, or None if the budget ended it."""
     ends: list[Ascent] = []
@@ -474,9 +489,7 @@ def search_from(
         if end is not None:
             ends.append(end)
 
-    spent = 0.0
-    batches = _Batches(target, remember, lambda: remaining() - spent)
+    batches = _Batches(target, remember, fits)
     for points in batches.complete([ascend(target, start, np.zeros(target.n_structural))], finish):
-        spent += points
         yield float(points)
     return laplace(target, ends[0]) if ends else None

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..signals.durations import growing_durations
 from .quadratic import check_quadratic, sums_of_squares
 
 __all__ = ["Archive", "NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
@@ -180,7 +181,10 @@ class ResponseTarget:
         shares : sequence of float
             Shares of the Arias intensity at which the parts end.
         """
-        durations = self._likelihood.growing_durations(shares)
+        if not hasattr(self.model, "first"):
+            return []
+        # differences, because a residual displacement is not motion
+        durations = growing_durations(np.diff(self.measured, axis=1), self.model.dt, shares)[:-1]
         return [
             ResponseTarget(_Shortened(self._likelihood.first(seconds), self._prior, self.ndim)) for seconds in durations
         ]

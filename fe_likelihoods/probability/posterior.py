@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..emulation.guide import ResponseGuide
 from .distributions import Distribution, RandomState
 from .inputs import as_points
 from .likelihood import FELikelihood
@@ -260,6 +261,30 @@ class Posterior:
         sigmas = noise.draw(misfit, self.likelihood.measurements.n_steps, rng)
         names = (*self.prior.names, *noise.noise.parameter_names)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
+
+    def guide(self, starts: int = 8) -> ResponseGuide:
+        """A guide for samplers: finds the modes from the responses and emulates the responses around them.
+
+        It reduces the simulations from thousands to hundreds: ``SMCSampler(..., guide=posterior.guide())``. The result
+        is that of the posterior in any case, since every draw of the guide is simulated and weighted.
+
+        Parameters
+        ----------
+        starts : int
+            Starts of the search for modes: the median of the prior, and draws of it. A mode to which no start leads can
+            be missed.
+
+        Returns
+        -------
+        ResponseGuide
+
+        Raises
+        ------
+        ValueError
+            If `starts` is not a whole number of at least one, or the noise uses statistics that are not quadratic in
+            the residuals.
+        """
+        return ResponseGuide(self, starts)
 
     def report(self) -> dict:
         """Summary of the simulations that this object has requested in this process.
