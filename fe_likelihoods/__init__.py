@@ -19,6 +19,17 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .data.make_isolated_bridge import (
         table_motion,
     )
+    from .emulation.emulator import (
+        ResponseEmulator,
+    )
+    from .emulation.guide import (
+        ResponseGuide,
+    )
+    from .emulation.modes import (
+        Mode,
+        ModeSearch,
+        find_modes,
+    )
     from .models.executable import (
         ExecutableModel,
     )
@@ -203,6 +214,8 @@ __all__ = [
     "LogNormal",
     "MarginalNoise",
     "Measurements",
+    "Mode",
+    "ModeSearch",
     "Model",
     "Noise",
     "OpenSeesModel",
@@ -214,6 +227,8 @@ __all__ = [
     "RCColumn",
     "Record",
     "ResidualChecks",
+    "ResponseEmulator",
+    "ResponseGuide",
     "ResponseSpectrum",
     "Rubber",
     "SharedGaussianNoise",
@@ -228,6 +243,7 @@ __all__ = [
     "average_predictions",
     "effective_samples",
     "exceedance",
+    "find_modes",
     "fit_fragility",
     "fit_measures",
     "fragility",
@@ -269,6 +285,13 @@ _EXPORTS = {
         "to_pymc",
     ),
     "data.make_isolated_bridge": ("table_motion",),
+    "emulation.emulator": ("ResponseEmulator",),
+    "emulation.guide": ("ResponseGuide",),
+    "emulation.modes": (
+        "Mode",
+        "ModeSearch",
+        "find_modes",
+    ),
     "models.executable": ("ExecutableModel",),
     "models.function": ("FunctionModel",),
     "models.isolated_bridge": ("IsolatedBridge",),

@@ -103,7 +103,7 @@ def fit_process(
     log_scales : (d,) float, optional
         Where the search for the length scales starts, such as those of an earlier fit.
     iterations : int
-        Largest number of iterations of this search.
+        Largest number of iterations of this search; 0 to keep the start.
 
     Returns
     -------
@@ -121,10 +121,10 @@ def fit_process(
     start = np.full(d, _FIRST_LOG_SCALE) if log_scales is None else log_scales
     if log_scales is None:  # one common scale first: cheap, and a good start for the others
         start = min((np.full(d, scale) for scale in np.arange(0.2, 3.4, 0.4)), key=loss)
-    found = minimize(
-        loss, start, method="L-BFGS-B", bounds=[_LOG_SCALES] * d, options={"maxiter": iterations, "eps": 1e-3}
-    )
-    log_scales = found.x
+    log_scales = np.asarray(start, dtype=float)
+    if iterations > 0:
+        options = {"maxiter": iterations, "eps": 1e-3}
+        log_scales = minimize(loss, log_scales, method="L-BFGS-B", bounds=[_LOG_SCALES] * d, options=options).x
     nuggets = _NUGGETS[_restricted(log_scales, inputs, contrasts, targets).argmin(axis=0)]
     covariance = _covariance(inputs, inputs, log_scales)
     linear, weights = np.empty((d + 1, outputs.shape[1])), np.empty_like(outputs)

@@ -11,16 +11,18 @@ import json
 import re
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..emulation.guide import ResponseGuide
 from .distributions import Distribution, RandomState
 from .inputs import as_points
 from .likelihood import FELikelihood
 from .marginal_noise import MarginalNoise
 from .priors import Prior
+
+if TYPE_CHECKING:
+    from ..emulation.guide import ResponseGuide
 
 __all__ = ["Posterior"]
 
@@ -262,7 +264,7 @@ class Posterior:
         names = (*self.prior.names, *noise.noise.parameter_names)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 
-    def guide(self, starts: int = 8) -> ResponseGuide:
+    def guide(self, starts: int = 8) -> "ResponseGuide":
         """A guide for samplers: finds the modes from the responses and emulates the responses around them.
 
         It reduces the simulations from thousands to hundreds: ``SMCSampler(..., guide=posterior.guide())``. The result
@@ -284,6 +286,8 @@ class Posterior:
             If `starts` is not a whole number of at least one, or the noise uses statistics that are not quadratic in
             the residuals.
         """
+        from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
+
         return ResponseGuide(self, starts)
 
     def report(self) -> dict:

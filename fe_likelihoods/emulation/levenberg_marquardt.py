@@ -1,0 +1,249 @@
+"""Levenberg-Marquardt on the responses: ascents to modes, run side by side.
+
+The log-density in the coordinates of `fe_likelihoods.emulation.target` is log L(S(r)) - |z|^2 / 2 with residuals r of
+which the log-likelihood is a function through quadratic statistics S. With J = dr/dz by finite differences and
+f = d log L / dS at the noise parameters that fit best, its gradient and its Gauss-Newton Hessian are
+
+    g = 2 sum_a f_a B_a(J, r) - z,        H = -2 sum_a f_a B_a(J, J) + 1,
+
+where B_a is the bilinear form of S_a. A step solves (H + lambda diag H) dz = g. Several lambda are simulated at once:
+they cost one parallel batch, and the largest improvement is taken. That reaches modes at the end of narrow curved
+valleys, where one lambda at a time does not. Steps of the differences are a small part of a posterior standard
+deviation: larger ones average over the valley, much smaller ones follow the roughness of the likelihood.
+
+References
+----------
+K. Levenberg (1944), Quarterly of Applied Mathematics 2, 164-168; D. W. Marquardt (1963), Journal of the Society for
+Industrial and Applied Mathematics 11, 431-441.
+"""
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .quadratic import bilinear_form
+from .target import NoiseFit, Remember, ResponseTarget, Runs
+
+__all__ = ["TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "squared_distance"]
+
+_DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+_FIRST_DAMPING = 1e-2
+_LARGEST_DAMPING = 1e8
+_LARGEST_STEP = 2.0  # prior standard deviations
+_FIRST_DIFFERENCE = 3e-3  # prior standard deviations
+_DIFFERENCE_SHARE = 0.1  # of a posterior standard deviation
+_DIFFERENCE_LIMITS = 3e-4, 2e-2
+_RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
+TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
+_MAX_ITERATIONS = 40
+_SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
+
+
+class Ascent(NamedTuple):
+    """Where an ascent from one start ended.
+
+    Attributes
+    ----------
+    coords : (n_structural,) float
+        Structural coordinates.
+    log_density : float
+        Log-density there, in standard normal coordinates, at the best noise parameters.
+    hessian : (n_structural, n_structural) float
+        Gauss-Newton Hessian of minus the log-density.
+    noise : NoiseFit
+        The best noise parameters.
+    residuals : (n_channels, n_steps) float
+        Residuals.
+    slopes : (n_structural, n_channels, n_steps) float
+        Their derivatives by the coordinates.
+    gain_left : float
+        Log-density still to gain according to the quadratic approximation.
+    iterations : int
+        Number of steps.
+    merged : int
+        Number of the ascent in whose mode this one would have ended, -1 if it went to its own end.
+    starts : tuple of int
+        Starts that ended here.
+    """
+
+    coords: np.ndarray
+    log_density: float
+    hessian: np.ndarray
+    noise: NoiseFit
+    residuals: np.ndarray
+    slopes: np.ndarray
+    gain_left: float
+    iterations: int
+    merged: int = -1
+    starts: tuple[int, ...] = ()
+
+    @property
+    def converged(self) -> bool:
+        """Whether little is left to gain."""
+        return self.gain_left < TOLERANCE or self.merged >= 0
+
+
+def ascend(
+    target: ResponseTarget,
+    start: np.ndarray,
+    centre: np.ndarray,
+    known: Sequence[Ascent] = (),
+    tolerance: float = TOLERANCE,
+) -> Generator[np.ndarray, Runs, Ascent | None]:
+    """Levenberg-Marquardt from one start.
+
+    Parameters
+    ----------
+    target : ResponseTarget
+        The posterior.
+    start : (n_structural,) float
+        Start.
+    centre : (n_structural,) float
+        Where the prior is centred.
+    known : sequence of Ascent
+        Ends of other ascents so far (the sequence grows): an ascent that would end in one of them stops.
+    tolerance : float
+        Log-density still to gain at which to stop.
+
+    Yields
+    ------
+    (n, n_structural) float
+        Points to simulate; the generator is sent their `Runs`.
+
+    Returns
+    -------
+    Ascent or None
+        None if the simulation of the start fails.
+    """
+    d = target.n_structural
+    runs = yield start[None]
+    if runs.failed[0]:
+        return None
+    coords, residuals, statistics = start, runs.residuals[0], runs.statistics[0]
+    noise = target.fit_noise(statistics)
+    value = noise.log_density + target.log_prior(coords - centre)
+    differences, damping, failures, slopes = np.full(d, _FIRST_DIFFERENCE), _FIRST_DAMPING, 0, None
+    gain_left, merged, iteration = np.inf, -1, 0
+    for iteration in range(_MAX_ITERATIONS):  # noqa: B007  the number of iterations is part of the result
+        if slopes is None:
+            slopes = yield from _difference(target, coords, residuals, differences)
+            weights = target.slopes(statistics, noise.coords)
+            gradient = 2.0 * bilinear_form(target.statistic, slopes, residuals[None])[:, 0] @ weights - (
+                coords - centre
+            )
+            hessian = -2.0 * bilinear_form(target.statistic, slopes) @ weights + np.eye(d)
+            scale = np.diag(np.diag(hessian))
+            whole = np.linalg.solve(hessian, gradient)
+            gain_left = 0.5 * float(gradient @ whole)
+            merged = next(
+                (k for k, end in enumerate(known) if squared_distance(coords + whole, end) < _SAME_MODE * d), -1
+            )
+            if gain_left < tolerance or merged >= 0:
+                break
+        dampings = damping * _DAMPINGS
+        steps = np.array([np.linalg.solve(hessian + each * scale, gradient) for each in dampings])
+        steps *= np.minimum(1.0, _LARGEST_STEP / np.abs(steps).max(axis=1, keepdims=True))
+        runs = yield coords + steps
+        best = None
+        for k in np.flatnonzero(~runs.failed):
+            fit = target.fit_noise(runs.statistics[k], noise.coords)
+            reached = fit.log_density + target.log_prior(coords + steps[k] - centre)
+            if reached > (value if best is None else best[0]):
+                best = reached, k, fit
+        if best is not None:
+            value, k, noise = best
+            coords, residuals, statistics = coords + steps[k], runs.residuals[k], runs.statistics[k]
+            damping = float(np.clip(dampings[k], 1e-8, _LARGEST_DAMPING))
+            spread = np.sqrt(np.diag(np.linalg.inv(hessian)))
+            differences, slopes, failures = np.clip(_DIFFERENCE_SHARE * spread, *_DIFFERENCE_LIMITS), None, 0
+        else:
+            failures += 1
+            if failures == 1:
+                damping = min(damping * 1e5, _LARGEST_DAMPING)
+            elif failures == 2:  # the differences may have met roughness: take larger ones
+                differences, slopes, damping = 3.0 * differences, None, 0.1
+            else:
+                break
+    if slopes is None:  # stopped after a step
+        slopes = yield from _difference(target, coords, residuals, differences)
+        weights = target.slopes(statistics, noise.coords)
+        hessian = -2.0 * bilinear_form(target.statistic, slopes) @ weights + np.eye(d)
+    return Ascent(coords, float(value), hessian, noise, residuals, slopes, gain_left, iteration, merged)
+
+
+def squared_distance(coords: np.ndarray, end: Ascent) -> float:
+    """Squared distance from the end of an ascent, in units of its Laplace approximation."""
+    apart = coords - end.coords
+    return float(apart @ end.hessian @ apart)
+
+
+def _difference(
+    target: ResponseTarget, coords: np.ndarray, residuals: np.ndarray, steps: np.ndarray
+) -> Generator[np.ndarray, Runs, np.ndarray]:
+    """Derivatives (d, n_channels, n_steps) of the residuals; zero for a parameter all of whose differences fail."""
+    runs = yield coords + np.diag(steps)
+    slopes = (runs.residuals - residuals) / steps[:, None, None]
+    for k in np.flatnonzero(runs.failed):
+        slopes[k] = 0.0
+        for factor in _RETRIES:
+            point = coords.copy()
+            point[k] += factor * steps[k]
+            again = yield point[None]
+            if not again.failed[0]:
+                slopes[k] = (again.residuals[0] - residuals) / (factor * steps[k])
+                break
+    return slopes
+
+
+class Batches:
+    """Runs generators of points side by side: their requests are simulated as one batch."""
+
+    def __init__(self, target: ResponseTarget, remember: Remember, fits: Callable[[float], bool]) -> None:
+        self._target, self._remember, self._fits = target, remember, fits
+
+    def complete(
+        self, ascents: Sequence[Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
+    ) -> Iterator[int]:
+        """Advance all generators to their ends; yields the number of points of each batch.
+
+        Stops early, with `interrupted` set, when a batch does not fit in what remains of the budget.
+        """
+        self.interrupted = False
+        waiting: dict[int, np.ndarray] = {}
+
+        def advance(index: int, runs: Runs | None) -> None:
+            try:
+                waiting[index] = ascents[index].send(runs)
+            except StopIteration as end:
+                waiting.pop(index, None)
+                finished(index, end.value)
+
+        for index in range(len(ascents)):
+            advance(index, None)
+        while waiting:
+            requests = list(waiting.items())
+            points = np.concatenate([request for _, request in requests])
+            if not self._fits(len(points)):
+                self.interrupted = True
+                return
+            runs = self._target.run(points, self._remember)
+            yield len(points)
+            place = 0
+            for index, request in requests:
+                rows = slice(place, place + len(request))
+                place += len(request)
+                advance(index, Runs(*(column[rows] for column in runs)))
+
+
+def distinct_ends(ends: Sequence[Ascent]) -> list[Ascent]:
+    """Ends that are different modes, the highest first; each carries the starts of those that it stands for."""
+    kept: list[Ascent] = []
+    for end in sorted(ends, key=lambda end: -end.log_density):
+        d = len(end.coords)
+        same = next((k for k, other in enumerate(kept) if squared_distance(end.coords, other) < _SAME_MODE * d), None)
+        if same is None:
+            kept.append(end)
+        else:
+            kept[same] = kept[same]._replace(starts=(*kept[same].starts, *end.starts))
+    return kept

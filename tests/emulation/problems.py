@@ -1,0 +1,56 @@
+"""Small posteriors for the tests of modes, emulators and guides."""
+
+import numpy as np
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    HalfNormal,
+    MarginalNoise,
+    Measurements,
+    Posterior,
+    SharedGaussianNoise,
+    TruncatedNormal,
+    Uniform,
+)
+
+N_STEPS, DT = 200, 0.02
+CHANNELS = (Channel("top", "displacement", "mm"), Channel("base", "force", "kN"))
+TRUTH = np.array([1.2, 0.8])
+SD = np.array([2e-3, 5.0])
+
+
+def free_vibration(theta):
+    """Decaying vibration: displacement [m] and spring force [N]."""
+    time = DT * np.arange(N_STEPS)
+    omega = 2.0 * np.pi * 1.5 * np.sqrt(theta[0])
+    displacement = 0.05 * np.exp(-0.05 * theta[1] * omega * time) * np.cos(omega * time)
+    return np.stack([displacement, 1e5 * theta[0] * displacement])
+
+
+def noisy(model, truth=TRUTH, sd=SD, seed=1):
+    """Synthetic measurements."""
+    errors = sd[:, None] * np.random.default_rng(seed).standard_normal((len(sd), model.n_steps))
+    return Measurements(model.channels, model.dt, model.simulate(truth) + errors)
+
+
+def vibration(noise="marginal", function=free_vibration, seed=1):
+    """Posterior of stiffness and damping of a vibrating mass, with one of the noises of the library."""
+    model = FunctionModel(function, ["stiffness", "damping"], CHANNELS, DT, N_STEPS)
+    measured = noisy(FunctionModel(free_vibration, ["stiffness", "damping"], CHANNELS, DT, N_STEPS), seed=seed)
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in model.parameter_names}
+    sigmas = {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
+    if noise == "marginal":
+        return Posterior(FELikelihood(model, measured, MarginalNoise(GaussianNoise(CHANNELS), sigmas)), prior)
+    if noise == "shared":
+        return Posterior(
+            FELikelihood(model, measured, SharedGaussianNoise.of(measured)), prior | {"sigma": HalfNormal(0.3)}
+        )
+    if noise == "autoregressive":
+        rho = {"rho_top": Uniform(-0.5, 0.9), "rho_base": Uniform(-0.5, 0.9)}
+        return Posterior(FELikelihood(model, measured, AutoregressiveNoise(CHANNELS)), prior | sigmas | rho)
+    options = {"sensor": {"sensor": {"top": 1e-3}}, "effective": {"effective_samples": {"top": 60.0}}, "white": {}}
+    return Posterior(FELikelihood(model, measured, GaussianNoise(CHANNELS, **options[noise])), prior | sigmas)

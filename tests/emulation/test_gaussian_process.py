@@ -1,0 +1,52 @@
+"""Gaussian processes: exact cases, left-out errors by refitting, and the spread of errors against the variance."""
+
+import numpy as np
+
+from fe_likelihoods.emulation.gaussian_process import fit_process, left_out_errors, predict
+
+
+def _smooth(inputs):
+    return np.stack([np.sin(inputs[:, 0]) + inputs[:, 1] ** 2, np.exp(0.3 * inputs.sum(axis=1))], axis=1)
+
+
+def test_a_linear_function_is_predicted_exactly():
+    rng = np.random.default_rng(1)
+    inputs, slopes = rng.standard_normal((30, 3)), rng.standard_normal((3, 2))
+    process = fit_process(inputs, 2.0 + inputs @ slopes, np.ones(2))
+    new = 3.0 * rng.standard_normal((50, 3))
+    np.testing.assert_allclose(predict(process, new)[0], 2.0 + new @ slopes, atol=1e-5)
+
+
+def test_training_points_of_a_smooth_function_are_reproduced():
+    rng = np.random.default_rng(2)
+    inputs = rng.standard_normal((60, 2))
+    process = fit_process(inputs, _smooth(inputs), np.ones(2))
+    np.testing.assert_allclose(predict(process, inputs)[0], _smooth(inputs), atol=1e-4)
+    new = 0.7 * rng.standard_normal((200, 2))
+    assert np.sqrt(np.square(predict(process, new)[0] - _smooth(new)).mean()) < 1e-2
+
+
+def test_left_out_errors_are_those_of_processes_without_the_point():
+    rng = np.random.default_rng(3)
+    inputs = rng.standard_normal((25, 2))
+    outputs = _smooth(inputs) + 0.1 * rng.standard_normal((25, 2))
+    process = fit_process(inputs, outputs, np.ones(2))
+    errors = left_out_errors(process)
+    for i in (0, 7, 24):
+        rest = np.delete(np.arange(25), i)
+        # iterations=0 keeps the length scales; the nuggets are those of the whole fit if the choice is clear
+        again = fit_process(inputs[rest], outputs[rest], np.ones(2), process.log_scales, iterations=0)
+        if [level.nugget for level in again.levels] == [level.nugget for level in process.levels]:
+            left_out = outputs[i] - predict(again, inputs[i : i + 1])[0][0]
+            np.testing.assert_allclose(errors[i], left_out, rtol=1e-5, atol=1e-8)
+
+
+def test_the_variance_covers_the_errors_of_a_rough_function():
+    rng = np.random.default_rng(4)
+    inputs = rng.standard_normal((120, 2))
+    noise = 0.2
+    process = fit_process(inputs, _smooth(inputs) + noise * rng.standard_normal((120, 2)), np.ones(2))
+    new = 0.8 * rng.standard_normal((400, 2))
+    mean, variance = predict(process, new)
+    score = np.square(_smooth(new) + noise * rng.standard_normal((400, 2)) - mean) / variance
+    assert 0.7 < score.mean() < 1.4

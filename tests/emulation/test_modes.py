@@ -1,0 +1,104 @@
+"""Modes: against a general optimiser, for every noise; two modes; failures; budgets; growing records."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, find_modes, problems
+from fe_likelihoods.emulation.target import ResponseTarget
+
+from .problems import free_vibration, vibration
+
+
+def _log_density(posterior, coords):
+    """Log-density in standard normal coordinates, by the posterior itself."""
+    target = ResponseTarget(posterior)
+    x = target.parameters(coords[None])
+    return float((posterior.log_likelihood(x) + target.log_prior(coords[None]))[0])
+
+
+@pytest.mark.parametrize("noise", ["marginal", "white", "shared", "autoregressive", "sensor", "effective"])
+def test_the_mode_is_the_one_of_a_general_optimiser(noise):
+    posterior = vibration(noise)
+    search = find_modes(posterior, starts=3, seed=1)
+    mode = search.modes[0]
+    assert mode.converged and search.finished and search.ends[0] == 0
+    assert mode.log_density == pytest.approx(_log_density(posterior, mode.coords), abs=1e-3)
+    scale = np.sqrt(np.diag(mode.covariance))
+    found = minimize(
+        lambda u: -_log_density(posterior, mode.coords + scale * u), np.zeros(posterior.ndim), method="Nelder-Mead",
+        options={"maxiter": 800, "xatol": 1e-3, "fatol": 1e-3},
+    )  # fmt: skip
+    assert mode.log_density > -found.fun - 0.5
+    assert np.abs(found.x).max() < 1.5
+
+
+@pytest.mark.parametrize("noise", ["marginal", "autoregressive"])
+def test_the_covariance_is_the_inverse_of_the_hessian(noise):
+    posterior = vibration(noise)
+    mode = find_modes(posterior, starts=1, seed=1).modes[0]
+    factor = np.linalg.cholesky(mode.covariance)
+    here = _log_density(posterior, mode.coords)
+    for k in range(posterior.ndim):
+        step = 0.5 * factor[:, k]
+        drop = here - 0.5 * sum(_log_density(posterior, mode.coords + sign * step) for sign in (1.0, -1.0))
+        assert drop == pytest.approx(0.125, rel=0.25)
+
+
+def _two_modes():
+    """The response depends on the square of a parameter, so that both signs fit alike."""
+    channels = (Channel("top", "displacement", "mm"),)
+    time = np.linspace(0.0, 1.0, 100)
+    model = FunctionModel(lambda theta: [theta[0] ** 2 * time + theta[1]], ["a", "b"], channels, 0.01, 100)
+    measured = Measurements(channels, 0.01, model.simulate(np.array([0.7, 0.2])) + 0.05 * np.sin(40.0 * time))
+    prior = {"a": Uniform(-2.0, 2.0), "b": Uniform(-1.0, 1.0), "sigma_top": Uniform(0.01, 0.5)}
+    return Posterior(FELikelihood(model, measured), prior)
+
+
+def test_two_modes_are_found_and_the_starts_are_assigned_to_them():
+    search = find_modes(_two_modes(), starts=8, seed=3)
+    assert len(search.modes) == 2
+    assert sorted(round(float(mode.parameters[0]), 1) for mode in search.modes) == [-0.7, 0.7]
+    for number, mode in enumerate(search.modes):
+        assert all(search.ends[start] == number for start in mode.starts)
+
+
+def test_a_failing_start_leads_nowhere_and_failing_steps_are_shortened():
+    def fails_near_the_median(theta):
+        if abs(theta[0] - 1.0) < 0.02 or theta[1] > 1.3:
+            raise RuntimeError("diverged")
+        return free_vibration(theta)
+
+    search = find_modes(vibration(function=fails_near_the_median), starts=4, seed=2)
+    assert search.ends[0] == -1 and len(search.modes) == 1
+    assert search.modes[0].parameters == pytest.approx([1.2, 0.8], abs=0.05)
+
+
+def test_a_search_in_which_everything_fails_finds_nothing():
+    def fails(theta):
+        raise RuntimeError("diverged")
+
+    search = find_modes(vibration(function=fails), starts=3, seed=2)
+    assert search.modes == () and search.ends == (-1, -1, -1) and search.finished
+
+
+@pytest.mark.parametrize("budget", [0, 3, 11])
+def test_a_budget_is_kept(budget):
+    posterior = vibration()
+    search = find_modes(posterior, starts=3, seed=1, max_simulations=budget)
+    assert not search.finished
+    assert posterior.report()["simulations"] == search.simulations <= budget
+
+
+def test_parts_of_the_record_count_as_fractions():
+    posterior = problems.isolated_bridge(noise="marginal")
+    search = find_modes(posterior, starts=4, seed=1)
+    assert len(search.modes) == 1 and search.ends == (0, 0, 0, 0)
+    whole = posterior.report()["simulations"]
+    assert whole < search.simulations < 300
+
+
+def test_starts_must_be_a_whole_number():
+    for starts in (0, 2.5, True):
+        with pytest.raises(ValueError, match="starts must be a whole number"):
+            find_modes(vibration(), starts=starts)
