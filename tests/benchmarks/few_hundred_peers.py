@@ -3,8 +3,9 @@
 Beside ``SMCSampler`` with the posterior's guide run PyVBMC (Acerbi 2018, arXiv:1810.05558) and GPry (El Gammal et al.
 2023, doi:10.1088/1475-7516/2023/10/021), which fit a Gaussian process to the log-density. Both are approximate: their
 samples come from the fit, and no draw is corrected. Every run has its own process and ``--limit`` seconds of wall time.
-Settings are the defaults of the other program, except the number of evaluations; they see the prior's bounds (quantiles
-of 1e-12 where these are infinite) and start at its median.
+Settings are the defaults of the other program, except the number of evaluations. PyVBMC has the prior's bounds (the
+quantiles of 1e-12 where these are infinite) and starts at its median; GPry has a uniform prior, in the box of the
+quantiles of 1e-4, and draws its first points between those of 16 and 84 %.
 
 PyVBMC stops by itself when it has converged, often before the budget: the column ``runs`` has the number. Install the
 others in an environment of their own, since they pull in many packages::
@@ -73,14 +74,17 @@ class _Counted:
 
 
 def _limits(posterior: Any) -> dict[str, np.ndarray]:
-    """Median, bounds and plausible bounds (16 and 84 %) of the prior, (ndim,) each."""
+    """Median, bounds, and quantiles of the prior, (ndim,) each: 16 and 84 % (plausible), 0.01 and 99.99 %."""
     distributions = posterior.prior.distributions.values()
     bounds = np.array([d.bounds for d in distributions])
-    quantile = {u: np.array([float(d.ppf(u)) for d in distributions]) for u in (1e-12, 0.16, 0.5, 0.84, 1.0 - 1e-12)}
+    levels = (1e-12, 1e-4, 0.16, 0.5, 0.84, 1.0 - 1e-4, 1.0 - 1e-12)
+    quantile = {u: np.array([float(d.ppf(u)) for d in distributions]) for u in levels}
     return {
         "median": quantile[0.5],
         "low": np.where(np.isfinite(bounds[:, 0]), bounds[:, 0], quantile[1e-12]),
         "high": np.where(np.isfinite(bounds[:, 1]), bounds[:, 1], quantile[1.0 - 1e-12]),
+        "least": quantile[1e-4],
+        "most": quantile[1.0 - 1e-4],
         "plausible_low": quantile[0.16],
         "plausible_high": quantile[0.84],
     }
@@ -125,6 +129,31 @@ def _guided(posterior: Any, seed: int, budget: int) -> Outcome:
     return outcome
 
 
+def _gpry(posterior: Any, seed: int, budget: int) -> Outcome:
+    from gpry import Runner
+
+    target, at, d = _Counted(posterior), _limits(posterior), posterior.ndim
+    low, high = np.maximum(at["low"], at["least"]), np.minimum(at["high"], at["most"])
+    volume = np.log(high - low).sum()  # its prior is uniform in the box: its log Z is that of the density times this
+    runner = Runner(
+        lambda x: target(x) + volume,
+        np.stack([low, high], axis=1).tolist(),
+        ref_bounds=np.stack([at["plausible_low"], at["plausible_high"]], axis=1).tolist(),
+        params=[f"x{i}" for i in range(d)],
+        options={"max_total": budget, "max_initial": min(budget, int(30 * d**1.5))},
+        seed=seed,
+        verbose=1,
+    )
+    runner.run()
+    runner.generate_mc_sample()
+    draws = runner.last_mc_samples()
+    weights = np.ones(len(draws["X"])) if draws["w"] is None else np.asarray(draws["w"])
+    rng = np.random.default_rng(seed)
+    samples = np.asarray(draws["X"])[rng.choice(len(weights), DRAWS, p=weights / weights.sum())]
+    status = "converged" if runner.has_converged else "not converged"
+    return _approximate(samples, target.calls, *runner.last_mc_logZ(), status)
+
+
 class Method(NamedTuple):
     """Module of a method, the function that runs it, and how to install it."""
 
@@ -136,6 +165,7 @@ class Method(NamedTuple):
 METHODS = {
     "guide": Method("samplers", _guided, ""),
     "PyVBMC": Method("pyvbmc", _pyvbmc, "pip install pyvbmc"),
+    "GPry": Method("gpry", _gpry, "pip install gpry"),
 }
 
 
