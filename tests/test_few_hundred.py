@@ -47,6 +47,7 @@ def test_judgement_of_a_run(rng):
         assert guided.compare(one, KNOWN, labels).judgement == "WRONG"
         assert guided.compare(one._replace(status="usable"), KNOWN, labels).judgement == "WRONG"
         assert guided.compare(one._replace(status="not usable"), KNOWN, labels).judgement == "refused"
+    assert guided.compare(right._replace(log_evidence_error=np.inf), KNOWN, labels).judgement == "no error"
     assert guided.compare(guided.Outcome(failed="ValueError: no"), KNOWN, labels).judgement == "ValueError: no"
 
 

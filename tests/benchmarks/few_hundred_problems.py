@@ -168,6 +168,7 @@ PROBLEMS = {
         500,
         needs=opensees_frame.missing,
         walkers=100,
+        reference_draws=150,
     ),
     "lehman_white": Problem(
         "tested column (Lehman 415), 7 parameters, white noise",
@@ -175,6 +176,8 @@ PROBLEMS = {
         tested_column.start,
         800,
         needs=tested_column.missing,
+        reference_draws=500,
+        reference_rounds=14,
     ),
     "lehman_ar1": Problem(
         "tested column (Lehman 415), 7 parameters and 2 of autoregressive noise",
@@ -182,6 +185,8 @@ PROBLEMS = {
         tested_column.start,
         800,
         needs=tested_column.missing,
+        reference_draws=500,
+        reference_rounds=14,
     ),
 }
 """All problems by name."""

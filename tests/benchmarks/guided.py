@@ -75,7 +75,8 @@ class Errors(NamedTuple):
     share : float
         Largest error of the share of a mode.
     judgement : str
-        "right", "refused" (the verdict is "not usable"), "WRONG", or the exception that ended the run.
+        "right", "refused" (the verdict is "not usable"), "WRONG", "no error" (a standard error is infinite or NaN), or
+        the exception that ended the run.
     """
 
     log_evidence: float
@@ -175,7 +176,11 @@ def compare(outcome: Outcome, reference: Any, labels: Callable[[np.ndarray], np.
         or np.any(sd > LIMIT / np.sqrt(n) + 2.0 * ROUNDING)  # also for tails heavier than Gaussian
         or share_z > LIMIT
     )
-    judgement = "refused" if outcome.status == "not usable" else "WRONG" if wrong else "right"
+    judgement = "WRONG" if wrong else "right"
+    if not (np.isfinite(evidence_se) and np.isfinite(mean_se).all()):
+        judgement = "no error"
+    if outcome.status == "not usable":
+        judgement = "refused"
     return Errors(
         float(evidence),
         float(evidence / evidence_se),

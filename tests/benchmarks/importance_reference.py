@@ -60,30 +60,45 @@ class _Proposal:
         return np.logaddexp.reduce([*parts, np.log(_PRIOR_WEIGHT) + self.prior.logpdf(x)], axis=0)
 
 
+def _lag_one(rows: np.ndarray) -> np.ndarray:
+    """Correlation of successive residuals (n_channels, 1)."""
+    before, after = rows[:, :-1], rows[:, 1:]
+    return ((before * after).sum(axis=1) / np.square(before).sum(axis=1))[:, None]
+
+
 def find_mode(posterior: Any, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mode of the structural parameters near a start, and the Gaussian covariance there, both by least squares.
 
-    The noise is taken as white with one standard deviation per channel, estimated from the residuals at the start and
-    again at the mode found with it.
+    The parameters of the noise are estimated from the residuals, at the start and again at each mode found with them:
+    one standard deviation per channel, and for autoregressive noise the lag-one correlation.
     """
     likelihood = posterior.likelihood
     d = len(likelihood.model.parameter_names)
     priors = list(posterior.prior.distributions.values())[:d]
     moments = np.array([prior.moments for prior in priors])
     bounds = np.array([prior.bounds for prior in priors]).T
+    correlated = any(name.startswith("rho") for name in posterior.parameter_names)
 
-    def residuals(theta: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-        rows = likelihood.residuals(theta) / sigma[:, None]
+    def whitened(rows: np.ndarray, rho: np.ndarray) -> np.ndarray:
+        first = rows[:, :1]
+        return np.concatenate([first, (rows[:, 1:] - rho * rows[:, :-1]) / np.sqrt(1.0 - rho**2)], axis=1)
+
+    def noise(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows = likelihood.residuals(theta)
+        rho = np.clip(_lag_one(rows), -0.999, 0.999) if correlated else np.zeros((len(rows), 1))
+        return rho, np.sqrt(np.square(whitened(rows, rho)).mean(axis=1))
+
+    def residuals(theta: np.ndarray, rho: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        rows = whitened(likelihood.residuals(theta), rho) / sigma[:, None]
         return np.concatenate([rows.ravel(), (theta - moments[:, 0]) / moments[:, 1]])
 
     theta = np.asarray(start, dtype=float)[:d]
-    sigma = np.sqrt(np.square(likelihood.residuals(theta)).mean(axis=1))
-    for _ in range(2):
+    for _ in range(4 if correlated else 2):
+        args = noise(theta)
         found = least_squares(
-            residuals, theta, bounds=bounds, diff_step=_DIFFERENCE, args=(sigma,), ftol=1e-6, xtol=1e-5, max_nfev=20
+            residuals, theta, bounds=bounds, diff_step=_DIFFERENCE, args=args, ftol=1e-6, xtol=1e-5, max_nfev=20
         )
         theta = found.x
-        sigma = np.sqrt(np.square(likelihood.residuals(theta)).mean(axis=1))
     return theta, np.linalg.inv(found.jac.T @ found.jac)
 
 
@@ -94,16 +109,17 @@ def _with_noise(posterior: Any, theta: np.ndarray, covariance: np.ndarray) -> tu
         return theta, covariance
     residuals = posterior.likelihood.residuals(theta)
     n, sigma = residuals.shape[1], residuals.std(axis=1)
+    correlated = any(name.startswith("rho") for name in names)
     means, deviations = [], []
     for i, name in enumerate(names):
         row = residuals[i % len(residuals)]
+        rho = float(_lag_one(row[None])[0, 0]) if correlated else 0.0
         if name.startswith("rho"):
-            rho = float(np.corrcoef(row[1:], row[:-1])[0, 1])
             means.append(rho)
             deviations.append(max(0.01, np.sqrt((1.0 - rho**2) / n)))
         else:
             means.append(sigma[i % len(residuals)])
-            deviations.append(0.1 * means[-1])
+            deviations.append(1.2 * means[-1] * np.sqrt((1.0 + rho) / (1.0 - rho) / (2.0 * n)))
     whole = np.zeros((len(theta) + len(names),) * 2)
     whole[: len(theta), : len(theta)] = covariance
     whole[len(theta) :, len(theta) :] = np.diag(np.square(deviations))
