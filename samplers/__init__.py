@@ -65,6 +65,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         RecyclingSettings,
         Settings,
     )
+    from .tempering.verdict import (
+        Verdict,
+    )
     from .tmcmc import (
         TMCMCSampler,
     )
@@ -91,6 +94,7 @@ __all__ = [
     "Summary",
     "TMCMCSampler",
     "TemperedSampler",
+    "Verdict",
     "compare_models",
     "comparison_table",
     "ladder_plot",
@@ -147,6 +151,7 @@ _EXPORTS = {
         "RecyclingSettings",
         "Settings",
     ),
+    "tempering.verdict": ("Verdict",),
     "tmcmc": ("TMCMCSampler",),
 }
 _MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names}

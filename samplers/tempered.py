@@ -22,12 +22,11 @@ from typing import Any
 
 import numpy as np
 from emcee import EnsembleSampler, State
-from emcee.ensemble import walkers_independent
 from emcee.pbar import get_progress_bar
 
 from .moves.fast_parameters import with_fast_sweeps
 from .moves.guided import GuideMove
-from .moves.kernels import RandomWalkMove
+from .moves.kernels import RandomWalkMove, calibrate_move
 from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import header
@@ -37,14 +36,15 @@ from .storage.journal import RunStart
 from .storage.recording import record, show_progress
 from .storage.returned_values import ErrorCapturing
 from .tempering.anneal import anneal
-from .tempering.budget import Budget
-from .tempering.diagnostics import check_evidence, warn
-from .tempering.guide import AdaptedGuide, Guide, GuideSession, check_guide
-from .tempering.guided import Guidance
+from .tempering.budget import Budget, BudgetExhausted, as_limit
+from .tempering.diagnostics import warn
+from .tempering.guide import AdaptedGuide, Guide, check_guide
+from .tempering.guided import lend
 from .tempering.mutation import MoveSchedule, check_moves
-from .tempering.population import Population, Sweep
+from .tempering.population import Population, Sweep, check_size, check_start
 from .tempering.results import AnnealingResult
 from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
+from .tempering.verdict import describe_halt, independent_points, judge
 
 __all__ = ["TemperedSampler"]
 
@@ -76,6 +76,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         An object that proposes draws near the posterior (`samplers.tempering.guide`). Its weighted draws replace the
         annealing, and the sweeps at beta = 1 are proposals of the guide. Where the draws cannot be trusted, recycling
         starts from them, with a `SamplingWarning`.
+    max_simulations : float, optional
+        Largest number of simulations (`simulations`). Where it is reached, the posterior is estimated from the points
+        that are known, the state is stored once if the call has stored no step, and a `SamplingWarning` says so; see
+        `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the same
+        file, and call `run_mcmc` again: the result is that of a run with the larger number from the start.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
         the run, and two samplers never share a stream. The random state of a backend that contains a chain takes
@@ -124,6 +129,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         log_prior_fn: Callable | None = None,
         coarse_log_prob_fn: Callable | None = None,
         guide: Guide | None = None,
+        max_simulations: float | None = None,
         seed: int | None = None,
         settings: Settings | None = None,
         **overrides: Any,
@@ -139,11 +145,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             )
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         self._optional.check_ndim(ndim)
-        if ndim < 1 or nwalkers < 2 * ndim:
-            raise ValueError(
-                "a population must span the parameters: at least 2 ndim walkers and one parameter are needed, some "
-                f"hundreds of walkers are usual; got nwalkers={nwalkers} for ndim={ndim}"
-            )
+        check_size(nwalkers, ndim)
         given = combine_settings(type(self).__name__, settings, overrides)
         recycle, moves = self._choose(given, moves, nwalkers)
         self.settings = replace(given, recycle=recycle)
@@ -159,8 +161,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if guide is not None:
             check_guide(guide, vectorize)
 
-        self._checkpoint = Checkpoint(backend)
-        self._result = AnnealingResult()
+        self._budget = Budget(limit=as_limit(max_simulations))
+        self._checkpoint = Checkpoint(backend, limited=max_simulations is not None)
+        self._result, self._verdict = AnnealingResult(), None
         self._annealed_state: State | None = None
         self.seconds = 0.0
         set_previous_state(self, None)
@@ -183,7 +186,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         followed = with_fast_sweeps(own_moves, fast, ndim, self.settings.fast_sweeps)
         set_moves(self, followed)
         self._moves_of_annealing = MoveSchedule(*get_moves(self))
-        self._fast = fast
+        self._fast, self._first_moves = fast, copy.deepcopy(followed)
+        self._budget.fast = self._optional.fast_parameters
         refuse_unused(given, recycle, followed != list(own_moves), self.unused_settings, guide is not None)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
@@ -195,13 +199,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
             convention,
             self._checkpoint,
             FailureLimit(self.settings.max_failure_share, nwalkers, ndim),
-            budget=Budget(self._optional.fast_parameters),
+            budget=self._budget,
         )
         self._coarse_evaluator = None
         if coarse_log_prob_fn is not None:
             function = ErrorCapturing(coarse_log_prob_fn, self.log_prob_fn.args, self.log_prob_fn.kwargs, vectorize)
             self._coarse_evaluator = Evaluator(function, self.log_prior_fn, convention, keep_blobs=False)
-        self._result = self._checkpoint.stored_result()
+        self._result, self._verdict = self._checkpoint.stored_result(), self._checkpoint.stored_verdict()
         if self.backend.random_state is None:
             get_random(self).seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
 
@@ -217,12 +221,24 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def reset(self):
         """Clear the chain, as in emcee. Ladder and state at beta = 1 are kept: burn in, reset, continue."""
         super().reset()
-        self._checkpoint.store_result(self._result)
+        self._checkpoint.store_result(self._result, self._verdict)
 
     @property
     def guide(self) -> Guide | None:
         """The guide in use, a copy of the given one that has learned from this run; None before it or without one."""
         return None if self._guide is None else self._guide.guide
+
+    @property
+    def max_simulations(self) -> float | None:
+        """Largest number of simulations; None for no limit."""
+        return self._budget.limit
+
+    @max_simulations.setter
+    def max_simulations(self, value: float | None) -> None:
+        limit = as_limit(value)
+        if limit is not None:
+            self._checkpoint.expect_limit(self.evaluations == 0)
+        self._budget.limit = limit
 
     # ------------------------------------------------------------------ running
 
@@ -306,20 +322,45 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 self._checkpoint.begin_call(iterations)
             self.seconds += time.perf_counter() - start
             start = time.perf_counter()
-            for advanced in super().sample(
-                state,
-                iterations=iterations,
-                tune=tune,
-                skip_initial_state_check=skip_initial_state_check,
-                thin_by=thin_by,
-                thin=thin,
-                store=store,
-                **bar,
-            ):
-                self.seconds += time.perf_counter() - start
-                yield advanced
-                start = time.perf_counter()
-            complete = True
+            self._evaluator.evaluates_parts = False
+            halted, advanced, stored, new = self._result.halt is not None, None, State(state, copy=True), 0
+            steps = (
+                ()
+                if halted
+                else super().sample(
+                    state,
+                    iterations=iterations,
+                    tune=tune,
+                    skip_initial_state_check=skip_initial_state_check,
+                    thin_by=thin_by,
+                    thin=thin,
+                    store=store,
+                    **bar,
+                )
+            )
+            try:
+                for advanced in steps:
+                    new += 1
+                    if self._budget.limit is not None:
+                        stored = State(advanced, copy=True)
+                        self._checkpoint.stepped(stored, store)
+                    self.seconds += time.perf_counter() - start
+                    yield advanced
+                    start = time.perf_counter()
+            except BudgetExhausted:
+                halted = True
+            complete = not halted
+            missing = 0 if iterations is None else iterations - new
+            self._judge(missing)
+            if halted:
+                if advanced is not None:  # the move that exceeded the limit may have changed some of its walkers
+                    for name in State.__slots__:
+                        setattr(advanced, name, getattr(stored, name))
+                self.random_state = stored.random_state
+                self._checkpoint.halt(stored, store and missing > 0 and made + new == 0, self._budget.off_path)
+                warn(describe_halt(self.verdict, self._budget.limit))
+                if new == 0 and missing > 0:
+                    yield stored
         except GeneratorExit:  # the user wants no more states
             complete = True
             raise
@@ -330,6 +371,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     f"{self.failure_count - failure_count} evaluations failed and count as impossible "
                     f"({self._evaluator.failures.most_common()}); see failures"
                 )
+
+    def _judge(self, missing: int) -> None:
+        """Store the verdict on an annealing of this object, or keep that of the backend."""
+        if self._result.independent_points is not None or self._verdict is None:
+            result, settings = self._result, self.settings.guided
+            self._verdict = judge(result, settings, self.nwalkers, self.ndim, self.simulations, missing)
+            self._checkpoint.store_verdict(self._verdict)
 
     def compute_log_prob(self, coords):
         """Log-probability and blobs of points (n, ndim), as in emcee; -inf for NaN and outside the prior's support."""
@@ -374,6 +422,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def _resume(self, state: State, iterations: int | None, bar: dict) -> tuple[State, int]:
         """Continue the interrupted run: repeat the annealing without evaluations, and go to the last stored step.
 
+        The run was killed, or ended by its limit of simulations, perhaps in this process.
+
         Returns
         -------
         state : State
@@ -382,15 +432,19 @@ class TemperedSampler(RunResults, EnsembleSampler):
             How many of the iterations wanted now it has made already.
         """
         start, last = self._checkpoint.interrupted.start, self._checkpoint.interrupted.last
-        if not any(np.array_equal(state.coords, known.coords) for known in (start, last) if known is not None):
+        known_states = start, last, self._checkpoint.interrupted.provisional, get_previous_state(self)
+        if not any(np.array_equal(state.coords, known.coords) for known in known_states if known is not None):
             raise ValueError(
                 f"{self.backend.filename} contains a run from other draws of the prior: pass None as initial_state to "
                 "continue it, or use another file; backend.reset(nwalkers, ndim) discards it"
             )
         contents = self._checkpoint.resume(self._header(), self._evaluator.log_prior, self._evaluator.compute)
         self.random_state = start.random_state
+        self._moves_of_annealing = self._moves_of_annealing._replace(moves=copy.deepcopy(self._first_moves))
+        self._evaluator.reset()
+        self._budget.unused = contents.unused
         state = self._anneal(State(start.coords, copy=True), True, bar)
-        if last is not None:
+        if last is not None and self._result.halt is None:
             state = State(last.coords, log_prob=last.log_prob, blobs=last.blobs, random_state=last.random_state)
             self.random_state = last.random_state
             self._evaluator.reset()
@@ -401,25 +455,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _start(self, state: State, skip_check: bool) -> Population:
         """Draws of the prior as a population, checked and entered in the journal."""
-        if state.coords.shape != (self.nwalkers, self.ndim):
-            raise ValueError(
-                f"incompatible input dimensions: initial_state must be ({self.nwalkers}, {self.ndim}) draws of the "
-                f"prior; got {state.coords.shape}"
-            )
-        if not skip_check and not walkers_independent(state.coords):
-            raise ValueError(
-                "Initial state has a large condition number: the walkers must be finite and linearly independent, as "
-                "draws of the prior are"
-            )
+        check_start(state.coords, self.nwalkers, self.ndim, skip_check)
         self.random_state = state.random_state
         coords = np.asarray(state.coords, dtype=float)
-        log_prior = self._evaluator.log_prior(coords)
-        outside = np.flatnonzero(log_prior == -np.inf)
-        if len(outside) > 0:
-            raise ValueError(
-                f"{len(outside)} of {self.nwalkers} initial points lie outside the prior's support (log_prior -inf or "
-                f"NaN), the first of them {coords[outside[0]]}: pass draws of the prior"
-            )
+        log_prior = self._evaluator.log_prior_of_start(coords)
         if self._checkpoint.wants_start:
             self._checkpoint.begin(self._header(), RunStart(coords, log_prior, self.random_state))
         records = None
@@ -427,23 +466,17 @@ class TemperedSampler(RunResults, EnsembleSampler):
             records = self._evaluator.pack(state.log_prob, log_prior, state.blobs)
         return Population(0.0, coords, records, float(self.nwalkers))
 
-    def _lend_to_guide(self) -> Guidance | None:
-        """A fresh copy of the guide, and what it is lent; None without a guide."""
-        if self._given_guide is None:
-            return None
-        self._guide, budget = AdaptedGuide(self._given_guide, self.ndim), self._evaluator.budget
-        budget.guide, budget.refused = self._guide, False
-        session = GuideSession(get_random(self), self._checkpoint.remember, budget.fits, lambda: budget.remaining)
-        return Guidance(self._guide, session, budget)
-
     def _anneal(self, state: State, skip_check: bool, bar: dict) -> State:
         """Carry draws of the prior to beta = 1; the ladder is stored stage by stage."""
-        self._result = AnnealingResult()
+        self._result, self._verdict, self._evaluator.evaluates_parts = AnnealingResult(), None, True
         population, coarse = self._start(state, skip_check), self._coarse_evaluator
         if coarse is not None:
             coarse.pool = self.pool
-        schedule, guidance = self._moves_of_annealing, self._lend_to_guide()
+        schedule, guidance = self._moves_of_annealing, None
         set_moves(self, *schedule)
+        if self._given_guide is not None:
+            self._guide = AdaptedGuide(self._given_guide, self.ndim)
+            guidance = lend(self._guide, get_random(self), self._checkpoint.remember, self._budget)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse, guidance)
         labels = {"desc": "ladder", "unit": " sweeps", **(bar["progress_kwargs"] or {})}
         with get_progress_bar(bar["progress"], None, **labels) as shown:
@@ -454,12 +487,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if coarse is not None and coarse.failures.count:
             failed = coarse.failures.count, coarse.evaluations, coarse.failures.most_common()
             logger.warning("%d of %d evaluations of the coarse model failed and count as impossible (%s)", *failed)
-        if self._result.check is not None:
-            check_evidence(self.log_evidence_ladder, self.ladder[-1].log_evidence_error, self._result.check)
+        self._result = self._result._replace(
+            concerns=() if guidance is None else guidance.guide.concerns,
+            independent_points=independent_points(self._result, population.coords),
+        )
         if self._result.start is not None and self._result.start.used:
-            followed = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
-            set_moves(self, followed, np.ones(1))
-            equal = np.full(self.nwalkers, 1.0 / self.nwalkers)
-            MoveSchedule(followed, np.ones(1)).calibrate(population.coords, equal, None)
+            moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
+            calibrate_move(moves[0], population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
+            set_moves(self, moves, np.ones(1))
         log_prob, blobs = self._evaluator.unpack(population.records)
         return State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)

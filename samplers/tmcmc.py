@@ -38,6 +38,10 @@ class TMCMCSampler(TemperedSampler):
         An object that proposes draws near the posterior, such as ``posterior.guide()`` (`samplers.tempering.guide`).
         Its weighted draws replace the annealing, and the sweeps at beta = 1 are proposals of the guide. Where its draws
         cannot be trusted, recycling starts from them, with a `SamplingWarning`.
+    max_simulations : float, optional
+        Largest number of simulations. Where it is reached, the posterior is estimated from the points that are known,
+        and `verdict` says what the estimate is worth. The run goes on when `max_simulations` is increased and
+        `run_mcmc` is called again.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator (``np.random.seed``). The random state of
         a backend that contains a chain takes precedence.

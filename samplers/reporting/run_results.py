@@ -7,6 +7,7 @@ from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.genealogy import standard_error_of_mean
 from ..tempering.population import GuidedRound, Stage
 from ..tempering.results import AnnealingResult
+from ..tempering.verdict import Verdict
 
 __all__ = ["RunResults"]
 
@@ -18,6 +19,7 @@ class RunResults:
     _evaluator: Evaluator
     _coarse_evaluator: Evaluator | None
     _result: AnnealingResult
+    _verdict: Verdict | None
 
     @property
     def evaluations(self) -> int:
@@ -97,3 +99,10 @@ class RunResults:
         continued. A cache of `log_prob_fn` can make some of them unnecessary.
         """
         return self._evaluator.budget.simulations
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the result is worth, and why; ``print(sampler.verdict)`` gives sentences."""
+        if self._verdict is None:
+            raise ValueError("there is no verdict before a run: call run_mcmc first")
+        return self._verdict

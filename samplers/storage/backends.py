@@ -10,6 +10,7 @@ beside the file. The group names its run, so that the journal of another run has
 """
 
 import itertools
+import json
 import logging
 import os
 import secrets
@@ -22,15 +23,25 @@ from emcee.backends import Backend, HDFBackend
 
 from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.population import Stage
-from .emcee_internals import append_steps, holds_steps
+from ..tempering.verdict import Verdict
+from .emcee_internals import append_steps, drop_last_step, holds_steps
 from .journal import Contents, EvaluatedBatch, Journal, RunStart, Step, read_journal
 
-__all__ = ["JournaledBackend", "read_check", "read_ladder", "write_check", "write_stage"]
+__all__ = [
+    "JournaledBackend",
+    "read_check",
+    "read_ladder",
+    "read_verdict",
+    "write_check",
+    "write_stage",
+    "write_verdict",
+]
 
 logger = logging.getLogger(__name__)
 
 DATASET = "ladder"
 CHECK = "evidence_check"
+VERDICT = "verdict"
 RUN = "run"
 SECONDS_BETWEEN_WRITES = 0.25
 # Superblock of HDF5, version 0 (file format specification, section II.A): signature, version, and the end of the file
@@ -168,6 +179,19 @@ class JournaledBackend(HDFBackend):
         """Enter that the call is complete, or was ended by the user, in the journal."""
         if self._journal is not None:
             self._journal.done()
+
+    def halt(self, provisional: bool, unused: float) -> None:
+        """Enter in the journal that the limit of simulations ended the call, and make the run ready to be continued."""
+        self.flush()
+        if self._journal is not None:
+            self._journal.halt(provisional, unused)
+            self.contents = read_journal(self.journal_path)
+
+    def back(self) -> None:
+        """Remove the last step, which only showed the state, from the chain."""
+        if self._journal is not None:
+            self._journal.back()
+        drop_last_step(self)
 
     def _write_run(self) -> None:
         """Name the run in the group."""
@@ -322,3 +346,26 @@ def read_check(backend: Backend) -> EvidenceCheck | None:
         group = file[backend.name]
         row = group[DATASET].attrs.get(CHECK) if DATASET in group else None
     return None if row is None else EvidenceCheck(*row[:4].tolist(), int(row[4]))
+
+
+def write_verdict(backend: Backend, verdict: Verdict) -> None:
+    """Store the verdict on a run with its chain."""
+    if isinstance(backend, HDFBackend):
+        with backend.open("a") as file:
+            file[backend.name].attrs[VERDICT] = json.dumps(verdict)
+    else:
+        setattr(backend, VERDICT, verdict)
+
+
+def read_verdict(backend: Backend) -> Verdict | None:
+    """The stored verdict; None if there is none."""
+    if not isinstance(backend, HDFBackend):
+        return getattr(backend, VERDICT, None)
+    if not backend.initialized:
+        return None
+    with backend.open() as file:
+        text = file[backend.name].attrs.get(VERDICT)
+    if text is None:
+        return None
+    status, reasons, *numbers = json.loads(text)
+    return Verdict(status, tuple(reasons), *numbers)

@@ -10,13 +10,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from emcee import State
 from emcee.backends import Backend, HDFBackend
 
 from ..tempering.population import Stage
 from ..tempering.results import AnnealingResult
-from .backends import JournaledBackend, read_check, read_ladder, write_check, write_stage
+from ..tempering.verdict import Verdict
+from .backends import JournaledBackend, read_check, read_ladder, read_verdict, write_check, write_stage, write_verdict
 from .compatibility import differences
+from .emcee_internals import trim_chain
 from .journal import Contents, EvaluatedBatch, RunStart
+from .memory_record import MemoryRecord
 
 __all__ = ["Checkpoint", "Replay"]
 
@@ -68,12 +72,15 @@ class Replay:
 class Checkpoint:
     """Stores the ladder of a run in its backend, keeps its journal, and resumes an interrupted run.
 
-    Without an HDF5 file that can be written there is no journal: the methods that concern it then do nothing.
+    Without an HDF5 file that can be written there is no journal. A run with a limit of simulations then keeps in memory
+    what a journal would contain. Otherwise the methods that concern the journal do nothing.
 
     Parameters
     ----------
     backend : emcee Backend or HDFBackend, optional
         Backend of the chain; in memory by default.
+    limited : bool
+        Whether the run has a limit of simulations.
 
     Attributes
     ----------
@@ -81,11 +88,15 @@ class Checkpoint:
         Backend to use in place of the given one.
     """
 
-    def __init__(self, backend: Backend | HDFBackend | None):
+    def __init__(self, backend: Backend | HDFBackend | None, limited: bool = False):
         if type(backend) is HDFBackend and not backend.read_only:
             backend = JournaledBackend.of(backend)
         self.backend = Backend() if backend is None else backend
-        self._journaled = self.backend if isinstance(self.backend, JournaledBackend) else None
+        self._journal: JournaledBackend | MemoryRecord | None = None
+        if isinstance(self.backend, JournaledBackend):
+            self._journal = self.backend
+        elif limited and not isinstance(self.backend, HDFBackend):
+            self._journal = MemoryRecord(self.backend)
         self._replayed: Replay | None = None
         self._earlier_stages: tuple[Stage, ...] = ()
 
@@ -95,8 +106,18 @@ class Checkpoint:
         """Ladder and check in the backend."""
         return AnnealingResult(read_ladder(self.backend), read_check(self.backend))
 
-    def store_result(self, result: AnnealingResult) -> None:
-        """Store ladder and check in the backend, after it was reset."""
+    def stored_verdict(self) -> Verdict | None:
+        """Verdict in the backend, if there is one."""
+        return read_verdict(self.backend)
+
+    def store_verdict(self, verdict: Verdict) -> None:
+        """Store a verdict in the backend."""
+        write_verdict(self.backend, verdict)
+
+    def store_result(self, result: AnnealingResult, verdict: Verdict | None) -> None:
+        """Store ladder, check and verdict in the backend, after it was reset."""
+        if verdict is not None:
+            write_verdict(self.backend, verdict)
         for index, stage in enumerate(result.ladder):
             write_stage(self.backend, index, stage)
         self.store_check(result)
@@ -120,16 +141,16 @@ class Checkpoint:
     @property
     def interrupted(self) -> Contents | None:
         """Journal of an interrupted run in the backend that has not been resumed yet."""
-        return None if self._journaled is None else self._journaled.contents
+        return None if self._journal is None else self._journal.contents
 
     @property
     def wants_start(self) -> bool:
         """Whether the start of the annealing is to be entered with `begin`."""
-        return self._journaled is not None and self._replayed is None
+        return self._journal is not None and self._replayed is None
 
     def begin(self, header: dict, start: RunStart) -> None:
         """Enter the start of the annealing."""
-        self._journaled.begin(header, start)
+        self._journal.begin(header, start)
 
     def resume(
         self,
@@ -157,12 +178,15 @@ class Checkpoint:
             If the run was made with other settings, another prior or another log-probability.
         """
         contents = self.interrupted
-        if differing := differences(header, contents, log_prior, compute):
+        in_memory = isinstance(self._journal, MemoryRecord)  # then nothing can differ
+        if not in_memory and (differing := differences(header, contents, log_prior, compute)):
             raise ValueError(
                 f"{self.backend.filename} contains another run, which cannot be continued here: {'; '.join(differing)}."
                 " Use the settings and functions that it was started with, or another file"
             )
-        self._journaled.continue_run(contents)
+        self._journal.continue_run(contents)
+        if contents.provisional is not None:
+            self._journal.back()
         self._replayed = Replay(contents)
         self._earlier_stages = read_ladder(self.backend)
         return contents
@@ -173,27 +197,62 @@ class Checkpoint:
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter a batch of evaluated points."""
-        if self._journaled is not None:
-            self._journaled.evaluated(batch)
+        if self._journal is not None:
+            self._journal.evaluated(batch)
 
     def remember(self, key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
         """Arrays that ``compute()`` returns, or that it returned for this key in the interrupted run."""
         if self._replayed is not None and (arrays := self._replayed.recall(key)) is not None:
             return arrays
         arrays = [np.asarray(array) for array in compute()]
-        if self._journaled is not None:
-            self._journaled.remembered(key, arrays)
+        if self._journal is not None:
+            self._journal.remembered(key, arrays)
         return arrays
 
     def begin_call(self, nsteps: int) -> None:
         """Enter the number of steps that a call asks for."""
-        if self._journaled is not None:
-            self._journaled.call(nsteps)
+        if self._journal is not None:
+            self._journal.call(nsteps)
+
+    def expect_limit(self, new: bool) -> None:
+        """Prepare for a limit of simulations that is set after the sampler was made; `new`: nothing was evaluated."""
+        if self._journal is not None or isinstance(self.backend, HDFBackend):
+            return
+        if not new:
+            raise ValueError(
+                "max_simulations was set after a run without it, of which too little was kept in memory to go on from "
+                "a limit: pass max_simulations when the sampler is made, or use a file"
+            )
+        self._journal = MemoryRecord(self.backend)
+
+    def stepped(self, state: State, stored: bool) -> None:
+        """Enter a step of a run with a limit, `stored` in the chain or not; a journal has stored steps by itself."""
+        if stored and isinstance(self._journal, MemoryRecord):
+            self._journal.stepped(state)
+
+    def halt(self, state: State, show: bool, unused: float) -> None:
+        """Enter that the limit of simulations ended a call.
+
+        Parameters
+        ----------
+        state : State
+            The last state.
+        show : bool
+            Whether to store the state as a step, which is replaced when the run goes on.
+        unused : float
+            Simulations of this call that its continuation does not use.
+        """
+        trim_chain(self.backend)
+        if show:
+            self.backend.grow(1, state.blobs)
+            self.backend.save_step(state, np.zeros(len(state.coords), dtype=bool))
+        if self._journal is not None:
+            self._journal.halt(show, unused)
 
     def end_call(self, complete: bool) -> None:
         """Write pending steps, and enter whether the call was completed; evaluations are no longer looked up."""
         self._replayed, self._earlier_stages = None, ()
-        if self._journaled is not None:
-            self._journaled.flush()
+        if self._journal is not None:
+            self._journal.flush()
             if complete:
-                self._journaled.done()
+                self._journal.done()

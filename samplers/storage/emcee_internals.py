@@ -9,18 +9,21 @@ from collections.abc import Sequence
 import h5py
 import numpy as np
 from emcee import EnsembleSampler, State
+from emcee.backends import Backend, HDFBackend
 from emcee.moves import Move
 
 from .journal import Step
 
 __all__ = [
     "append_steps",
+    "drop_last_step",
     "get_moves",
     "get_previous_state",
     "get_random",
     "holds_steps",
     "set_moves",
     "set_previous_state",
+    "trim_chain",
 ]
 
 
@@ -70,6 +73,25 @@ def append_steps(group: h5py.Group, steps: Sequence[Step]) -> None:
     for i, value in enumerate(steps[-1].random_state):
         group.attrs[f"random_state_{i}"] = value
     group.attrs["iteration"] = stop
+
+
+def drop_last_step(backend: Backend) -> None:
+    """Remove the last step, for which no proposal was accepted, from the chain of a backend."""
+    if isinstance(backend, HDFBackend):
+        with backend.open("a") as file:
+            file[backend.name].attrs["iteration"] -= 1
+    else:
+        backend.iteration -= 1
+        trim_chain(backend)
+
+
+def trim_chain(backend: Backend) -> None:
+    """Remove the room for steps that were not made, which ``Backend.grow`` does not expect to find."""
+    if not isinstance(backend, HDFBackend):
+        for name in ("chain", "log_prob", "blobs"):
+            values = vars(backend)[name]
+            if values is not None:
+                setattr(backend, name, values[: backend.iteration])
 
 
 def holds_steps(group: h5py.Group, steps: Sequence[Step]) -> bool:

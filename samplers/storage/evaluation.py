@@ -265,6 +265,17 @@ class Evaluator:
         log_prior, _ = log_probabilities(results, len(coords), "log_prior_fn")
         return np.where(np.isnan(log_prior), -np.inf, log_prior)
 
+    def log_prior_of_start(self, coords: np.ndarray) -> np.ndarray:
+        """Log-prior (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the support."""
+        log_prior = self.log_prior(coords)
+        outside = np.flatnonzero(log_prior == -np.inf)
+        if len(outside) > 0:
+            raise ValueError(
+                f"{len(outside)} of {len(coords)} initial points lie outside the prior's support (log_prior -inf or "
+                f"NaN), the first of them {coords[outside[0]]}: pass draws of the prior"
+            )
+        return log_prior
+
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior."""
         return self.log_prior(coords) > -np.inf

@@ -12,6 +12,9 @@ then dropped. Arrays are stored in NumPy's own format, texts as JSON; nothing is
     CALL  number of steps at beta = 1 that a call asks for (JSON)
     STEP  a stored step: points, log-probabilities, acceptance, blobs, state of the random generator
     DONE  the call is complete
+    HALT  the limit of simulations ended the call (JSON): whether the last step only shows the state, and will be
+          replaced when the run goes on; how many simulations the longer run will not use
+    BACK  this last step has been removed
     WIPE  the chain was reset
 
 A journal survives the death of the process. It is not forced to the disk, so a power failure can lose the last seconds.
@@ -150,6 +153,10 @@ class Contents(NamedTuple):
         Number of steps that the last call asked for; None if it is complete.
     made : int
         Number of these steps that were made.
+    provisional : Step, or None
+        Last step, if it only shows the state of a run that its limit of simulations ended; not in `last` and `made`.
+    unused : float
+        Simulations that the run has made and its continuation does not use.
     size : int
         Size of the file [bytes].
     whole : int
@@ -165,8 +172,10 @@ class Contents(NamedTuple):
     last: Step | None
     wanted: int | None
     made: int
-    size: int
-    whole: int
+    provisional: Step | None = None
+    unused: float = 0.0
+    size: int = 0
+    whole: int = 0
 
 
 def _pack_arrays(arrays: Sequence[np.ndarray]) -> bytes:
@@ -298,6 +307,14 @@ class Journal:
         """Enter that the call is complete, or was ended by the user."""
         self._append(b"DONE")
 
+    def halt(self, provisional: bool, unused: float) -> None:
+        """Enter that the limit of simulations ended the call."""
+        self._append(b"HALT", json.dumps([provisional, unused]).encode())
+
+    def back(self) -> None:
+        """Enter that the last step, which only showed the state, has been removed."""
+        self._append(b"BACK")
+
     def step(self, step: Step) -> None:
         """Enter a step of the chain."""
         blobs = [] if step.blobs is None else [step.blobs]
@@ -352,6 +369,7 @@ def read_journal(path: Path) -> Contents | None:
         raise ValueError(_damaged(path, "it does not start like a journal"))
     header, start, evaluated, remembered, steps, last = {}, None, [], [], [], None
     before_last, wanted, made, whole = 0, None, 0, len(MAGIC)
+    before_step, provisional, unused = (None, 0, 0), None, 0.0
     for kind, content, end in _blocks(data, path):
         whole = end
         if kind == b"HEAD":
@@ -359,6 +377,7 @@ def read_journal(path: Path) -> Contents | None:
         elif kind == b"INIT":
             coords, log_prior, *random = _unpack_arrays(content)
             start, last, wanted = RunStart(coords, log_prior, _unpack_random(random)), None, None
+            provisional = None
         elif kind == b"EVAL":
             coords, log_prob, *blobs = _unpack_arrays(content)
             evaluated.append(EvaluatedBatch(coords, log_prob, blobs[0] if blobs else None, {}))
@@ -373,14 +392,36 @@ def read_journal(path: Path) -> Contents | None:
             wanted = None
         elif kind == b"STEP":
             coords, log_prob, accepted, keys, rest, *blobs = _unpack_arrays(content)
+            before_step = last, before_last, made
             last = Step(coords, log_prob, accepted, blobs[0] if blobs else None, _unpack_random([keys, rest]))
             steps.append(last)
             before_last = len(evaluated)
             made += 1
+        elif kind == b"HALT":
+            is_provisional, made_in_vain = json.loads(content)
+            unused += made_in_vain
+            if is_provisional:
+                provisional, (last, before_last, made) = last, before_step
+        elif kind == b"BACK":
+            provisional, steps = None, steps[:-1]
         elif kind == b"WIPE":
-            steps = []
+            steps, provisional = [], None
         else:
             raise ValueError(_damaged(path, f"it has a block of unknown kind {kind!r}"))
     if start is None:
         return None
-    return Contents(header, start, evaluated, remembered, before_last, steps, last, wanted, made, len(data), whole)
+    return Contents(
+        header,
+        start,
+        evaluated,
+        remembered,
+        before_last,
+        steps,
+        last,
+        wanted,
+        made,
+        provisional,
+        unused,
+        len(data),
+        whole,
+    )

@@ -4,8 +4,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from ..tempering.diagnostics import check_evidence, warn
 from ..tempering.evidence_check import EvidenceCheck
-from ..tempering.population import GuidedRound, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
+from ..tempering.population import Doubt, GuidedRound, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from ..tempering.results import AnnealingResult
 from .checkpoint import Checkpoint
 from .evaluation import Evaluator
@@ -16,7 +17,7 @@ __all__ = ["record", "show_progress"]
 def record(
     steps: Iterator[tuple[Population, Report]], evaluator: Evaluator, checkpoint: Checkpoint
 ) -> Iterator[tuple[AnnealingResult, Population, Report]]:
-    """Time and store the stages of an annealing.
+    """Time and store the stages of an annealing, and warn where its result is doubtful.
 
     Parameters
     ----------
@@ -48,17 +49,25 @@ def record(
             evaluations += report.evaluations  # these belong to no stage
             result = result._replace(check=report)
         elif isinstance(report, Restart):
-            result = AnnealingResult(rounds=result.rounds, start=result.start)
+            result = AnnealingResult(rounds=result.rounds)
         elif isinstance(report, GuidedRound):
             result = result._replace(rounds=(*result.rounds, report))
         elif isinstance(report, GuidedStart):
             result = result._replace(start=report)
+        elif isinstance(report, Doubt):
+            warn(report.message)
+            result = result._replace(doubts=(*result.doubts, report))
         elif isinstance(report, Halt):
             result = result._replace(halt=report)
         if result.finished and population.founders:
             result = result._replace(founders=population.founders[0])
         yield result, population, report
     checkpoint.store_check(result)
+    if result.check is not None:
+        for doubt in check_evidence(result.log_evidence_ladder, result.ladder[-1].log_evidence_error, result.check):
+            warn(doubt.message)
+            result = result._replace(doubts=(*result.doubts, doubt))
+            yield result, population, doubt
 
 
 def show_progress(

@@ -91,7 +91,8 @@ def anneal(
         `Sweep`: the points have been moved once. `Stage`: a stage is finished. `Restart`: all stages so far are void.
         `EvidenceCheck`: the independent estimate of the evidence (at most one, before or after the last stage).
         `GuidedRound`, `GuidedStart`: a round of a guide, and what all rounds are worth. `Halt`: the limit of
-        simulations has ended the annealing. The population of the last pair is at beta = 1, equally weighted.
+        simulations has ended the annealing. `Doubt`: the result is doubtful. The population of the last pair is at
+        beta = 1, equally weighted.
     """
     try:
         yield from _without_limit(population, density, random, schedule, settings, coarse, guidance)
@@ -109,7 +110,14 @@ def _without_limit(
     guidance: Guidance | None,
 ) -> Steps:
     """The annealing; raises `StoppedEarly` where it exceeds the limit of simulations."""
-    if guidance is not None and (yield from _from_guide(population, density, random, schedule, settings, guidance)):
+    if guidance is not None:
+        found = yield from _from_guide(population, density, random, schedule, settings, guidance)
+        if found is None:
+            return
+        try:
+            yield from _without_limit(population, density, random, schedule, settings, coarse, None)
+        except StoppedEarly as stop:
+            raise _better(stop, found) from None
         return
     if coarse is not None and (yield from _from_coarse(population, density, coarse, random, schedule, settings)):
         return
@@ -133,7 +141,7 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState) 
     """Resample the points that are known to `size` points at beta = 1."""
     population = stop.population
     if stop.complete:
-        yield population, Halt(1.0, len(population.coords), population.effective_sample_size, float("-inf"))
+        yield population, Halt(1.0, len(population.coords), population.effective_sample_size, float("-inf"), True)
         return
     log_weights = population.log_weights
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
@@ -143,8 +151,7 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState) 
             "limit; the simulations made so far are kept"
         )
     ancestors = systematic(normalised_weights(log_weights), random, size)
-    effective = effective_sample_size(log_weights)
-    known = len(log_weights)
+    effective, known = stop.effective_sample_size, len(log_weights)
     population = Population(1.0, population.coords[ancestors], population.records[ancestors], effective, (ancestors,))
     yield population, Halt(stop.beta, known, effective, pareto_shape(log_weights))
     yield (
@@ -168,13 +175,12 @@ def _from_guide(
     schedule: MoveSchedule,
     settings: Settings,
     guidance: Guidance,
-) -> Generator[tuple[Population, Report], None, bool]:
-    """Draws of a guide, or recycling that starts from them; returns whether the result can be trusted."""
+) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
+    """Draws of a guide, or recycling that starts from them; returns the draws if neither can be trusted."""
     size = len(population.coords)
     found = yield from draw_rounds(population, density, random, guidance, settings.guided)
     if found.stopped:
         raise _stopped_rounds(found)
-    shape, concerns = found.pooled.pareto_shape, guidance.guide.concerns
     if not found.doubt:
         weights = normalised_weights(found.pooled.log_weights)
         ancestors = systematic(weights, random, size)
@@ -182,7 +188,7 @@ def _from_guide(
         effective = found.pooled.effective_sample_size
         coords, records = found.pooled.coords[ancestors], found.pooled.records[ancestors]
         population = Population(1.0, coords, records, effective, (ancestors,))
-        yield population, GuidedStart("", found.shortfall, shape, concerns)
+        yield population, GuidedStart("", found.shortfall, found.pooled.pareto_shape)
         yield (
             population,
             Stage(
@@ -195,12 +201,12 @@ def _from_guide(
                 log_evidence_error=found.pooled.log_evidence_error,
             ),
         )
-        return True
+        return None
     warn(
         f"the draws of the guide are not close enough to the posterior ({found.doubt}), so the run goes on by "
         "recycling, which starts from them and needs more simulations. Use a better guide, or none"
     )
-    yield population, GuidedStart(found.doubt, "", shape, concerns)
+    yield population, GuidedStart(found.doubt, "", found.pooled.pareto_shape)
     try:
         started, start = start_from_guide(found.last, population, density, guidance.guide)
     except BudgetExhausted:
@@ -208,10 +214,15 @@ def _from_guide(
     try:
         recycled = yield from _by_recycling(started, density, random, schedule, settings, start, size)
     except StoppedEarly as stop:
-        rounds = _stopped_rounds(found)
-        better = stop.effective_sample_size >= rounds.effective_sample_size
-        raise (stop if better else rounds) from None
-    return recycled.trusted
+        raise _better(stop, found) from None
+    return None if recycled.trusted else found
+
+
+def _better(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
+    """Of the points known at a stop and the rounds of the guide before it, those that are worth more."""
+    rounds = _stopped_rounds(found)
+    rounds.log_evidence_of_stages = stop.log_evidence_of_stages
+    return stop if stop.complete or stop.effective_sample_size >= rounds.effective_sample_size else rounds
 
 
 def _stopped_rounds(found: RoundsOfGuide) -> StoppedEarly:
@@ -268,8 +279,10 @@ def _by_moves(
             )
         )
         yield population, stages[-1]
-        check_stages(stages, n, ndim)
-    check_annealing(stages, n, ndim, mutated.correlation)
+        for doubt in check_stages(stages, n, ndim):
+            yield population, doubt
+    for doubt in check_annealing(stages, n, ndim, mutated.correlation):
+        yield population, doubt
     if settings.check_draws != 0:
         try:
             check = _check_evidence(population.coords, density, random, settings.check_draws)

@@ -9,11 +9,12 @@ steps and goes on.
 
 import hashlib
 from collections.abc import Sequence
-from typing import Protocol
+from numbers import Real
+from typing import Any, Protocol
 
 import numpy as np
 
-__all__ = ["Budget", "BudgetExhausted", "CountsSimulations"]
+__all__ = ["Budget", "BudgetExhausted", "CountsSimulations", "as_limit"]
 
 
 class BudgetExhausted(Exception):
@@ -33,6 +34,15 @@ class BudgetExhausted(Exception):
     def __init__(self, records: np.ndarray):
         super().__init__("the limit of simulations (max_simulations) does not allow this batch")
         self.records = records
+
+
+def as_limit(value: Any) -> float | None:
+    """A limit of simulations as float, or None for no limit; ValueError for anything but a positive number."""
+    if value is None:
+        return None
+    if isinstance(value, bool | str) or not isinstance(value, Real) or not value > 0.0:
+        raise ValueError(f"max_simulations must be a positive number, or None for no limit; got {value!r}")
+    return float(value)
 
 
 class CountsSimulations(Protocol):
@@ -59,16 +69,22 @@ class Budget:
 
     Attributes
     ----------
+    fast : sequence of int
+        Indices of the fast parameters.
     limit : float, or None
         The limit.
     guide : object with an attribute simulations, or None
         The guide of the run.
     refused : bool
         Whether `fits` has returned False.
+    unused : float
+        Simulations made by the interrupted run that this one continues but does not use.
+    off_path : float
+        Simulations of this run that its continuation will not use.
     """
 
     def __init__(self, fast: Sequence[int] = (), limit: float | None = None):
-        self._fast = np.asarray(fast, dtype=int)
+        self.fast = fast
         self.limit = limit
         self.guide: CountsSimulations | None = None
         self.reset()
@@ -76,17 +92,17 @@ class Budget:
     def reset(self) -> None:
         """Forget all points."""
         self._seen: set[int] = set()
-        self.refused = False
+        self.refused, self.unused, self.off_path = False, 0.0, 0.0
 
     def _keys(self, coords: np.ndarray) -> list[int]:
-        slow = np.setdiff1d(np.arange(coords.shape[1]), self._fast)
+        slow = np.setdiff1d(np.arange(coords.shape[1]), np.asarray(self.fast, dtype=int))
         rows = np.ascontiguousarray(coords[:, slow] if len(slow) > 0 else coords)
         return [int.from_bytes(hashlib.blake2b(row, digest_size=8).digest(), "little") for row in rows]
 
     @property
     def simulations(self) -> float:
-        """Distinct points in the slow parameters, and the simulations of the guide."""
-        return len(self._seen) + (0.0 if self.guide is None else self.guide.simulations)
+        """Distinct points in the slow parameters, the simulations of the guide, and the unused ones."""
+        return len(self._seen) + (0.0 if self.guide is None else self.guide.simulations) + self.unused
 
     @property
     def remaining(self) -> float:

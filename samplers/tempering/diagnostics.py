@@ -1,4 +1,4 @@
-"""Warnings about runs that ended without an error but whose result is doubtful.
+"""Doubts about runs that ended without an error but whose result is doubtful.
 
 Collapsed populations, moves that are rejected or too few, one stage that dominates the error, evidences that disagree.
 """
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .evidence_check import EvidenceCheck
-from .population import Stage
+from .population import Doubt, Stage
 
 __all__ = ["SamplingWarning", "check_annealing", "check_evidence", "check_stages", "warn"]
 
@@ -39,29 +39,32 @@ def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
     return stage.distinct_ancestors < max(ndim + 2, nwalkers // 50)
 
 
-def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> None:
-    """Warn if the last stage is the first one that is collapsed or stuck.
+def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Doubt]:
+    """Doubts if the last stage is the first one that is collapsed or stuck.
 
     Collapsed: fewer distinct points survived the resampling than 2 % of the walkers, or than span the parameters.
     Stuck: less than 1 % of the proposals were accepted.
     """
-    stage, number = stages[-1], len(stages)
+    stage, number, doubts = stages[-1], len(stages), []
     collapsed = [_collapsed(s, nwalkers, ndim) for s in stages]
     stuck = [s.acceptance < LOW_ACCEPTANCE for s in stages]
     if collapsed[-1] and not any(collapsed[:-1]):
-        warn(
+        message = (
             f"collapse at stage {number} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points of "
             f"{nwalkers} survived the resampling. Use more walkers, more moves or a larger ess_ratio"
         )
+        doubts.append(Doubt(message, True))
     if stuck[-1] and not any(stuck[:-1]):
-        warn(
+        message = (
             f"stuck at stage {number} (beta = {stage.beta:.3g}): {100 * stage.acceptance:.2g} % of the proposals were "
             "accepted, so the points did not move. Use other moves or more of them"
         )
+        doubts.append(Doubt(message, True))
+    return doubts
 
 
-def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlation: float) -> None:
-    """Warn if annealing by moves ended with points that had not moved enough, or if one stage dominates the error.
+def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlation: float) -> list[Doubt]:
+    """Doubts if annealing by moves ended with points that had not moved enough, or if one stage dominates the error.
 
     Not moved enough: the largest correlation of the final population with its resampled start, `correlation`, is above
     0.9. Not reported where `check_stages` found the moves stuck.
@@ -70,12 +73,14 @@ def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlati
     the variance of all stages. The choice of beta keeps the stages alike, so there was no choice at this stage: for
     example, most draws of the prior have zero likelihood. Not reported for a collapsed stage.
     """
+    doubts = []
     if correlation > HIGH_CORRELATION and not any(s.acceptance < LOW_ACCEPTANCE for s in stages):
-        warn(
+        message = (
             f"the moves at beta = {stages[-1].beta:.3g} were too short: particles are still correlated "
             f"({correlation:.2f}) with their resampled start, so copies have not separated, and modes keep the weights "
             "that the resampling gave them. Use more moves (max_moves, burn_in) or longer ones"
         )
+        doubts.append(Doubt(message, True))
     variances = np.array([1.0 / s.effective_sample_size - 1.0 / nwalkers for s in stages])
     worst = int(np.argmax(variances))
     stage, total = stages[worst], float(variances.sum())
@@ -87,26 +92,32 @@ def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlati
             )
         else:
             cause = "the likelihood decreases steeply there. Use a larger ess_ratio or"
-        warn(
+        message = (
             f"stage {worst + 1} (beta = {stage.beta:.3g}) dominates the error of the evidence: its effective sample "
             f"size is {stage.effective_sample_size:.2g} of {nwalkers}, which alone gives the log-evidence a standard "
             f"error of {np.sqrt(variances[worst]):.2f}; {cause} more walkers"
         )
+        doubts.append(Doubt(message, False))
+    return doubts
 
 
-def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> None:
-    """Warn if the independent estimate is unusable, or differs from the other by more than three joint errors."""
+def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> list[Doubt]:
+    """Doubts if the independent estimate is unusable, or differs from the other by more than three joint errors."""
+    doubts = []
     if not check.reliable and check.effective_sample_size < LOW_YIELD * check.evaluations:
-        warn(
+        message = (
             f"no mixture fits the final points: {check.evaluations} draws from the best one have an effective sample "
             f"size of {check.effective_sample_size:.2g}, so evidence and posterior could not be checked. Use more "
             "walkers or more moves, and compare two runs"
         )
+        doubts.append(Doubt(message, False))
     joint = float(np.hypot(error, check.error))
     if check.reliable and abs(log_evidence - check.log_evidence) > 3.0 * joint + 1e-6:
-        warn(
+        message = (
             f"the stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
             f"points gives {check.log_evidence:.2f} +- {check.error:.2f}. The posterior may still be right. "
             "Check first that log_prior is normalised, which only the second estimate depends on; otherwise use more "
             "walkers or more moves for the evidence"
         )
+        doubts.append(Doubt(message, False))
+    return doubts

@@ -9,7 +9,7 @@ A part of the posterior that a guide never proposes is not seen by its own draws
 their density can find it; others rest on their search (`concerns`).
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from .population import Density, GuidedRound, Population, Report, Sweep
 from .rounds import PooledRounds, Round, pool_rounds
 from .settings import GuidedSettings
 
-__all__ = ["LARGEST_USABLE_SHAPE", "Guidance", "RoundsOfGuide", "draw_rounds", "start_from_guide", "trusted"]
+__all__ = ["LARGEST_USABLE_SHAPE", "Guidance", "RoundsOfGuide", "draw_rounds", "lend", "start_from_guide", "trusted"]
 
 LARGEST_USABLE_SHAPE = 0.7
 FEW_DRAWS = 100
@@ -43,6 +43,12 @@ class Guidance(NamedTuple):
     guide: AdaptedGuide
     session: GuideSession
     budget: Budget
+
+
+def lend(guide: AdaptedGuide, random: np.random.RandomState, remember: Callable, budget: Budget) -> Guidance:
+    """A fresh guide with what it is lent; its simulations count from now on."""
+    budget.guide, budget.refused = guide, False
+    return Guidance(guide, GuideSession(random, remember, budget.fits, lambda: budget.remaining), budget)
 
 
 class RoundsOfGuide(NamedTuple):
@@ -113,6 +119,7 @@ def draw_rounds(
     size, rounds = len(population.coords), []
     for _ in guide.prepare(session):
         yield population, Sweep(0.0)
+    before = budget.simulations
     while True:
         coords = guide.draw(_next_size(rounds, size, settings, guide), random)
         latest, complete = _evaluate_round(coords, density, guide, session)
@@ -135,6 +142,8 @@ def draw_rounds(
             ),
         )
         yield population, Sweep(last.effective_share)
+        if budget.refused:  # the search was cut short: with a larger limit the guide goes on searching, and draws later
+            budget.off_path += budget.simulations - before
         if not complete or budget.refused:
             return RoundsOfGuide("", "", pooled, last, True)
         enough = pooled.effective_sample_size >= size

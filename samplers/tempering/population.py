@@ -8,10 +8,24 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from emcee.ensemble import walkers_independent
 
 from .evidence_check import EvidenceCheck
 
-__all__ = ["Density", "GuidedRound", "GuidedStart", "Halt", "Population", "Report", "Restart", "Stage", "Sweep"]
+__all__ = [
+    "Density",
+    "Doubt",
+    "GuidedRound",
+    "GuidedStart",
+    "Halt",
+    "Population",
+    "Report",
+    "Restart",
+    "Stage",
+    "Sweep",
+    "check_size",
+    "check_start",
+]
 
 
 class Density(Protocol):
@@ -68,6 +82,29 @@ class Population(NamedTuple):
     effective_sample_size: float
     founders: tuple[np.ndarray, ...] = ()
     log_weights: np.ndarray | None = None
+
+
+def check_size(nwalkers: int, ndim: int) -> None:
+    """Raise ValueError for too few walkers or parameters."""
+    if ndim < 1 or nwalkers < 2 * ndim:
+        raise ValueError(
+            "a population must span the parameters: at least 2 ndim walkers and one parameter are needed, some "
+            f"hundreds of walkers are usual; got nwalkers={nwalkers} for ndim={ndim}"
+        )
+
+
+def check_start(coords: np.ndarray, nwalkers: int, ndim: int, skip_independence: bool) -> None:
+    """Raise ValueError unless points have the shape (nwalkers, ndim) and, if that is wanted, span the parameters."""
+    if coords.shape != (nwalkers, ndim):
+        raise ValueError(
+            f"incompatible input dimensions: initial_state must be ({nwalkers}, {ndim}) draws of the prior; got "
+            f"{coords.shape}"
+        )
+    if not skip_independence and not walkers_independent(coords):
+        raise ValueError(
+            "Initial state has a large condition number: the walkers must be finite and linearly independent, as draws "
+            "of the prior are"
+        )
 
 
 class Stage(NamedTuple):
@@ -167,19 +204,31 @@ class GuidedStart(NamedTuple):
         What the rounds did not reach although their draws are used; empty if they reached all.
     pareto_shape : float
         Pareto shape of the largest weights of all rounds.
-    concerns : tuple of str
-        Reasons of the guide why parts of the posterior may be missing.
     """
 
     doubt: str
     shortfall: str
     pareto_shape: float
-    concerns: tuple[str, ...]
 
     @property
     def used(self) -> bool:
         """Whether the population consists of draws of the guide."""
         return not self.doubt
+
+
+class Doubt(NamedTuple):
+    """A reason to doubt the result.
+
+    Attributes
+    ----------
+    message : str
+        What was found, and what to do.
+    grave : bool
+        Whether the numbers may be wrong by more than their stated errors.
+    """
+
+    message: str
+    grave: bool
 
 
 class Halt(NamedTuple):
@@ -195,12 +244,15 @@ class Halt(NamedTuple):
         Of their weights at beta = 1.
     pareto_shape : float
         Pareto shape of the largest of these weights.
+    complete : bool
+        Whether the annealing was complete; only moves or a check at beta = 1 are then missing.
     """
 
     beta: float
     points: int
     effective_sample_size: float
     pareto_shape: float
+    complete: bool = False
 
 
-Report = Stage | Sweep | Restart | EvidenceCheck | GuidedRound | GuidedStart | Halt
+Report = Stage | Sweep | Restart | EvidenceCheck | GuidedRound | GuidedStart | Halt | Doubt

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .evidence_check import EvidenceCheck
-from .population import GuidedRound, GuidedStart, Halt, Stage
+from .population import Doubt, GuidedRound, GuidedStart, Halt, Stage
 
 __all__ = ["AnnealingResult"]
 
@@ -28,6 +28,12 @@ class AnnealingResult(NamedTuple):
         What they are worth; None without a guide.
     halt : Halt, optional
         Where the limit of simulations ended the annealing; None if it did not.
+    concerns : tuple of str
+        Reasons of the guide why parts of the posterior may be missing.
+    doubts : tuple of Doubt
+        What the diagnostics found.
+    independent_points : float, optional
+        Effective sample size of the walkers when beta = 1 was reached; None for a result that was read from a backend.
     """
 
     ladder: tuple[Stage, ...] = ()
@@ -36,6 +42,9 @@ class AnnealingResult(NamedTuple):
     rounds: tuple[GuidedRound, ...] = ()
     start: GuidedStart | None = None
     halt: Halt | None = None
+    concerns: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+    independent_points: float | None = None
 
     @property
     def finished(self) -> bool:
@@ -53,6 +62,12 @@ class AnnealingResult(NamedTuple):
     def log_evidence_ladder(self) -> float:
         """Log-evidence by tempering: the sum of the increments of all stages."""
         return float(sum(stage.log_evidence_increment for stage in self.require_finished()))
+
+    @property
+    def has_better_check(self) -> bool:
+        """Whether the check of the evidence is reliable and has a smaller error than the stages."""
+        check = self.check
+        return check is not None and check.reliable and check.error < self.ladder[-1].log_evidence_error
 
     @property
     def evidence(self) -> tuple[float, float]:

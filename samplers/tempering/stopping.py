@@ -41,10 +41,19 @@ class StoppedEarly(Exception):
 
     @property
     def effective_sample_size(self) -> float:
-        """Of the weights at beta = 1."""
-        if self.population.log_weights is None:
+        """Of the weights at beta = 1, where copies of a point count as one point."""
+        log_weights = self.population.log_weights
+        if log_weights is None or len(log_weights) == 0:
             return self.population.effective_sample_size
-        return effective_sample_size(self.population.log_weights)
+        return effective_sample_size(_of_distinct_points(self.population.coords, log_weights))
+
+
+def _of_distinct_points(coords: np.ndarray, log_weights: np.ndarray) -> np.ndarray:
+    """Log-weights of the distinct points among (n, ndim); those of copies are added."""
+    distinct, owner = np.unique(coords, axis=0, return_inverse=True)
+    total = np.full(len(distinct), -np.inf)
+    np.logaddexp.at(total, owner.reshape(-1), log_weights)
+    return total
 
 
 def stop_at(
@@ -83,7 +92,7 @@ def stop_at(
     if not alive.any():
         return StoppedEarly(population, float("-inf"), float("inf"), population.beta, log_evidence_of_stages)
     increment = log_mean_weight(log_weights)
-    effective = effective_sample_size(log_weights)
-    variance = error**2 + 1.0 / effective - 1.0 / len(log_weights) + tail_variance(log_weights)
+    distinct = _of_distinct_points(population.coords, log_weights)
+    variance = error**2 + 1.0 / effective_sample_size(distinct) - 1.0 / len(distinct) + tail_variance(distinct)
     total = log_evidence + increment
     return StoppedEarly(population, total, float(np.sqrt(variance)), population.beta, log_evidence_of_stages)

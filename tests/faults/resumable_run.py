@@ -10,6 +10,7 @@ import emcee
 
 from samplers import RAMANCHA_2022_LITERAL, SMCSampler, TMCMCSampler
 from tests.contract.targets import WithBlobs
+from tests.tempering.guides import SearchingGuide
 
 N, NDIM = 40, 3
 SAMPLERS = {
@@ -18,6 +19,8 @@ SAMPLERS = {
     "tmcmc": (TMCMCSampler, {}),
     "leaders": (TMCMCSampler, {"chains": "leaders", "burn_in": 1}),
     "literal": (SMCSampler, {**RAMANCHA_2022_LITERAL, "ess_floor": 10.0}),  # the floor of the preset is above N
+    "guided": (SMCSampler, {"guide": SearchingGuide}),
+    "guided, TMCMC": (TMCMCSampler, {"guide": SearchingGuide}),
     "stretch": (SMCSampler, {"moves": emcee.moves.StretchMove(), "max_moves": 5}),
 }
 
@@ -39,7 +42,10 @@ def make(path, name, seconds=0.0, sd=0.01, **changes):
     Sampler, settings = SAMPLERS[name]
     posterior = Slow(seconds, ndim=NDIM, sd=sd)
     backend = emcee.backends.HDFBackend(str(path))
-    return Sampler(N, NDIM, posterior, vectorize=True, backend=backend, **{"seed": 5, **settings, **changes})
+    settings = {"seed": 5, **settings, **changes}
+    if "guide" in settings:
+        settings["guide"] = settings["guide"](posterior)
+    return Sampler(N, NDIM, posterior, vectorize=True, backend=backend, **settings)
 
 
 if __name__ == "__main__":

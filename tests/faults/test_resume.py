@@ -14,6 +14,7 @@ import pytest
 from samplers.storage.journal import read_journal
 from tests.contract.targets import Gaussian
 from tests.faults.resumable_run import NDIM, SAMPLERS, N, make
+from tests.tempering.guides import SearchingGuide
 
 ROOT = Path(__file__).parents[2]
 STEPS = 12
@@ -42,10 +43,11 @@ def same(sampler, whole):
     return True
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SAMPLERS if name not in ("smc", "moves")]
+QUICK = ["smc", "moves", "guided"]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SAMPLERS if name not in QUICK]
 
 
-@pytest.mark.parametrize("name", ["smc", "moves", *SLOW])
+@pytest.mark.parametrize("name", [*QUICK, *SLOW])
 def test_killed_again_and_again(name, tmp_path, rng):
     """The same script is started until it ends, and killed by signal 9 at random places."""
     whole = make(tmp_path / "whole.h5", name)
@@ -67,6 +69,29 @@ def test_killed_again_and_again(name, tmp_path, rng):
     for s in (sampler, whole):  # and so do later steps
         s.run_mcmc(None, 3)
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
+
+
+@pytest.mark.parametrize("kind", [b"MEMO", b"EVAL"])
+def test_killed_while_a_guide_searches_or_draws(kind, tmp_path):
+    """Nothing that the journal holds is evaluated again, and the draws after it are the same."""
+    whole = make(tmp_path / "whole.h5", "guided")
+    whole.run_mcmc(None, 2)
+    path = tmp_path / "killed.h5"
+    with spawn(path, "guided", 2, seconds=0.3) as process:
+        while not journal_of(path).exists() or kind not in journal_of(path).read_bytes():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.001)
+        process.kill()
+    contents = read_journal(journal_of(path))
+    assert contents.remembered and bool(contents.evaluated) == (kind == b"EVAL")
+    known = sum(len(batch.coords) for batch in contents.evaluated)
+    known += sum(SearchingGuide.batch for key, _ in contents.remembered if key.startswith("search"))
+    sampler = make(path, "guided", seed=99)
+    sampler.run_mcmc(None, 2)
+    assert same(sampler, whole)
+    assert sampler.simulations == whole.simulations
+    calls = [s.log_prob_fn.f.calls for s in (sampler, whole)]
+    assert calls[0] == calls[1] - known + bool(contents.evaluated)  # one to check that the posterior is the same
 
 
 @pytest.fixture
@@ -132,6 +157,7 @@ def test_the_same_draws_continue_and_others_are_refused(tmp_path):
         ({"recycle": False}, "recycle was True, is False"),
         ({"moves": emcee.moves.DEMove(), "recycle": True}, "moves was"),
         ({"sd": 0.02}, "log_prob_fn was"),
+        ({"guide": SearchingGuide}, "guide was None, is SearchingGuide"),
         ({"log_prior_fn": lambda x: -np.sum(np.abs(x), axis=-1)}, "log-prior"),
     ],
     ids=lambda value: str(next(iter(value))) if isinstance(value, dict) else "",

@@ -1,0 +1,95 @@
+"""What a journal holds, kept in memory: for a run whose limit of simulations may be raised in the same process."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from emcee import State
+from emcee.backends import Backend
+
+from .emcee_internals import drop_last_step
+from .journal import Contents, EvaluatedBatch, RunStart, Step
+
+__all__ = ["MemoryRecord"]
+
+
+class MemoryRecord:
+    """Evaluations and state of a run whose chain is in memory.
+
+    Parameters
+    ----------
+    backend : emcee.backends.Backend
+        Backend of the chain.
+
+    Attributes
+    ----------
+    contents : Contents, or None
+        What can be continued; None unless the limit of simulations has ended the run.
+    """
+
+    def __init__(self, backend: Backend):
+        self._backend = backend
+        self.contents: Contents | None = None
+        self._evaluated: list[EvaluatedBatch] = []
+        self._remembered: list[tuple[str, list[np.ndarray]]] = []
+        self._last: Step | None = None
+        self._before_last, self._wanted, self._made, self._unused = 0, None, 0, 0.0
+
+    def begin(self, header: dict, start: RunStart) -> None:
+        """Enter the start of the annealing."""
+        self._header, self._start, self._last, self._wanted = header, start, None, None
+
+    def continue_run(self, contents: Contents) -> None:
+        """Add to what has been kept from now on."""
+        self.contents = None
+
+    def evaluated(self, batch: EvaluatedBatch) -> None:
+        """Enter a batch of evaluated points."""
+        self._evaluated.append(batch)
+
+    def remembered(self, key: str, arrays: Sequence[np.ndarray]) -> None:
+        """Enter arrays that a guide stores."""
+        self._remembered.append((key, list(arrays)))
+
+    def call(self, nsteps: int) -> None:
+        """Enter the number of steps that a call asks for."""
+        self._wanted, self._made = nsteps, 0
+
+    def stepped(self, state: State) -> None:
+        """Enter a stored step of the chain."""
+        state = State(state, copy=True)
+        accepted = np.zeros(len(state.coords), dtype=bool)
+        self._last = Step(state.coords, state.log_prob, accepted, state.blobs, state.random_state)
+        self._before_last = len(self._evaluated)
+        self._made += 1
+
+    def done(self) -> None:
+        """Enter that the call is complete, or was ended by the user."""
+        self._wanted = None
+
+    def flush(self) -> None:
+        """Nothing is pending in memory."""
+
+    def halt(self, provisional: bool, unused: float) -> None:
+        """Enter that the limit of simulations ended the call, and make the run ready to be continued."""
+        self._unused += unused
+        shown = None
+        if provisional:
+            last = self._backend.get_last_sample()
+            shown = Step(last.coords, last.log_prob, np.zeros(len(last.coords), dtype=bool), last.blobs, ())
+        self.contents = Contents(
+            self._header,
+            self._start,
+            list(self._evaluated),
+            list(self._remembered),
+            self._before_last,
+            [],
+            self._last,
+            self._wanted,
+            self._made,
+            shown,
+            self._unused,
+        )
+
+    def back(self) -> None:
+        """Remove the last step, which only showed the state, from the chain."""
+        drop_last_step(self._backend)

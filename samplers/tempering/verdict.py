@@ -1,0 +1,200 @@
+"""What the result of a run is worth, in words: converged, usable or not usable, with reasons.
+
+``converged``
+    Nothing that the run can observe speaks against the result.
+``usable``
+    Means and evidence have the errors that are stated, but something was not reached or could not be checked.
+``not usable``
+    The numbers may be far from the posterior, by more than their stated errors.
+
+No run can see a part of the posterior in which it has no points. The reasons say what the verdict rests on.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .genealogy import standard_error_of_mean
+from .guided import LARGEST_USABLE_SHAPE
+from .population import Doubt, GuidedRound, Halt
+from .results import AnnealingResult
+from .settings import GuidedSettings
+
+__all__ = ["CONVERGED", "NOT_USABLE", "USABLE", "Verdict", "describe_halt", "independent_points", "judge"]
+
+CONVERGED = "converged"
+USABLE = "usable"
+NOT_USABLE = "not usable"
+STATUSES = (CONVERGED, USABLE, NOT_USABLE)
+# Fewer effective points per parameter (and one more) do not determine means and covariances.
+POINTS_PER_DIMENSION = 3.0
+FEWEST_POINTS = 20.0
+# Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
+LARGEST_ERROR = 0.35
+
+
+class Verdict(NamedTuple):
+    """What the result of a run is worth. ``str`` gives sentences.
+
+    Attributes
+    ----------
+    status : {"converged", "usable", "not usable"}
+        The judgement.
+    reasons : tuple of str
+        Why, and what it rests on.
+    simulations : float
+        Simulations made (`samplers.tempering.budget`).
+    more_simulations : float, optional
+        About how many more simulations a converged result takes; 0 if it is converged, None if that is not known.
+    effective_sample_size : float
+        Of the walkers when beta = 1 was reached.
+    """
+
+    status: str
+    reasons: tuple[str, ...]
+    simulations: float
+    more_simulations: float | None
+    effective_sample_size: float
+
+    def __str__(self) -> str:
+        first = (
+            f"{self.status.capitalize()}: effective sample size {self.effective_sample_size:.0f} from "
+            f"{self.simulations:.6g} simulations."
+        )
+        more = []
+        if self.more_simulations is None:
+            more = ["How many more simulations are needed is not known."]
+        elif self.more_simulations > 0.0:
+            more = [f"About {self.more_simulations:.0f} more simulations are needed."]
+        return " ".join([first, *(f"{reason[0].upper()}{reason[1:]}." for reason in self.reasons), *more])
+
+
+def judge(
+    result: AnnealingResult,
+    settings: GuidedSettings,
+    nwalkers: int,
+    ndim: int,
+    simulations: float,
+    missing_steps: int = 0,
+) -> Verdict:
+    """Judge an annealing that has reached beta = 1.
+
+    Parameters
+    ----------
+    result : AnnealingResult
+        What the annealing has found.
+    settings : GuidedSettings
+        Constants of the rounds of a guide.
+    nwalkers, ndim : int
+        Size of the ensemble.
+    simulations : float
+        Simulations made.
+    missing_steps : int
+        Steps at beta = 1 that the limit of simulations did not allow.
+
+    Returns
+    -------
+    Verdict
+    """
+    stage = result.ladder[-1]
+    found = list(result.doubts)
+    reasons: list[str] = []
+    more: float | None = 0.0
+    halt = result.halt
+    if halt is not None and not halt.complete:
+        found += _of_halt(halt, stage.log_evidence_error, ndim)
+        more = _missing_draws(result.rounds, nwalkers, settings) if result.rounds else None
+    elif halt is not None:
+        found.append(Doubt("the limit of simulations ended the run at beta = 1, before its last check", False))
+        more = None
+    if result.start is not None and result.start.used:
+        last = result.rounds[-1]
+        reasons.append(
+            f"the latest {last.draws} draws of the guide, which shaped nothing that they are weighted with, have an "
+            f"effective sample size of {100 * last.effective_share:.0f} % of their number"
+        )
+        if result.start.shortfall:
+            found.append(Doubt(result.start.shortfall, False))
+        if result.start.pareto_shape >= settings.largest_pareto_shape:
+            found.append(
+                Doubt(
+                    f"the Pareto shape of all weights is {result.start.pareto_shape:.2f}: a few large weights carry "
+                    "the result",
+                    result.start.pareto_shape >= LARGEST_USABLE_SHAPE,
+                )
+            )
+    elif result.start is not None:
+        found.append(Doubt(f"the draws of the guide were not used ({result.start.doubt})", False))
+    if result.rounds:
+        found += [Doubt(f"the guide reports: {concern}", False) for concern in result.concerns]
+        if not result.concerns:
+            reasons.append("parts of the posterior in which the guide makes no draws are not seen")
+    if stage.log_evidence_error > LARGEST_ERROR and not result.has_better_check:
+        found.append(
+            Doubt(f"the standard error of the log-evidence is {stage.log_evidence_error:.2g}", halt is not None)
+        )
+    if missing_steps > 0:
+        reasons.append(
+            f"{missing_steps} of the steps at beta = 1 {'was' if missing_steps == 1 else 'were'} not made, which takes "
+            f"up to {missing_steps * nwalkers} simulations"
+        )
+    status = STATUSES[max((1 + doubt.grave for doubt in found), default=0)]
+    if status == CONVERGED:
+        more = 0.0
+    elif halt is None:
+        more = None
+    return Verdict(
+        status,
+        (*(doubt.message.rstrip(".") for doubt in found), *reasons),
+        float(simulations),
+        None if more is None else float(more),
+        float(stage.effective_sample_size if result.independent_points is None else result.independent_points),
+    )
+
+
+def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
+    """Effective sample size of the walkers (n, ndim) when beta = 1 was reached.
+
+    That of the weights if the walkers were resampled from weighted draws, and were not moved after that. Otherwise the
+    smallest squared ratio, over the parameters, of standard deviation and standard error of the mean, at most n.
+    """
+    if result.halt is not None and not result.halt.complete:
+        return result.halt.effective_sample_size
+    if result.start is not None and result.start.used:
+        return result.ladder[-1].effective_sample_size
+    founders = np.arange(len(coords)) if result.founders is None else result.founders
+    spread, error = coords.std(axis=0), standard_error_of_mean(coords[None], founders)
+    return float(np.min((spread / error)[error > 0.0] ** 2, initial=len(coords)))
+
+
+def describe_halt(verdict: Verdict, limit: float | None) -> str:
+    """The warning when the limit of simulations has ended a call."""
+    return (
+        f"max_simulations={limit:g} ended the run. {verdict} To go on from here, set the attribute max_simulations of "
+        "the sampler to a larger number, or make a new sampler with the same file, and call run_mcmc again"
+    )
+
+
+def _of_halt(halt: Halt, error: float, ndim: int) -> list[Doubt]:
+    """Doubts about a population that was made from the points known when the limit of simulations was reached."""
+    where = f"at beta = {halt.beta:.3g} " if halt.beta < 1.0 else ""
+    needed = max(FEWEST_POINTS, POINTS_PER_DIMENSION * (ndim + 1.0))
+    few = halt.effective_sample_size < needed
+    heavy = halt.pareto_shape >= LARGEST_USABLE_SHAPE
+    text = (
+        f"the limit of simulations ended the run {where}with {halt.points} weighted points, whose effective sample "
+        f"size is {halt.effective_sample_size:.2g} and whose weights have a Pareto shape of {halt.pareto_shape:.2g}"
+    )
+    if few or heavy or error > LARGEST_ERROR:
+        wanted = f"an effective sample size of {needed:.0f} and a shape below {LARGEST_USABLE_SHAPE:g} are needed"
+        return [Doubt(f"{text} ({wanted})", True)]
+    return [Doubt(text, False)]
+
+
+def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int, settings: GuidedSettings) -> float | None:
+    """Draws that the guide still needs if its later rounds are like the last one; None if that one says nothing."""
+    last = rounds[-1]
+    if last.effective_share < settings.usable_share:
+        return None
+    missing = max(nwalkers - last.effective_sample_size, settings.first_round_share * nwalkers)
+    return float(np.ceil(missing / last.effective_share))

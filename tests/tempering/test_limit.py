@@ -1,0 +1,179 @@
+"""A limit of simulations: what a run reports where it ends, and how it goes on."""
+
+import json
+import warnings
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler, Verdict
+from tests.contract.targets import Gaussian
+from tests.tempering.guides import LearningGuide, SearchingGuide
+from tests.tempering.test_guided import N, laplace
+
+PATHS = {
+    "guide": (SMCSampler, "guide", {}),
+    "guide, TMCMC": (TMCMCSampler, "guide", {}),
+    "searching guide": (SMCSampler, "search", {}),
+    "recycling": (SMCSampler, None, {"recycle": True}),
+    "moves": (SMCSampler, None, {"recycle": False}),
+    "stretch": (SMCSampler, None, {"moves": emcee.moves.StretchMove()}),
+    "TMCMC": (TMCMCSampler, None, {}),
+    "leaders": (TMCMCSampler, None, {"chains": "leaders"}),
+}
+
+
+def make(path, limit, file=None, seed=4):
+    Sampler, guide, settings = PATHS[path]
+    posterior = Gaussian(3, sd=0.05)
+    given = {
+        None: lambda: None,
+        "guide": lambda: laplace(posterior, scale=2.5, guide=LearningGuide),
+        "search": lambda: SearchingGuide(posterior),
+    }[guide]()
+    backend = None if file is None else emcee.backends.HDFBackend(str(file))
+    kwargs = {"seed": seed, "guide": given, "max_simulations": limit, "backend": backend, **settings}
+    return Sampler(N, 3, posterior, vectorize=True, **kwargs)
+
+
+def halted(sampler, steps):
+    with pytest.warns(SamplingWarning, match="max_simulations=.* ended the run"):
+        sampler.run_mcmc(None, steps)
+
+
+def same(sampler, whole):
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+    assert np.array_equal(sampler.get_log_prob(), whole.get_log_prob())
+    assert np.array_equal(sampler.backend.accepted, whole.backend.accepted)
+    assert np.array_equal(sampler.random_state[1], whole.random_state[1])
+    assert [s._replace(seconds=0) for s in sampler.ladder] == [s._replace(seconds=0) for s in whole.ladder]
+    assert (sampler.log_evidence, sampler.log_evidence_error) == (whole.log_evidence, whole.log_evidence_error)
+    assert sampler.simulations == whole.simulations
+    assert sampler.verdict == whole.verdict
+    return True
+
+
+@pytest.mark.parametrize("where", ["memory", "file", "new process"])
+@pytest.mark.parametrize("path", PATHS)
+def test_a_run_that_goes_on_is_the_long_run(path, where, tmp_path):
+    """Several limits, one after the other; the last one is never reached."""
+    whole = make(path, None)
+    whole.run_mcmc(None, 6)
+    total = whole.simulations
+    file = None if where == "memory" else tmp_path / "run.h5"
+    sampler = make(path, 0.15 * total, file)
+    for share in (0.15, 0.4, 0.4, 0.7, 0.93):
+        limit = share * total
+        if where == "new process":
+            sampler.backend.close()
+            sampler = make(path, limit, file, seed=4 if share == 0.15 else 77)
+        sampler.max_simulations = limit
+        halted(sampler, 6)
+        assert sampler.simulations <= limit
+        assert 1 <= sampler.iteration < 6
+        assert sampler.get_chain().shape == (sampler.iteration, N, 3)
+        assert np.all(np.isfinite(sampler.get_log_prob()))
+        assert np.isfinite(sampler.log_evidence) and sampler.verdict.status in ("usable", "not usable", "converged")
+        assert sampler.verdict.simulations == sampler.simulations
+    made = sampler.log_prob_fn.f.calls
+    if where == "new process":
+        sampler.backend.close()
+        sampler = make(path, total, file, seed=77)
+    sampler.max_simulations = total
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sampler.run_mcmc(None, 6)
+    assert same(sampler, whole)
+    if where == "memory" and path != "searching guide":
+        assert sampler.log_prob_fn.f.calls <= whole.log_prob_fn.f.calls and made > 0
+    for s in (sampler, whole):
+        s.max_simulations = None
+        s.run_mcmc(None, 2)
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+
+
+@pytest.mark.parametrize("path", ["guide", "moves", "recycling"])
+def test_a_limited_run_is_the_beginning_of_the_long_run(path):
+    """The same limit, reached at once or in two parts."""
+    whole = make(path, None)
+    whole.run_mcmc(None, 6)
+    limit = 0.6 * whole.simulations
+    once, twice = make(path, limit), make(path, 0.3 * whole.simulations)
+    halted(once, 6)
+    halted(twice, 6)
+    twice.max_simulations = limit
+    halted(twice, 6)
+    assert same(twice, once)
+
+
+def test_steps_that_fit_are_kept():
+    sampler = make("guide", None)
+    sampler.run_mcmc(None, 0)
+    annealing = sampler.simulations
+    sampler = make("guide", annealing + 2.5 * N)
+    with pytest.warns(SamplingWarning, match="3 of the steps at beta = 1 were not made"):
+        sampler.run_mcmc(None, 5)
+    assert sampler.iteration == 2 and sampler.simulations == annealing + 2 * N
+    sampler = make("guide", annealing + 0.5 * N)
+    halted(sampler, 5)
+    assert sampler.iteration == 1 and sampler.simulations == annealing
+    assert sampler.verdict.status == "converged"
+    assert "5 of the steps at beta = 1 were not made" in str(sampler.verdict)
+
+
+def test_no_step_is_stored_where_none_was_wanted():
+    sampler = make("guide", 40)
+    halted(sampler, 0)
+    assert sampler.iteration == 0 and sampler.verdict.status == "not usable"
+    sampler.max_simulations = 10_000
+    sampler.run_mcmc(None, 3)
+    whole = make("guide", None)
+    whole.run_mcmc(None, 3)
+    assert same(sampler, whole)
+
+
+def test_the_states_of_a_generator_end_where_the_limit_is():
+    sampler = make("guide", None)
+    sampler.run_mcmc(None, 0)
+    sampler = make("guide", sampler.simulations + 3 * N)
+    with pytest.warns(SamplingWarning):
+        states = [state.coords.copy() for state in sampler.sample(None, iterations=10)]
+    assert np.array_equal(np.stack(states), sampler.get_chain()) and len(states) == 3
+
+
+def test_nothing_known_is_an_error_that_keeps_what_was_made():
+    sampler = make("searching guide", 20)
+    with pytest.raises(ValueError, match="there is nothing to report"):
+        make("searching guide", 0.5).run_mcmc(None, 1)
+    halted(sampler, 1)
+    assert sampler.simulations == 20 and sampler.verdict.status == "not usable"
+    assert "the search was not finished" in str(sampler.verdict)
+
+
+def test_the_verdict_is_stored_with_the_chain(tmp_path):
+    sampler = make("guide", 60, tmp_path / "run.h5")
+    with pytest.raises(ValueError, match="no verdict before a run"):
+        sampler.verdict  # noqa: B018
+    halted(sampler, 2)
+    sampler.backend.close()
+    again = make("guide", 60, tmp_path / "run.h5")
+    assert again.verdict == sampler.verdict and isinstance(again.verdict, Verdict)
+    assert json.dumps(again.verdict)
+    assert str(again.verdict).startswith("Usable: effective sample size 22 from 60 simulations.")
+
+
+@pytest.mark.parametrize("limit", [0, -5, True, "many", np.nan])
+def test_impossible_limits(limit):
+    with pytest.raises(ValueError, match="max_simulations must be a positive number"):
+        make("moves", limit)
+
+
+def test_a_limit_that_comes_too_late():
+    sampler = make("guide", None)
+    sampler.max_simulations = 10_000
+    sampler.run_mcmc(None, 1)
+    sampler = make("guide", None)
+    sampler.run_mcmc(None, 1)
+    with pytest.raises(ValueError, match="set after a run without it"):
+        sampler.max_simulations = 10_000
