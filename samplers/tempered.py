@@ -40,6 +40,7 @@ from .tempering.budget import Budget, BudgetExhausted, as_limit
 from .tempering.diagnostics import warn
 from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import lend
+from .tempering.multilevel import check_coarse
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, Sweep, check_size, check_start
 from .tempering.results import AnnealingResult
@@ -149,13 +150,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         given = combine_settings(type(self).__name__, settings, overrides)
         recycle, moves = self._choose(given, moves, nwalkers)
         self.settings = replace(given, recycle=recycle)
-        if coarse_log_prob_fn is not None and not callable(coarse_log_prob_fn):
-            raise ValueError(f"coarse_log_prob_fn must be callable; got {coarse_log_prob_fn!r}")
-        if coarse_log_prob_fn is not None and not recycle:
-            raise ValueError(
-                f"coarse_log_prob_fn needs recycling, which is off for this {type(self).__name__} with {nwalkers} "
-                f"walkers{' and recycle=False' if given.recycle is False else ''}: {self.how_to_recycle}"
-            )
+        if coarse_log_prob_fn is not None:
+            off = f" and recycle=False: {self.how_to_recycle}" if given.recycle is False else f": {self.how_to_recycle}"
+            check_coarse(coarse_log_prob_fn, recycle, f"{type(self).__name__} with {nwalkers} walkers{off}")
         self.coarse_log_prob_fn = coarse_log_prob_fn
         self._given_guide, self._guide = guide, None
         if guide is not None:
@@ -185,7 +182,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         fast = self._optional.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(own_moves, fast, ndim, self.settings.fast_sweeps)
         set_moves(self, followed)
-        self._moves_of_annealing = MoveSchedule(*get_moves(self))
+        self._usual_moves: MoveSchedule | None = None  # those that the moves of a guide have replaced
         self._fast, self._first_moves = fast, copy.deepcopy(followed)
         self._budget.fast = self._optional.fast_parameters
         refuse_unused(given, recycle, followed != list(own_moves), self.unused_settings, guide is not None)
@@ -222,23 +219,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Clear the chain, as in emcee. Ladder and state at beta = 1 are kept: burn in, reset, continue."""
         super().reset()
         self._checkpoint.store_result(self._result, self._verdict)
-
-    @property
-    def guide(self) -> Guide | None:
-        """The guide in use, a copy of the given one that has learned from this run; None before it or without one."""
-        return None if self._guide is None else self._guide.guide
-
-    @property
-    def max_simulations(self) -> float | None:
-        """Largest number of simulations; None for no limit."""
-        return self._budget.limit
-
-    @max_simulations.setter
-    def max_simulations(self, value: float | None) -> None:
-        limit = as_limit(value)
-        if limit is not None:
-            self._checkpoint.expect_limit(self.evaluations == 0)
-        self._budget.limit = limit
 
     # ------------------------------------------------------------------ running
 
@@ -417,7 +397,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def _header(self) -> dict:
         """What this run is started with."""
         functions = self.log_prob_fn.f, self.coarse_log_prob_fn
-        return header(self.nwalkers, self.ndim, *functions, self.settings, *self._moves_of_annealing, self._given_guide)
+        return header(
+            self.nwalkers,
+            self.ndim,
+            *functions,
+            self.settings,
+            *(self._usual_moves or get_moves(self)),
+            self._given_guide,
+        )
 
     def _resume(self, state: State, iterations: int | None, bar: dict) -> tuple[State, int]:
         """Continue the interrupted run: repeat the annealing without evaluations, and go to the last stored step.
@@ -440,7 +427,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
             )
         contents = self._checkpoint.resume(self._header(), self._evaluator.log_prior, self._evaluator.compute)
         self.random_state = start.random_state
-        self._moves_of_annealing = self._moves_of_annealing._replace(moves=copy.deepcopy(self._first_moves))
+        if self.evaluations > 0:  # a run of this object: its moves have adapted
+            _, probabilities = self._usual_moves or get_moves(self)
+            self._usual_moves = MoveSchedule(copy.deepcopy(self._first_moves), probabilities)
         self._evaluator.reset()
         self._budget.unused = contents.unused
         state = self._anneal(State(start.coords, copy=True), True, bar)
@@ -472,8 +461,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         population, coarse = self._start(state, skip_check), self._coarse_evaluator
         if coarse is not None:
             coarse.pool = self.pool
-        schedule, guidance = self._moves_of_annealing, None
-        set_moves(self, *schedule)
+        if self._usual_moves is not None:
+            set_moves(self, *self._usual_moves)
+        schedule, guidance, self._usual_moves = MoveSchedule(*get_moves(self)), None, None
         if self._given_guide is not None:
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
             guidance = lend(self._guide, get_random(self), self._checkpoint.remember, self._budget)
@@ -495,5 +485,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             calibrate_move(moves[0], population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
             set_moves(self, moves, np.ones(1))
+            self._usual_moves = schedule
         log_prob, blobs = self._evaluator.unpack(population.records)
         return State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)

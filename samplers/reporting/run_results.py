@@ -2,9 +2,12 @@
 
 import numpy as np
 
+from ..storage.checkpoint import Checkpoint
 from ..storage.evaluation import Evaluator
+from ..tempering.budget import Budget, as_limit
 from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.genealogy import standard_error_of_mean
+from ..tempering.guide import AdaptedGuide, Guide
 from ..tempering.population import GuidedRound, Stage
 from ..tempering.results import AnnealingResult
 from ..tempering.verdict import Verdict
@@ -13,11 +16,14 @@ __all__ = ["RunResults"]
 
 
 class RunResults:
-    """Base class of `samplers.tempered.TemperedSampler`: what a user reads after a run."""
+    """Base class of `samplers.tempered.TemperedSampler`: what a user reads after a run, and the limit to go on with."""
 
     nwalkers: int
     _evaluator: Evaluator
     _coarse_evaluator: Evaluator | None
+    _budget: Budget
+    _checkpoint: Checkpoint
+    _guide: AdaptedGuide | None
     _result: AnnealingResult
     _verdict: Verdict | None
 
@@ -87,9 +93,26 @@ class RunResults:
         return standard_error_of_mean(chain, np.arange(self.nwalkers) if founders is None else founders)
 
     @property
+    def guide(self) -> Guide | None:
+        """The guide in use, a copy of the given one that has learned from this run; None before it or without one."""
+        return None if self._guide is None else self._guide.guide
+
+    @property
     def rounds(self) -> tuple[GuidedRound, ...]:
         """Rounds of the guide in the last annealing of this object; empty without a guide."""
         return self._result.rounds
+
+    @property
+    def max_simulations(self) -> float | None:
+        """Largest number of simulations; None for no limit."""
+        return self._budget.limit
+
+    @max_simulations.setter
+    def max_simulations(self, value: float | None) -> None:
+        limit = as_limit(value)
+        if limit is not None:
+            self._checkpoint.expect_limit(self.evaluations == 0)
+        self._budget.limit = limit
 
     @property
     def simulations(self) -> float:

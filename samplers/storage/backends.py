@@ -103,6 +103,8 @@ class JournaledBackend(HDFBackend):
         if self._journal is not None:
             self._journal.wipe()
             self._write_run()
+            if self.contents is not None:
+                self.contents = self.contents._replace(steps=[], provisional=None)
 
     def save_step(self, state, accepted):
         """emcee's: store a step."""
@@ -158,7 +160,8 @@ class JournaledBackend(HDFBackend):
         """Append to the journal that was read from now on."""
         self.contents = None
         self._run = contents.header[RUN]
-        self._journal = Journal(self.journal_path, contents)
+        if self._journal is None:
+            self._journal = Journal(self.journal_path, contents)
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter a batch of evaluated points in the journal."""
@@ -180,11 +183,15 @@ class JournaledBackend(HDFBackend):
         if self._journal is not None:
             self._journal.done()
 
-    def halt(self, provisional: bool, unused: float) -> None:
-        """Enter in the journal that the limit of simulations ended the call, and make the run ready to be continued."""
+    def halt(self, shows: bool, unused: float) -> None:
+        """Enter in the journal that the limit of simulations ended the call, and whether the next step shows it."""
+        if self._journal is not None:
+            self._journal.halt(shows, unused)
+
+    def prepare_to_continue(self) -> None:
+        """Read the journal, so that the run can be continued."""
         self.flush()
         if self._journal is not None:
-            self._journal.halt(provisional, unused)
             self.contents = read_journal(self.journal_path)
 
     def back(self) -> None:

@@ -116,6 +116,8 @@ class Checkpoint:
 
     def store_result(self, result: AnnealingResult, verdict: Verdict | None) -> None:
         """Store ladder, check and verdict in the backend, after it was reset."""
+        if isinstance(self._journal, MemoryRecord):
+            self._journal.forget_steps()
         if verdict is not None:
             write_verdict(self.backend, verdict)
         for index, stage in enumerate(result.ladder):
@@ -243,11 +245,13 @@ class Checkpoint:
             Simulations of this call that its continuation does not use.
         """
         trim_chain(self.backend)
+        if self._journal is not None:
+            self._journal.halt(show, unused)
         if show:
             self.backend.grow(1, state.blobs)
             self.backend.save_step(state, np.zeros(len(state.coords), dtype=bool))
         if self._journal is not None:
-            self._journal.halt(show, unused)
+            self._journal.prepare_to_continue()
 
     def end_call(self, complete: bool) -> None:
         """Write pending steps, and enter whether the call was completed; evaluations are no longer looked up."""

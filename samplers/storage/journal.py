@@ -12,9 +12,9 @@ then dropped. Arrays are stored in NumPy's own format, texts as JSON; nothing is
     CALL  number of steps at beta = 1 that a call asks for (JSON)
     STEP  a stored step: points, log-probabilities, acceptance, blobs, state of the random generator
     DONE  the call is complete
-    HALT  the limit of simulations ended the call (JSON): whether the last step only shows the state, and will be
+    HALT  the limit of simulations ended the call (JSON): whether a step follows that only shows the state and will be
           replaced when the run goes on; how many simulations the longer run will not use
-    BACK  this last step has been removed
+    BACK  this step has been removed
     WIPE  the chain was reset
 
 A journal survives the death of the process. It is not forced to the disk, so a power failure can lose the last seconds.
@@ -307,9 +307,9 @@ class Journal:
         """Enter that the call is complete, or was ended by the user."""
         self._append(b"DONE")
 
-    def halt(self, provisional: bool, unused: float) -> None:
-        """Enter that the limit of simulations ended the call."""
-        self._append(b"HALT", json.dumps([provisional, unused]).encode())
+    def halt(self, shows: bool, unused: float) -> None:
+        """Enter that the limit of simulations ended the call; `shows`: the next step only shows the state."""
+        self._append(b"HALT", json.dumps([shows, unused]).encode())
 
     def back(self) -> None:
         """Enter that the last step, which only showed the state, has been removed."""
@@ -369,7 +369,7 @@ def read_journal(path: Path) -> Contents | None:
         raise ValueError(_damaged(path, "it does not start like a journal"))
     header, start, evaluated, remembered, steps, last = {}, None, [], [], [], None
     before_last, wanted, made, whole = 0, None, 0, len(MAGIC)
-    before_step, provisional, unused = (None, 0, 0), None, 0.0
+    shows, provisional, unused = False, None, 0.0
     for kind, content, end in _blocks(data, path):
         whole = end
         if kind == b"HEAD":
@@ -377,7 +377,7 @@ def read_journal(path: Path) -> Contents | None:
         elif kind == b"INIT":
             coords, log_prior, *random = _unpack_arrays(content)
             start, last, wanted = RunStart(coords, log_prior, _unpack_random(random)), None, None
-            provisional = None
+            shows, provisional = False, None
         elif kind == b"EVAL":
             coords, log_prob, *blobs = _unpack_arrays(content)
             evaluated.append(EvaluatedBatch(coords, log_prob, blobs[0] if blobs else None, {}))
@@ -387,21 +387,20 @@ def read_journal(path: Path) -> Contents | None:
             key, *arrays = _unpack_arrays(content)
             remembered.append((key.tobytes().decode(), arrays))
         elif kind == b"CALL":
-            wanted, made = json.loads(content), 0
+            wanted, made, shows = json.loads(content), 0, False
         elif kind == b"DONE":
             wanted = None
         elif kind == b"STEP":
             coords, log_prob, accepted, keys, rest, *blobs = _unpack_arrays(content)
-            before_step = last, before_last, made
-            last = Step(coords, log_prob, accepted, blobs[0] if blobs else None, _unpack_random([keys, rest]))
-            steps.append(last)
-            before_last = len(evaluated)
-            made += 1
+            step = Step(coords, log_prob, accepted, blobs[0] if blobs else None, _unpack_random([keys, rest]))
+            steps.append(step)
+            if shows:
+                shows, provisional = False, step
+            else:
+                last, before_last, made = step, len(evaluated), made + 1
         elif kind == b"HALT":
-            is_provisional, made_in_vain = json.loads(content)
-            unused += made_in_vain
-            if is_provisional:
-                provisional, (last, before_last, made) = last, before_step
+            shows, of_call = json.loads(content)
+            unused += of_call
         elif kind == b"BACK":
             provisional, steps = None, steps[:-1]
         elif kind == b"WIPE":

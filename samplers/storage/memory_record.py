@@ -32,7 +32,9 @@ class MemoryRecord:
         self._evaluated: list[EvaluatedBatch] = []
         self._remembered: list[tuple[str, list[np.ndarray]]] = []
         self._last: Step | None = None
-        self._before_last, self._wanted, self._made, self._unused = 0, None, 0, 0.0
+        self._header: dict = {}
+        self._start: RunStart | None = None
+        self._before_last, self._wanted, self._made, self._unused, self._shows = 0, None, 0, 0.0, False
 
     def begin(self, header: dict, start: RunStart) -> None:
         """Enter the start of the annealing."""
@@ -69,11 +71,17 @@ class MemoryRecord:
     def flush(self) -> None:
         """Nothing is pending in memory."""
 
-    def halt(self, provisional: bool, unused: float) -> None:
-        """Enter that the limit of simulations ended the call, and make the run ready to be continued."""
+    def halt(self, shows: bool, unused: float) -> None:
+        """Enter that the limit of simulations ended the call, and whether the next step shows it."""
+        self._shows = shows
         self._unused += unused
+
+    def prepare_to_continue(self) -> None:
+        """Collect what has been kept, so that the run can be continued."""
         shown = None
-        if provisional:
+        if self._start is None:
+            return
+        if self._shows:
             last = self._backend.get_last_sample()
             shown = Step(last.coords, last.log_prob, np.zeros(len(last.coords), dtype=bool), last.blobs, ())
         self.contents = Contents(
@@ -89,6 +97,11 @@ class MemoryRecord:
             shown,
             self._unused,
         )
+
+    def forget_steps(self) -> None:
+        """The chain was reset."""
+        if self.contents is not None:
+            self.contents = self.contents._replace(provisional=None)
 
     def back(self) -> None:
         """Remove the last step, which only showed the state, from the chain."""

@@ -33,7 +33,7 @@ from .mutation import MoveSchedule, Mutated, grow_chains, move_together
 from .population import Density, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from .resampling import systematic
 from .settings import Settings
-from .stopping import StoppedEarly, stop_at
+from .stopping import StoppedEarly, stop_at, usable
 from .weights import (
     EvidenceError,
     coarse_weights,
@@ -153,7 +153,7 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState) 
     ancestors = systematic(normalised_weights(log_weights), random, size)
     effective, known = stop.effective_sample_size, len(log_weights)
     population = Population(1.0, population.coords[ancestors], population.records[ancestors], effective, (ancestors,))
-    yield population, Halt(stop.beta, known, effective, pareto_shape(log_weights))
+    yield population, Halt(stop.beta, known, effective, pareto_shape(log_weights), from_guide=stop.from_guide)
     yield (
         population,
         Stage(
@@ -219,20 +219,28 @@ def _from_guide(
 
 
 def _better(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
-    """Of the points known at a stop and the rounds of the guide before it, those that are worth more."""
-    rounds = _stopped_rounds(found)
+    """Of the points known at a stop and the rounds of the guide before it, those that are worth more.
+
+    The rounds if they are usable, since each has a proposal of its own, and no mode is lost from one to the next.
+    """
+    rounds, pooled = _stopped_rounds(found), found.pooled
     rounds.log_evidence_of_stages = stop.log_evidence_of_stages
-    return stop if stop.complete or stop.effective_sample_size >= rounds.effective_sample_size else rounds
+    ndim, effective = pooled.coords.shape[1], pooled.effective_sample_size
+    if stop.complete:
+        return stop
+    if usable(effective, pooled.pareto_shape, pooled.log_evidence_error, ndim):
+        return rounds
+    return stop if stop.effective_sample_size >= effective else rounds
 
 
 def _stopped_rounds(found: RoundsOfGuide) -> StoppedEarly:
     """All rounds of a guide, as the points from which the limit of simulations makes a population."""
     if found.pooled is None:
         nothing = Population(1.0, np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))
-        return StoppedEarly(nothing, float("-inf"), float("inf"), 1.0)
+        return StoppedEarly(nothing, float("-inf"), float("inf"), 1.0, from_guide=True)
     pooled = found.pooled
     known = Population(1.0, pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights)
-    return StoppedEarly(known, pooled.log_evidence, pooled.log_evidence_error, 1.0)
+    return StoppedEarly(known, pooled.log_evidence, pooled.log_evidence_error, 1.0, from_guide=True)
 
 
 def _by_moves(

@@ -14,6 +14,9 @@ import numpy as np
 __all__ = ["AdaptedGuide", "Guide", "GuideSession", "check_guide", "guide_fingerprint"]
 
 
+UNKNOWN = "it has no attribute concerns, so it is not known whether the posterior has other modes"
+
+
 class GuideSession(NamedTuple):
     """What a sampler lends to its guide.
 
@@ -57,7 +60,9 @@ class Guide(Protocol):
     ``log_density_error`` : float
         Standard error of the logarithm of the normalising constant of the density.
     ``concerns`` : sequence of str
-        Reasons why parts of the posterior may be missing.
+        Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any, the
+        verdict is not better than usable. Without this attribute, that the search is unknown counts as a reason: set
+        it to () if the posterior is known to have no parts that the guide misses.
     ``fingerprint`` : str
         Identity of the guide: a run is resumed only with an equal one.
     """
@@ -111,8 +116,8 @@ class AdaptedGuide:
 
     @property
     def concerns(self) -> tuple[str, ...]:
-        """Why parts of the posterior may be missing."""
-        return tuple(self._optional("concerns", ()))
+        """Why parts of the posterior may be missing; a guide that does not say is itself a reason."""
+        return tuple(self._optional("concerns", (UNKNOWN,)))
 
     @property
     def observe(self) -> Callable[[np.ndarray, GuideSession], None] | None:

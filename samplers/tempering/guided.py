@@ -20,10 +20,10 @@ from .guide import AdaptedGuide, GuideSession
 from .population import Density, GuidedRound, Population, Report, Sweep
 from .rounds import PooledRounds, Round, pool_rounds
 from .settings import GuidedSettings
+from .stopping import LARGEST_SHAPE
 
-__all__ = ["LARGEST_USABLE_SHAPE", "Guidance", "RoundsOfGuide", "draw_rounds", "lend", "start_from_guide", "trusted"]
+__all__ = ["Guidance", "RoundsOfGuide", "draw_rounds", "lend", "start_from_guide", "trusted"]
 
-LARGEST_USABLE_SHAPE = 0.7
 FEW_DRAWS = 100
 
 
@@ -147,18 +147,24 @@ def draw_rounds(
         if not complete or budget.refused:
             return RoundsOfGuide("", "", pooled, last, True)
         enough = pooled.effective_sample_size >= size
-        if enough and trusted(last, settings):
+        if enough and trusted(last, settings) and _even(pooled, settings):
             return RoundsOfGuide("", "", pooled, last)
         if doubt := _hopeless(rounds, settings):
             return RoundsOfGuide(doubt, "", pooled, last)
         if len(rounds) >= settings.most_rounds:
-            shortfall = _describe(last, settings)
-            usable = last.effective_share >= settings.usable_share and pooled.pareto_shape < LARGEST_USABLE_SHAPE
+            shortfall = _describe(last, pooled, settings)
+            usable = last.effective_share >= settings.usable_share and pooled.pareto_shape < LARGEST_SHAPE
             return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
         for _ in guide.refine(last.coords, last.records["log_prob"].copy(), session):
             yield population, Sweep(last.effective_share)
         if budget.refused:
             return RoundsOfGuide("", "", pooled, last, True)
+
+
+def _even(pooled: PooledRounds, settings: GuidedSettings) -> bool:
+    """Whether no few weights of all rounds carry the result."""
+    n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
+    return pooled.pareto_shape < settings.largest_pareto_shape or (n < FEW_DRAWS and share >= settings.short_tail_share)
 
 
 def _next_size(rounds: Sequence[Round], size: int, settings: GuidedSettings, guide: AdaptedGuide) -> int:
@@ -208,15 +214,15 @@ def _hopeless(rounds: Sequence[Round], settings: GuidedSettings) -> str:
     return f"the effective sample size of the last {len(recent)} rounds is {100 * np.mean(recent):.2g} % of their draws"
 
 
-def _describe(last: Round, settings: GuidedSettings) -> str:
-    """What the last round lacks."""
-    found = (
+def _describe(last: Round, pooled: PooledRounds, settings: GuidedSettings) -> str:
+    """What the rounds have reached, and what they lack."""
+    return (
         f"after {settings.most_rounds} rounds, the effective sample size of fresh draws is "
-        f"{100 * last.effective_share:.2g} % of their number, and the Pareto shape of their weights is "
-        f"{last.pareto_shape:.2g}"
+        f"{100 * last.effective_share:.2g} % of their number with a Pareto shape of {last.pareto_shape:.2g}, and that "
+        f"of all draws is {pooled.effective_sample_size:.0f} with a shape of {pooled.pareto_shape:.2g} (a share of at "
+        f"least {100 * settings.trusted_share:g} %, as many effective draws as walkers, and shapes below "
+        f"{settings.largest_pareto_shape:g} are needed)"
     )
-    needed = f"at least {100 * settings.trusted_share:g} % and below {settings.largest_pareto_shape:g} are needed"
-    return f"{found} ({needed})"
 
 
 def start_from_guide(

@@ -12,6 +12,7 @@ coarse model saves.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,27 @@ from ..proposals.mixture import Mixture, log_density
 from .adaptive_importance import StartingDensity
 from .evidence_check import draw_inside
 
-__all__ = ["draw_start"]
+__all__ = ["check_coarse", "draw_start"]
 
 LAST_SHARE = 0.5
+
+
+def check_coarse(function: Any, recycle: bool, sampler: str) -> None:
+    """Raise ValueError for a coarse model that cannot be called, or without recycling.
+
+    Parameters
+    ----------
+    function : callable
+        The coarse log-probability.
+    recycle : bool
+        Whether the sampler recycles.
+    sampler : str
+        The sampler and what to do, for the message.
+    """
+    if not callable(function):
+        raise ValueError(f"coarse_log_prob_fn must be callable; got {function!r}")
+    if not recycle:
+        raise ValueError(f"coarse_log_prob_fn needs recycling, which is off for this {sampler}")
 
 
 def draw_start(

@@ -246,6 +246,8 @@ class Halt(NamedTuple):
         Pareto shape of the largest of these weights.
     complete : bool
         Whether the annealing was complete; only moves or a check at beta = 1 are then missing.
+    from_guide : bool
+        Whether the points are the draws of a guide.
     """
 
     beta: float
@@ -253,6 +255,7 @@ class Halt(NamedTuple):
     effective_sample_size: float
     pareto_shape: float
     complete: bool = False
+    from_guide: bool = False
 
 
 Report = Stage | Sweep | Restart | EvidenceCheck | GuidedRound | GuidedStart | Halt | Doubt

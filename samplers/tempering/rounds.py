@@ -32,6 +32,7 @@ __all__ = ["PooledRounds", "Round", "pool_rounds", "round_shares", "tail_varianc
 
 # Pareto shape that is assumed for fewer weights than an estimate needs
 SHAPE_OF_FEW = 0.7
+FEWEST_EFFECTIVE = 5.0
 
 
 class Round(NamedTuple):
@@ -117,7 +118,8 @@ def tail_variance(log_weights: np.ndarray) -> float:
 
     If the largest weights have a Pareto shape :math:`0 < k < 1`, the mean excess over the largest normalised weight
     :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error. It is infinite for
-    :math:`k \ge 1`. Where there are too few weights for an estimate, k is 0.7.
+    :math:`k \ge 1`. Where there are too few weights for an estimate, k is 0.7. With an effective sample size below 5,
+    points that were not drawn may have any weight, and the variance is infinite.
 
     Parameters
     ----------
@@ -126,7 +128,7 @@ def tail_variance(log_weights: np.ndarray) -> float:
     """
     shape = pareto_shape(log_weights)
     shape = SHAPE_OF_FEW if shape == np.inf else shape
-    if shape >= 1.0:
+    if shape >= 1.0 or effective_sample_size(log_weights) < FEWEST_EFFECTIVE:
         return float("inf")
     largest = float(np.max(normalised_weights(log_weights)))
     return (largest * max(shape, 0.0) / (1.0 - shape)) ** 2

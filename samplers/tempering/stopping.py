@@ -6,7 +6,27 @@ from .population import Population
 from .rounds import tail_variance
 from .weights import effective_sample_size, log_mean_weight
 
-__all__ = ["StoppedEarly", "stop_at"]
+__all__ = ["LARGEST_ERROR", "LARGEST_SHAPE", "StoppedEarly", "fewest_points", "stop_at", "usable"]
+
+
+# Weights of a larger Pareto shape have no useful mean (Vehtari et al. 2024, JMLR 25(72)).
+LARGEST_SHAPE = 0.7
+# Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
+LARGEST_ERROR = 0.35
+# Fewer effective points, or fewer per parameter (and one more), do not determine means and covariances.
+FEWEST_POINTS = 20.0
+POINTS_PER_DIMENSION = 3.0
+
+
+def fewest_points(ndim: int) -> float:
+    """Smallest effective sample size of weighted points from which a population is usable."""
+    return max(FEWEST_POINTS, POINTS_PER_DIMENSION * (ndim + 1.0))
+
+
+def usable(effective_sample_size: float, pareto_shape: float, error: float, ndim: int) -> bool:
+    """Whether weighted points give means and an evidence with errors that can be stated."""
+    enough = effective_sample_size >= fewest_points(ndim)
+    return enough and pareto_shape < LARGEST_SHAPE and error <= LARGEST_ERROR
 
 
 class StoppedEarly(Exception):
@@ -24,6 +44,8 @@ class StoppedEarly(Exception):
         Part of the log-evidence that is in stages already reported.
     complete : bool
         Whether beta = 1 was reached and its stage reported; the population is then equally weighted.
+    from_guide : bool
+        Whether the points are the draws of a guide.
     """
 
     def __init__(
@@ -34,10 +56,11 @@ class StoppedEarly(Exception):
         beta: float,
         log_evidence_of_stages: float = 0.0,
         complete: bool = False,
+        from_guide: bool = False,
     ):
         super().__init__("the limit of simulations (max_simulations) ended the annealing")
         self.population, self.log_evidence, self.error, self.beta = population, log_evidence, error, beta
-        self.log_evidence_of_stages, self.complete = log_evidence_of_stages, complete
+        self.log_evidence_of_stages, self.complete, self.from_guide = log_evidence_of_stages, complete, from_guide
 
     @property
     def effective_sample_size(self) -> float:

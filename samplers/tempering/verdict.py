@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from .genealogy import standard_error_of_mean
-from .guided import LARGEST_USABLE_SHAPE
 from .population import Doubt, GuidedRound, Halt
 from .results import AnnealingResult
 from .settings import GuidedSettings
+from .stopping import LARGEST_ERROR, LARGEST_SHAPE, fewest_points, usable
 
 __all__ = ["CONVERGED", "NOT_USABLE", "USABLE", "Verdict", "describe_halt", "independent_points", "judge"]
 
@@ -26,11 +26,6 @@ CONVERGED = "converged"
 USABLE = "usable"
 NOT_USABLE = "not usable"
 STATUSES = (CONVERGED, USABLE, NOT_USABLE)
-# Fewer effective points per parameter (and one more) do not determine means and covariances.
-POINTS_PER_DIMENSION = 3.0
-FEWEST_POINTS = 20.0
-# Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
-LARGEST_ERROR = 0.35
 
 
 class Verdict(NamedTuple):
@@ -103,7 +98,7 @@ def judge(
     halt = result.halt
     if halt is not None and not halt.complete:
         found += _of_halt(halt, stage.log_evidence_error, ndim)
-        more = _missing_draws(result.rounds, nwalkers, settings) if result.rounds else None
+        more = _missing_draws(result.rounds, nwalkers, settings) if halt.from_guide else None
     elif halt is not None:
         found.append(Doubt("the limit of simulations ended the run at beta = 1, before its last check", False))
         more = None
@@ -111,22 +106,15 @@ def judge(
         last = result.rounds[-1]
         reasons.append(
             f"the latest {last.draws} draws of the guide, which shaped nothing that they are weighted with, have an "
-            f"effective sample size of {100 * last.effective_share:.0f} % of their number"
+            f"effective sample size of {100 * last.effective_share:.0f} % of their number; the Pareto shape of all "
+            f"weights is {result.start.pareto_shape:.2f}"
         )
         if result.start.shortfall:
             found.append(Doubt(result.start.shortfall, False))
-        if result.start.pareto_shape >= settings.largest_pareto_shape:
-            found.append(
-                Doubt(
-                    f"the Pareto shape of all weights is {result.start.pareto_shape:.2f}: a few large weights carry "
-                    "the result",
-                    result.start.pareto_shape >= LARGEST_USABLE_SHAPE,
-                )
-            )
     elif result.start is not None:
         found.append(Doubt(f"the draws of the guide were not used ({result.start.doubt})", False))
-    if result.rounds:
-        found += [Doubt(f"the guide reports: {concern}", False) for concern in result.concerns]
+    if result.start is not None or (halt is not None and halt.from_guide):
+        found += [Doubt(f"concern of the guide: {concern}", False) for concern in result.concerns]
         if not result.concerns:
             reasons.append("parts of the posterior in which the guide makes no draws are not seen")
     if stage.log_evidence_error > LARGEST_ERROR and not result.has_better_check:
@@ -178,17 +166,14 @@ def describe_halt(verdict: Verdict, limit: float | None) -> str:
 def _of_halt(halt: Halt, error: float, ndim: int) -> list[Doubt]:
     """Doubts about a population that was made from the points known when the limit of simulations was reached."""
     where = f"at beta = {halt.beta:.3g} " if halt.beta < 1.0 else ""
-    needed = max(FEWEST_POINTS, POINTS_PER_DIMENSION * (ndim + 1.0))
-    few = halt.effective_sample_size < needed
-    heavy = halt.pareto_shape >= LARGEST_USABLE_SHAPE
     text = (
         f"the limit of simulations ended the run {where}with {halt.points} weighted points, whose effective sample "
         f"size is {halt.effective_sample_size:.2g} and whose weights have a Pareto shape of {halt.pareto_shape:.2g}"
     )
-    if few or heavy or error > LARGEST_ERROR:
-        wanted = f"an effective sample size of {needed:.0f} and a shape below {LARGEST_USABLE_SHAPE:g} are needed"
-        return [Doubt(f"{text} ({wanted})", True)]
-    return [Doubt(text, False)]
+    if usable(halt.effective_sample_size, halt.pareto_shape, error, ndim):
+        return [Doubt(text, False)]
+    wanted = f"an effective sample size of {fewest_points(ndim):.0f} and a shape below {LARGEST_SHAPE:g} are needed"
+    return [Doubt(f"{text} ({wanted})", True)]
 
 
 def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int, settings: GuidedSettings) -> float | None:

@@ -16,6 +16,7 @@ class FixedGuide:
     """
 
     dof = 6.0
+    concerns = ()
 
     def __init__(self, posterior, means, covariances, weights=None, prior_share=0.0):
         self.posterior, self.prior_share = posterior, prior_share

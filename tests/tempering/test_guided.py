@@ -10,7 +10,7 @@ import pytest
 from samplers import GuideMove, SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.tempering.rounds import Round, pool_rounds, round_shares
 from tests.contract.targets import Gaussian
-from tests.tempering.guides import FixedGuide, LearningGuide
+from tests.tempering.guides import FixedGuide, LearningGuide, SearchingGuide
 
 N = 100
 
@@ -151,6 +151,14 @@ def test_guided_runs_are_pickled():
     for s in (sampler, again):
         s.run_mcmc(None, 3)
     assert np.array_equal(sampler.get_chain(), again.get_chain())
+
+
+def test_the_progress_bar_counts_searches_rounds_and_sweeps(capfd):
+    posterior = Gaussian()
+    sampler = SMCSampler(N, 3, posterior, vectorize=True, seed=1, guide=SearchingGuide(posterior))
+    sampler.run_mcmc(None, 2, progress=True)
+    shown = capfd.readouterr().err
+    assert "ladder" in shown and f"{3 + 2 * len(sampler.rounds) - 1} sweeps" in shown and "2/2" in shown
 
 
 def test_shares_of_rounds_depend_on_earlier_rounds_only():

@@ -133,6 +133,38 @@ def test_no_step_is_stored_where_none_was_wanted():
     assert same(sampler, whole)
 
 
+@pytest.mark.parametrize("where", ["memory", "file"])
+def test_reset_after_a_limit(where, tmp_path):
+    """The chain is discarded, and the run goes on."""
+    whole = make("guide", None)
+    whole.run_mcmc(None, 3)
+    sampler = make("guide", 100, None if where == "memory" else tmp_path / "run.h5")
+    halted(sampler, 3)
+    sampler.compute_log_prob(sampler.get_last_sample().coords)
+    sampler.reset()
+    assert sampler.iteration == 0
+    sampler.max_simulations = None
+    sampler.run_mcmc(None, 3)
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+
+
+def test_killed_while_the_state_is_stored(tmp_path):
+    """The journal says that a step is only shown before it holds this step."""
+    file = tmp_path / "run.h5"
+    whole, sampler = make("guide", None), make("guide", 100, file)
+    whole.run_mcmc(None, 3)
+    halted(sampler, 3)
+    sampler.backend.close()
+    journal = file.with_name("run.h5.mcmc.journal")
+    data = journal.read_bytes()
+    for cut in (data.rindex(b"STEP"), data.rindex(b"STEP") + 100, data.rindex(b"HALT"), data.rindex(b"CALL")):
+        journal.write_bytes(data[:cut])
+        sampler = make("guide", None, file)
+        sampler.run_mcmc(None, 3)
+        assert np.array_equal(sampler.get_chain(), whole.get_chain())
+        sampler.backend.close()
+
+
 def test_the_states_of_a_generator_end_where_the_limit_is():
     sampler = make("guide", None)
     sampler.run_mcmc(None, 0)
