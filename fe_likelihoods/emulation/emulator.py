@@ -34,7 +34,7 @@ __all__ = ["ResponseEmulator", "TrainingSet", "fit_emulator"]
 _MAX_COMPONENTS = 60
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
-_REACH = 1.2  # squared distance up to which the emulator is used, as a multiple of the largest of the training points
+_REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the largest of the training points
 _ROWS = 4096  # points evaluated at once
 
 

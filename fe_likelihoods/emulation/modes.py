@@ -6,7 +6,8 @@ cheap and their misfit is smoother, because errors in a period have had less tim
 is centred on each start, so that starts keep their differences in parameters that the early part does not depend on.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from .target import Remember, ResponseTarget, run_at_once
 
 __all__ = ["Mode", "ModeSearch", "draw_starts", "find_modes", "laplace", "search_from", "search_modes"]
 
+_FIRST_WAVE = 3  # starts whose ascents are made first
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _HOPELESS = 200.0  # an end of a short part whose log-density is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
@@ -117,6 +119,18 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     return Mode(parameters, at, covariance, top, log_evidence, end.starts, end.converged)
 
 
+def _finish(fronts: Sequence[tuple], ends: list[Ascent], index: int, end: Ascent | None) -> None:
+    """Enter where an ascent from a front has ended, or that it joined an earlier end."""
+    if end is None:
+        return
+    starts = fronts[index][2]
+    if end.merged >= 0:
+        joined = ends[end.merged]
+        ends[end.merged] = joined._replace(starts=(*joined.starts, *starts))
+    else:
+        ends.append(end._replace(starts=starts))
+
+
 def search_modes(
     target: ResponseTarget,
     starts: np.ndarray,
@@ -148,23 +162,17 @@ def search_modes(
         share = part.n_steps / target.n_steps
         whole = part is target
         ends: list[Ascent] = []
-
-        def finish(index: int, end: Ascent | None, fronts: list = fronts, ends: list = ends) -> None:
-            if end is None:
-                return
-            if end.merged >= 0:
-                joined = ends[end.merged]
-                ends[end.merged] = joined._replace(starts=(*joined.starts, *fronts[index][2]))
-            else:
-                ends.append(end._replace(starts=fronts[index][2]))
-
         tolerance = TOLERANCE if whole else min(TOLERANCE / share, _LOOSEST)
         origin = np.zeros(target.n_structural)
-        ascents = [ascend(part, start, origin if whole else centre, ends, tolerance) for start, centre, _ in fronts]
         batches = Batches(part, remember, lambda points, share=share: fits(share * points))
-        for points in batches.complete(ascents, finish):
-            spent += share * points
-            yield share * points
+        # two waves: the ascents of the second one stop as soon as they head for an end of the first
+        for wave in (fronts[:_FIRST_WAVE], fronts[_FIRST_WAVE:]):
+            ascents = [ascend(part, start, origin if whole else centre, ends, tolerance) for start, centre, _ in wave]
+            for points in batches.complete(ascents, partial(_finish, wave, ends)):
+                spent += share * points
+                yield share * points
+            if batches.interrupted:
+                break
         interrupted = batches.interrupted
         if not ends or interrupted:
             break
@@ -180,9 +188,17 @@ def search_modes(
 
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
-    """Starts (n, n_structural) in standard normal coordinates: the median of the prior, then draws of it."""
-    drawn = random.standard_normal((max(n - 1, 0), target.n_structural))
-    return np.concatenate([np.zeros((1, target.n_structural)), drawn])[:n]
+    """Starts (n, n_structural) in standard normal coordinates: the median of the prior, then a Latin hypercube.
+
+    Every parameter has one start in each of n - 1 intervals of equal prior probability, in random order.
+    """
+    from scipy.special import ndtri
+
+    d, m = target.n_structural, n - 1
+    starts = np.zeros((n, d))
+    for k in range(d):
+        starts[1:, k] = ndtri((random.permutation(m) + random.uniform(size=m)) / max(m, 1))
+    return starts
 
 
 def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulations: float | None = None) -> ModeSearch:
@@ -193,7 +209,7 @@ def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulation
     posterior : Posterior
         Any noise whose statistics are quadratic in the residuals, as all noises of this package are.
     starts : int
-        Number of starts: the median of the prior, and draws of it.
+        Number of starts: the median of the prior, and a Latin hypercube of its quantiles.
     seed : int, optional
         Seed of the draws.
     max_simulations : float, optional
