@@ -27,12 +27,14 @@ import numpy as np
 from .evidence_check import pareto_shape
 from .weights import effective_sample_size, log_mean_weight, normalised_weights
 
-__all__ = ["PooledRounds", "Round", "pool_rounds", "round_shares", "tail_variance"]
+__all__ = ["PooledRounds", "Round", "pool_rounds", "round_shares", "tail_shape", "tail_variance"]
 
 
 # Pareto shape that is assumed for fewer weights than an estimate needs
 SHAPE_OF_FEW = 0.7
 FEWEST_EFFECTIVE = 5.0
+# part of the sum of all weights by which the largest must exceed the others for their shape to matter
+SMALLEST_EXCESS = 0.05
 
 
 class Round(NamedTuple):
@@ -64,8 +66,8 @@ class Round(NamedTuple):
 
     @property
     def pareto_shape(self) -> float:
-        """Pareto shape of the largest weights; inf for too few weights."""
-        return pareto_shape(self.log_weights)
+        """`tail_shape` of the weights; inf for too few of them."""
+        return tail_shape(self.log_weights)
 
 
 class PooledRounds(NamedTuple):
@@ -84,7 +86,7 @@ class PooledRounds(NamedTuple):
     effective_sample_size : float
         Of the weights.
     pareto_shape : float
-        Of the largest weights.
+        `tail_shape` of the weights.
     """
 
     coords: np.ndarray
@@ -113,6 +115,28 @@ def round_shares(sizes: Sequence[int], effective_shares: Sequence[float]) -> np.
     return shares / shares.sum()
 
 
+def tail_shape(log_weights: np.ndarray) -> float:
+    """Pareto shape of the largest weights where these have a part in the mean; 0 where they have none.
+
+    The shape of a distribution does not depend on its scale. The weights of a guide that describes the posterior nearly
+    exactly are all equal but for small errors, and the shape of these errors says nothing about the mean: it is used
+    only if the largest weights exceed the next one by at least 5 % of the sum of all weights together.
+
+    Parameters
+    ----------
+    log_weights : (n,) float
+        Logarithms of the weights, at least one of them finite.
+    """
+    shape = pareto_shape(log_weights)
+    if not np.isfinite(shape):
+        return max(shape, 0.0)
+    ordered = np.sort(normalised_weights(log_weights))
+    n = len(ordered)
+    count = int(min(n / 5.0, 3.0 * np.sqrt(n)))
+    excess = float((ordered[-count:] - ordered[-count - 1]).sum())
+    return shape if excess >= SMALLEST_EXCESS else 0.0
+
+
 def tail_variance(log_weights: np.ndarray) -> float:
     r"""Variance of the log-evidence due to weights larger than all that were drawn.
 
@@ -126,7 +150,7 @@ def tail_variance(log_weights: np.ndarray) -> float:
     log_weights : (n,) float
         Logarithms of the weights, at least one of them finite.
     """
-    shape = pareto_shape(log_weights)
+    shape = tail_shape(log_weights)
     shape = SHAPE_OF_FEW if shape == np.inf else shape
     if shape >= 1.0 or effective_sample_size(log_weights) < FEWEST_EFFECTIVE:
         return float("inf")
@@ -157,7 +181,7 @@ def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> Pool
     parts = [r.log_weights + np.log(share / n) for r, share, n in zip(rounds, shares, sizes, strict=True)]
     log_weights = np.concatenate(parts)
     log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
-    shape = pareto_shape(log_weights)
+    shape = tail_shape(log_weights)
     coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
     if log_evidence == -np.inf:
         return PooledRounds(coords, records, log_weights, log_evidence, float("inf"), 0.0, shape)

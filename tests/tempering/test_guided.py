@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from samplers import GuideMove, SamplingWarning, SMCSampler, TMCMCSampler
-from samplers.tempering.rounds import Round, pool_rounds, round_shares
+from samplers.tempering.rounds import Round, pool_rounds, round_shares, tail_shape, tail_variance
 from tests.contract.targets import Gaussian
 from tests.tempering.guides import FixedGuide, LearningGuide, SearchingGuide
 
@@ -188,3 +188,13 @@ def test_no_warning_with_a_good_guide():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run(Gaussian(), laplace(Gaussian()))
+
+
+def test_the_shape_of_the_tail_counts_only_where_the_tail_does():
+    """Equal weights with tiny heavy-tailed errors have no tail; the same errors at full size do."""
+    errors = np.random.default_rng(1).pareto(1.0, 300)
+    assert tail_shape(np.log1p(1e-4 * errors)) == 0.0
+    assert tail_variance(np.log1p(1e-4 * errors)) == 0.0
+    assert tail_shape(np.log1p(errors)) > 0.7
+    assert tail_shape(np.zeros(300)) == 0.0
+    assert tail_shape(np.zeros(3)) == np.inf
