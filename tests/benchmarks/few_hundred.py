@@ -33,6 +33,7 @@ from .rows import aligned, machine
 __all__ = ["load", "make_default", "make_reference", "reference_named"]
 
 FILE = Path(__file__).with_name("few_hundred_references.json")
+LONG = 8  # sweeps at beta = 1 of a reference by the default sampler
 BUDGET = 4  # default, in goals of the problem
 HEADER = (
     "problem",
@@ -112,21 +113,49 @@ def _quadrature(posterior: Posterior, about: Reference, points: int = 141, reach
     )
 
 
+def _long_run(posterior: Posterior, problem: Problem, seed: int) -> Reference:
+    """Reference from the default sampler; errors as the sampler reports them."""
+    sampler = SMCSampler(problem.walkers, posterior.ndim, posterior, vectorize=True, seed=seed)
+    sampler.run_mcmc(None, LONG)
+    samples = sampler.get_chain(flat=True)
+    error, sd = sampler.mean_error(), samples.std(axis=0)
+    n = float((sd / error).min() ** 2)  # effective sample size of the worst mean
+    label = np.zeros(len(samples), dtype=int) if problem.labels is None else problem.labels(samples)
+    shares = np.bincount(label) / len(label)
+    return Reference(
+        float(sampler.log_evidence),
+        float(sampler.log_evidence_error),
+        samples.mean(axis=0),
+        error,
+        sd,
+        sd / np.sqrt(2.0 * n),
+        shares,
+        np.sqrt(shares * (1.0 - shares) / n),
+        n,
+        len(samples),
+    )
+
+
 def make_reference(name: str, problem: Problem, seed: int) -> None:
     """Make the reference of a problem and seed, and store it."""
     posterior = problem.posterior(seed)
     start = time.perf_counter()
-    found = by_importance(
-        posterior,
-        problem.starts(posterior),
-        draws=problem.reference_draws,
-        rounds=problem.reference_rounds,
-        seed=seed,
-        labels=problem.labels,
-        inform=lambda text: print(text, flush=True),
-    )
+    if problem.reference_draws:
+        method = "importance sampling from the known modes"
+        found = by_importance(
+            posterior,
+            problem.starts(posterior),
+            draws=problem.reference_draws,
+            rounds=problem.reference_rounds,
+            seed=seed,
+            labels=problem.labels,
+            inform=lambda text: print(text, flush=True),
+        )
+    else:
+        method = f"default SMCSampler, {problem.walkers} walkers, {LONG} sweeps"
+        found = _long_run(posterior, problem, seed)
     if posterior.ndim == 2:
-        found = _quadrature(posterior, found)
+        method, found = "quadrature", _quadrature(posterior, found)
     entry = {
         key: _rounded(value) if np.ndim(value) else (round(value, 6) if np.isfinite(value) else None)
         for key, value in found._asdict().items()
@@ -137,7 +166,7 @@ def make_reference(name: str, problem: Problem, seed: int) -> None:
         "parameters": posterior.parameter_names,
         "simulations": report["simulations"],
         "failures": report["failure_count"],
-        "method": "quadrature" if posterior.ndim == 2 else "importance sampling from the known modes",
+        "method": method,
     }
     _store("references", f"{name} {seed}", entry)
     print(
