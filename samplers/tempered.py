@@ -356,7 +356,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Store the verdict on an annealing of this object, or keep that of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             result, settings = self._result, self.settings.guided
-            self._verdict = judge(result, settings, self.nwalkers, self.ndim, self.simulations, missing)
+            failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
+            self._verdict = judge(result, settings, self.nwalkers, self.ndim, self.simulations, missing, failed)
             self._checkpoint.store_verdict(self._verdict)
 
     def compute_log_prob(self, coords):

@@ -71,6 +71,7 @@ def judge(
     ndim: int,
     simulations: float,
     missing_steps: int = 0,
+    failures: str = "",
 ) -> Verdict:
     """Judge an annealing that has reached beta = 1.
 
@@ -86,6 +87,8 @@ def judge(
         Simulations made.
     missing_steps : int
         Steps at beta = 1 that the limit of simulations did not allow.
+    failures : str
+        How many evaluations failed, for the reasons; empty if none did.
 
     Returns
     -------
@@ -126,6 +129,8 @@ def judge(
             f"{missing_steps} of the steps at beta = 1 {'was' if missing_steps == 1 else 'were'} not made, which takes "
             f"up to {missing_steps * nwalkers} simulations"
         )
+    if failures:
+        reasons.append(f"{failures} failed and count as impossible")
     status = STATUSES[max((1 + doubt.grave for doubt in found), default=0)]
     if status == CONVERGED:
         more = 0.0

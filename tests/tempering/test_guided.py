@@ -2,12 +2,13 @@
 
 import pickle
 import warnings
+from dataclasses import fields, replace
 
 import emcee
 import numpy as np
 import pytest
 
-from samplers import GuideMove, SamplingWarning, SMCSampler, TMCMCSampler
+from samplers import GuidedSettings, GuideMove, SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.tempering.rounds import Round, pool_rounds, round_shares, tail_shape, tail_variance
 from tests.contract.targets import Gaussian
 from tests.tempering.guides import FixedGuide, LearningGuide, SearchingGuide
@@ -198,3 +199,69 @@ def test_the_shape_of_the_tail_counts_only_where_the_tail_does():
     assert tail_shape(np.log1p(errors)) > 0.7
     assert tail_shape(np.zeros(300)) == 0.0
     assert tail_shape(np.zeros(3)) == np.inf
+
+
+GUIDED_CHANGES = {
+    "first_round_share": (0.5, {}, 2.0),
+    "round_share": (0.9, {}, 2.0),
+    "fewest_draws": (70, {}, 2.0),
+    "trusted_share": (0.99, {}, 1.0),
+    "largest_pareto_shape": (0.01, {"short_tail_share": 1.0}, 1.2),
+    "short_tail_share": (1.0, {"largest_pareto_shape": 1e-6, "short_tail_share": 0.5}, 0.85),
+    "most_rounds": (2, {}, 2.0),
+    "hopeless_rounds": (2, {"hopeless_share": 0.9}, 2.0),
+    "hopeless_share": (0.9, {}, 2.0),
+    "usable_share": (1.0, {"most_rounds": 6}, 2.0),
+}
+
+
+def test_the_changes_cover_all_constants():
+    assert set(GUIDED_CHANGES) == {field.name for field in fields(GuidedSettings)}
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("name", GUIDED_CHANGES)
+def test_every_constant_of_the_rounds_changes_the_run(name):
+    value, needed, scale = GUIDED_CHANGES[name]
+    plain = GuidedSettings(**needed)
+    shift = 0.0 if name == "short_tail_share" else 0.3
+    found = []
+    for settings in (plain, replace(plain, **{name: value})):
+        sampler = run(Gaussian(), laplace(Gaussian(), scale=scale, shift=shift), steps=0, guided=settings)
+        found.append((sampler.rounds, [stage._replace(seconds=0.0) for stage in sampler.ladder]))
+    assert found[0] != found[1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"first_round_share": 0.0},
+        {"trusted_share": 1.1},
+        {"fewest_draws": 0},
+        {"most_rounds": 2.5},
+        {"hopeless_share": -0.1},
+        {"largest_pareto_shape": 0.8},
+    ],
+    ids=str,
+)
+def test_impossible_constants(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        GuidedSettings(**settings)
+
+
+def test_constants_without_a_guide_are_refused():
+    with pytest.raises(ValueError, match="it belongs to a guide: pass guide= too"):
+        SMCSampler(N, 3, Gaussian(), guided=GuidedSettings(most_rounds=3))
+
+
+def test_failed_draws_count_as_impossible_and_are_reported():
+    class Fails(Gaussian):
+        def __call__(self, x):
+            return np.where(x[..., 0] > self.mean[0], np.nan, super().__call__(x))
+
+    posterior = Fails()
+    with pytest.warns(SamplingWarning, match="evaluations failed"):
+        sampler = run(posterior, laplace(posterior, guide=LearningGuide), max_failure_share=0.9)
+    assert sampler.get_chain()[..., 0].max() <= posterior.mean[0]
+    assert abs(sampler.log_evidence - posterior.log_evidence - np.log(0.5)) < 4.0 * sampler.log_evidence_error
+    assert f"{sampler.failure_count} of {sampler.evaluations} evaluations failed" in str(sampler.verdict)

@@ -1,0 +1,115 @@
+"""Coverage of the errors, and verdicts, of runs with a guide and a limit of simulations."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from samplers import SMCSampler
+from tests.contract.targets import Box, Gaussian
+from tests.tempering.guides import FixedGuide, LearningGuide
+
+N = 100
+RUNS = 40
+
+
+class TwoModes(Box):
+    """Two Gaussian modes of equal mass in a square; the evidence is that of both."""
+
+    def __init__(self, width=0.05):
+        super().__init__([0.0, 0.0], [1.0, 1.0], self._log_likelihood)
+        self.width, self.centres = width, np.array([[0.3, 0.3], [0.7, 0.7]])
+        self.mean, self.log_evidence = np.array([0.5, 0.5]), np.log(2.0 * 2.0 * np.pi * width**2)
+
+    def _log_likelihood(self, x):
+        return np.logaddexp(*(-0.5 * np.sum(((x - c) / self.width) ** 2, axis=-1) for c in self.centres))
+
+
+def gaussian(scale, shift, guide, **more):
+    posterior = Gaussian(5, sd=0.05)
+    covariance = np.diag((scale * posterior.sd) ** 2)
+    return posterior, guide(posterior, posterior.mean + shift * posterior.sd, [covariance], **more)
+
+
+def two_modes(modes, guide, width=0.05, **more):
+    posterior = TwoModes(width)
+    covariances = np.stack([np.eye(2) * width**2] * modes)
+    return posterior, guide(posterior, posterior.centres[:modes], covariances, **more)
+
+
+CASES = {
+    "exact": gaussian(1.0, 0.0, FixedGuide),
+    "with a share of the prior": gaussian(1.0, 0.0, FixedGuide, prior_share=0.05),
+    "too narrow": gaussian(0.6, 0.0, FixedGuide),
+    "too wide": gaussian(2.0, 0.0, FixedGuide),
+    "too wide, learns": gaussian(2.0, 0.0, LearningGuide),
+    "shifted, learns": gaussian(1.5, 1.0, LearningGuide),
+    "two modes": two_modes(2, FixedGuide),
+}
+
+
+def outcomes(posterior, guide, limit, runs=RUNS):
+    """Deviations of the log-evidence and of the means in standard errors, and verdicts, one row per run."""
+    deviations, statuses = [], []
+    for seed in range(runs):
+        sampler = SMCSampler(
+            N, posterior.ndim, posterior, vectorize=True, seed=seed, guide=guide, max_simulations=limit
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            sampler.run_mcmc(None, 1)
+        means = (sampler.get_chain(flat=True).mean(axis=0) - posterior.mean) / sampler.mean_error()
+        evidence = (sampler.log_evidence - posterior.log_evidence) / sampler.log_evidence_error
+        deviations.append([evidence, *means])
+        statuses.append(sampler.verdict.status)
+    return np.array(deviations), np.array(statuses)
+
+
+@pytest.mark.parametrize(
+    "limit", [200, pytest.param(500, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("case", CASES)
+def test_two_standard_errors_cover(case, limit):
+    """At least 90 %, less two standard deviations of the number of 40 runs; a converged result is never far off."""
+    deviations, statuses = outcomes(*CASES[case], limit)
+    believed = statuses != "not usable"
+    assert case.endswith("learns") or np.mean(believed) > 0.9
+    if believed.sum() < 10:
+        return
+    covered = np.abs(deviations[believed]) < 2.0
+    least = 0.9 - 2.0 * np.sqrt(0.9 * 0.1 / believed.sum())
+    assert np.mean(covered[:, 0]) > least
+    assert np.mean(covered[:, 1:]) > least
+    assert np.all(np.abs(deviations[statuses == "converged"]) < 4.5)
+
+
+def test_control_a_guide_that_misses_a_mode_is_wrong():
+    """Negative control: the criterion of the test above fails. The guide claims that it has no concerns."""
+    deviations, statuses = outcomes(*two_modes(1, FixedGuide), 500, runs=5)
+    assert np.all(np.abs(deviations[:, 0]) > 5.0) and np.mean(statuses == "converged") > 0.5
+
+
+def test_a_guide_that_does_not_say_how_it_searched_is_at_best_usable():
+    class Silent(FixedGuide):
+        concerns = property()  # reading it raises AttributeError
+
+    posterior, guide = two_modes(1, Silent)
+    assert not hasattr(guide, "concerns")
+    _, statuses = outcomes(posterior, guide, 500, runs=3)
+    assert np.all(statuses == "usable")
+
+
+def test_a_share_of_the_prior_finds_a_missing_mode_or_shows_that_something_is_missing():
+    """With 30 % of the draws from the prior and a mode that holds 13 % of it, some draws reach the mode."""
+    posterior, guide = two_modes(1, LearningGuide, width=0.08, prior_share=0.3)
+    posterior.log_evidence = np.log(2.0 * 2.0 * np.pi * 0.08**2)
+    deviations, statuses = outcomes(posterior, guide, 1000, runs=20)
+    wrong = np.abs(deviations[:, 0]) > 4.0
+    assert not np.any(wrong & (statuses == "converged"))
+    assert np.mean(~wrong & (statuses != "not usable")) > 0.5
+
+
+def test_a_heavy_tail_is_not_called_converged():
+    posterior, guide = gaussian(1.0, 1.5, FixedGuide)
+    _, statuses = outcomes(posterior, guide, 400, runs=10)
+    assert not np.any(statuses == "converged") and np.mean(statuses == "not usable") > 0.5
