@@ -4,7 +4,21 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from . import bridge, cache, column, cost, executors, few_hundred_peers, growth, job, peers, samplers, startup, storage
+from . import (
+    bridge,
+    cache,
+    column,
+    cost,
+    executors,
+    few_hundred_peers,
+    growth,
+    job,
+    overhead,
+    peers,
+    samplers,
+    startup,
+    storage,
+)
 from .comparison import compare
 from .rows import as_table, machine, write_json
 
@@ -21,6 +35,7 @@ BENCHMARKS = {
     "executors": executors.executors,
     "samplers": samplers.rows,
     "peers": peers.rows,
+    "overhead": overhead.overhead,
     "few_hundred_peers": few_hundred_peers.rows,
     "memory": job.memory,
     "job": job.job,
