@@ -7,7 +7,6 @@ A limit never changes what a run does: it only ends it. So a run that is continu
 steps and goes on.
 """
 
-import hashlib
 from collections.abc import Sequence
 from numbers import Real
 from typing import Any, Protocol
@@ -15,6 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 
 __all__ = ["Budget", "BudgetExhausted", "CountsSimulations", "as_limit"]
+
+
+# Odd, with bits spread evenly: the golden ratio times 2^64 (Knuth, The Art of Computer Programming 3, section 6.4)
+MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 
 
 class BudgetExhausted(Exception):
@@ -95,9 +98,14 @@ class Budget:
         self.refused, self.unused, self.off_path = False, 0.0, 0.0
 
     def _keys(self, coords: np.ndarray) -> list[int]:
+        """A hash of the slow parameters of each point, the same in every process."""
         slow = np.setdiff1d(np.arange(coords.shape[1]), np.asarray(self.fast, dtype=int))
-        rows = np.ascontiguousarray(coords[:, slow] if len(slow) > 0 else coords)
-        return [int.from_bytes(hashlib.blake2b(row, digest_size=8).digest(), "little") for row in rows]
+        bits = np.ascontiguousarray(coords[:, slow] if len(slow) > 0 else coords, dtype=float).view(np.uint64)
+        keys = np.zeros(len(bits), dtype=np.uint64)
+        for column in bits.T:
+            for value in (column, keys >> np.uint64(32)):
+                keys = (keys ^ value) * MULTIPLIER
+        return (keys ^ (keys >> np.uint64(29))).tolist()
 
     @property
     def simulations(self) -> float:
