@@ -99,7 +99,7 @@ def run(posterior: Any, seed: int, budget: float | None, *, guided: bool = True,
     budget : float or None
         Largest number of simulations.
     guided : bool
-        False: the default sampler, with 1 sweep more than the annealing.
+        False: the default sampler.
     **settings
         Other arguments of `SMCSampler`.
 
@@ -162,7 +162,7 @@ def compare(outcome: Outcome, reference: Any, labels: Callable[[np.ndarray], np.
     evidence_se = np.hypot(outcome.log_evidence_error, reference.log_evidence_error)
     mean = np.abs(outcome.mean - reference.mean)
     mean_se = np.hypot(outcome.mean_error, reference.mean_error)
-    n = max(outcome.effective_sample_size, 1.0)
+    n = min(max(outcome.effective_sample_size, 1.0), len(outcome.samples))
     sd = np.abs(outcome.sd / reference.sd - 1.0)
     share = share_z = 0.0
     if labels is not None:

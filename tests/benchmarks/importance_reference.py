@@ -217,10 +217,10 @@ def by_importance(
     for start in np.atleast_2d(starts):
         mean, covariance = _with_noise(posterior, *find_mode(posterior, start))
         components.append(_Component(1.0, mean, 1.2 * np.linalg.cholesky(covariance)))
-    proposals, points, values, before = [], np.empty((0, posterior.ndim)), np.empty(0), posterior.prior
+    proposals, points, values = [], np.empty((0, posterior.ndim)), np.empty(0)
     label = (lambda x: np.zeros(len(x), dtype=int)) if labels is None else labels
     for number in range(rounds):
-        proposal = _Proposal(components, before)
+        proposal = _Proposal(components, posterior.prior)
         proposals.append(proposal)
         new = proposal.draw(draws, rng)
         points, values = np.concatenate([points, new]), np.concatenate([values, posterior(new)])

@@ -13,9 +13,9 @@ from scipy.special import gammaln
 
 from fe_likelihoods.probability.noise import noise_statistic
 
-from .hard_posteriors import CASES, HardPosterior
+from .hard_posteriors import HardPosterior
 
-__all__ = ["Reference", "log_prob_function", "reference", "reference_of"]
+__all__ = ["Reference", "log_prob_function", "reference"]
 
 _POPULATION, _COMPONENTS, _NEIGHBOURS, _FREEDOM = 4000, 150, 60, 5.0
 _PRIOR_SHARE = 0.05
@@ -225,8 +225,3 @@ def _estimate(case: HardPosterior, x: np.ndarray, log_weights: np.ndarray, draws
         float(1.0 / np.square(w).sum()),
         len(w),
     )
-
-
-def reference_of(name: str, seed: int) -> Reference:
-    """Reference of the case with a name."""
-    return reference(CASES[name], seed)
