@@ -30,7 +30,7 @@ from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, draw_rounds, start_from_guide
 from .multilevel import draw_start
 from .mutation import MoveSchedule, Mutated, grow_chains, move_together
-from .population import Density, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
+from .population import Density, Doubt, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from .resampling import systematic
 from .settings import Settings
 from .stopping import StoppedEarly, stop_at, usable
@@ -212,10 +212,22 @@ def _from_guide(
     except BudgetExhausted:
         raise _stopped_rounds(found) from None
     try:
-        recycled = yield from _by_recycling(started, density, random, schedule, settings, start, size)
+        recycled = yield from _by_recycling(started, density, random, schedule, settings, start, size, found)
     except StoppedEarly as stop:
         raise _better(stop, found) from None
     return None if recycled.trusted else found
+
+
+def _disagreement(population: Population, found: RoundsOfGuide, log_evidence: float, error: float) -> Steps:
+    """A doubt if recycling and the rounds of the guide before it have different evidences: one has lost a part."""
+    value, joint = found.pooled.log_evidence, float(np.hypot(found.pooled.log_evidence_error, error))
+    if abs(value - log_evidence) > 3.0 * joint:
+        message = (
+            f"recycling gives the log-evidence {log_evidence:.2f} +- {error:.2f}, the draws of the guide before it "
+            f"give {value:.2f} +- {found.pooled.log_evidence_error:.2f}: one of them has lost a part of the posterior. "
+            "Use a better guide, or more walkers without one"
+        )
+        yield population, Doubt(message, True)
 
 
 def _better(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
@@ -307,8 +319,12 @@ def _by_recycling(
     settings: Settings,
     start: StartingDensity | None = None,
     size: int | None = None,
+    earlier: RoundsOfGuide | None = None,
 ) -> Generator[tuple[Population, Report], None, Recycled]:
-    """Adaptive importance sampling, resampled to `size` points (the number of points by default) and moved."""
+    """Adaptive importance sampling, resampled to `size` points (the number of points by default) and moved.
+
+    Its evidence is compared with that of `earlier` rounds of a guide, if there were any.
+    """
     size = len(population.coords) if size is None else size
     found = yield from recycle(population.coords, population.records, density, random, settings.recycling, start, size)
     if not found.trusted:
@@ -322,6 +338,8 @@ def _by_recycling(
     population = Population(1.0, found.coords[ancestors], found.records[ancestors], effective, (ancestors,))
     if settings.check_draws != 0:
         yield population, found.check
+    if earlier is not None:
+        yield from _disagreement(population, earlier, found.log_evidence, found.log_evidence_error)
     mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
     yield (
         mutated.population,

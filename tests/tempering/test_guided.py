@@ -265,3 +265,22 @@ def test_failed_draws_count_as_impossible_and_are_reported():
     assert sampler.get_chain()[..., 0].max() <= posterior.mean[0]
     assert abs(sampler.log_evidence - posterior.log_evidence - np.log(0.5)) < 4.0 * sampler.log_evidence_error
     assert f"{sampler.failure_count} of {sampler.evaluations} evaluations failed" in str(sampler.verdict)
+
+
+def test_evidences_that_disagree_are_reported(monkeypatch):
+    """Rounds of a guide whose density is wrong by a constant contradict the recycling that starts from them."""
+    posterior = Gaussian(2)
+    guide = laplace(posterior, scale=0.6, shift=1.0)
+    sampler = SMCSampler(N, 2, posterior, vectorize=True, seed=1, guide=guide, guided=GuidedSettings(most_rounds=3))
+    from samplers.tempering import anneal
+
+    def wrong_rounds(*args):
+        found = yield from draw_rounds(*args)
+        inflated = found.pooled._replace(log_evidence=found.pooled.log_evidence + 9.0, log_evidence_error=0.1)
+        return found._replace(pooled=inflated)
+
+    draw_rounds = anneal.draw_rounds
+    monkeypatch.setattr(anneal, "draw_rounds", wrong_rounds)
+    with pytest.warns(SamplingWarning, match="one of them has lost a part of the posterior"):
+        sampler.run_mcmc(None, 1)
+    assert sampler.verdict.status == "not usable"
