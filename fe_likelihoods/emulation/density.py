@@ -110,8 +110,8 @@ class EmulatedPosterior:
         for k, region in enumerate(self._regions):
             rows = np.flatnonzero((nearest == k) & (squared[k] <= region.emulator.reach))
             if len(rows):
-                statistics = region.emulator.statistics(structural[rows])
-                result[rows] = self._target.log_likelihood(statistics, noise[rows])
+                statistics, correction = region.emulator.statistics(structural[rows])
+                result[rows] = self._target.log_likelihood(statistics, noise[rows]) + correction
         return np.where(np.isnan(result), -np.inf, result) + self._target.log_prior(coords)
 
     @staticmethod

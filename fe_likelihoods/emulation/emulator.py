@@ -6,11 +6,17 @@ predicts from the whitened coordinates w (`fe_likelihoods.emulation.gaussian_pro
 of the parameters where its misfit, summed over thousands of samples, is a narrow and curved one; and the same emulator
 serves every noise.
 
-With means m_k and variances v_k of the coefficients, the expected statistics of the residuals are, in closed form,
+With means m_k and variances v_k of the coefficients, the statistics of the residuals at the mean response are, in
+closed form,
 
-    E S = S(y - R_0) - 2 sum_k m_k B(y - R_0, P_k) + sum_kl m_k m_l B(P_k, P_l) + sum_k v_k B(P_k, P_k),
+    S = S(y - R_0) - 2 sum_k m_k B(y - R_0, P_k) + sum_kl m_k m_l B(P_k, P_l),
 
-where B is the bilinear form of the statistics. Where the emulator is uncertain, the misfit therefore is larger.
+where B is the bilinear form of the statistics. The uncertainty of the emulator enters through the expected likelihood.
+The log-likelihood is nearly quadratic in each coefficient, with the curvature h_k = -2 sum_a f_a B_a(P_k, P_k) for the
+slopes f = d log L / dS at the mode. Averaged over the coefficients it decreases by sum_k log(1 + h_k v_k) / 2 at its
+maximum, and this is subtracted everywhere. (The likelihood of the expected misfit, E S = S + sum_k v_k B(P_k, P_k), is
+lower by sum_k h_k v_k / 2: far too small where the emulator is uncertain, and a density of draws must not be too small
+anywhere.)
 
 References
 ----------
@@ -87,12 +93,13 @@ class ResponseEmulator:
         mean: np.ndarray,
         components: np.ndarray,
         coefficients: np.ndarray,
+        slopes: np.ndarray,
     ) -> None:
         self._target, self.centre, self._whitening, self.process = target, centre, whitening, process
         self._mean, self._components = mean, components
         self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
         self.left_out = left_out_errors(process)
-        self._coefficients = coefficients
+        self._coefficients, self._slopes = coefficients, slopes
         self._forms = self._bilinear(target.measured)
 
     def _bilinear(self, measured: np.ndarray) -> _Forms:
@@ -137,29 +144,41 @@ class ResponseEmulator:
         """Squared distance (n,) of structural coordinates (n, d) from the centre, in whitened coordinates."""
         return np.square(self.whitened(coords)).sum(axis=1)
 
-    def statistics(self, coords: np.ndarray) -> np.ndarray:
-        """Expected statistics (n, n_numbers) of the residuals at structural coordinates (n, d)."""
+    def statistics(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Statistics of the residuals, and what the uncertainty of the emulator adds to the log-likelihood.
+
+        Parameters
+        ----------
+        coords : (n, d) float
+            Structural coordinates.
+
+        Returns
+        -------
+        statistics : (n, n_numbers) float
+            At the mean response.
+        correction : (n,) float
+            Not positive, see the module.
+        """
         parts = [self._statistics(coords[k : k + _ROWS]) for k in range(0, len(coords), _ROWS)]
-        return np.concatenate(parts) if parts else np.empty((0, len(self._forms.constant)))
+        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
-    def _statistics(self, coords: np.ndarray) -> np.ndarray:
-        return self._expected(*predict(self.process, self.whitened(coords)))
+    def _statistics(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        mean, variance = predict(self.process, self.whitened(coords))
+        curvature = np.maximum(-2.0 * np.diagonal(self._forms.quadratic @ self._slopes), 0.0)
+        return self._at(mean), -0.5 * np.log1p(curvature * variance).sum(axis=1)
 
-    def _expected(self, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    def _at(self, mean: np.ndarray) -> np.ndarray:
+        """Statistics (n, n_numbers) at coefficients (n, k)."""
         constant, linear, quadratic = self._forms
         columns = [
-            constant[a]
-            - 2.0 * mean @ linear[:, a]
-            + ((mean @ quadratic[:, :, a]) * mean).sum(axis=1)
-            + variance @ np.diag(quadratic[:, :, a])
+            constant[a] - 2.0 * mean @ linear[:, a] + ((mean @ quadratic[:, :, a]) * mean).sum(axis=1)
             for a in range(len(constant))
         ]
         return np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
 
     def left_out_statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """Statistics (m, n_numbers) of the training runs as predicted from the other runs, and of their own."""
-        nothing = np.zeros_like(self._coefficients)
-        return self._expected(self._coefficients - self.left_out, nothing), self._expected(self._coefficients, nothing)
+        return self._at(self._coefficients - self.left_out), self._at(self._coefficients)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Predicted response (n_channels, n_steps) [SI]; `SimulationFailed` away from the training points."""
@@ -185,6 +204,7 @@ def fit_emulator(
     centre: np.ndarray,
     covariance: np.ndarray,
     scales: np.ndarray,
+    slopes: np.ndarray,
     earlier: ResponseEmulator | None = None,
 ) -> ResponseEmulator:
     """Fit an emulator to simulated responses.
@@ -199,6 +219,8 @@ def fit_emulator(
         About the mean and covariance of the posterior, for whitening.
     scales : (n_channels,) float
         Standard deviations of the noise [SI]; components are in these units.
+    slopes : (n_numbers,) float
+        Derivatives of the log-likelihood by the statistics at the mode.
     earlier : ResponseEmulator, optional
         Earlier fit, whose length scales are the start of the search.
 
@@ -221,4 +243,4 @@ def fit_emulator(
     importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
     log_scales = None if earlier is None else earlier.process.log_scales
     process = fit_process(inputs, coefficients, importance, log_scales)
-    return ResponseEmulator(target, centre, whitening, process, mean, components, coefficients)
+    return ResponseEmulator(target, centre, whitening, process, mean, components, coefficients, slopes)

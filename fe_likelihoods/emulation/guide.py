@@ -88,6 +88,18 @@ class ResponseGuide:
         return f"{type(self).__name__}({self._posterior.fingerprint}, starts={self._starts})"
 
     @property
+    def basis(self) -> str:
+        """What a verdict without concerns rests on."""
+        if self.search is None or not self.search.modes:
+            return ""
+        n, modes = len(self.search.ends), len(self._modes)
+        missed = 1.0 - 0.05 ** (1.0 / n)
+        return (
+            f"{n} starts led to {modes} mode{'s' if modes > 1 else ''}; with 95 % probability, they would have found "
+            f"any mode to which more than {100.0 * missed:.0f} % of such starts lead"
+        )
+
+    @property
     def emulators(self) -> tuple[ResponseEmulator, ...]:
         return tuple(region.emulator for region in self._regions if region.emulator is not None)
 
@@ -116,6 +128,11 @@ class ResponseGuide:
             self._add_concern("no start of the search led to a mode: the simulations of all starts fail")
         elif not all(mode.converged for mode in self.search.modes):
             self._add_concern("the search for modes ended before the top of a mode")
+        elif any(self.search.ends.count(number) == 1 for number in range(len(self.search.modes))) and self._starts > 1:
+            self._add_concern(
+                f"only one of {self._starts} starts led to one of the modes, so there may be modes to which none led: use "
+                "more starts"
+            )
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Independent draws (n, ndim) of the parameters, inside the support of the prior."""
@@ -260,7 +277,7 @@ class ResponseGuide:
             residuals = self._target.measured - archive.responses[best]
             scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max()
             training = TrainingSet(coords[rows], np.array([archive.responses[row] for row in rows]))
-            emulator = fit_emulator(
-                self._target, training, region.centre[:d], region.covariance[:d, :d], scales, region.emulator
-            )
+            slopes = self._target.slopes(statistics[best], self._target.fit_noise(statistics[best], noise).coords)
+            centre, covariance = region.centre[:d], region.covariance[:d, :d]
+            emulator = fit_emulator(self._target, training, centre, covariance, scales, slopes, region.emulator)
             self._regions[k] = region._replace(emulator=emulator)
