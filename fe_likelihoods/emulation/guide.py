@@ -30,6 +30,7 @@ _WIDE_SHARE_ALONE = 0.9  # before there is an emulator
 _WIDE_FREEDOM = 5.0
 _WIDENED = 1.5  # variances of the wide components, as multiples of those of their regions
 _SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
+_FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
 _FEWEST_RUNS = 2.0, 6.0  # training runs that an emulator needs: per dimension, and in addition
 _MOST_RUNS = 300
 _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
@@ -68,6 +69,11 @@ class ResponseGuide:
     def __init__(self, posterior: Any, starts: int = 8) -> None:
         if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
             raise ValueError(f"starts must be a whole number of at least one; got {starts!r}")
+        if posterior.likelihood.memory_cache.rows < _FEWEST_CACHED:
+            raise ValueError(
+                f"a guide needs a likelihood with memory_rows of {_FEWEST_CACHED} or more, so that no simulation is "
+                f"run twice; got {posterior.likelihood.memory_cache.rows}"
+            )
         self._target = ResponseTarget(posterior)
         self._posterior, self._starts = posterior, int(starts)
         self.search: ModeSearch | None = None
@@ -130,8 +136,8 @@ class ResponseGuide:
             self._add_concern("the search for modes ended before the top of a mode")
         elif any(self.search.ends.count(number) == 1 for number in range(len(self.search.modes))) and self._starts > 1:
             self._add_concern(
-                f"only one of {self._starts} starts led to one of the modes, so there may be modes to which none led: use "
-                "more starts"
+                f"only one of {self._starts} starts led to one of the modes, so there may be modes to which none led: "
+                "use more starts"
             )
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:

@@ -1,0 +1,94 @@
+"""The guide behind the samplers: right on small posteriors, exact counts, budgets, refusals."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import FELikelihood, Posterior, ResponseGuide
+from samplers import SMCSampler, TMCMCSampler
+
+from .problems import free_vibration, vibration
+
+
+def quadrature(posterior):
+    """Log-evidence and means of a posterior of two parameters on grids that are narrowed to it."""
+    centre, spread = np.array([1.2, 0.8]), np.array([0.05, 0.2])
+    for _ in range(6):
+        axes = [np.linspace(centre[k] - 7.0 * spread[k], centre[k] + 7.0 * spread[k], 181) for k in range(2)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        log_density = posterior.log_prob(grid)
+        top = log_density.max()
+        density = np.exp(log_density - top)
+        centre = density @ grid / density.sum()
+        spread = np.maximum(np.sqrt(density @ (grid - centre) ** 2 / density.sum()), 0.05 * spread)
+    cell = (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0])
+    return top + np.log(density.sum() * cell), centre
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_evidence_and_means_against_quadrature(Sampler):
+    posterior = vibration()
+    log_evidence, means = quadrature(vibration())
+    sampler = Sampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=600)
+    sampler.run_mcmc(None, 1)
+    assert sampler.verdict.status == "converged"
+    assert abs(sampler.log_evidence - log_evidence) < 3.0 * sampler.log_evidence_error < 0.3
+    assert (np.abs(sampler.get_chain(flat=True).mean(axis=0) - means) < 4.0 * sampler.mean_error()).all()
+    assert posterior.report()["simulations"] == sampler.verdict.simulations <= 600
+
+
+@pytest.mark.parametrize("noise", ["shared", "autoregressive", "effective"])
+def test_every_noise_is_sampled_together_with_its_parameters(noise):
+    posterior = vibration(noise)
+    sampler = SMCSampler(
+        100, posterior.ndim, posterior, vectorize=True, seed=2, guide=posterior.guide(3), max_simulations=500
+    )
+    sampler.run_mcmc(None, 1)
+    assert sampler.verdict.status == "converged"
+    reference = SMCSampler(500, posterior.ndim, vibration(noise), vectorize=True, seed=3)
+    reference.run_mcmc(None, 2)
+    joint = np.hypot(sampler.log_evidence_error, reference.log_evidence_error)
+    assert abs(sampler.log_evidence - reference.log_evidence) < 4.0 * joint
+    expected = reference.get_chain(flat=True)
+    difference = np.abs(sampler.get_chain(flat=True).mean(axis=0) - expected.mean(axis=0))
+    assert (difference < 0.5 * expected.std(axis=0)).all()
+
+
+def test_densities_are_normalised_and_draws_are_inside_the_support():
+    """The mean over draws of any normalised density divided by that of the guide is one."""
+    posterior = vibration()
+    sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide())
+    sampler.run_mcmc(None, 0)
+    guide = sampler.guide
+    coords = guide.draw(4000, np.random.RandomState(5))
+    assert np.isfinite(posterior.log_prior(coords)).all()
+    centre, spread = coords.mean(axis=0), coords.std(axis=0)
+    log_normal = -0.5 * np.square((coords - centre) / spread).sum(axis=1) - np.log(2.0 * np.pi * spread.prod())
+    ratio = np.exp(log_normal - guide.log_density(coords))
+    assert ratio.mean() == pytest.approx(1.0, abs=4.0 * ratio.std() / np.sqrt(4000))
+
+
+def test_a_model_whose_prior_median_fails():
+    def fails(theta):
+        if abs(theta[0] - 1.0) < 0.05:
+            raise RuntimeError("diverged")
+        return free_vibration(theta)
+
+    posterior = vibration(function=fails)
+    sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=600)
+    sampler.run_mcmc(None, 1)
+    assert sampler.verdict.status == "converged"
+    assert sampler.get_chain(flat=True).mean(axis=0) == pytest.approx([1.2, 0.8], abs=0.05)
+
+
+def test_impossible_guides_are_refused_before_any_simulation():
+    posterior = vibration()
+    with pytest.raises(ValueError, match="starts must be a whole number"):
+        posterior.guide(0)
+    with pytest.raises(ValueError, match="vectorize=True"):
+        SMCSampler(100, 2, posterior, guide=posterior.guide())
+    likelihood = posterior.likelihood
+    forgetful = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, memory_rows=0)
+    with pytest.raises(ValueError, match="memory_rows"):
+        Posterior(forgetful, posterior.prior).guide()
+    assert posterior.report()["simulations"] == 0
+    assert isinstance(posterior.guide(), ResponseGuide)
