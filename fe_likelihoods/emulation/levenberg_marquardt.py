@@ -25,7 +25,7 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
-__all__ = ["TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "squared_distance"]
+__all__ = ["HOPELESS", "TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "squared_distance"]
 
 _DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 _FIRST_DAMPING = 1e-2
@@ -37,6 +37,8 @@ _DIFFERENCE_LIMITS = 3e-4, 2e-2
 _RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
+_PATIENCE = 8  # iterations after which an ascent that is far below a known end is given up
+HOPELESS = 200.0  # log-density below the best end at which another one is given up
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
 
 
@@ -114,7 +116,7 @@ def ascend(
     Returns
     -------
     Ascent or None
-        None if the simulation of the start fails.
+        None if the simulation of the start fails, or if the ascent is slow and far below a known end.
     """
     d = target.n_structural
     runs = yield start[None]
@@ -141,6 +143,9 @@ def ascend(
             )
             if gain_left < tolerance or merged >= 0:
                 break
+            behind = max((end.log_density for end in known), default=-np.inf) - value
+            if iteration >= _PATIENCE and behind > HOPELESS:
+                return None
         dampings = damping * _DAMPINGS
         steps = np.array([np.linalg.solve(hessian + each * scale, gradient) for each in dampings])
         steps *= np.minimum(1.0, _LARGEST_STEP / np.abs(steps).max(axis=1, keepdims=True))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .levenberg_marquardt import TOLERANCE, Ascent, Batches, ascend, distinct_ends
+from .levenberg_marquardt import HOPELESS, TOLERANCE, Ascent, Batches, ascend, distinct_ends
 from .quadratic import bilinear_form
 from .target import Remember, ResponseTarget, run_at_once
 
@@ -20,7 +20,6 @@ __all__ = ["Mode", "ModeSearch", "draw_starts", "find_modes", "laplace", "search
 
 _FIRST_WAVE = 3  # starts whose ascents are made first
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
-_HOPELESS = 200.0  # an end of a short part whose log-density is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
 _ROUNDS_OF_STEPS = 4
@@ -176,7 +175,7 @@ def search_modes(
         interrupted = batches.interrupted
         if not ends or interrupted:
             break
-        kept = [end for end in distinct_ends(ends) if end.log_density > max(e.log_density for e in ends) - _HOPELESS]
+        kept = [end for end in distinct_ends(ends) if end.log_density > max(e.log_density for e in ends) - HOPELESS]
         fronts = [(end.coords, end.coords, end.starts) for end in kept]
     modes: list[Mode] = []
     if part is target and ends:
