@@ -480,6 +480,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             logger.warning("%d of %d evaluations of the coarse model failed and count as impossible (%s)", *failed)
         self._result = self._result._replace(
             concerns=() if guidance is None else guidance.guide.concerns,
+            basis="" if guidance is None else guidance.guide.basis,
             independent_points=independent_points(self._result, population.coords),
         )
         if self._result.start is not None and self._result.start.used:

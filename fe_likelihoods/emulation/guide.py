@@ -143,7 +143,9 @@ class ResponseGuide:
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Independent draws (n, ndim) of the parameters, inside the support of the prior."""
         wide, prior = self._shares()
-        parts = random.multinomial(n, [1.0 - wide - prior, wide, prior])
+        # as many draws of each part as its share says, rounded at random: fewer chance differences than by lot
+        ends = np.floor(n * np.cumsum([0.0, 1.0 - wide - prior, wide, prior]) + random.random_sample()).astype(int)
+        parts = np.diff(np.minimum(ends, n + ends[0]))
         coords = [random.standard_normal((parts[2], self._target.ndim))]
         if parts[1]:
             coords.append(draw_mixture(self._wide, parts[1], random))
@@ -281,7 +283,7 @@ class ResponseGuide:
                 continue
             best = rows[0]
             residuals = self._target.measured - archive.responses[best]
-            scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max()
+            scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max(axis=1)
             training = TrainingSet(coords[rows], np.array([archive.responses[row] for row in rows]))
             slopes = self._target.slopes(statistics[best], self._target.fit_noise(statistics[best], noise).coords)
             centre, covariance = region.centre[:d], region.covariance[:d, :d]

@@ -27,10 +27,16 @@ _HALF_LOG_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
 _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise parameters are first searched
 _GRID = np.linspace(-1.0, 1.0, 41)
 _SLOPE_STEP = 1e-4
+_AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
 _NEWTON_STEPS = 12
 _NEWTON_GAIN = 1e-4
 _NEWTON_DIFFERENCE = 1e-3
 _DAMPED = 0.0, 1.0, 10.0, 100.0
+
+
+def _finite(coords: np.ndarray) -> np.ndarray:
+    """Coordinates of parameters that were rounded to a bound of their prior are finite: `_AT_BOUND`."""
+    return np.where(np.isinf(coords), np.copysign(_AT_BOUND, coords), coords)
 
 
 class _Likelihood(Protocol):
@@ -197,7 +203,7 @@ class ResponseTarget:
 
     def coordinates(self, parameters: np.ndarray) -> np.ndarray:
         """Coordinates (n, ndim) of parameters (n, ndim)."""
-        return self._prior.to_normal(parameters)
+        return _finite(self._prior.to_normal(parameters))
 
     def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
@@ -209,7 +215,7 @@ class ResponseTarget:
         """Coordinates (n, n_structural) of structural parameters (n, n_structural)."""
         full = np.repeat(self._median[None], len(thetas), axis=0)
         full[:, : self.n_structural] = thetas
-        return self._prior.to_normal(full)[:, : self.n_structural]
+        return _finite(self._prior.to_normal(full)[:, : self.n_structural])
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""
@@ -313,7 +319,8 @@ class ResponseTarget:
     def slopes(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Derivatives (n_numbers,) of the log-likelihood by the statistics, at fixed noise parameters."""
         width = len(statistics)
-        steps = _SLOPE_STEP * np.maximum(np.abs(statistics), 1e-9 * np.abs(statistics).max())
+        sizes = np.abs(statistics)  # each by itself: channels in different units differ by any factor
+        steps = _SLOPE_STEP * np.where(sizes > 0.0, sizes, 1e-9 * sizes.max())
         shifted = np.concatenate([statistics + np.diag(steps), statistics - np.diag(steps)])
         values = self.log_likelihood(shifted, np.broadcast_to(coords, (2 * width, self.n_noise)))
         return (values[:width] - values[width:]) / (2.0 * steps)

@@ -10,6 +10,7 @@ import hashlib
 import json
 import re
 import sys
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -273,8 +274,8 @@ class Posterior:
         Parameters
         ----------
         starts : int
-            Starts of the search for modes: the median of the prior, and draws of it. A mode to which no start leads can
-            be missed.
+            Starts of the search for modes: the median of the prior, and a Latin hypercube of its quantiles. A mode to
+            which no start leads can be missed.
 
         Returns
         -------
@@ -283,9 +284,21 @@ class Posterior:
         Raises
         ------
         ValueError
-            If `starts` is not a whole number of at least one, or the noise uses statistics that are not quadratic in
-            the residuals.
+            If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory, or
+            the noise uses statistics that are not quadratic in the residuals.
+
+        Notes
+        -----
+        The guide needs responses. A cache on disk saves their simulation only if it stores them:
+        ``SimulationCache(path, responses=True)``.
         """
+        cache = self.likelihood.cache
+        if cache is not None and not cache.responses:
+            warnings.warn(
+                "the cache on disk stores no responses, which a guide needs: points that it knows are simulated again. "
+                "Pass cache=SimulationCache(path, responses=True) to the likelihood",
+                stacklevel=2,
+            )
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
         return ResponseGuide(self, starts)

@@ -63,6 +63,8 @@ class Guide(Protocol):
         Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any, the
         verdict is not better than usable. Without this attribute, that the search is unknown counts as a reason: set
         it to () if the posterior is known to have no parts that the guide misses.
+    ``basis`` : str
+        What the search for parts of the posterior was, as a clause; it is part of the verdict.
     ``fingerprint`` : str
         Identity of the guide: a run is resumed only with an equal one.
     """
@@ -118,6 +120,11 @@ class AdaptedGuide:
     def concerns(self) -> tuple[str, ...]:
         """Why parts of the posterior may be missing; a guide that does not say is itself a reason."""
         return tuple(self._optional("concerns", (UNKNOWN,)))
+
+    @property
+    def basis(self) -> str:
+        """What the search for parts of the posterior was; empty if the guide does not say."""
+        return str(self._optional("basis", ""))
 
     @property
     def observe(self) -> Callable[[np.ndarray, GuideSession], None] | None:

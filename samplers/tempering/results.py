@@ -30,6 +30,8 @@ class AnnealingResult(NamedTuple):
         Where the limit of simulations ended the annealing; None if it did not.
     concerns : tuple of str
         Reasons of the guide why parts of the posterior may be missing.
+    basis : str
+        What the guide's search for parts of the posterior was; empty if it does not say.
     doubts : tuple of Doubt
         What the diagnostics found.
     independent_points : float, optional
@@ -43,6 +45,7 @@ class AnnealingResult(NamedTuple):
     start: GuidedStart | None = None
     halt: Halt | None = None
     concerns: tuple[str, ...] = ()
+    basis: str = ""
     doubts: tuple[Doubt, ...] = ()
     independent_points: float | None = None
 

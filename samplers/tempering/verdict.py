@@ -119,7 +119,7 @@ def judge(
     if result.start is not None or (halt is not None and halt.from_guide):
         found += [Doubt(f"concern of the guide: {concern}", False) for concern in result.concerns]
         if not result.concerns:
-            reasons.append("parts of the posterior in which the guide makes no draws are not seen")
+            reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")
     if stage.log_evidence_error > LARGEST_ERROR and not result.has_better_check:
         found.append(
             Doubt(f"the standard error of the log-evidence is {stage.log_evidence_error:.2g}", halt is not None)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import FELikelihood, Posterior, ResponseGuide
+from fe_likelihoods import FELikelihood, Posterior, ResponseGuide, SimulationCache
 from samplers import SMCSampler, TMCMCSampler
 
 from .problems import free_vibration, vibration
@@ -92,3 +92,18 @@ def test_impossible_guides_are_refused_before_any_simulation():
         Posterior(forgetful, posterior.prior).guide()
     assert posterior.report()["simulations"] == 0
     assert isinstance(posterior.guide(), ResponseGuide)
+
+
+def test_a_cache_without_responses_is_warned_of(tmp_path):
+    likelihood = vibration().likelihood
+    parts = likelihood.model, likelihood.measurements, likelihood.noise
+    prior = vibration().prior
+    with pytest.warns(UserWarning, match="responses=True"):
+        Posterior(FELikelihood(*parts, cache=tmp_path / "a.sqlite"), prior).guide()
+    counts = []
+    for _ in range(2):  # the second run finds every response of the first
+        posterior = Posterior(FELikelihood(*parts, cache=SimulationCache(tmp_path / "b.sqlite", responses=True)), prior)
+        sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide(2))
+        sampler.run_mcmc(None, 1)
+        counts.append(posterior.report()["simulations"])
+    assert counts[0] > 100 and counts[1] == 0

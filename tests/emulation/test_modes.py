@@ -102,3 +102,19 @@ def test_starts_must_be_a_whole_number():
     for starts in (0, 2.5, True):
         with pytest.raises(ValueError, match="starts must be a whole number"):
             find_modes(vibration(), starts=starts)
+
+
+def test_channels_of_very_different_sizes():
+    """A displacement in metres with a small noise, and a force in newtons."""
+    channels = (Channel("top", "displacement", "mm"), Channel("base", "force", "kN"))
+    time = np.linspace(0.0, 1.0, 100)
+    model = FunctionModel(
+        lambda theta: [1e-5 * theta[0] * np.sin(9.0 * time), 1e7 * theta[0] * theta[1] * np.cos(7.0 * time)],
+        ["a", "b"], channels, 0.01, 100,
+    )  # fmt: skip
+    noise = np.array([[5e-8], [5e4]]) * np.random.default_rng(1).standard_normal((2, 100))
+    measured = Measurements(channels, 0.01, model.simulate(np.array([1.2, 0.9])) + noise)
+    prior = {"a": Uniform(0.5, 2.0), "b": Uniform(0.5, 2.0), "sigma_top": Uniform(1e-9, 1e-6)}
+    prior["sigma_base"] = Uniform(1e3, 1e6)
+    mode = find_modes(Posterior(FELikelihood(model, measured), prior), starts=2, seed=1).modes[0]
+    assert mode.converged and mode.parameters[:2] == pytest.approx([1.2, 0.9], rel=0.01)
