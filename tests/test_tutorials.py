@@ -266,6 +266,27 @@ def test_bridge_column_on_another_record(shared, tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text())["rrmse"]["Before updating (reported values)"]
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_main_job_has_the_evidence_and_the_posterior_of_the_annealing(tmp_path):
+    """`make update` uses a guide and a twentieth of the simulations."""
+    runs = {}
+    for name, options in {"guide": (), "annealing": ("--no-guide", "--walkers", "500")}.items():
+        out = tmp_path / name
+        output = run_tutorial("02_bridge_column.py", "--preset", "reduced", "--out", str(out), *options)
+        runs[name] = json.loads((out / "summary.json").read_text())
+        assert runs[name]["verdict"].capitalize() in output and runs[name]["verdict"] != "not usable"
+    guide, annealing = runs["guide"], runs["annealing"]
+    assert guide["verdict"] == "converged"
+    assert guide["simulations"] < 1000 < 10_000 < annealing["simulations"]
+    error = np.hypot(guide["log_evidence_error"], annealing["log_evidence_error"])
+    assert abs(guide["log_evidence"] - annealing["log_evidence"]) < 4.0 * error < 1.0
+    for name, mean in annealing["posterior_mean"].items():
+        sd = annealing["posterior_sd"][name]
+        assert guide["posterior_mean"][name] == pytest.approx(mean, abs=0.5 * sd), name
+        assert guide["posterior_sd"][name] == pytest.approx(sd, rel=0.4), name
+
+
 # 03
 
 

@@ -12,7 +12,8 @@ posterior means of the paper, plus white noise with the noise levels of the pape
 synthetic motion or any record that you name::
 
     python tutorials/02_bridge_column.py                                       # all data, the default sampler
-    python tutorials/02_bridge_column.py --preset reduced                      # a quarter of the samples; minutes
+    python tutorials/02_bridge_column.py --preset reduced                      # few samples and simulations; a minute
+    python tutorials/02_bridge_column.py --preset reduced --no-guide --walkers 500     # the same by annealing
     python tutorials/02_bridge_column.py --preset ramancha2022                 # the algorithm of the paper; hours
     python tutorials/02_bridge_column.py --record motion.AT2 --scale 0.85      # another base motion (AT2, V2, CSV)
     python tutorials/02_bridge_column.py --preset reduced --classes            # compare model classes by evidence
@@ -60,13 +61,13 @@ from samplers import (
     to_arviz,
 )
 
-# walkers, one sample kept in `every`, sweeps at beta = 1, settings of the sampler
+# walkers, one sample kept in `every`, sweeps at beta = 1, with a guide, settings of the sampler
 PRESETS = {
-    "default": (500, 1, 10, {}),
-    "reduced": (500, 4, 4, {}),
-    "fast": (40, 16, 4, {"max_moves": 3}),
-    "ramancha2022": (1000, 1, 1, RAMANCHA_2022_LITERAL),
-    "ramancha2022-constant": (1000, 1, 1, RAMANCHA_2022_CONSTANT),
+    "default": (500, 1, 10, False, {}),
+    "reduced": (100, 4, 4, True, {}),
+    "fast": (40, 16, 4, False, {"max_moves": 3}),
+    "ramancha2022": (1000, 1, 1, False, RAMANCHA_2022_LITERAL),
+    "ramancha2022-constant": (1000, 1, 1, False, RAMANCHA_2022_CONSTANT),
 }
 
 parser = argparse.ArgumentParser(description="Update the bridge column with SMC; write tables and figures to a folder.")
@@ -76,14 +77,16 @@ parser.add_argument("--scale", type=float, default=1.0, help="factor by which th
 parser.add_argument("--preset", choices=PRESETS, default="fast" if os.environ.get("FAST") else "default")
 parser.add_argument("--walkers", type=int, help="number of particles (default: from the preset)")
 parser.add_argument("--every", type=int, help="keep one sample in EVERY (default: from the preset)")
+parser.add_argument("--guide", action=argparse.BooleanOptionalAction, help="few simulations (default: from the preset)")
 parser.add_argument("--seed", type=int, default=1, help="seed of the sampler and of the synthetic noise")
 parser.add_argument("--classes", action="store_true", help="also compare model classes by their evidence")
 parser.add_argument("--resume", action="store_true", help="continue an interrupted run in OUT, with the same options")
 parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the results")
 args = parser.parse_args()
 
-walkers, every, sweeps, settings = PRESETS[args.preset]
+walkers, every, sweeps, guided, settings = PRESETS[args.preset]
 walkers, every = args.walkers or walkers, args.every or every
+guided = guided if args.guide is None else args.guide
 args.out.mkdir(parents=True, exist_ok=True)
 
 
@@ -155,19 +158,26 @@ figure.savefig(args.out / "fig3_data.png", dpi=150)
 # SMC anneals from the prior (beta = 0) to the posterior (beta = 1); the chain contains the draws at beta = 1. Chain and
 # tempering stages are stored in ``chain.h5`` during the run, and every evaluation is stored in a journal next to it. An
 # interrupted run can be continued with ``--resume``, and gives the same result as an uninterrupted one.
+#
+# With a guide there is no annealing, and hundreds of simulations are enough instead of more than ten thousand. The
+# guide finds the posterior by Gauss-Newton steps on the responses, fits emulators of the responses there, and proposes
+# draws. Every draw is simulated by the model itself and weighted, so the result is that of the model. The verdict says
+# what the result is worth.
 
 backend = emcee.backends.HDFBackend(args.out / "chain.h5")
 if not args.resume:
     backend.reset(walkers, posterior.ndim)
 start = time.perf_counter()
+guide = posterior.guide() if guided else None
 sampler = SMCSampler(
-    walkers, posterior.ndim, posterior, vectorize=True, backend=backend, seed=args.seed, **dict(settings)
+    walkers, posterior.ndim, posterior, vectorize=True, backend=backend, seed=args.seed, guide=guide, **dict(settings)
 )
 sampler.run_mcmc(None, sweeps, progress=True)
 seconds = time.perf_counter() - start
 samples = sampler.get_chain(flat=True)
 report = posterior.report()
 print(ladder_table(sampler))
+print(sampler.verdict)
 (args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
 ladder_plot(sampler).savefig(args.out / "ladder.png", dpi=150)
 
@@ -318,8 +328,9 @@ if args.classes:
     runs, posteriors = {"as updated": sampler}, {"as updated": posterior}
     for name, change in variants.items():
         posteriors[name] = problems.bridge_column(record=record, measurements=measurements, every=every, **change)
+        guide = posteriors[name].guide() if guided else None
         runs[name] = SMCSampler(
-            walkers, posterior.ndim, posteriors[name], vectorize=True, seed=args.seed, **dict(settings)
+            walkers, posterior.ndim, posteriors[name], vectorize=True, seed=args.seed, guide=guide, **dict(settings)
         )
         runs[name].run_mcmc(None, 1, progress=True)
     comparison = compare_models(runs)
@@ -355,7 +366,9 @@ result = {
     "posterior_sd": dict(zip(posterior.parameter_names, samples.std(axis=0, ddof=1).tolist(), strict=True)),
     "truth": dict(zip(posterior.parameter_names, truth.tolist(), strict=True)),
     "rrmse": {k: dict(zip([c.name for c in measured.channels], v.tolist(), strict=True)) for k, v in errors.items()},
-    "simulations": report["simulations"],
+    "verdict": sampler.verdict.status,
+    "reasons": sampler.verdict.reasons,
+    "simulations": sampler.simulations,
     "failures": report["failure_count"],
     "failure_reasons": report["failure_reasons"],
     "seconds": seconds,
@@ -364,6 +377,7 @@ result = {
 (args.out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
 print(
     f"log evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}; {len(sampler.ladder)} stages, "
-    f"{report['simulations']} simulations ({report['failure_count']} failed) in {seconds:.0f} s\n"
+    f"{sampler.simulations:.0f} simulations ({report['failure_count']} failed) in {seconds:.0f} s, "
+    f"{sampler.verdict.status}\n"
     f"tables and figures are in {args.out}/"
 )
