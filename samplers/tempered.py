@@ -156,7 +156,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self.coarse_log_prob_fn = coarse_log_prob_fn
         self._given_guide, self._guide = guide, None
         if guide is not None:
-            check_guide(guide, vectorize)
+            check_guide(guide, log_prob_fn, vectorize)
 
         self._budget = Budget(limit=as_limit(max_simulations))
         self._checkpoint = Checkpoint(backend, limited=max_simulations is not None)

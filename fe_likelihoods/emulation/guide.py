@@ -12,7 +12,7 @@ that is far more probable than expected, away from the known modes, starts anoth
 The equations are on the page ``docs/theory/guided.rst``.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,14 @@ class ResponseGuide:
         self._modes: list[Mode] = []
         self._emulated: EmulatedPosterior | None = None
         self._wide: StudentMixture | None = None
+
+    def check(self, log_prob_fn: Callable) -> None:
+        """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""
+        if getattr(log_prob_fn, "__self__", log_prob_fn) is not self._posterior:
+            raise ValueError(
+                "the guide belongs to another posterior object than the one that is sampled, so every draw would be "
+                f"simulated twice: pass the same posterior to the sampler, and its guide(); got {log_prob_fn!r}"
+            )
 
     def fresh(self) -> "ResponseGuide":
         """A guide of the same posterior that has not searched yet."""

@@ -52,6 +52,8 @@ class Guide(Protocol):
     ``observe(coords, session)``
         Called with points (n, ndim) directly before they are evaluated, so that a guide can simulate and keep what
         `log_prob_fn` does not return. Requires ``vectorize=True``.
+    ``check(log_prob_fn)``
+        Raises ValueError if the guide is of another density than the sampler.
     ``fresh()``
         A new guide in the state before `prepare`. A sampler works on it and never changes the guide that it was given;
         without this method, it works on a deep copy.
@@ -161,8 +163,8 @@ class AdaptedGuide:
         yield from self.guide.refine(coords, log_prob, session) or ()
 
 
-def check_guide(guide: Any, vectorize: bool) -> None:
-    """Raise ValueError if an object lacks a method that every guide needs, or cannot observe without `vectorize`."""
+def check_guide(guide: Any, log_prob_fn: Callable, vectorize: bool) -> None:
+    """Raise ValueError if an object lacks a method that every guide needs, cannot observe, or is of another density."""
     missing = [name for name in ("draw", "log_density", "refine") if not callable(getattr(guide, name, None))]
     if missing:
         raise ValueError(
@@ -174,6 +176,9 @@ def check_guide(guide: Any, vectorize: bool) -> None:
             "this guide simulates the points before they are evaluated (it has a method observe), so they must be "
             "evaluated in this process: pass vectorize=True, and a pool to the posterior instead of to the sampler"
         )
+    check = getattr(guide, "check", None)
+    if check is not None:
+        check(log_prob_fn)
 
 
 def guide_fingerprint(guide: Guide) -> str:

@@ -162,7 +162,8 @@ def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> Pool
     r"""Combine rounds.
 
     The variance of the log-evidence is the sum of three parts: the variance of the mean weights of the rounds,
-    :math:`\sum_r \alpha_r^2 s_r^2 / (n_r \hat Z^2)` with the sample variance :math:`s_r^2` of the weights;
+    :math:`\sum_r \alpha_r^2 s_r^2 / (n_r \hat Z^2)` with the sample variance :math:`s_r^2` of the weights, or the
+    variance between the rounds, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, where that is larger;
     `tail_variance`; and the squared error of the normalising constant of the proposal density.
 
     Parameters
@@ -185,10 +186,11 @@ def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> Pool
     coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
     if log_evidence == -np.inf:
         return PooledRounds(coords, records, log_weights, log_evidence, float("inf"), 0.0, shape)
-    variance = log_density_error**2
-    for part, n in zip(parts, sizes, strict=True):
+    within, between = 0.0, 0.0
+    for part, n, share in zip(parts, sizes, shares, strict=True):
         weights = np.exp(part - log_evidence)
-        variance += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
-    variance += tail_variance(log_weights)
+        within += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
+        between += float(weights.sum() - share) ** 2  # a round that missed the posterior has small weights only
+    variance = max(within, between) + tail_variance(log_weights) + log_density_error**2
     effective = effective_sample_size(log_weights)
     return PooledRounds(coords, records, log_weights, log_evidence, float(np.sqrt(variance)), effective, shape)

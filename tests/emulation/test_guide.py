@@ -86,6 +86,8 @@ def test_impossible_guides_are_refused_before_any_simulation():
         posterior.guide(0)
     with pytest.raises(ValueError, match="vectorize=True"):
         SMCSampler(100, 2, posterior, guide=posterior.guide())
+    with pytest.raises(ValueError, match="another posterior object"):
+        SMCSampler(100, 2, vibration(), vectorize=True, guide=posterior.guide())
     likelihood = posterior.likelihood
     forgetful = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, memory_rows=0)
     with pytest.raises(ValueError, match="memory_rows"):

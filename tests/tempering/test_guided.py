@@ -284,3 +284,14 @@ def test_evidences_that_disagree_are_reported(monkeypatch):
     with pytest.warns(SamplingWarning, match="one of them has lost a part of the posterior"):
         sampler.run_mcmc(None, 1)
     assert sampler.verdict.status == "not usable"
+
+
+def test_a_round_that_missed_the_posterior_enters_the_error():
+    """Its weights are all small, so their spread is small too; the difference between the rounds is not."""
+    random = np.random.default_rng(1)
+    rounds = [
+        Round(np.zeros((60, 1)), np.zeros(60), log_z + 0.1 * random.standard_normal(60)) for log_z in (0.0, 0.0, -15.0)
+    ]
+    pooled = pool_rounds(rounds)
+    assert pooled.log_evidence < -0.2
+    assert pooled.log_evidence_error > abs(pooled.log_evidence)
