@@ -15,6 +15,7 @@ stochastic table motion, plus white noise of 5 % of the root mean square of each
 
     python tutorials/03_isolated_bridge.py                       # TMCMC, 1000 samples per stage
     python tutorials/03_isolated_bridge.py --sampler smc         # the same posterior by SMC
+    python tutorials/03_isolated_bridge.py --sampler guide --walkers 100      # by SMC with a guide: few simulations
     python tutorials/03_isolated_bridge.py --preset published    # TMCMC as published, and its warnings
     python tutorials/03_isolated_bridge.py --data means          # data that do not distinguish the piers: two modes
 
@@ -74,7 +75,7 @@ parser = argparse.ArgumentParser(
     description="Update the isolated bridge with TMCMC; write tables and figures to a folder."
 )
 parser.add_argument("--preset", choices=PRESETS, default="fast" if os.environ.get("FAST") else "default")
-parser.add_argument("--sampler", choices=("tmcmc", "smc"), default="tmcmc")
+parser.add_argument("--sampler", choices=("tmcmc", "smc", "guide"), default="tmcmc")
 parser.add_argument(
     "--data", choices=("twin", "means"), default="twin", help="posterior with one mode (twin) or two (means)"
 )
@@ -115,17 +116,27 @@ if args.preset == "fast":
 # Sampling
 # --------
 #
-# Read the warnings of the sampler: they say when the draws are not reliable.
+# Read the warnings of the sampler: they say when the draws are not reliable. The verdict says what the result is worth.
+# With ``--sampler guide --walkers 100`` the run needs hundreds of simulations instead of more than ten thousand: the
+# guide finds the posterior from the responses, and its draws are simulated and weighted.
 
 backend = emcee.backends.HDFBackend(args.out / "chain.h5")
 if not args.resume:
     backend.reset(walkers, posterior.ndim)
-Sampler = {"tmcmc": TMCMCSampler, "smc": SMCSampler}[args.sampler]
+Sampler = TMCMCSampler if args.sampler == "tmcmc" else SMCSampler
+guide = posterior.guide() if args.sampler == "guide" else None
 start = time.perf_counter()
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always", SamplingWarning)
     sampler = Sampler(
-        walkers, posterior.ndim, posterior, vectorize=True, backend=backend, seed=args.seed, **dict(settings)
+        walkers,
+        posterior.ndim,
+        posterior,
+        vectorize=True,
+        backend=backend,
+        seed=args.seed,
+        guide=guide,
+        **dict(settings),
     )
     sampler.run_mcmc(None, sweeps, progress=True)
 messages = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
@@ -134,6 +145,7 @@ report = posterior.report()
 samples = sampler.get_chain(flat=True)
 for message in messages:
     print(f"WARNING: {message}")
+print(sampler.verdict)
 
 moments = summary(samples, names)
 lines = [f"{'parameter':<10} {'truth':>7} {'mean':>8} {'sd':>8} {'cv':>7} {'(mean-truth)/sd':>16}"]
@@ -344,8 +356,9 @@ result = {
     "rrmse": dict(zip([c.name for c in measured.channels], errors.tolist(), strict=True)),
     "coverage": dict(zip([c.name for c in measured.channels], covered.tolist(), strict=True)),
     "fragility": {"intensity": curve.intensity.tolist(), "probability": curve.probability.tolist()},
+    "verdict": sampler.verdict.status,
     "warnings": messages,
-    "simulations": report["simulations"],
+    "simulations": sampler.simulations,
     "failures": report["failure_count"],
     "seconds_sampling": seconds,
     "milliseconds_per_simulation": 1e3 * report["seconds"] / max(1, report["simulations"]),
@@ -354,6 +367,6 @@ result = {
 (args.out / "summary.json").write_text(json.dumps(result, indent=2) + "\n")
 print(
     f"log evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}; {len(sampler.ladder)} stages, "
-    f"{report['simulations']} simulations ({report['failure_count']} failed) in {seconds:.0f} s, "
+    f"{sampler.simulations:.0f} simulations ({report['failure_count']} failed) in {seconds:.0f} s, "
     f"{result['seconds']:.0f} s in total\ntables and figures are in {args.out}/"
 )

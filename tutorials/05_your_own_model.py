@@ -102,7 +102,7 @@ def measurements(seed: int) -> Measurements:
     return Measurements(own_models.CHANNELS, own_models.RECORD.dt, clean + noise, "SYNTHETIC: bilinear oscillator")
 
 
-def make_posterior(model, data: Measurements, pool, cache: Path) -> Posterior:
+def make_posterior(model, data: Measurements, pool, cache: Path | None) -> Posterior:
     """Posterior with the same prior, noise, pool and cache for every model."""
     prior = Prior(
         {name: TruncatedNormal(1.0, 0.3) for name in model.parameter_names}
@@ -153,6 +153,24 @@ def make_pool(kind: str, workers: int):
 # ------------------
 #
 # Worker processes import the script, so a script that starts them needs the guard ``if __name__ == "__main__"``.
+
+
+# %%
+# A slow model
+# ------------
+#
+# With a model that takes a minute, thousands of simulations take days. A guide finds the posterior from the responses,
+# and hundreds of simulations are enough. Nothing about the model changes. The verdict says what the result is worth.
+# With a larger ``max_simulations`` the run goes on where it stopped.
+
+
+def with_few_simulations(posterior: Posterior, walkers: int, seed: int) -> SMCSampler:
+    """The same posterior by a guide, which needs the responses and therefore does not read the cache file."""
+    sampler = SMCSampler(
+        walkers, posterior.ndim, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=1000
+    )
+    sampler.run_mcmc(None, 1)
+    return sampler
 
 
 def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
@@ -236,6 +254,8 @@ def main() -> None:
             f"{report['failure_count']} failed, "
             f"{results[name]['seconds']:.1f} s"
         )
+    few = with_few_simulations(make_posterior(models(args.out)["function"], data, None, None), 100, args.seed)
+    print(f"with a guide: log evidence {few.log_evidence:.2f} +- {few.log_evidence_error:.2f}\n{few.verdict}")
     for thing in to_close:
         thing.close()
 
