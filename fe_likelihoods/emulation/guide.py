@@ -12,6 +12,7 @@ that is far more probable than expected, away from the known modes, starts anoth
 The equations are on the page ``docs/theory/guided.rst``.
 """
 
+import logging
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -25,10 +26,13 @@ from .target import ResponseTarget
 
 __all__ = ["ResponseGuide"]
 
+logger = logging.getLogger(__name__)
+
 _WIDE_SHARE, _PRIOR_SHARE = 0.10, 0.05
 _WIDE_SHARE_ALONE = 0.9  # before there is an emulator
 _WIDE_FREEDOM = 5.0
 _WIDENED = 1.5  # variances of the wide components, as multiples of those of their regions
+_SHARE_OF_MODES = 0.25  # of the wide mixture around the modes that were found, the rest around the emulated means
 _SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
 _FEWEST_RUNS = 2.0, 6.0  # training runs that an emulator needs: per dimension, and in addition
@@ -36,6 +40,7 @@ _MOST_RUNS = 300
 _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
+_IMPLAUSIBLE = 15.0  # emulated log-evidence above that of the Laplace approximation at which a fit is refused
 _SURPRISE = 10.0  # log-density above that of any known mode minus this, at which a far point starts an ascent
 _MOST_ASCENTS = 2  # of these, per refinement
 
@@ -184,7 +189,12 @@ class ResponseGuide:
         self._fit_emulators()
         ready = [region for region in self._regions if region.emulator is not None]
         if ready and len(ready) == len(self._regions):
-            self._emulated = EmulatedPosterior(self._target, self._regions, session.random)
+            emulated = EmulatedPosterior(self._target, self._regions, session.random)
+            expected = max(mode.log_evidence for mode in self._modes)
+            if emulated.log_evidence > expected + _IMPLAUSIBLE:
+                logger.info("the emulators have a top that no run has (%.1f): they are not used", emulated.log_evidence)
+                return
+            self._emulated = emulated
             self._regions = self._emulated.moments()
             self._wide = self._wide_mixture()
 
@@ -223,9 +233,12 @@ class ResponseGuide:
         shares = np.array([region.log_evidence for region in self._regions])
         weights = np.exp(shares - shares.max())
         weights = (1.0 - _SMALLEST_WEIGHT) * weights / weights.sum() + _SMALLEST_WEIGHT / len(weights)
-        factors = [np.linalg.cholesky(_WIDENED * region.covariance) for region in self._regions]
-        centres = np.array([region.centre for region in self._regions])
-        return StudentMixture(weights, centres, np.array(factors), _WIDE_FREEDOM)
+        # the modes themselves as well: where an emulator is wrong, so are the moments that it gives
+        centres = [*(region.centre for region in self._regions), *(mode.coords for mode in self._modes)]
+        covariances = [*(region.covariance for region in self._regions), *(mode.covariance for mode in self._modes)]
+        factors = [np.linalg.cholesky(_WIDENED * covariance) for covariance in covariances]
+        weights = np.concatenate([(1.0 - _SHARE_OF_MODES) * weights, _SHARE_OF_MODES * weights])
+        return StudentMixture(weights, np.array(centres), np.array(factors), _WIDE_FREEDOM)
 
     def _far(self, coords: np.ndarray) -> np.ndarray:
         """Whether structural coordinates (n, d) are away from all regions."""
@@ -295,5 +308,9 @@ class ResponseGuide:
             training = TrainingSet(coords[rows], np.array([archive.responses[row] for row in rows]))
             slopes = self._target.slopes(statistics[best], self._target.fit_noise(statistics[best], noise).coords)
             centre, covariance = region.centre[:d], region.covariance[:d, :d]
-            emulator = fit_emulator(self._target, training, centre, covariance, scales, slopes, region.emulator)
+            try:
+                emulator = fit_emulator(self._target, training, centre, covariance, scales, slopes, region.emulator)
+            except np.linalg.LinAlgError as error:  # runs that do not span the parameters: the earlier fit stays
+                logger.info("no emulator could be fitted to %d runs: %s", len(rows), error)
+                continue
             self._regions[k] = region._replace(emulator=emulator)

@@ -2,10 +2,11 @@
 
 Synthetic data have a known truth, so the search for the modes, the difficult part for a sampler, is left out. From
 every given start, least squares finds the mode and its Gaussian approximation. Then rounds of draws from a mixture of
-Student-t components follow, fitted to all earlier draws, all of them weighted by the mixture of all proposals
-(Cornuet, Marin, Mira & Robert 2012, doi:10.1111/j.1467-9469.2011.00756.x). A few thousand simulations give log Z to
-0.03. Nothing of `samplers` is used. A mode without a start is not in the result: it is compared with a long run of the
-default sampler on one data set of every problem.
+Student-t components follow, fitted to all earlier draws (Cornuet, Marin, Mira & Robert 2012,
+doi:10.1111/j.1467-9469.2011.00756.x). The second half of the rounds is drawn from the last fit, and only these draws,
+which had no part in it, give the result: draws that shaped the proposals that they are weighted with make log Z too
+small, by 0.07 for ten parameters. A few thousand simulations give log Z to 0.03. Nothing of `samplers` is used. A mode
+without a start is not in the result.
 """
 
 from collections.abc import Callable
@@ -200,7 +201,7 @@ def by_importance(
     starts : (n_modes, d) float
         Structural parameters near every mode.
     draws, rounds : int
-        Draws per round.
+        Draws per round, and number of rounds; the result is that of the second half of them.
     seed : int
         Seed of the draws.
     labels : callable, optional
@@ -219,7 +220,12 @@ def by_importance(
         components.append(_Component(1.0, mean, 1.2 * np.linalg.cholesky(covariance)))
     proposals, points, values = [], np.empty((0, posterior.ndim)), np.empty(0)
     label = (lambda x: np.zeros(len(x), dtype=int)) if labels is None else labels
+    adapting, log_weights = max(rounds // 2, 1), np.empty(0)
     for number in range(rounds):
+        if number == adapting:  # from here on, the last fit stays, and the draws that shaped it are left out
+            softened = _soften(log_weights, max(60.0, 10.0 * posterior.ndim))
+            components = _refit(points, softened, label(points), rng) or components
+            proposals, points, values = [], np.empty((0, posterior.ndim)), np.empty(0)
         proposal = _Proposal(components, posterior.prior)
         proposals.append(proposal)
         new = proposal.draw(draws, rng)
@@ -230,9 +236,9 @@ def by_importance(
         ess = weights.sum() ** 2 / (weights**2).sum()
         log_evidence = float(log_weights.max() + np.log(weights.mean()))
         inform(f"  round {number + 1}: {len(points)} draws, effective {ess:.0f}, log Z {log_evidence:.3f}")
-        softened = _soften(log_weights, max(60.0, 10.0 * posterior.ndim))
-        fitted = _refit(points, softened, label(points), rng)
-        components = fitted or components
+        if number < adapting - 1:
+            softened = _soften(log_weights, max(60.0, 10.0 * posterior.ndim))
+            components = _refit(points, softened, label(points), rng) or components
     w = weights / weights.sum()
     mean = w @ points
     variance = w @ (points - mean) ** 2
