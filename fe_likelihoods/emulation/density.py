@@ -94,6 +94,10 @@ class EmulatedPosterior:
         Logarithm of the integral of the emulated density.
     log_evidence_error : float
         Its standard error, that of the importance sampling in memory.
+    top : float
+        Largest log-density in the pool.
+    effective_share : float
+        Effective sample size of the pool divided by its size.
     """
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
@@ -209,7 +213,9 @@ class EmulatedPosterior:
         """Draw the pool."""
         self._mixture = mixture
         self._pool = draw_mixture(mixture, _POOL, random)
-        self._log_weights = self.log_density(self._pool) - mixture_log_density(mixture, self._pool)
+        log_density = self.log_density(self._pool)
+        self.top = float(log_density.max())
+        self._log_weights = log_density - mixture_log_density(mixture, self._pool)
         self._weights = _normalised(self._log_weights)
         self.log_evidence = _log_mean(self._log_weights)
         effective = effective_sample_size(self._log_weights)

@@ -40,7 +40,7 @@ _MOST_RUNS = 300
 _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
-_IMPLAUSIBLE = 15.0  # emulated log-evidence above that of the Laplace approximation at which a fit is refused
+_IMPLAUSIBLE = 10.0  # emulated log-density above that of all runs, besides 1 per dimension, at which a fit is refused
 _SURPRISE = 10.0  # log-density above that of any known mode minus this, at which a far point starts an ascent
 _MOST_ASCENTS = 2  # of these, per refinement
 
@@ -86,6 +86,7 @@ class ResponseGuide:
         self.concerns: tuple[str, ...] = ()
         self._regions: list[Region] = []
         self._modes: list[Mode] = []
+        self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
         self._emulated: EmulatedPosterior | None = None
         self._wide: StudentMixture | None = None
 
@@ -190,9 +191,8 @@ class ResponseGuide:
         ready = [region for region in self._regions if region.emulator is not None]
         if ready and len(ready) == len(self._regions):
             emulated = EmulatedPosterior(self._target, self._regions, session.random)
-            expected = max(mode.log_evidence for mode in self._modes)
-            if emulated.log_evidence > expected + _IMPLAUSIBLE:
-                logger.info("the emulators have a top that no run has (%.1f): they are not used", emulated.log_evidence)
+            if emulated.top > self._best + _IMPLAUSIBLE + self._target.ndim:
+                logger.info("the emulators have a top (%.1f) far above all runs (%.1f)", emulated.top, self._best)
                 return
             self._emulated = emulated
             self._regions = self._emulated.moments()
@@ -224,6 +224,7 @@ class ResponseGuide:
 
     def _add_modes(self, modes: Any) -> None:
         for mode in modes:
+            self._best = max(self._best, mode.log_density)
             self._modes.append(mode)
             self._regions.append(Region(mode.coords, mode.covariance, None, mode.log_evidence))
         if self._regions:
@@ -260,6 +261,7 @@ class ResponseGuide:
             return
         coords = self._target.coordinates(parameters[alive])
         density = log_prob[alive] - self._posterior.log_prior(parameters[alive]) + self._target.log_prior(coords)
+        self._best = max(self._best, float(density.max()))
         structural = coords[:, : self._target.n_structural]
         if self._modes:
             best = max(mode.log_density for mode in self._modes)

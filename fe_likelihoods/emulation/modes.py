@@ -84,8 +84,9 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     The residuals are taken as linear in the structural coordinates, so that nothing is simulated. The Hessian of the
     log-density is computed by central differences with steps of a third of a standard deviation.
     """
-    d, at = target.n_structural, np.concatenate([end.coords, end.noise.coords])
     statistics = target.statistic(end.residuals)
+    noise = max(end.noise, target.fit_noise(statistics), key=lambda fit: fit.log_density)
+    d, at = target.n_structural, np.concatenate([end.coords, noise.coords])
     along = 2.0 * bilinear_form(target.statistic, end.slopes, end.residuals[None])[:, 0]
     curved = bilinear_form(target.statistic, end.slopes)
 

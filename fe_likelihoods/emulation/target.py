@@ -25,6 +25,7 @@ Remember = Callable[[str, Callable[[], Sequence[np.ndarray]]], Sequence[np.ndarr
 
 _HALF_LOG_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
 _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise parameters are first searched
+_WIDTHS_AROUND_START = 1.0, 0.1
 _GRID = np.linspace(-1.0, 1.0, 41)
 _SLOPE_STEP = 1e-4
 _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
@@ -277,13 +278,11 @@ class ResponseTarget:
         if not self.n_noise:
             return NoiseFit(np.zeros(0), float(self._noise_density(statistics, np.zeros((1, 0)))[0]))
         coords = np.zeros(self.n_noise) if start is None else start
-        if start is None:
-            for width in _WIDTHS:
-                for k in range(self.n_noise):
-                    trial = np.repeat(coords[None], len(_GRID), axis=0)
-                    trial[:, k] += width * _GRID
-                    coords = trial[np.argmax(self._noise_density(statistics, trial))]
-
+        for width in _WIDTHS if start is None else _WIDTHS_AROUND_START:
+            for k in range(self.n_noise):
+                trial = np.repeat(coords[None], len(_GRID), axis=0)
+                trial[:, k] += width * _GRID
+                coords = trial[np.argmax(self._noise_density(statistics, trial))]
         best = NoiseFit(coords, float(self._noise_density(statistics, coords[None])[0]))
         for _ in range(_NEWTON_STEPS):
             improved = self._newton_step(statistics, best)

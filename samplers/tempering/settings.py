@@ -163,7 +163,7 @@ class GuidedSettings:
     trusted_share: float = 0.5
     largest_pareto_shape: float = 0.5
     short_tail_share: float = 0.75
-    most_rounds: int = 10
+    most_rounds: int = 20
     hopeless_rounds: int = 4
     hopeless_share: float = 0.03
     usable_share: float = 0.1
