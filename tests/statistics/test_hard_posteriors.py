@@ -58,6 +58,7 @@ def quadrature(name: str, seed: int) -> tuple[float, np.ndarray]:
     return total, np.array(shares)
 
 
+@pytest.mark.slow
 def test_brute_force_agrees_with_quadrature():
     found = reference(CASES["far"], 1, draws=40_000)
     total, shares = quadrature("far", 1)
