@@ -108,8 +108,7 @@ class EmulatedPosterior:
         """Logarithm of prior times emulated likelihood (n,) at coordinates (n, ndim); not normalised."""
         d = self._target.n_structural
         structural, noise = coords[:, :d], coords[:, d:]
-        squared = np.stack([region.emulator.squared_distance(structural) for region in self._regions])
-        nearest = self._assign(squared)
+        nearest, squared = self._nearest(coords)
         result = np.full(len(coords), -np.inf)
         for k, region in enumerate(self._regions):
             rows = np.flatnonzero((nearest == k) & (squared[k] <= region.emulator.reach))
@@ -118,9 +117,11 @@ class EmulatedPosterior:
                 result[rows] = self._target.log_likelihood(statistics, noise[rows]) + correction
         return np.where(np.isnan(result), -np.inf, result) + self._target.log_prior(coords)
 
-    @staticmethod
-    def _assign(squared: np.ndarray) -> np.ndarray:
-        return np.argmin(squared, axis=0)
+    def _nearest(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Region (n,) that coordinates (n, ndim) belong to, and squared distances (n_regions, n) from all of them."""
+        structural = coords[:, : self._target.n_structural]
+        squared = np.stack([region.emulator.squared_distance(structural) for region in self._regions])
+        return np.argmin(squared, axis=0), squared
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Draws (n, ndim) of the emulated posterior that are practically independent."""
@@ -135,9 +136,7 @@ class EmulatedPosterior:
 
     def moments(self) -> list[Region]:
         """The regions with the mean, covariance and evidence that the pool gives them, where it suffices."""
-        d = self._target.n_structural
-        squared = np.stack([region.emulator.squared_distance(self._pool[:, :d]) for region in self._regions])
-        nearest, updated = self._assign(squared), []
+        (nearest, _), updated = self._nearest(self._pool), []
         for k, region in enumerate(self._regions):
             rows = nearest == k
             share = self._weights[rows].sum()
@@ -165,7 +164,6 @@ class EmulatedPosterior:
         return StudentMixture(weights, np.array([region.centre for region in regions]), np.array(factors), _FREEDOM)
 
     def _adapt(self, random: np.random.RandomState) -> None:
-        d = self._target.n_structural
         regions = list(self._regions)
         shares = np.array([region.log_evidence for region in regions])
         mixture = self._mixture_of(regions, shares)
@@ -173,8 +171,7 @@ class EmulatedPosterior:
         for _ in range(_ROUNDS):
             coords = draw_mixture(mixture, _DRAWS, random)
             log_weights = self.log_density(coords) - mixture_log_density(mixture, coords)
-            squared = np.stack([region.emulator.squared_distance(coords[:, :d]) for region in self._regions])
-            nearest = self._assign(squared)
+            nearest, _ = self._nearest(coords)
             for k, region in enumerate(regions):
                 rows = np.flatnonzero((nearest == k) & (log_weights > -np.inf))
                 if len(rows) <= enough:
@@ -194,10 +191,10 @@ class EmulatedPosterior:
 
     def _kernels(self, regions: Sequence[Region], random: np.random.RandomState) -> StudentMixture:
         """The components, and narrower ones around weighted points: for a posterior that no ellipsoid covers."""
-        d, ndim = self._target.n_structural, self._target.ndim
+        ndim = self._target.ndim
         centres = self._pool[random.choice(len(self._pool), _KERNELS, p=self._weights)]
         width = (4.0 / (ndim + 2.0)) ** (1.0 / (ndim + 4.0)) * _KERNELS ** (-1.0 / (ndim + 4.0))
-        squared = np.stack([region.emulator.squared_distance(centres[:, :d]) for region in self._regions])
+        nearest, _ = self._nearest(centres)
         narrow = [width * np.linalg.cholesky(region.covariance) for region in regions]
         weights = np.concatenate(
             [(1.0 - _KERNEL_SHARE) * self._mixture.weights, np.full(_KERNELS, _KERNEL_SHARE / _KERNELS)]
@@ -205,7 +202,7 @@ class EmulatedPosterior:
         return StudentMixture(
             weights,
             np.concatenate([self._mixture.centres, centres]),
-            np.concatenate([self._mixture.factors, [narrow[k] for k in self._assign(squared)]]),
+            np.concatenate([self._mixture.factors, [narrow[k] for k in nearest]]),
             _KERNEL_FREEDOM,
         )
 

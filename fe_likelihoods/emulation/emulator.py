@@ -99,8 +99,9 @@ class ResponseEmulator:
         self._mean, self._components = mean, components
         self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
         self.left_out = left_out_errors(process)
-        self._coefficients, self._slopes = coefficients, slopes
+        self._coefficients = coefficients
         self._forms = self._bilinear(target.measured)
+        self._curvature = np.maximum(-2.0 * np.diagonal(self._forms.quadratic @ slopes), 0.0)
 
     def _bilinear(self, measured: np.ndarray) -> _Forms:
         statistic, origin = self._target.statistic, measured - self._mean
@@ -164,8 +165,7 @@ class ResponseEmulator:
 
     def _statistics(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         mean, variance = predict(self.process, self.whitened(coords))
-        curvature = np.maximum(-2.0 * np.diagonal(self._forms.quadratic @ self._slopes), 0.0)
-        return self._at(mean), -0.5 * np.log1p(curvature * variance).sum(axis=1)
+        return self._at(mean), -0.5 * np.log1p(self._curvature * variance).sum(axis=1)
 
     def _at(self, mean: np.ndarray) -> np.ndarray:
         """Statistics (n, n_numbers) at coefficients (n, k)."""

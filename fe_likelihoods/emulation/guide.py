@@ -13,7 +13,7 @@ The equations are on the page ``docs/theory/guided.rst``.
 """
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -132,15 +132,7 @@ class ResponseGuide:
     def prepare(self, session: Any) -> Iterator[None]:
         """Search for modes; each item is a batch of simulations."""
         starts = draw_starts(self._target, self._starts, session.random)
-        search = search_modes(self._target, starts, session.remember, session.fits)
-        while True:
-            try:
-                cost = next(search)
-            except StopIteration as end:
-                self.search = end.value
-                break
-            self.simulations += cost
-            yield
+        self.search = yield from self._counted(search_modes(self._target, starts, session.remember, session.fits))
         self._add_modes(self.search.modes)
         if not self.search.finished:
             self._add_concern("the budget ended the search for modes")
@@ -199,6 +191,16 @@ class ResponseGuide:
             self._wide = self._wide_mixture()
 
     # ------------------------------------------------------------------ parts
+
+    def _counted(self, search: Generator[float, None, Any]) -> Generator[None, None, Any]:
+        """Result of a search; the simulations of each of its batches are counted as soon as they are made."""
+        while True:
+            try:
+                cost = next(search)
+            except StopIteration as end:
+                return end.value
+            self.simulations += cost
+            yield
 
     def _add_concern(self, text: str) -> None:
         if text not in self.concerns:
@@ -270,14 +272,7 @@ class ResponseGuide:
             surprising = density >= density.max()
         for row in np.flatnonzero(surprising)[np.argsort(-density[surprising])][:_MOST_ASCENTS]:
             search = search_from(self._target, structural[row], session.remember, session.fits)
-            while True:
-                try:
-                    cost = next(search)
-                except StopIteration as end:
-                    found = end.value
-                    break
-                self.simulations += cost
-                yield
+            found = yield from self._counted(search)
             if found is None:
                 self._add_concern("the budget ended an ascent to a mode that the search had missed")
             elif not self._modes or self._far(found.coords[None, : self._target.n_structural])[0]:
