@@ -165,7 +165,7 @@ def make_pool(kind: str, workers: int):
 
 
 def with_few_simulations(posterior: Posterior, walkers: int, seed: int) -> SMCSampler:
-    """The same posterior by a guide, which needs the responses and therefore does not read the cache file."""
+    """The same posterior by a guide."""
     sampler = SMCSampler(
         walkers, posterior.ndim, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=1000
     )

@@ -1,8 +1,9 @@
 """Simulations of a model and their statistics against measurements: counted, cached, and run in chunks.
 
 `CachedSimulations.statistics` and, where responses are needed, `CachedSimulations.simulate` are the only places where a
-likelihood requests simulations. Both select the rows to simulate, count them, record failures and cache the statistics
-in memory and on disk.
+likelihood requests simulations. Both look for results in this order: statistics in memory, statistics on disk,
+responses in memory, responses on disk. From a response, which is cached in double precision, the statistics are
+computed; they have the same bits as those of a new simulation. What is left is simulated, counted and cached.
 """
 
 import hashlib
@@ -15,11 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..signals.channels import Measurements
-from ..simulation.cache_rows import CachedRows
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
 from ..simulation.fingerprint import simulation_fingerprint
-from ..simulation.memory_cache import MemoryCache, distinct_keys
+from ..simulation.memory_cache import MemoryCache, ResponseMemory, distinct_keys
 from ..simulation.model import (
     Model,
     SimulationBatch,
@@ -47,40 +47,46 @@ class _Simulated(NamedTuple):
     response: np.ndarray | None
 
 
-def _in_single_precision(response: np.ndarray) -> np.ndarray:
-    """Responses (n, n_channels, n_steps) as the cache on disk returns them; unchanged where it does not store them."""
-    with np.errstate(over="ignore"):
-        single = response.astype(np.float32)
-    return np.where(np.isfinite(single).all(axis=(1, 2), keepdims=True), single, response)
-
-
-class CachedSimulations:
-    """Statistics of the residuals of a model, each simulation of which is run once.
-
-    Parameters
-    ----------
-    model : Model
-    measurements : Measurements
-        The model's channels, in any order, at the model's time step and length.
-    statistic : Statistic or None
-        Statistic of the residuals; None for the sums of squares.
-    pool, memory_rows, cache, max_failure_share
-        As for `FELikelihood`.
+class _Requested(NamedTuple):
+    """Distinct simulations that were requested, with arrays that are filled in.
 
     Attributes
     ----------
-    simulations : int
-        Simulations run by this object in this process.
-    cache_hits : int
-        Rows whose statistics were cached, in memory or on disk.
-    disk_hits : int
-        Rows among them that came from the cache on disk.
-    seconds : float
-        Wall time of the simulations [s].
-    memory_cache : MemoryCache
-        The statistics that are cached in memory.
-    chunk_size : int
-        Number of simulations after which the next results are stored on disk; adapted to their duration.
+    keys : list of n bytes
+        See `distinct_keys`.
+    thetas : (n, n_structural) float
+        Structural parameters.
+    misfit : (n, n_numbers) float
+        Statistics of the residuals; NaN where they are not known.
+    known : (n,) bool
+        Whether the statistics are known, those of failures included.
+    reasons : list of n str
+        Reasons of failures.
+    response : (n, n_channels, n_steps) float, optional
+        Responses, if they were requested.
+    cached, on_disk : (n,) bool
+        Whether no simulation was needed, and whether the result came from the disk.
+    """
+
+    keys: list[bytes]
+    thetas: np.ndarray
+    misfit: np.ndarray
+    known: np.ndarray
+    reasons: list[str]
+    response: np.ndarray | None
+    cached: np.ndarray
+    on_disk: np.ndarray
+
+
+class CachedSimulations:
+    """Base of `FELikelihood`, which documents the attributes: a model's simulations, each of which is run once.
+
+    Parameters
+    ----------
+    model, measurements, pool, memory_rows, memory_bytes, cache, max_failure_share
+        As for `FELikelihood`.
+    statistic : Statistic or None
+        Statistic of the residuals; None for the sums of squares.
     """
 
     def __init__(
@@ -90,6 +96,7 @@ class CachedSimulations:
         statistic: Statistic | None,
         pool: Any,
         memory_rows: int,
+        memory_bytes: int,
         cache: SimulationCache | str | os.PathLike | None,
         max_failure_share: float,
     ) -> None:
@@ -103,6 +110,7 @@ class CachedSimulations:
         self.pool = as_executor(pool, model)
         self.max_failure_share = max_failure_share
         self.memory_cache = MemoryCache(memory_rows)
+        self.response_memory = ResponseMemory(memory_bytes)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._model_fingerprint = None if cache is None else model.fingerprint
         self._key = None if cache is None else self.simulation_key
@@ -193,10 +201,10 @@ class CachedSimulations:
         return result
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
-        """Responses of the model; their statistics are cached, so that `log_likelihood` needs no further simulation.
+        """Responses of the model; they and their statistics are cached.
 
-        Duplicates are simulated once. The statistics of a point may be cached without its response. Such a point is
-        simulated again, unless its simulation failed.
+        Duplicates are simulated once, and cached responses are reused. The statistics of a point may be cached without
+        its response. Such a point is simulated again, unless its simulation failed.
 
         Parameters
         ----------
@@ -212,12 +220,6 @@ class CachedSimulations:
         ------
         TooManyFailures
             As for `statistics`: the finished simulations are cached.
-
-        Notes
-        -----
-        The responses are in double precision. With ``SimulationCache(..., responses=True)`` they are all rounded to
-        single precision, as the cache stores them, so that they do not depend on what was stored. The statistics are
-        those of the responses in double precision in either case.
         """
         thetas = self._as_rows(thetas)
         finite = np.flatnonzero(np.isfinite(thetas).all(axis=1))
@@ -278,86 +280,146 @@ class CachedSimulations:
         if all(known):
             self.cache_hits += len(thetas)
         else:
-            known = np.array(known)
-            new, on_disk = ~known, np.zeros(len(keys), dtype=bool)
-            misfit[new], on_disk[new] = self._obtain([key for key, is_new in zip(keys, new, strict=True) if is_new])
-            self.disk_hits += int(on_disk[distinct].sum())
-            self.cache_hits += int((known | on_disk)[distinct].sum())
+            new = ~np.array(known)
+            requested = self._requested([key for key, is_new in zip(keys, new, strict=True) if is_new])
+            self._obtain(requested)
+            misfit[new] = requested.misfit
+            counts = np.bincount(distinct)  # of the rows that were requested
+            self.disk_hits += int(counts[new][requested.on_disk].sum())
+            self.cache_hits += int(counts[~new].sum() + counts[new][requested.cached].sum())
         return misfit if len(keys) == len(thetas) else misfit[distinct]
-
-    def _obtain(self, keys: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-        """Statistics of rows that are not in memory, simulated or from disk, and which of them came from disk."""
-        thetas = self._thetas(keys)
-        misfit, _, on_disk = self._read(keys, thetas)
-        left = np.flatnonzero(~on_disk)
-        for rows, batch in self._chunks(keys, thetas, left):
-            misfit[rows] = batch.misfit
-        return misfit, on_disk
 
     def _responses(self, keys: list[bytes], distinct: list[int]) -> SimulationBatch:
         """Responses of distinct keys; `distinct` has the key of every row that was requested, for the counts."""
-        thetas, shape = self._thetas(keys), self.measurements.values.shape
-        response, reasons = np.full((len(keys), *shape), np.nan), [""] * len(keys)
         misfit, known = self.memory_cache.look_up(keys, self._width)
-        cached = np.array(known, dtype=bool) & ~np.isfinite(misfit).all(axis=1)  # failures need no response
-        for row in np.flatnonzero(cached):
-            reasons[row] = "the simulation failed before"
-        left = np.flatnonzero(~cached)
-        on_disk = np.zeros(len(keys), dtype=bool)
-        single = self.cache is not None and self.cache.responses
-        if self.cache is not None and len(left):
-            _, stored, on_disk[left] = self._read([keys[row] for row in left], thetas[left])
-            responses = self.cache.look_up_responses(self.model, thetas[left]) if single else [None] * len(left)
-            for row, reason, values in zip(left, stored, responses, strict=True):
-                cached[row] = bool(reason) or (on_disk[row] and values is not None)
-                reasons[row] = reason
-                if cached[row] and not reason:
-                    response[row] = values
-        for rows, batch in self._chunks(keys, thetas, np.flatnonzero(~cached), responses=True):
-            response[rows] = _in_single_precision(batch.response) if single else batch.response
+        response = np.full((len(keys), *self.measurements.values.shape), np.nan)
+        requested = self._requested(keys, misfit, np.array(known, dtype=bool), response)
+        self._obtain(requested)
+        counts = np.bincount(distinct, minlength=len(keys))
+        self.disk_hits += int(counts[requested.on_disk].sum())
+        self.cache_hits += int(counts[requested.cached].sum())
+        return SimulationBatch(response, requested.reasons)
+
+    def _requested(
+        self,
+        keys: list[bytes],
+        misfit: np.ndarray | None = None,
+        known: np.ndarray | None = None,
+        response: np.ndarray | None = None,
+    ) -> _Requested:
+        """Arrays to be filled in by `_obtain`."""
+        n = len(keys)
+        thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(n, self._n_structural).copy()
+        if misfit is None:
+            misfit, known = np.full((n, self._width), np.nan), np.zeros(n, dtype=bool)
+        return _Requested(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, dtype=bool), np.zeros(n, bool))
+
+    def _obtain(self, requested: _Requested) -> None:
+        """Fill in what was requested, from the caches or by simulation."""
+        self._read_statistics(requested)
+        failed = requested.known & ~np.isfinite(requested.misfit).all(axis=1)
+        # a failure needs no response
+        requested.cached[:] = requested.known if requested.response is None else failed
+        self._name_failures(requested, np.flatnonzero(failed))
+        left = np.flatnonzero(~requested.cached)
+        size = max(1, _RESPONSE_VALUES // self.measurements.values.size)
+        for start in range(0, len(left), size):
+            self._read_responses(requested, left[start : start + size])
+        for rows, batch in self._chunks(requested, np.flatnonzero(~requested.cached)):
+            requested.misfit[rows] = batch.misfit
             for row, reason in zip(rows, batch.reasons, strict=True):
-                reasons[row] = reason
-        self.disk_hits += int((on_disk & cached)[distinct].sum())
-        self.cache_hits += int(cached[distinct].sum())
-        return SimulationBatch(response, reasons)
+                requested.reasons[row] = reason
+            if requested.response is not None:
+                requested.response[rows] = batch.response
 
-    def _thetas(self, keys: list[bytes]) -> np.ndarray:
-        """Structural parameters of keys, (n, n_structural)."""
-        return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), self._n_structural).copy()
+    def _read_statistics(self, requested: _Requested) -> None:
+        """Fill in statistics from the cache on disk; they are then cached in memory, and failures recorded."""
+        new = np.flatnonzero(~requested.known)
+        if self.cache is None or not len(new):
+            return
+        stored = self.cache.look_up(self._key, requested.thetas[new], self._width, self.measurements.n_steps)
+        rows = new[stored.known]
+        requested.misfit[rows] = stored.misfit[stored.known]
+        requested.known[rows] = requested.on_disk[rows] = True
+        for row, reason in zip(new, stored.reasons, strict=True):
+            requested.reasons[row] = reason
+        self._add_outcomes(requested, rows)
 
-    def _read(self, keys: list[bytes], thetas: np.ndarray) -> CachedRows:
-        """Rows of the cache on disk, which are then cached in memory; failures among them are recorded."""
-        if self.cache is None:
-            nothing = np.full((len(keys), self._width), np.nan)
-            return CachedRows(nothing, [""] * len(keys), np.zeros(len(keys), dtype=bool))
-        stored = self.cache.look_up(self._key, thetas, self._width, self.measurements.n_steps)
-        self._outcomes += int(stored.known.sum())
-        for row in np.flatnonzero(stored.known):
-            if stored.reasons[row]:
-                self._failures.add(thetas[row], stored.reasons[row])
-        self.memory_cache.store([keys[row] for row in np.flatnonzero(stored.known)], stored.misfit[stored.known])
-        return stored
+    def _read_responses(self, requested: _Requested, rows: np.ndarray) -> None:
+        """Fill in rows whose responses are cached, and their statistics where these are not known."""
+        outcomes: list[np.ndarray | str | None] = [None] * len(rows)
+        keys = [requested.keys[row] for row in rows]
+        if len(self.response_memory):
+            outcomes = self.response_memory.look_up(self.model.fingerprint, keys)
+        left = [place for place, outcome in enumerate(outcomes) if outcome is None]
+        if self.cache is not None and left:
+            stored = self.cache.look_up_responses(self.model, requested.thetas[rows[left]])
+            found = [(place, response) for place, response in zip(left, stored, strict=True) if response is not None]
+            for place, response in found:
+                outcomes[place] = response
+                requested.on_disk[rows[place]] = True
+            if requested.response is not None and found:
+                found_keys = [keys[place] for place, _ in found]
+                self.response_memory.store(self.model.fingerprint, found_keys, [response for _, response in found])
+        places = [place for place, outcome in enumerate(outcomes) if outcome is not None]
+        if not places:
+            return
+        rows, outcomes = rows[places], [outcomes[place] for place in places]
+        nothing = np.full(self.measurements.values.shape, np.nan)
+        reasons = [outcome if isinstance(outcome, str) else "" for outcome in outcomes]
+        response = np.array([nothing if isinstance(outcome, str) else outcome for outcome in outcomes])
+        if requested.response is not None:
+            requested.response[rows] = response
+        new = np.flatnonzero(~requested.known[rows])
+        if len(new):
+            batch = SimulationBatch(response[new], [reasons[place] for place in new])
+            misfit, reasons_of_new = misfit_of_responses(self.model, batch, self.measurements.values, self._statistic)
+            requested.misfit[rows[new]], requested.known[rows[new]] = misfit, True
+            for row, reason in zip(rows[new], reasons_of_new, strict=True):
+                requested.reasons[row] = reason
+                if reason and requested.response is not None:
+                    requested.response[row] = np.nan
+            self._add_outcomes(requested, rows[new])
+            if self.cache is not None:
+                n_steps = self.measurements.n_steps
+                self.cache.store(self._key, requested.thetas[rows[new]], n_steps, misfit, reasons_of_new, 0.0)
+        requested.cached[rows] = True
 
-    def _chunks(
-        self, keys: list[bytes], thetas: np.ndarray, left: np.ndarray, responses: bool = False
-    ) -> Iterator[tuple[np.ndarray, _Simulated]]:
+    def _add_outcomes(self, requested: _Requested, rows: np.ndarray) -> None:
+        """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
+        self._outcomes += len(rows)
+        for row in rows:
+            if requested.reasons[row]:
+                self._failures.add(requested.thetas[row], requested.reasons[row])
+        self.memory_cache.store([requested.keys[row] for row in rows], requested.misfit[rows])
+
+    def _name_failures(self, requested: _Requested, rows: np.ndarray) -> None:
+        """Fill in reasons of failures of which only the statistics were cached."""
+        rows = [row for row in rows if not requested.reasons[row]]
+        if not rows or requested.response is None:
+            return
+        outcomes = self.response_memory.look_up(self.model.fingerprint, [requested.keys[row] for row in rows])
+        for row, outcome in zip(rows, outcomes, strict=True):
+            requested.reasons[row] = outcome if isinstance(outcome, str) else "the simulation failed before"
+
+    def _chunks(self, requested: _Requested, left: np.ndarray) -> Iterator[tuple[np.ndarray, _Simulated]]:
         """Simulate the rows `left` in chunks that are stored one by one; yields their indices and results."""
-        smallest, largest = self._chunk_limits(len(left)) if len(left) else (0, 0)
+        responses = requested.response is not None
+        smallest, largest = self._chunk_limits(len(left), responses) if len(left) else (0, 0)
         while len(left):
             size = max(smallest, min(largest, self.chunk_size))
             rows, left = left[:size], left[size:]
             start = time.perf_counter()
-            batch = self._simulate(thetas[rows], responses)
+            batch = self._simulate([requested.keys[row] for row in rows], requested.thetas[rows], responses)
             # the size grows by steps: the first simulations may be failures that took no time
             self.chunk_size = min(4 * size, 1 + int(_SECONDS_PER_CHUNK * len(rows) / (time.perf_counter() - start)))
-            self.memory_cache.store([keys[row] for row in rows], batch.misfit)
             yield rows, batch
 
-    def _chunk_limits(self, n: int) -> tuple[int, int]:
+    def _chunk_limits(self, n: int, responses: bool) -> tuple[int, int]:
         """Smallest (all workers are busy) and largest number of simulations, of n, between two writes to disk."""
         if self.cache is None:
             return n, n
-        largest = max(1, _RESPONSE_VALUES // self.measurements.values.size) if self.cache.responses else n
+        largest = max(1, _RESPONSE_VALUES // self.measurements.values.size) if responses or self.cache.responses else n
         if self.pool is not None:
             workers = self.pool.n_workers or n
         elif has_batch_method(self.model):
@@ -366,8 +428,8 @@ class CachedSimulations:
             return 1, largest
         return min(_ROUNDS_PER_CHUNK * workers, largest), largest
 
-    def _simulate(self, thetas: np.ndarray, responses: bool) -> _Simulated:
-        """Results of new simulations, which are counted, recorded if they fail, and stored on disk."""
+    def _simulate(self, keys: list[bytes], thetas: np.ndarray, responses: bool) -> _Simulated:
+        """Results of new simulations, which are counted, recorded if they fail, and cached in memory and on disk."""
         # checked before a batch and not after it, so that finished simulations are stored
         self._failures.check(self._outcomes)
         start = time.perf_counter()
@@ -385,15 +447,20 @@ class CachedSimulations:
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self._failures.add(theta, reason)
+        self.memory_cache.store(keys, misfit)
+        if responses:
+            outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
+            self.response_memory.store(self.model.fingerprint, keys, outcomes)
         if self.cache is not None:
             if self.model.fingerprint != self._model_fingerprint:
                 raise ValueError(
                     "the model has changed since the likelihood was made (its fingerprint differs), so its simulations "
                     "cannot be stored with the earlier ones; make a new likelihood"
                 )
-            self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
-            if self.cache.responses:
+            if batch is not None:
+                # before the statistics, which are computed from them if the program is killed in between
                 self.cache.store_responses(self.model, thetas, batch.response)
+            self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
         if responses:
             batch.response[[bool(reason) for reason in reasons]] = np.nan
         return _Simulated(misfit, reasons, batch.response if responses else None)

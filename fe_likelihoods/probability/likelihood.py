@@ -43,10 +43,15 @@ class FELikelihood(CachedSimulations):
         Number of simulations whose statistics are cached in memory (about 250 bytes each), failures included, so that
         they are not simulated again; 0 for none. The contents are not pickled with the likelihood: every process caches
         its own simulations.
+    memory_bytes : int
+        Largest size of the responses that are cached in memory [bytes], at 8 bytes per channel and sample: those that
+        `simulate` returned, as for a guide. The oldest are dropped. `with_noise` and `first` share them; they are not
+        pickled. The default holds 1300 responses of two channels of 12 800 samples, more than a run with a guide needs.
     cache : SimulationCache or path, optional
         Cache on disk, used after the one in memory: simulations of earlier runs and of other processes are not run
         again, and a killed run loses only its last few seconds. A batch is then simulated in chunks of a few seconds
-        that are stored one by one; with a pool of unknown size, in one chunk.
+        that are stored one by one; with a pool of unknown size, in one chunk. The responses of `simulate` are stored as
+        well, up to the `max_response_bytes` of the cache.
     max_failure_share : float
         Largest share of failed simulations, in [0, 1]. If more have failed, of 20 or more, the next request for a
         simulation raises `TooManyFailures`.
@@ -67,6 +72,8 @@ class FELikelihood(CachedSimulations):
         Wall time of the simulations [s].
     memory_cache : MemoryCache
         The statistics that are cached in memory.
+    response_memory : ResponseMemory
+        The responses that are cached in memory.
     chunk_size : int
         Number of simulations after which the next results are stored on disk; adapted to their duration.
 
@@ -86,6 +93,7 @@ class FELikelihood(CachedSimulations):
         pool: Any = None,
         *,
         memory_rows: int = 100_000,
+        memory_bytes: int = 2**28,
         cache: SimulationCache | str | os.PathLike | None = None,
         max_failure_share: float = 1.0,
     ) -> None:
@@ -98,7 +106,7 @@ class FELikelihood(CachedSimulations):
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
         self.fast_parameters = tuple(range(len(structural), len(self.parameter_names)))
         statistic = noise_statistic(self.noise)
-        super().__init__(model, measurements, statistic, pool, memory_rows, cache, max_failure_share)
+        super().__init__(model, measurements, statistic, pool, memory_rows, memory_bytes, cache, max_failure_share)
 
     def __call__(self, x: Any) -> np.ndarray | float:
         """Same as `log_likelihood`."""
@@ -112,7 +120,7 @@ class FELikelihood(CachedSimulations):
     def first(self, seconds: float) -> "FELikelihood":
         """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).
 
-        Noise, pool, cache on disk and limits are kept; counts and the cache in memory start empty.
+        Noise, pool, limits, cache on disk and the responses in memory are kept; counts start at zero.
 
         Parameters
         ----------
@@ -201,7 +209,7 @@ class FELikelihood(CachedSimulations):
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.
 
-        Model, measurements, pool, cache on disk and limits are kept; counts and the cache in memory start empty.
+        Model, measurements, pool, limits, cache on disk and the responses in memory are kept; counts start at zero.
         """
         return self._with(self.model, self.measurements, noise)
 
@@ -211,8 +219,9 @@ class FELikelihood(CachedSimulations):
             measurements,
             noise,
             memory_rows=self.memory_cache.rows,
+            memory_bytes=self.response_memory.max_bytes,
             cache=self.cache,
             max_failure_share=self.max_failure_share,
         )
-        other.pool = self.pool
+        other.pool, other.response_memory = self.pool, self.response_memory
         return other

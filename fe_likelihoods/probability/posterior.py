@@ -10,7 +10,6 @@ import hashlib
 import json
 import re
 import sys
-import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -289,16 +288,9 @@ class Posterior:
 
         Notes
         -----
-        The guide needs responses. A cache on disk saves their simulation only if it stores them:
-        ``SimulationCache(path, responses=True)``.
+        The likelihood caches the responses that the guide requests, in memory and in the file of its cache, so another
+        sampler with a guide repeats no simulation of them.
         """
-        cache = self.likelihood.cache
-        if cache is not None and not cache.responses:
-            warnings.warn(
-                "the cache on disk stores no responses, which a guide needs: points that it knows are simulated again. "
-                "Pass cache=SimulationCache(path, responses=True) to the likelihood",
-                stacklevel=2,
-            )
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
         return ResponseGuide(self, starts)

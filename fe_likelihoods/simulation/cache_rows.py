@@ -31,9 +31,8 @@ STORE = (
     "ON CONFLICT (key) DO UPDATE SET misfit = excluded.misfit, n_steps = excluded.n_steps, reason = excluded.reason, "
     "seconds = excluded.seconds, crc = excluded.crc WHERE length(reason) > 0"  # a success is never overwritten
 )
-STORE_RESPONSE = (
-    "INSERT INTO responses (key, n_channels, size, crc, response) VALUES (?, ?, ?, ?, ?) ON CONFLICT (key) DO NOTHING"
-)
+# replaces a response that an earlier version stored in single precision
+STORE_RESPONSE = "INSERT OR REPLACE INTO responses (key, n_channels, size, crc, response) VALUES (?, ?, ?, ?, ?)"
 
 
 class CachedRows(NamedTuple):

@@ -9,6 +9,11 @@ results never have to be invalidated. Results that are no longer used are evicte
 Hits are exact. They occur when only the noise parameters change, in resumed and repeated runs, for duplicates, and when
 samplers are compared from the same start.
 
+Responses are stored where they were requested, as a guide does, or for every simulation. They depend on the model alone
+and are stored as computed, in double precision. In single precision, a response with an offset of a million times its
+noise would lose its digits, and the cache knows neither noise nor measurements. Compression without loss would save 10
+to 25 % of their size and is not used.
+
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
 """
@@ -69,9 +74,11 @@ class SimulationCache:
         Run failed simulations again, after a change that no fingerprint contains (an external program, memory, a time
         limit).
     responses : bool
-        Store full responses as well, in single precision, for predictions.
+        Store the response of every simulation. By default only the responses that are requested are stored
+        (`FELikelihood.simulate`, guides).
     max_response_bytes : int
-        Largest size of the stored responses [bytes]; the oldest are evicted.
+        Largest size of the stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted, with a
+        message at level INFO at the first one.
     timeout : float
         How long to wait for another writer [s].
 
@@ -130,7 +137,7 @@ class SimulationCache:
         self.max_response_bytes = max_response_bytes
         self.hits = self.misses = self.evictions = self.damaged = 0
         self._waiting: list[tuple] = []
-        self._warned_read_only = False
+        self._warned_read_only = self._said_evicted = False
         self.retry_times: dict[str, float] = {}  # time before which an action that failed is not tried again
 
     def __getstate__(self) -> tuple:
@@ -227,7 +234,7 @@ class SimulationCache:
         )
 
     def store_responses(self, model: Model, thetas: np.ndarray, responses: np.ndarray) -> None:
-        """Store full responses in single precision, in one transaction that also evicts.
+        """Store responses in double precision, in one transaction that also evicts.
 
         Parameters
         ----------
@@ -236,17 +243,16 @@ class SimulationCache:
         thetas : (n, n_structural) float
             Structural parameters.
         responses : (n, n_channels, n_steps) float
-            [SI]. Responses that are not finite, also in single precision, are not stored.
+            [SI]. Responses that are not finite are not stored.
         """
         rows = []
         keys = simulation_keys(simulation_fingerprint(model), thetas)
         for key, response in zip(keys, responses, strict=True):
-            with np.errstate(over="ignore"):
-                single = np.asarray(response, dtype="<f4")
-            if np.isfinite(single).all():
-                data = single.tobytes()
-                rows.append((key, len(single), len(data), zlib.crc32(key + data), data))
-        self._write(STORE_RESPONSE, rows)
+            if np.isfinite(response).all():
+                data = np.asarray(response, dtype="<f8").tobytes()
+                rows.append((key, len(response), len(data), zlib.crc32(key + data), data))
+        if rows:
+            self._write(STORE_RESPONSE, rows)
 
     def look_up_responses(self, model: Model, thetas: np.ndarray) -> list[np.ndarray | None]:
         """Look up responses of a model.
@@ -259,19 +265,20 @@ class SimulationCache:
 
         Returns
         -------
-        list of n (n_channels, n_steps) float32, or None
-            [SI]; None where the response is not stored.
+        list of n (n_channels, n_steps) float, or None
+            [SI]; None where the response is not stored, or in single precision, by an earlier version.
         """
         shape = len(model.channels), model.n_steps
+        size = 8 * shape[0] * shape[1]
         keys = simulation_keys(simulation_fingerprint(model), thetas)
         query = "key, crc, response FROM responses"
         found, bad = {}, []
         with self.file.lock:
             for key, crc, data in self._try("read", lambda connection: self._select(connection, keys, query), []):
-                if isinstance(data, bytes) and crc == zlib.crc32(key + data) and len(data) == 4 * shape[0] * shape[1]:
-                    found[key] = np.frombuffer(data, dtype="<f4").reshape(shape).copy()
-                else:
+                if not isinstance(data, bytes) or crc != zlib.crc32(key + data) or len(data) not in (size, size // 2):
                     bad.append(key)
+                elif len(data) == size:
+                    found[key] = np.frombuffer(data, dtype="<f8").reshape(shape)
             self._drop("responses", bad)
         return [found.get(key) for key in keys]
 
@@ -395,6 +402,7 @@ class SimulationCache:
         evicted = connection.execute(
             "DELETE FROM simulations WHERE id <= (SELECT max(id) FROM simulations) - ?", (self.max_rows,)
         ).rowcount
+        responses = 0
         if statement is STORE_RESPONSE:
             ((excess,),) = connection.execute("SELECT total(size) - ? FROM responses", (self.max_response_bytes,))
             for age, size in connection.execute("SELECT id, size FROM responses ORDER BY id").fetchall():
@@ -402,9 +410,16 @@ class SimulationCache:
                     break
                 connection.execute("DELETE FROM responses WHERE id = ?", (age,))
                 excess -= size
-                evicted += 1
+                responses += 1
         connection.execute("COMMIT")
-        self.evictions += evicted
+        self.evictions += evicted + responses
+        if responses and not self._said_evicted:
+            self._said_evicted = True
+            logger.info(
+                "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)",
+                self.path,
+                self.max_response_bytes,
+            )
 
     def _write(self, statement: str, rows: list[tuple]) -> None:
         with self.file.lock:

@@ -1,18 +1,23 @@
-"""Cache in memory of the statistics of recent simulations.
+"""Caches in memory of recent simulations: of their statistics, and of their responses.
 
 The statistics of the residuals do not depend on the noise parameters. They are reused when only these change, when a
-sampler returns to a point, and when a chain is evaluated again.
+sampler returns to a point, and when a chain is evaluated again. Responses do not depend on the measurements and on the
+noise either. They are reused when a search for modes is repeated, and by likelihoods of the same model.
 """
 
+import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-__all__ = ["MemoryCache", "distinct_keys"]
+__all__ = ["MemoryCache", "ResponseMemory", "distinct_keys"]
+
+logger = logging.getLogger(__name__)
 
 _NAN = np.array([np.nan]).tobytes()
+_ENTRY_BYTES = 250  # of an entry of the response memory besides its numbers
 
 
 def distinct_keys(rows: np.ndarray) -> tuple[list[bytes], list[int]]:
@@ -89,3 +94,92 @@ class MemoryCache:
             self._misfits.update(zip(keys, map(np.ndarray.tobytes, misfits), strict=True))
             while len(self._misfits) > self.rows:
                 self._misfits.popitem(last=False)
+
+
+class ResponseMemory:
+    """The most recently stored responses, in double precision, and the reasons of the failures among them.
+
+    Likelihoods of one model and of its shortened versions share one. It may be shared by threads. It is empty after
+    unpickling, as a `MemoryCache` is.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Largest size [bytes]; 0 for no responses. The oldest are dropped, with a message at level INFO at the first one.
+
+    Attributes
+    ----------
+    dropped : int
+        Number of simulations dropped.
+
+    Raises
+    ------
+    ValueError
+        If `max_bytes` is not a whole number or is negative.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        if isinstance(max_bytes, bool) or not isinstance(max_bytes, int | np.integer) or max_bytes < 0:
+            raise ValueError(
+                f"memory_bytes must be the size of the responses to keep in memory [bytes], a whole number of 0 or "
+                f"more; got {max_bytes!r}"
+            )
+        self.max_bytes = int(max_bytes)
+        self.dropped = 0
+        self._outcomes: OrderedDict[tuple[str, bytes], np.ndarray | str] = OrderedDict()  # the oldest first
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.max_bytes,)
+
+    def __len__(self) -> int:
+        return len(self._outcomes)
+
+    def look_up(self, fingerprint: str, keys: Sequence[bytes]) -> list[np.ndarray | str | None]:
+        """Stored outcomes of simulations.
+
+        Parameters
+        ----------
+        fingerprint : str
+            Of the model.
+        keys : sequence of n bytes
+            Of the structural parameters, see `distinct_keys`.
+
+        Returns
+        -------
+        list of n
+            The response (n_channels, n_steps) [SI], not to be changed; the reason (str) where the simulation failed;
+            None where nothing is stored.
+        """
+        with self._lock:
+            return [self._outcomes.get((fingerprint, key)) for key in keys]
+
+    def store(self, fingerprint: str, keys: Sequence[bytes], outcomes: Iterable[np.ndarray | str]) -> None:
+        """Store copies of responses, and reasons of failures; the oldest beyond the limit are dropped."""
+        if not self.max_bytes:
+            return
+        with self._lock:
+            for key, outcome in zip(keys, outcomes, strict=True):
+                self._remove((fingerprint, key))
+                self._outcomes[fingerprint, key] = outcome if isinstance(outcome, str) else np.array(outcome)
+                self._bytes += _size(outcome)
+                while self._bytes > self.max_bytes:
+                    self._remove(next(iter(self._outcomes)))
+                    if not self.dropped:
+                        logger.info(
+                            "responses are dropped from memory, the oldest first, because they have more than %d bytes "
+                            "(memory_bytes); they are simulated again if they are needed and in no cache on disk",
+                            self.max_bytes,
+                        )
+                    self.dropped += 1
+
+    def _remove(self, key: tuple[str, bytes]) -> None:
+        outcome = self._outcomes.pop(key, None)
+        if outcome is not None:
+            self._bytes -= _size(outcome)
+
+
+def _size(outcome: np.ndarray | str) -> int:
+    """Bytes of an outcome in the response memory."""
+    return _ENTRY_BYTES + (len(outcome) if isinstance(outcome, str) else outcome.nbytes)

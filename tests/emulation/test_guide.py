@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import FELikelihood, Posterior, ResponseGuide, SimulationCache
+from fe_likelihoods import FELikelihood, Posterior, ResponseGuide
 from samplers import SMCSampler, TMCMCSampler
+from tests.faults import guided_run
 
 from .problems import free_vibration, vibration
 
@@ -96,16 +97,34 @@ def test_impossible_guides_are_refused_before_any_simulation():
     assert isinstance(posterior.guide(), ResponseGuide)
 
 
-def test_a_cache_without_responses_is_warned_of(tmp_path):
-    likelihood = vibration().likelihood
-    parts = likelihood.model, likelihood.measurements, likelihood.noise
-    prior = vibration().prior
-    with pytest.warns(UserWarning, match="responses=True"):
-        Posterior(FELikelihood(*parts, cache=tmp_path / "a.sqlite"), prior).guide()
+def test_a_second_sampler_repeats_no_simulation(tmp_path):
+    """Neither in the same process nor, with a file, in another one; short parts of the record included."""
+    results, counts = [], []
+    for number in range(2):
+        log = tmp_path / f"log {number}"
+        posterior = guided_run.make(tmp_path / "cache.sqlite", log)[1]
+        for kind in (SMCSampler, TMCMCSampler):
+            sampler = kind(50, 3, posterior, vectorize=True, seed=1, guide=posterior.guide(2))
+            sampler.run_mcmc(None, 2)
+            results.append(sampler.log_evidence)
+            runs = guided_run.runs(log)
+            counts.append(len(runs))
+            assert len(set(runs)) == len(runs)
+    assert len({run[0] for run in guided_run.runs(tmp_path / "log 0")}) > 1  # parts of the record
+    assert counts[0] > 100
+    assert counts[2:] == [0] * 2
+    assert results[:2] == results[2:]
+
+
+def test_a_second_sampler_in_memory(tmp_path):
+    posterior = guided_run.make(None, tmp_path / "log")[1]
     counts = []
-    for _ in range(2):  # the second run finds every response of the first
-        posterior = Posterior(FELikelihood(*parts, cache=SimulationCache(tmp_path / "b.sqlite", responses=True)), prior)
-        sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=posterior.guide(2))
+    for _ in range(2):
+        sampler = SMCSampler(50, 3, posterior, vectorize=True, seed=1, guide=posterior.guide(2))
         sampler.run_mcmc(None, 1)
-        counts.append(posterior.report()["simulations"])
-    assert counts[0] > 100 and counts[1] == 0
+        counts.append((len(guided_run.runs(tmp_path / "log")), sampler.log_evidence))
+    assert counts[0] == counts[1]
+    marginal = posterior.marginal()  # shares the responses
+    SMCSampler(50, 2, marginal, vectorize=True, seed=1, guide=marginal.guide(2)).run_mcmc(None, 1)
+    runs = guided_run.runs(tmp_path / "log")
+    assert len(set(runs)) == len(runs) > 100

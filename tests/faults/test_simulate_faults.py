@@ -12,7 +12,7 @@ import pytest
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.simulation.disk_cache import SimulationCache
-from tests.faults import cached_run
+from tests.faults import cached_run, guided_run
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, DiesOnce, Treacherous, line
 
@@ -58,10 +58,50 @@ def test_a_killed_program_has_stored_what_it_finished(tmp_path, responses):
     np.testing.assert_array_equal(batch.response, expected.response)
     assert batch.reasons == expected.reasons
     assert 10 < again.failure_count == sum(map(bool, batch.reasons))
-    known = stored.failures + (stored.responses if responses else 0)
+    known = stored.failures + stored.responses
+    assert stored.simulations <= known < 300
     assert again.simulations == again.model.runs == 300 - known
     np.testing.assert_array_equal(again.statistics(thetas), whole.statistics(thetas))
     assert again.model.runs == 300 - known
+
+
+def guided(path, log):
+    """A run with a guide over two processes, in a program of its own."""
+    command = [sys.executable, "-m", "tests.faults.guided_run", str(path), str(log), "0.02"]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [60, 120])
+def test_a_guide_that_is_killed_repeats_no_stored_simulation(tmp_path, stop):
+    """Started again from scratch: ``cache="path"`` has the responses, of short parts of the record as well."""
+    path, logs = tmp_path / "killed.sqlite", [tmp_path / f"log {n}" for n in range(3)]
+    with guided(path, logs[0]) as process:
+        while len(guided_run.runs(logs[0])) < stop:
+            assert process.poll() is None
+            time.sleep(0.002)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    time.sleep(0.2)  # the workers end
+    first = guided_run.runs(logs[0])
+    cache, stored = SimulationCache(path), set()
+    for n_steps, *theta in first:
+        model = guided_run.Vibration(None, 0.0, n_steps)
+        (response,) = cache.look_up_responses(model, [theta])
+        if response is not None:
+            stored.add((n_steps, *theta))
+            np.testing.assert_array_equal(response, model.simulate(theta))
+    assert len(stored) == cache.info().responses > 0
+    cache.close()
+    with guided(path, logs[1]) as process:
+        again = process.communicate()[0].split()
+    with guided(tmp_path / "whole.sqlite", logs[2]) as process:
+        whole = process.communicate()[0].split()
+    second, third = guided_run.runs(logs[1]), guided_run.runs(logs[2])
+    assert not stored & set(second)
+    assert stored | set(second) == set(third)
+    assert len(set(second)) == len(second) and len(set(third)) == len(third)
+    assert again[0] == whole[0]
 
 
 def test_a_point_that_kills_its_worker_fails_alone(tmp_path):
@@ -78,11 +118,10 @@ def test_a_point_that_kills_its_worker_fails_alone(tmp_path):
         assert np.isnan(batch.response[[3, 8]]).all()
         assert likelihood.failure_reasons == {"the worker process died (signal 11)": 2}
         assert likelihood.simulations == likelihood.cache.info().simulations == 12
-        again = likelihood.simulate(thetas)  # the failures are not repeated
-        assert likelihood.simulations == 22
+        again = likelihood.simulate(thetas)  # neither the responses nor the failures are repeated
         np.testing.assert_array_equal(again.response, batch.response)
         assert np.isfinite(likelihood.statistics(thetas)[fine]).all()
-        assert likelihood.simulations == 22
+        assert likelihood.simulations == 12
     finally:
         likelihood.pool.close()
 

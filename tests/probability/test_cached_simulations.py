@@ -1,5 +1,7 @@
 """Responses that are simulated on request: their statistics are cached as those of a log-likelihood are."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -149,11 +151,84 @@ def test_a_response_is_simulated_again_and_a_failure_is_not(thetas):
 
 
 def test_without_a_memory_cache(thetas):
-    likelihood = likelihood_of(Line(), memory_rows=0)
+    likelihood = likelihood_of(Line(), memory_rows=0, memory_bytes=0)
     batch = likelihood.simulate(thetas)
     assert sum(map(bool, batch.reasons)) == likelihood.failure_count
     likelihood.misfit(thetas)
     assert likelihood.simulations == 80
+
+
+def test_responses_are_simulated_once(thetas):
+    likelihood = likelihood_of(Line())
+    batch = likelihood.simulate(thetas[:30])
+    batch.response[:] = 0.0  # what is stored is not changed
+    again = likelihood.simulate(thetas)
+    expected = simulate_batch(Line(), thetas)
+    np.testing.assert_array_equal(again.response, expected.response)
+    assert again.reasons == expected.reasons
+    assert likelihood.simulations == likelihood.model.runs == 40
+    assert (likelihood.cache_hits, likelihood.disk_hits) == (30, 0)
+    assert_same_log_likelihood(likelihood, thetas, 40)
+
+
+class Shortened(Line):
+    """Can be shortened; counts the runs of all its parts."""
+
+    def __init__(self, n_steps=8, log=None):
+        self.n_steps, self.log = n_steps, [] if log is None else log
+        self.fingerprint = f"line {n_steps}"
+
+    def first(self, seconds):
+        return Shortened(1 + round(seconds / self.dt), self.log)
+
+    def simulate(self, theta):
+        self.log.append((self.n_steps, *theta))
+        self.runs = 0
+        return super().simulate(theta)
+
+
+def test_likelihoods_of_one_model_share_responses(thetas):
+    """Another noise, or the same part of the record again, needs no simulation, with the bits of a new one."""
+    likelihood = likelihood_of(Shortened())
+    batch = likelihood.simulate(thetas)
+    short = likelihood.first(2.0)
+    expected = short.simulate(thetas)
+    assert len(likelihood.model.log) == 80
+    other = likelihood.with_noise(AutoregressiveNoise(Line.channels))
+    np.testing.assert_array_equal(other.simulate(thetas).response, batch.response)
+    third = likelihood.with_noise(AutoregressiveNoise(Line.channels))
+    again = likelihood.first(2.0)
+    np.testing.assert_array_equal(again.simulate(thetas).response, expected.response)
+    for one in (other, third, again):
+        assert_same_log_likelihood(one, thetas, 0)
+        assert one.failures == likelihood.failures
+    assert len({run for run in likelihood.model.log if run[0] == 8}) == 40
+
+
+def test_responses_in_memory_are_bounded(thetas, caplog):
+    caplog.set_level("INFO")
+    good = thetas[thetas[:, 1] < 1.0]
+    size = 2 * 8 * 8 + 250
+    likelihood = likelihood_of(Line(), memory_bytes=10 * size)
+    expected = likelihood.simulate(good).response
+    memory = likelihood.response_memory
+    assert (len(memory), memory.dropped) == (10, len(good) - 10)
+    assert len([record for record in caplog.records if "dropped from memory" in record.message]) == 1
+    np.testing.assert_array_equal(likelihood.simulate(good[-10:]).response, expected[-10:])
+    assert likelihood.simulations == len(good)
+    np.testing.assert_array_equal(likelihood.simulate(good).response, expected)
+    assert likelihood.simulations == 2 * len(good) - 10
+    with pytest.raises(ValueError, match="memory_bytes must be"):
+        likelihood_of(Line(), memory_bytes=1.5)
+
+
+def test_responses_are_not_pickled(thetas):
+    likelihood = likelihood_of(Line())
+    small = len(pickle.dumps(likelihood))
+    likelihood.simulate(np.column_stack([np.arange(1000.0), np.full(1000, 0.5)]))
+    copy = pickle.loads(pickle.dumps(likelihood))
+    assert len(pickle.dumps(likelihood)) < small + 100
+    assert (len(copy.response_memory), copy.response_memory.max_bytes) == (0, 2**28)
 
 
 @pytest.mark.parametrize("model", [Line, Batched])
@@ -162,7 +237,7 @@ def test_the_disk_cache_has_the_rows_of_statistics(model, responses, path, theta
     first = likelihood_of(model(), cache=SimulationCache(path, responses=responses))
     batch = first.simulate(thetas)
     assert first.cache.info().simulations == 40
-    assert first.cache.info().responses == (40 - first.failure_count if responses else 0)
+    assert first.cache.info().responses == 40 - first.failure_count
     assert_same_log_likelihood(first, thetas, 40)
     second = likelihood_of(model(), cache=path)
     assert_same_log_likelihood(second, thetas, 0)
@@ -171,29 +246,36 @@ def test_the_disk_cache_has_the_rows_of_statistics(model, responses, path, theta
     again = third.simulate(thetas)
     np.testing.assert_array_equal(again.response, batch.response)
     assert again.reasons == batch.reasons
-    good = 40 - first.failure_count
-    assert third.simulations == third.model.runs == (0 if responses else good)
-    assert third.disk_hits == third.cache_hits == (40 if responses else 40 - good)
+    assert third.simulations == third.model.runs == 0
+    assert third.disk_hits == third.cache_hits == 40
     assert third.failure_count == first.failure_count
     assert_same_log_likelihood(third, thetas, third.simulations)
 
 
-def test_responses_of_a_cache_are_rounded_also_when_they_are_new(path, thetas):
-    exact = likelihood_of(Line()).simulate(thetas).response
-    likelihood = likelihood_of(Line(), cache=SimulationCache(path, responses=True))
-    new = likelihood.simulate(thetas).response
-    assert new.dtype == np.float64
-    np.testing.assert_array_equal(new, exact.astype(np.float32))
-    assert (new != exact).any()
-    huge = likelihood.simulate([[1e60, 0.5], [1.0, 0.5]])  # beyond single precision: not stored, and not rounded
-    assert huge.reasons == ["", ""]
-    np.testing.assert_array_equal(huge.response[0], Line().simulate([1e60, 0.5]))
-    np.testing.assert_array_equal(huge.response[1], Line().simulate([1.0, 0.5]).astype(np.float32))
+def test_statistics_from_stored_responses(path, thetas):
+    """Another noise, or other measurements: no simulation, and the bits of a new one."""
+    first = likelihood_of(Line(), cache=path)
+    first.simulate(thetas)
+    failed = first.failure_count
+    second = likelihood_of(Line(), AutoregressiveNoise(Line.channels), cache=path)
+    assert_same_log_likelihood(second, thetas, failed)  # failures are stored with the statistics
+    assert second.disk_hits == second.cache_hits == 40 - failed
+    third = likelihood_of(Line(), AutoregressiveNoise(Line.channels), cache=path)
+    first.cache.file.connection().execute("DELETE FROM responses")
+    assert_same_log_likelihood(third, thetas, 0)  # the statistics have been stored
+
+
+def test_responses_of_any_size_are_stored(path):
+    expected = likelihood_of(Line()).simulate([[1e60, 0.5], [1.0, 0.5]]).response
+    for runs in (2, 0):
+        likelihood = likelihood_of(Line(), cache=path)
+        np.testing.assert_array_equal(likelihood.simulate([[1e60, 0.5], [1.0, 0.5]]).response, expected)
+        assert likelihood.simulations == runs
 
 
 def test_a_response_that_is_no_longer_stored_is_simulated_again(path, thetas):
     good = thetas[thetas[:, 1] < 1.0]
-    cache = SimulationCache(path, responses=True, max_response_bytes=10 * 2 * 8 * 4)
+    cache = SimulationCache(path, responses=True, max_response_bytes=10 * 2 * 8 * 8)
     expected = likelihood_of(Line(), cache=cache).simulate(good).response
     likelihood = likelihood_of(Line(), cache=SimulationCache(path, responses=True))
     np.testing.assert_array_equal(likelihood.simulate(good).response, expected)

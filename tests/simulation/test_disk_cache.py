@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 import threading
+import zlib
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
@@ -127,14 +128,15 @@ def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
     assert (likelihood.simulations, likelihood.disk_hits) == (300, 600)
 
 
-def test_a_batch_needs_one_query_and_one_write(path, thetas):
+def test_a_batch_needs_two_queries_and_one_write(path, thetas):
     likelihood = likelihood_of(Batched(), path)
     statements = []
     likelihood.cache.file.connection().set_trace_callback(statements.append)
     likelihood.chunk_size = 1000
     likelihood.misfit(thetas)
     kinds = [statement.split()[0] for statement in statements]
-    assert kinds.count("SELECT") == kinds.count("BEGIN") == kinds.count("COMMIT") == 1
+    assert kinds.count("SELECT") == 2  # of statistics, and of responses where these are missing
+    assert kinds.count("BEGIN") == kinds.count("COMMIT") == 1
     assert kinds.count("INSERT") == 300
     statements.clear()
     likelihood.misfit(thetas)
@@ -559,15 +561,15 @@ def test_responses_are_stored_in_addition_to_the_sums(path, rng, model):
             assert response is None
         else:
             kept += 1
-            assert response.dtype == np.float32
-            np.testing.assert_array_equal(response, simulate_batch(model, theta[None]).response[0].astype("f4"))
+            np.testing.assert_array_equal(response, simulate_batch(model, theta[None]).response[0])
     assert again.info().responses == kept > 0
     assert again.look_up_responses(model, thetas[:1] + 1e-9) == [None]
     assert again.look_up_responses(Line(fingerprint="another"), thetas[:1, :2]) == [None]
 
 
-def test_responses_are_bounded(path, rng):
-    bytes_each = 2 * 8 * 4
+def test_responses_are_bounded(path, rng, caplog):
+    caplog.set_level("INFO")
+    bytes_each = 2 * 8 * 8
     cache = SimulationCache(path, responses=True, max_response_bytes=10 * bytes_each)
     thetas = rng.normal(size=(25, 2)) * [1.0, 0.1]
     likelihood = likelihood_of(Batched(), cache)
@@ -577,6 +579,28 @@ def test_responses_are_bounded(path, rng):
     kept = [response is not None for response in cache.look_up_responses(Batched(), thetas)]
     assert kept == [False] * 15 + [True] * 10
     assert cache.info().simulations == 25
+    assert len([r for r in caplog.records if "max_response_bytes" in r.message]) == 1
+
+
+def test_responses_in_single_precision_are_replaced(path, rng):
+    """An earlier version stored them; they are not what was computed."""
+    thetas = rng.uniform(0.1, 0.9, size=(6, 2))
+    first = likelihood_of(Line(), SimulationCache(path, responses=True))
+    expected = first.misfit(thetas)
+    connection = first.cache.file.connection()
+    for key, data in connection.execute("SELECT key, response FROM responses").fetchall()[:4]:
+        single = np.frombuffer(data).astype("<f4").tobytes()
+        change = "UPDATE responses SET response = ?, size = ?, crc = ? WHERE key = ?"
+        connection.execute(change, (single, len(single), zlib.crc32(key + single), key))
+    first.cache.close()
+    second = likelihood_of(Line(), path)
+    np.testing.assert_array_equal(second.misfit(thetas), expected)
+    assert second.simulations == 0
+    np.testing.assert_array_equal(second.simulate(thetas).response, simulate_batch(Line(), thetas).response)
+    assert (second.simulations, second.cache.damaged) == (4, 0)
+    third = likelihood_of(Line(), path)
+    third.simulate(thetas)
+    assert (third.simulations, third.cache.info().responses) == (0, 6)
 
 
 def test_a_response_whose_misfit_overflows_is_a_failure(path):
