@@ -366,6 +366,11 @@ def test_comparison_run_twice_simulates_once(tmp_path):
     assert results["SMC"]["mean"][0] == pytest.approx(1.15, abs=0.03)
     assert results["TMCMC as published"]["warnings"] and not results["emcee"]["warnings"]
 
+    guided = results["SMC with a guide"]
+    assert guided["verdict"] != "not usable" and guided["mean"][0] == pytest.approx(1.15, abs=0.03)
+    assert 3.0 * guided["simulations"] < results["SMC"]["simulations"]
+    assert f"verdict of SMC with a guide: {guided['verdict'].capitalize()}" in outputs[0]
+
     panels = read_figure(tmp_path, "wrong_bridge").axes
     assert [axes.get_title().split("\n")[0] for axes in panels] == list(results)
     for axes, run in zip(panels, results.values(), strict=True):
@@ -374,7 +379,7 @@ def test_comparison_run_twice_simulates_once(tmp_path):
         assert axes.get_title().endswith("warning (see the output)" if run["warnings"] else "no warning")
     labels = "fmin_1 df_1 a_1 fmin_2 df_2 a_2 Kd_1 C0_1 Kd_2 C0_2 sigma".split()
     truth = [1.15, 0.85, 1.2, 0.9, 1.1, 0.8, 0.8, 1.25, 1.3, 0.9, 0.05]
-    check_corner(read_figure(tmp_path, "corner_bridge"), labels, truth, n_posteriors=3)
+    check_corner(read_figure(tmp_path, "corner_bridge"), labels, truth, n_posteriors=4)
 
 
 # 05

@@ -2,9 +2,9 @@
 SMC, TMCMC and emcee on the same posterior
 ==========================================
 
-Three samplers are exchanged by changing one name. They sample the bridge column and the isolated bridge (synthetic
-data for both, assumed nominal values for the bridge). The tutorial shows what each sampler needs, what it returns,
-and where it fails::
+Three samplers are exchanged by changing one name, and SMC runs once more with a guide. They sample the bridge column
+and the isolated bridge (synthetic data for both, assumed nominal values for the bridge). The tutorial shows what each
+sampler needs, what it returns, and where it fails::
 
     python tutorials/04_compare_samplers.py                          # all three problems
     python tutorials/04_compare_samplers.py --problem column         # one of them
@@ -17,8 +17,14 @@ and where it fails::
 * emcee stays in the mode in which it starts. Nothing in its chain shows that there is another mode.
 * emcee walkers that start from the prior get stuck at many places.
 
-The cache stores sums of squared residuals by parameters. Equal seeds lead to equal simulations, so a repeated or an
-interrupted run finds all previous simulations in the cache.
+**A guide** replaces thousands of simulations by hundreds. SMC, TMCMC and emcee see log-probabilities only. The guide
+also sees the responses, finds the modes by Gauss-Newton steps, and proposes draws from emulators of the responses.
+Every draw is simulated by the model and weighted. A guide fails where the response is not a smooth function of the
+parameters, and it cannot see a mode to which none of its searches leads. The verdict of the sampler says what the
+result is worth.
+
+The cache stores sums of squared residuals by parameters, and the responses that the guide requests. Equal seeds lead to
+equal simulations, so a repeated or an interrupted run finds all previous simulations in the cache.
 
 ``FAST=1`` runs everything in about a minute. Its chains are too short to converge; the numbers are not results.
 """
@@ -48,6 +54,7 @@ FAST = bool(os.environ.get("FAST"))
 parser = argparse.ArgumentParser(description="Compare SMC, TMCMC and emcee; write tables and figures to a folder.")
 parser.add_argument("--problem", choices=("column", "bridge", "means"), action="append", help="default: all three")
 parser.add_argument("--walkers", type=int, default=40 if FAST else 500, help="walkers of SMC and TMCMC")
+parser.add_argument("--max-simulations", type=int, default=1500, help="limit of simulations of SMC with a guide")
 parser.add_argument("--cache", type=Path, help="file of the simulation cache; created if it does not exist")
 parser.add_argument("--steps", type=int, default=40 if FAST else 1500, help="steps of emcee")
 parser.add_argument("--seed", type=int, default=1, help="seed of the samplers")
@@ -102,29 +109,62 @@ SAMPLERS = {
     "TMCMC as published": (TMCMCSampler, CHING_CHEN_2007),
 }
 EMCEE_WALKERS = 24 if FAST else 64
-COLOURS = {"SMC": "#1f5a8c", "TMCMC": "#d9822b", "TMCMC as published": "#b03a48"}
+GUIDED_WALKERS = 40 if FAST else 100
+GUIDED = "SMC with a guide"
+COLOURS = {"SMC": "#1f5a8c", "TMCMC": "#d9822b", "TMCMC as published": "#b03a48", GUIDED: "#d4007a"}
 COLOURS |= {"emcee": "#5b8c5a", "emcee from the prior": "#7b5ea7"}
 
 
 # %%
 # Sampling: the same lines for all samplers
 # -----------------------------------------
+#
+# With a guide, the run ends when the effective sample size of the weighted draws reaches the number of walkers.
+# Therefore it has 100 walkers instead of 500, and makes one step: each further step needs up to 100 simulations more.
+# The guide needs a posterior that knows the responses, not only log-probabilities. Nothing else is changed; the noise
+# levels are sampled like the other parameters.
 
 
-def sample(name: str, problem: Problem):
-    """Run every sampler on one problem; return a posterior, and runs, seconds, simulations and warnings by sampler."""
-    runs, seconds, simulations, messages = {}, {}, {}, {}
-    for number, (label, (Sampler, settings)) in enumerate(SAMPLERS.items()):
+def make_sampler(label: str, posterior: Posterior, seed: int) -> SMCSampler | TMCMCSampler:
+    """A tempered sampler of the posterior."""
+    if label == GUIDED:
+        return SMCSampler(
+            GUIDED_WALKERS,
+            posterior.ndim,
+            posterior,
+            vectorize=True,
+            seed=seed,
+            guide=posterior.guide(),
+            max_simulations=args.max_simulations,
+        )
+    Sampler, settings = SAMPLERS[label]
+    return Sampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=seed, **dict(settings))
+
+
+class Run(NamedTuple):
+    """A sampler that has run, what it cost, and its warnings."""
+
+    sampler: emcee.EnsembleSampler
+    seconds: float
+    new: int  # simulations made by this run of the script
+    needed: float  # simulations without a cache file
+    warnings: list[str]
+
+
+def sample(name: str, problem: Problem) -> tuple[Posterior, dict[str, Run]]:
+    """Run every sampler on one problem; return its posterior, and the runs by sampler."""
+    runs = {}
+    for number, label in enumerate([*SAMPLERS, GUIDED]):
         posterior = problem.make()
         seed = args.seed + number  # different seeds: with few walkers SMC makes the same moves as TMCMC
         begin = time.perf_counter()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", SamplingWarning)
-            sampler = Sampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=seed, **dict(settings))
-            sampler.run_mcmc(None, 4, progress=not FAST)
-        runs[label], seconds[label] = sampler, time.perf_counter() - begin
-        simulations[label] = posterior.report()["simulations"]
-        messages[label] = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
+            sampler = make_sampler(label, posterior, seed)
+            sampler.run_mcmc(None, 1 if label == GUIDED else 4, progress=not FAST)
+        messages = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
+        new = posterior.report()["simulations"]
+        runs[label] = Run(sampler, time.perf_counter() - begin, new, sampler.simulations, messages)
     rng = np.random.default_rng(args.seed)
     ball = problem.truth * (1.0 + 0.005 * rng.standard_normal((EMCEE_WALKERS, posterior.ndim)))
     starts = {"emcee": ball}
@@ -136,9 +176,10 @@ def sample(name: str, problem: Problem):
         begin = time.perf_counter()
         sampler = emcee.EnsembleSampler(EMCEE_WALKERS, posterior.ndim, posterior, vectorize=True)
         sampler.run_mcmc(start, args.steps, progress=not FAST)
-        runs[label], seconds[label] = sampler, time.perf_counter() - begin
-        simulations[label], messages[label] = posterior.report()["simulations"], []
-    return posterior, runs, seconds, simulations, messages
+        report = posterior.report()
+        needed = report["simulations"] + report["disk_hits"]
+        runs[label] = Run(sampler, time.perf_counter() - begin, report["simulations"], needed, [])
+    return posterior, runs
 
 
 def draws(label: str, sampler) -> np.ndarray:
@@ -151,11 +192,12 @@ def other_mode(posterior: Posterior, truth: np.ndarray) -> np.ndarray:
     return np.append(posterior.likelihood.model.exchange_piers(truth[:10]), truth[10])
 
 
-def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict, messages: dict) -> None:
+def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict[str, Run]) -> None:
     """Samples of two parameters, one panel per sampler on common axes, with the known errors in the titles."""
     i, j = (posterior.parameter_names.index(parameter) for parameter in problem.pair)
-    trusted = np.concatenate([draws(label, runs[label]) for label in ("SMC", "TMCMC")])[:, [i, j]]
-    everything = np.concatenate([np.unique(draws(label, run), axis=0) for label, run in runs.items()])[:, [i, j]]
+    trusted = np.concatenate([draws(label, runs[label].sampler) for label in ("SMC", "TMCMC")])[:, [i, j]]
+    distinct = [np.unique(draws(label, run.sampler), axis=0) for label, run in runs.items()]
+    everything = np.concatenate(distinct)[:, [i, j]]
     low, high = np.quantile(everything, [0.01, 0.99], axis=0)
     modes = [problem.truth, *([other_mode(posterior, problem.truth)] if name == "means" else [])]
     inside = np.concatenate([trusted, np.array(modes)[:, [i, j]]])
@@ -165,20 +207,22 @@ def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict,
         1, len(runs), figsize=(3.1 * len(runs), 3.9), sharex=True, sharey=True, layout="constrained"
     )
     for axes, (label, run) in zip(panels, runs.items(), strict=True):
-        x = draws(label, run)
+        x = draws(label, run.sampler)
         share = len(np.unique(x, axis=0)) / len(x)
-        axes.plot(x[:, i], x[:, j], ".", color=COLOURS[label], markersize=3, alpha=0.5, markeredgewidth=0)
+        size = 5 if label == GUIDED else 3  # fewer points
+        axes.plot(x[:, i], x[:, j], ".", color=COLOURS[label], markersize=size, alpha=0.5, markeredgewidth=0)
         axes.plot(problem.truth[i], problem.truth[j], "+", color="k", markersize=11, label="truth (synthetic)")
-        text = f"{100 * share:.0f} % distinct points"
+        text = f"{run.needed:.0f} simulations\n{100 * share:.0f} % of {len(x)} points distinct"
         if name == "means":
             axes.plot(modes[1][i], modes[1][j], "x", color="k", markersize=8, label="piers exchanged: equally likely")
             text += f"\n{100 * np.mean(x[:, i] < x[:, j]):.0f} % in the true mode (+)"
-        text += "\nwarning (see the output)" if messages[label] else "\nno warning"
+        text += "\nwarning (see the output)" if run.warnings else "\nno warning"
         axes.set_title(f"{label}\n{text}", fontsize="small", color=COLOURS[label])
         axes.set(xlabel=f"{problem.pair[0]} [x nominal]", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.grid(alpha=0.25)
     panels[0].set_ylabel(f"{problem.pair[1]} [x nominal]")
-    panels[0].legend(fontsize="x-small", loc="lower left")
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, fontsize="small", loc="outside lower center", ncols=2, frameon=False)
     figure.suptitle(f"{name} (synthetic data)" + (f"\n{TOO_SHORT}" if FAST else ""), fontsize="medium")
     figure.savefig(args.out / f"wrong_{name}.png", dpi=90)
 
@@ -187,56 +231,72 @@ def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict,
 # Results
 # -------
 #
-# For every problem: a table of the samplers, a table of the posteriors, the warnings, a corner plot of the samplers
-# whose result is reliable, and one panel per sampler that shows where samplers fail.
+# For every problem: tables of the samplers and of their posteriors, the warnings and verdicts, a corner plot of the
+# samplers whose result is reliable, and one panel per sampler that shows where samplers fail.
+#
+# Evaluations in the first table contain changes of the noise levels, which need no simulation, and do not contain the
+# search of the guide. Simulations in the second table are what a slow model costs, the search of the guide included. The
+# effective sample size of emcee is too large where its chain is short.
 
 results = {}
 for name in args.problem or PROBLEMS:
     problem = PROBLEMS[name]
-    posterior, runs, seconds, simulations, messages = sample(name, problem)
+    posterior, runs = sample(name, problem)
     print(f"\n=== {name}: {posterior.likelihood.measurements.description}")
-    emcee_seconds = {label: value for label, value in seconds.items() if label.startswith("emcee")}
-    print(comparison_table(runs, emcee_seconds, discard=args.steps // 3))
+    samplers = {label: run.sampler for label, run in runs.items()}
+    emcee_seconds = {label: run.seconds for label, run in runs.items() if label.startswith("emcee")}
+    cost = comparison_table(samplers, emcee_seconds, discard=args.steps // 3)
+    print(cost)
+    print(f"\n{'':<20}{'simulations':>12}{'per effective sample':>22}")
+    for (label, run), size in zip(runs.items(), cost.effective_sample_size, strict=True):
+        print(f"{label:<20}{run.needed:12.0f}{run.needed / max(size, 1.0):22.1f}")
+    print()
     lines = [f"{'':<20}" + "".join(f"{n[:11]:>12}" for n in posterior.parameter_names)]
     lines.append(f"{'truth':<20}" + "".join(f"{value:12.4g}" for value in problem.truth))
-    for label, sampler in runs.items():
+    for label, sampler in samplers.items():
         x = draws(label, sampler)
         lines.append(f"{label:<20}" + "".join(f"{value:12.4g}" for value in x.mean(axis=0)))
         lines.append(f"{'  sd':<20}" + "".join(f"{value:12.2g}" for value in x.std(axis=0)))
     print("\n".join(lines))
-    for label, own in messages.items():
-        for message in own:
+    for label, run in runs.items():
+        for message in run.warnings:
             print(f"warning of {label}: {message}")
+        if not label.startswith("emcee"):
+            print(f"verdict of {label}: {run.sampler.verdict}")
     if name == "means":
         truth, other = problem.truth, other_mode(posterior, problem.truth)
         odds = np.exp(posterior.log_prior(truth) - posterior.log_prior(other))
         print(f"weight of the mode with df_1 < df_2 (about {odds / (1 + odds):.2f} by the prior at the two modes):")
-        for label, sampler in runs.items():
+        for label, sampler in samplers.items():
             x = draws(label, sampler)
             print(f"  {label:<20} {np.mean(x[:, 1] < x[:, 4]):.2f}")
     results[name] = {
         label: {
-            "mean": draws(label, sampler).mean(axis=0).tolist(),
-            "sd": draws(label, sampler).std(axis=0).tolist(),
-            "simulations": simulations[label],
-            "seconds": seconds[label],
-            "log_evidence": float(getattr(sampler, "log_evidence", np.nan)),
-            "warnings": messages[label],
+            "mean": draws(label, run.sampler).mean(axis=0).tolist(),
+            "sd": draws(label, run.sampler).std(axis=0).tolist(),
+            "new_simulations": run.new,
+            "simulations": run.needed,
+            "seconds": run.seconds,
+            "log_evidence": float(getattr(run.sampler, "log_evidence", np.nan)),
+            "verdict": None if label.startswith("emcee") else run.sampler.verdict.status,
+            "warnings": run.warnings,
         }
-        for label, sampler in runs.items()
+        for label, run in runs.items()
     }
 
     # corner plots of the reliable samplers on common axes
-    shown = [label for label in runs if label != "TMCMC as published"]
-    if name == "means":
-        shown = ["SMC", "TMCMC"]  # emcee has one mode, or walkers at many places
-    pool = np.concatenate([draws(label, runs[label]) for label in shown])
+    shown = ["SMC", "TMCMC", GUIDED]
+    if runs[GUIDED].sampler.verdict.status == "not usable":
+        shown.remove(GUIDED)
+    if name != "means":  # where emcee has one mode, or walkers at many places
+        shown.append("emcee")
+    pool = np.concatenate([draws(label, samplers[label]) for label in shown])
     low, high = np.quantile(pool, [0.001, 0.999], axis=0)
     low, high = np.minimum(low, problem.truth), np.maximum(high, problem.truth)
     limits = list(zip(low - 0.02 * (high - low), high + 0.02 * (high - low), strict=True))
     figure = None
     for label in shown:
-        x = draws(label, runs[label])
+        x = draws(label, samplers[label])
         figure = corner.corner(
             x,
             fig=figure,
@@ -244,9 +304,11 @@ for name in args.problem or PROBLEMS:
             range=limits,
             color=COLOURS[label],
             weights=np.full(len(x), 1.0 / len(x)),
-            plot_datapoints=False,
+            plot_datapoints=label == GUIDED,  # its draws are too few for contours
+            plot_contours=label != GUIDED,
+            data_kwargs={"alpha": 0.7, "ms": 4},
             plot_density=False,
-            fill_contours=False,
+            no_fill_contours=True,  # a white interior would hide the samplers drawn before
             levels=(0.5, 0.9),
             smooth=1.0,
             truths=problem.truth,
@@ -257,12 +319,15 @@ for name in args.problem or PROBLEMS:
     for axes in figure.axes[:: posterior.ndim + 1]:  # corner scales each diagonal panel to the last histogram only
         axes.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches))
     handles = [Line2D([], [], color=COLOURS[label], label=label) for label in shown]
+    for handle in handles:
+        if handle.get_label() == GUIDED:
+            handle.set(marker="o", linestyle="")
     figure.legend(handles=handles, loc="upper right", fontsize=22, frameon=False)
-    title = f"{name}: contours contain 50 and 90 % (synthetic data; grey: truth)"
+    title = f"{name}: contours contain 50 and 90 %; points: draws with a guide (synthetic data; grey: truth)"
     figure.suptitle(title + (f"\n{TOO_SHORT}" if FAST else ""), fontsize=22, color="#b03a48" if FAST else "k")
     figure.savefig(args.out / f"corner_{name}.png", dpi=70)
-    plot_failures(name, problem, posterior, runs, messages)
+    plot_failures(name, problem, posterior, runs)
 
 (args.out / "comparison.json").write_text(json.dumps(results, indent=2) + "\n")
-total = sum(run["simulations"] for problem in results.values() for run in problem.values())
+total = sum(run["new_simulations"] for problem in results.values() for run in problem.values())
 print(f"\n{total} simulations in total; figures and comparison.json are in {args.out}/")
