@@ -235,8 +235,8 @@ def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict[
 # samplers whose result is reliable, and one panel per sampler that shows where samplers fail.
 #
 # Evaluations in the first table contain changes of the noise levels, which need no simulation, and do not contain the
-# search of the guide. Simulations in the second table are what a slow model costs, the search of the guide included. The
-# effective sample size of emcee is too large where its chain is short.
+# search of the guide. Simulations in the second table are what a slow model costs; the search of the guide is included.
+# The effective sample size of emcee is too large where its chain is short.
 
 results = {}
 for name in args.problem or PROBLEMS:

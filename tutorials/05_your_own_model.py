@@ -165,7 +165,7 @@ def make_pool(kind: str, workers: int):
 
 
 def with_few_simulations(posterior: Posterior, walkers: int, seed: int) -> SMCSampler:
-    """The same posterior by a guide."""
+    """The same posterior by a guide. The cache file keeps the responses that the guide requests."""
     sampler = SMCSampler(
         walkers, posterior.ndim, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=1000
     )
@@ -179,7 +179,8 @@ def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
     together = np.concatenate([x[:, :2] for x in draws.values()] + [TRUTH[None]])
     margin = 0.25 * np.ptp(together, axis=0)
     figure = plt.figure(figsize=(6.5, 6.5))
-    for width, (name, x) in zip((4.0, 2.0, 0.8), draws.items(), strict=False):  # equal curves stay visible
+    widths = (4.5, 2.5, 0.8)  # equal curves stay visible
+    for width, (name, x) in zip(widths, draws.items(), strict=False):
         corner.corner(
             x[:, :2],
             fig=figure,
@@ -201,7 +202,10 @@ def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
     for k in (0, 3):  # corner scales each diagonal panel to the last histogram only
         diagonal = figure.axes[k]
         diagonal.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in diagonal.patches))
-    handles = [Line2D([], [], color=colour, label=name) for name, colour in colours.items()]
+    handles = [
+        Line2D([], [], color=colour, linewidth=width, label=name)
+        for width, (name, colour) in zip(widths, colours.items(), strict=False)
+    ]
     handles.append(Line2D([], [], color="#8a8f98", marker="s", label="truth (synthetic)"))
     figure.legend(handles=handles, loc="upper right", frameon=False, bbox_to_anchor=(0.95, 0.93))
     figure.text(0.6, 0.66, "contours contain 50 and 90 %", fontsize="small")
@@ -254,7 +258,7 @@ def main() -> None:
             f"{report['failure_count']} failed, "
             f"{results[name]['seconds']:.1f} s"
         )
-    few = with_few_simulations(make_posterior(models(args.out)["function"], data, None, None), 100, args.seed)
+    few = with_few_simulations(make_posterior(models(args.out)["function"], data, None, cache), 100, args.seed)
     print(f"with a guide: log evidence {few.log_evidence:.2f} +- {few.log_evidence_error:.2f}\n{few.verdict}")
     for thing in to_close:
         thing.close()
