@@ -42,7 +42,7 @@ from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import lend
 from .tempering.multilevel import check_coarse
 from .tempering.mutation import MoveSchedule, check_moves
-from .tempering.population import Population, Sweep, check_size, check_start
+from .tempering.population import GuideTick, Population, Sweep, check_size, check_start
 from .tempering.results import AnnealingResult
 from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
 from .tempering.verdict import describe_halt, independent_points, judge
@@ -337,8 +337,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     for name in State.__slots__:
                         setattr(advanced, name, getattr(stored, name))
                 self.random_state = stored.random_state
-                self._checkpoint.halt(stored, store and missing > 0 and made + new == 0, self._budget.off_path)
-                warn(describe_halt(self.verdict, self._budget.limit))
+                self._checkpoint.halt(stored, store and missing > 0 and made + new == 0)
+                before_sweeps = self._result.halt is not None
+                warn(describe_halt(self.verdict, self._budget.limit, made + new, missing, before_sweeps))
                 if new == 0 and missing > 0:
                     yield stored
         except GeneratorExit:  # the user wants no more states
@@ -357,7 +358,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if self._result.independent_points is not None or self._verdict is None:
             result, settings = self._result, self.settings.guided
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
-            self._verdict = judge(result, settings, self.nwalkers, self.ndim, self.simulations, missing, failed)
+            searched = self._budget.of_guides
+            self._verdict = judge(
+                result, settings, self.nwalkers, self.ndim, self.simulations, missing, failed, searched
+            )
             self._checkpoint.store_verdict(self._verdict)
 
     def compute_log_prob(self, coords):
@@ -432,7 +436,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             _, probabilities = self._usual_moves or get_moves(self)
             self._usual_moves = MoveSchedule(copy.deepcopy(self._first_moves), probabilities)
         self._evaluator.reset()
-        self._budget.unused = contents.unused
+        known = (batch.coords for batch in contents.evaluated)
+        self._budget.restore(known, contents.of_earlier_guides, contents.of_guides)
         state = self._anneal(State(start.coords, copy=True), True, bar)
         if last is not None and self._result.halt is None:
             state = State(last.coords, log_prob=last.log_prob, blobs=last.blobs, random_state=last.random_state)
@@ -469,12 +474,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
             guidance = lend(self._guide, get_random(self), self._checkpoint.remember, self._budget)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse, guidance)
-        labels = {"desc": "ladder", "unit": " sweeps", **(bar["progress_kwargs"] or {})}
+        unit = " sweeps" if guidance is None else " batches"
+        labels = {"desc": "ladder", "unit": unit, **(bar["progress_kwargs"] or {})}
         with get_progress_bar(bar["progress"], None, **labels) as shown:
             for result, population, report in record(steps, self._evaluator, self._checkpoint):
                 self._result = result
-                if isinstance(report, Sweep):
-                    show_progress(shown, population, report, self.evaluations, self._optional.report)
+                if isinstance(report, Sweep | GuideTick):
+                    show_progress(shown, labels["desc"], population, report, self.evaluations, self._optional.report)
         if coarse is not None and coarse.failures.count:
             failed = coarse.failures.count, coarse.evaluations, coarse.failures.most_common()
             logger.warning("%d of %d evaluations of the coarse model failed and count as impossible (%s)", *failed)

@@ -58,7 +58,8 @@ def ladder_plot(sampler: Any) -> "Figure":
     middle.plot(number, column["effective_sample_size"], "o-", color=BLUE, markersize=4, label="effective sample size")
     middle.plot(number, column["distinct_ancestors"], "s--", color=ORANGE, markersize=4, label="distinct points")
     middle.axhline(sampler.nwalkers, color=GREY, linewidth=1, linestyle=":", label="walkers")
-    middle.set_ylim(0, 1.08 * sampler.nwalkers)
+    # the weighted draws of a guide are more than the walkers that are resampled from them
+    middle.set_ylim(0, 1.08 * max(sampler.nwalkers, column["effective_sample_size"].max()))
     middle.set_ylabel("points")
     middle.legend(frameon=False, fontsize="small", ncols=3, loc="lower left")
     bottom.bar(number, column["moves"], color=GREY, alpha=0.35, width=0.7)

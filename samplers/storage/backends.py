@@ -17,6 +17,7 @@ import secrets
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from emcee.backends import Backend, HDFBackend
@@ -25,7 +26,7 @@ from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.population import Stage
 from ..tempering.verdict import Verdict
 from .emcee_internals import append_steps, drop_last_step, holds_steps
-from .journal import Contents, EvaluatedBatch, Journal, RunStart, Step, read_journal
+from .journal import Contents, EvaluatedBatch, Journal, RunStart, Step, describe_damage, read_journal
 
 __all__ = [
     "JournaledBackend",
@@ -168,10 +169,10 @@ class JournaledBackend(HDFBackend):
         if self._journal is not None:
             self._journal.evaluated(batch)
 
-    def remembered(self, key: str, arrays: Sequence[np.ndarray]) -> None:
-        """Enter arrays that a guide stores in the journal."""
+    def remembered(self, key: str, arrays: Sequence[np.ndarray], of_guides: float) -> None:
+        """Enter arrays that a guide stores in the journal, with the number of simulations made by guides."""
         if self._journal is not None:
-            self._journal.remembered(key, arrays)
+            self._journal.remembered(key, arrays, of_guides)
 
     def call(self, nsteps: int) -> None:
         """Enter the number of steps that a call asks for in the journal."""
@@ -183,10 +184,10 @@ class JournaledBackend(HDFBackend):
         if self._journal is not None:
             self._journal.done()
 
-    def halt(self, shows: bool, unused: float) -> None:
+    def halt(self, shows: bool) -> None:
         """Enter in the journal that the limit of simulations ended the call, and whether the next step shows it."""
         if self._journal is not None:
-            self._journal.halt(shows, unused)
+            self._journal.halt(shows)
 
     def prepare_to_continue(self) -> None:
         """Read the journal, so that the run can be continued."""
@@ -215,6 +216,8 @@ class JournaledBackend(HDFBackend):
                 if run is None:
                     return None
                 contents = read_journal(self.journal_path)
+                if contents is None and self.journal_path.exists() and _holds_results(file[self.name]):
+                    raise ValueError(describe_damage(self.journal_path, "it ends before the start of the run"))
                 if contents is None or contents.header[RUN] != run:
                     logger.info("%s: the journal of the run is missing or has no start", self.filename)
                     return None
@@ -230,7 +233,8 @@ class JournaledBackend(HDFBackend):
             if contents is None and not _is_unfinished(self.filename):
                 raise ValueError(
                     f"{self.filename} is damaged or not an HDF5 file ({error}), and there is no journal at "
-                    f"{self.journal_path} to rebuild it from: restore it from a copy, or give another file"
+                    f"{self.journal_path}, or too little of one, to rebuild it from: restore it from a copy, or give "
+                    "another file"
                 ) from error
             aside = _set_aside(self.filename)
             if contents is None:
@@ -255,6 +259,11 @@ class JournaledBackend(HDFBackend):
             self.grow(len(contents.steps), contents.steps[0].blobs)
             self._pending = list(contents.steps)
             self.flush()
+
+
+def _holds_results(group: Any) -> bool:
+    """Whether the HDF5 group of a run has stages or steps, which a run enters after its start is in the journal."""
+    return int(group.attrs["iteration"]) > 0 or (DATASET in group and len(group[DATASET]) > 0)
 
 
 def _is_unfinished(filename: str) -> bool:

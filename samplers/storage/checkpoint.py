@@ -202,13 +202,18 @@ class Checkpoint:
         if self._journal is not None:
             self._journal.evaluated(batch)
 
-    def remember(self, key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
-        """Arrays that ``compute()`` returns, or that it returned for this key in the interrupted run."""
+    def remember(
+        self, key: str, compute: Callable[[], Sequence[np.ndarray]], of_guides: Callable[[], float]
+    ) -> list[np.ndarray]:
+        """Arrays that ``compute()`` returns, or that it returned for this key in the interrupted run.
+
+        New ones are stored with ``of_guides()``, the number of simulations that guides have made by themselves.
+        """
         if self._replayed is not None and (arrays := self._replayed.recall(key)) is not None:
             return arrays
         arrays = [np.asarray(array) for array in compute()]
         if self._journal is not None:
-            self._journal.remembered(key, arrays)
+            self._journal.remembered(key, arrays, of_guides())
         return arrays
 
     def begin_call(self, nsteps: int) -> None:
@@ -232,7 +237,7 @@ class Checkpoint:
         if stored and isinstance(self._journal, MemoryRecord):
             self._journal.stepped(state)
 
-    def halt(self, state: State, show: bool, unused: float) -> None:
+    def halt(self, state: State, show: bool) -> None:
         """Enter that the limit of simulations ended a call.
 
         Parameters
@@ -241,12 +246,10 @@ class Checkpoint:
             The last state.
         show : bool
             Whether to store the state as a step, which is replaced when the run goes on.
-        unused : float
-            Simulations of this call that its continuation does not use.
         """
         trim_chain(self.backend)
         if self._journal is not None:
-            self._journal.halt(show, unused)
+            self._journal.halt(show)
         if show:
             self.backend.grow(1, state.blobs)
             self.backend.save_step(state, np.zeros(len(state.coords), dtype=bool))

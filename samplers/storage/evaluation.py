@@ -250,9 +250,8 @@ class Evaluator:
         return {**self.__dict__, "pool": None}
 
     def reset(self) -> None:
-        """Forget evaluations and failures."""
+        """Forget evaluations and failures; `budget` keeps its points."""
         self.evaluations, self.failures = 0, Failures()
-        self.budget.reset()
 
     @property
     def map(self) -> Callable:

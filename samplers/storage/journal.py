@@ -8,12 +8,12 @@ then dropped. Arrays are stored in NumPy's own format, texts as JSON; nothing is
     INIT  start of the annealing: draws of the prior, their log-prior, state of the random generator
     EVAL  points, and what ``log_prob_fn`` returned for them (NaN where it failed)
     FAIL  why evaluations failed (JSON), for the block before
-    MEMO  arrays that a guide has stored, after their key
+    MEMO  arrays that a guide has stored, after their key and the number of simulations that guides have made by then
     CALL  number of steps at beta = 1 that a call asks for (JSON)
     STEP  a stored step: points, log-probabilities, acceptance, blobs, state of the random generator
     DONE  the call is complete
     HALT  the limit of simulations ended the call (JSON): whether a step follows that only shows the state and will be
-          replaced when the run goes on; how many simulations the longer run will not use
+          replaced when the run goes on
     BACK  this step has been removed
     WIPE  the chain was reset
 
@@ -37,7 +37,16 @@ try:
 except ImportError:  # without such locks, two runs on one file are not detected
     lockf = None
 
-__all__ = ["Contents", "EvaluatedBatch", "Journal", "RunStart", "Step", "merge_batches", "read_journal"]
+__all__ = [
+    "Contents",
+    "EvaluatedBatch",
+    "Journal",
+    "RunStart",
+    "Step",
+    "describe_damage",
+    "merge_batches",
+    "read_journal",
+]
 
 MAGIC = b"samplers journal 1\n"
 HEADER = struct.Struct("<4sQI")
@@ -155,8 +164,10 @@ class Contents(NamedTuple):
         Number of these steps that were made.
     provisional : Step, or None
         Last step, if it only shows the state of a run that its limit of simulations ended; not in `last` and `made`.
-    unused : float
-        Simulations that the run has made and its continuation does not use.
+    of_earlier_guides : float
+        Simulations that guides had made by themselves when the last annealing started.
+    of_guides : float
+        Simulations that guides have made by themselves.
     size : int
         Size of the file [bytes].
     whole : int
@@ -173,7 +184,8 @@ class Contents(NamedTuple):
     wanted: int | None
     made: int
     provisional: Step | None = None
-    unused: float = 0.0
+    of_earlier_guides: float = 0.0
+    of_guides: float = 0.0
     size: int = 0
     whole: int = 0
 
@@ -295,9 +307,10 @@ class Journal:
         if batch.reasons:
             self._append(b"FAIL", json.dumps(list(batch.reasons.items())).encode())
 
-    def remembered(self, key: str, arrays: Sequence[np.ndarray]) -> None:
-        """Enter arrays that a guide stores."""
-        self._append(b"MEMO", _pack_arrays([np.frombuffer(key.encode(), dtype=np.uint8), *arrays]))
+    def remembered(self, key: str, arrays: Sequence[np.ndarray], of_guides: float) -> None:
+        """Enter arrays that a guide stores, and the number of simulations that guides have made by then."""
+        name, count = np.frombuffer(key.encode(), dtype=np.uint8), np.array([of_guides], dtype=float)
+        self._append(b"MEMO", _pack_arrays([name, count, *arrays]))
 
     def call(self, nsteps: int) -> None:
         """Enter the number of steps that a call asks for."""
@@ -307,9 +320,9 @@ class Journal:
         """Enter that the call is complete, or was ended by the user."""
         self._append(b"DONE")
 
-    def halt(self, shows: bool, unused: float) -> None:
+    def halt(self, shows: bool) -> None:
         """Enter that the limit of simulations ended the call; `shows`: the next step only shows the state."""
-        self._append(b"HALT", json.dumps([shows, unused]).encode())
+        self._append(b"HALT", json.dumps(shows).encode())
 
     def back(self) -> None:
         """Enter that the last step, which only showed the state, has been removed."""
@@ -332,19 +345,22 @@ def _blocks(data: bytes, path: Path) -> Iterator[tuple[bytes, bytes, int]]:
     while place + BEFORE_CONTENT <= len(data):
         header = data[place : place + HEADER.size]
         if CHECKSUM.unpack_from(data, place + HEADER.size)[0] != zlib.crc32(header):
-            raise ValueError(_damaged(path, f"the header of the block at byte {place} does not match its checksum"))
+            raise ValueError(
+                describe_damage(path, f"the header of the block at byte {place} does not match its checksum")
+            )
         kind, length, checksum = HEADER.unpack(header)
         end = place + BEFORE_CONTENT + length
         if end > len(data):
             break
         content = data[place + BEFORE_CONTENT : end]
         if zlib.crc32(content) != checksum:
-            raise ValueError(_damaged(path, f"the block at byte {place} does not match its checksum"))
+            raise ValueError(describe_damage(path, f"the block at byte {place} does not match its checksum"))
         yield kind, content, end
         place = end
 
 
-def _damaged(path: Path, what: str) -> str:
+def describe_damage(path: Path, what: str) -> str:
+    """The message of the error for a damaged journal."""
     return (
         f"{path} is damaged ({what}), so the run cannot be continued from it: restore it from a copy, or remove it to "
         "continue from the chain alone"
@@ -366,10 +382,10 @@ def read_journal(path: Path) -> Contents | None:
     if MAGIC.startswith(data):
         return None
     if not data.startswith(MAGIC):
-        raise ValueError(_damaged(path, "it does not start like a journal"))
+        raise ValueError(describe_damage(path, "it does not start like a journal"))
     header, start, evaluated, remembered, steps, last = {}, None, [], [], [], None
     before_last, wanted, made, whole = 0, None, 0, len(MAGIC)
-    shows, provisional, unused = False, None, 0.0
+    shows, provisional, of_earlier_guides, of_guides = False, None, 0.0, 0.0
     for kind, content, end in _blocks(data, path):
         whole = end
         if kind == b"HEAD":
@@ -377,15 +393,16 @@ def read_journal(path: Path) -> Contents | None:
         elif kind == b"INIT":
             coords, log_prior, *random = _unpack_arrays(content)
             start, last, wanted = RunStart(coords, log_prior, _unpack_random(random)), None, None
-            shows, provisional = False, None
+            shows, provisional, of_earlier_guides = False, None, of_guides
         elif kind == b"EVAL":
             coords, log_prob, *blobs = _unpack_arrays(content)
             evaluated.append(EvaluatedBatch(coords, log_prob, blobs[0] if blobs else None, {}))
         elif kind == b"FAIL":
             evaluated[-1].reasons.update({row: reason for row, reason in json.loads(content)})
         elif kind == b"MEMO":
-            key, *arrays = _unpack_arrays(content)
+            key, count, *arrays = _unpack_arrays(content)
             remembered.append((key.tobytes().decode(), arrays))
+            of_guides = max(of_guides, float(count.item()))
         elif kind == b"CALL":
             wanted, made, shows = json.loads(content), 0, False
         elif kind == b"DONE":
@@ -399,14 +416,13 @@ def read_journal(path: Path) -> Contents | None:
             else:
                 last, before_last, made = step, len(evaluated), made + 1
         elif kind == b"HALT":
-            shows, of_call = json.loads(content)
-            unused += of_call
+            shows = json.loads(content)
         elif kind == b"BACK":
             provisional, steps = None, steps[:-1]
         elif kind == b"WIPE":
             steps, provisional = [], None
         else:
-            raise ValueError(_damaged(path, f"it has a block of unknown kind {kind!r}"))
+            raise ValueError(describe_damage(path, f"it has a block of unknown kind {kind!r}"))
     if start is None:
         return None
     return Contents(
@@ -420,7 +436,8 @@ def read_journal(path: Path) -> Contents | None:
         wanted,
         made,
         provisional,
-        unused,
+        of_earlier_guides,
+        of_guides,
         len(data),
         whole,
     )

@@ -34,11 +34,13 @@ class MemoryRecord:
         self._last: Step | None = None
         self._header: dict = {}
         self._start: RunStart | None = None
-        self._before_last, self._wanted, self._made, self._unused, self._shows = 0, None, 0, 0.0, False
+        self._before_last, self._wanted, self._made, self._shows = 0, None, 0, False
+        self._of_earlier_guides, self._of_guides = 0.0, 0.0
 
     def begin(self, header: dict, start: RunStart) -> None:
         """Enter the start of the annealing."""
         self._header, self._start, self._last, self._wanted = header, start, None, None
+        self._of_earlier_guides = self._of_guides
 
     def continue_run(self, contents: Contents) -> None:
         """Add to what has been kept from now on."""
@@ -48,9 +50,10 @@ class MemoryRecord:
         """Enter a batch of evaluated points."""
         self._evaluated.append(batch)
 
-    def remembered(self, key: str, arrays: Sequence[np.ndarray]) -> None:
-        """Enter arrays that a guide stores."""
+    def remembered(self, key: str, arrays: Sequence[np.ndarray], of_guides: float) -> None:
+        """Enter arrays that a guide stores, and the number of simulations that guides have made by then."""
         self._remembered.append((key, list(arrays)))
+        self._of_guides = max(self._of_guides, of_guides)
 
     def call(self, nsteps: int) -> None:
         """Enter the number of steps that a call asks for."""
@@ -71,10 +74,9 @@ class MemoryRecord:
     def flush(self) -> None:
         """Nothing is pending in memory."""
 
-    def halt(self, shows: bool, unused: float) -> None:
+    def halt(self, shows: bool) -> None:
         """Enter that the limit of simulations ended the call, and whether the next step shows it."""
         self._shows = shows
-        self._unused += unused
 
     def prepare_to_continue(self) -> None:
         """Collect what has been kept, so that the run can be continued."""
@@ -95,7 +97,8 @@ class MemoryRecord:
             self._wanted,
             self._made,
             shown,
-            self._unused,
+            self._of_earlier_guides,
+            self._of_guides,
         )
 
     def forget_steps(self) -> None:

@@ -6,7 +6,18 @@ from typing import Any
 
 from ..tempering.diagnostics import check_evidence, warn
 from ..tempering.evidence_check import EvidenceCheck
-from ..tempering.population import Doubt, GuidedRound, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
+from ..tempering.population import (
+    Doubt,
+    GuidedRound,
+    GuidedStart,
+    GuideTick,
+    Halt,
+    Population,
+    Report,
+    Restart,
+    Stage,
+    Sweep,
+)
 from ..tempering.results import AnnealingResult
 from .checkpoint import Checkpoint
 from .evaluation import Evaluator
@@ -72,29 +83,41 @@ def record(
 
 def show_progress(
     bar: Any,
+    label: str,
     population: Population,
-    sweep: Sweep,
+    tick: Sweep | GuideTick,
     evaluations: int,
     report: Callable[[], Mapping[str, Any]] | None,
 ) -> None:
-    """Advance a progress bar by one sweep.
+    """Advance a progress bar by one sweep, or by one batch of a guide.
 
     Parameters
     ----------
     bar : tqdm bar, or emcee's silent one
         The bar.
-    population, sweep : Population, Sweep
+    label : str
+        Its description in sweeps; that of a guide is its phase.
+    population, tick : Population, Sweep or GuideTick
         What to show.
     evaluations : int
         Number of evaluations so far.
     report : callable, optional
         Method ``report`` of the posterior; its number of simulations is shown, if it has one.
     """
-    if hasattr(bar, "set_postfix"):  # emcee's silent bar has only update
+    if not hasattr(bar, "set_postfix"):  # emcee's silent bar has only update
+        return
+    if isinstance(tick, GuideTick):
+        figures = {"simulations": f"{tick.simulations:.6g}"}
+        figures["ESS"] = f"{population.effective_sample_size:.0f}/{tick.target}"
+        bar.set_description(f"guide: {tick.phase}", refresh=False)
+        bar.set_postfix(figures, refresh=not tick.finished)  # the next batch may take minutes
+        bar.update(int(tick.finished))
+    else:
         figures = {"beta": f"{population.beta:.3g}", "ESS": f"{population.effective_sample_size:.0f}"}
-        figures |= {"acceptance": f"{sweep.acceptance:.2f}", "evaluations": str(evaluations)}
+        figures |= {"acceptance": f"{tick.acceptance:.2f}", "evaluations": str(evaluations)}
         simulations = None if report is None else report().get("simulations")
         if simulations is not None:
             figures["simulations"] = str(simulations)
+        bar.set_description(label, refresh=False)
         bar.set_postfix(figures, refresh=False)
-    bar.update(1)
+        bar.update(1)

@@ -35,6 +35,7 @@ from .resampling import systematic
 from .settings import Settings
 from .stopping import StoppedEarly, stop_at, usable
 from .weights import (
+    WHERE_TO_LOOK,
     EvidenceError,
     coarse_weights,
     effective_sample_size,
@@ -145,10 +146,11 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState) 
         return
     log_weights = population.log_weights
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
+        advice = f", or {WHERE_TO_LOOK}" if len(log_weights) > 0 else ""
         raise ValueError(
             f"the limit of simulations (max_simulations) ended the run after {len(log_weights)} evaluated points, none "
             "of which has a finite log-probability: there is nothing to report. Call run_mcmc again with a larger "
-            "limit; the simulations made so far are kept"
+            f"limit (the simulations made so far are kept){advice}"
         )
     ancestors = systematic(normalised_weights(log_weights), random, size)
     effective, known = stop.effective_sample_size, len(log_weights)
@@ -202,6 +204,14 @@ def _from_guide(
             ),
         )
         return None
+    if found.pooled.log_evidence == -np.inf:
+        _check_prior(found, population, density, settings)
+        warn(
+            f"the draws of the guide are impossible ({found.doubt}), so the run goes on without them, by annealing "
+            "from the prior, which needs more simulations. Use a better guide, or none"
+        )
+        yield population, GuidedStart(found.doubt, "", found.pooled.pareto_shape)
+        return found
     warn(
         f"the draws of the guide are not close enough to the posterior ({found.doubt}), so the run goes on by "
         "recycling, which starts from them and needs more simulations. Use a better guide, or none"
@@ -216,6 +226,20 @@ def _from_guide(
     except StoppedEarly as stop:
         raise _better(stop, found) from None
     return None if recycled.trusted else found
+
+
+def _check_prior(found: RoundsOfGuide, population: Population, density: Density, settings: Settings) -> None:
+    """Raise ValueError if a few draws of the prior are as impossible as those of the guide."""
+    few = population.coords[: settings.guided.fewest_draws]
+    try:
+        records = density.evaluate(few)
+    except BudgetExhausted:
+        raise _stopped_rounds(found) from None
+    if np.max(records["log_prob"]) == -np.inf:
+        raise ValueError(
+            f"none of {len(found.pooled.coords)} draws of the guide and of {len(few)} draws of the prior has a finite "
+            f"log-probability: {WHERE_TO_LOOK}"
+        )
 
 
 def _disagreement(population: Population, found: RoundsOfGuide, log_evidence: float, error: float) -> Steps:

@@ -4,10 +4,11 @@ An evaluation needs a simulation unless only fast parameters differ from an earl
 the slow parameters are counted, and the simulations that a guide made by itself are added.
 
 A limit never changes what a run does: it only ends it. So a run that is continued with a larger limit repeats the same
-steps and goes on.
+steps and goes on. The simulations of the interrupted run are counted from the start of its continuation, and cost
+nothing more. A limit below their number acts as a limit of this number.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import Any, Protocol
 
@@ -18,6 +19,8 @@ __all__ = ["Budget", "BudgetExhausted", "CountsSimulations", "as_limit"]
 
 # Odd, with bits spread evenly: the golden ratio times 2^64 (Knuth, The Art of Computer Programming 3, section 6.4)
 MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
+# Sums of fractions of simulations, in another order, differ by less.
+ROUNDING = 1e-6
 
 
 class BudgetExhausted(Exception):
@@ -77,25 +80,46 @@ class Budget:
     limit : float, or None
         The limit.
     guide : object with an attribute simulations, or None
-        The guide of the run.
+        The guide in use.
     refused : bool
         Whether `fits` has returned False.
-    unused : float
-        Simulations made by the interrupted run that this one continues but does not use.
-    off_path : float
-        Simulations of this run that its continuation will not use.
     """
 
     def __init__(self, fast: Sequence[int] = (), limit: float | None = None):
         self.fast = fast
         self.limit = limit
-        self.guide: CountsSimulations | None = None
         self.reset()
 
     def reset(self) -> None:
-        """Forget all points."""
+        """Forget all points and guides."""
         self._seen: set[int] = set()
-        self.refused, self.unused, self.off_path = False, 0.0, 0.0
+        self.guide: CountsSimulations | None = None
+        self.refused = False
+        self._earlier, self._granted = 0.0, 0.0  # simulations of earlier guides, and those that `fits` has allowed
+        self._made_before = 0.0
+
+    def restore(self, batches: Iterable[np.ndarray], of_earlier_guides: float, of_guides: float) -> None:
+        """Start again with the simulations of the interrupted run that is continued.
+
+        Parameters
+        ----------
+        batches : iterable of (n, ndim) float
+            All points that it has evaluated.
+        of_earlier_guides : float
+            Simulations of guides before the annealing that is repeated.
+        of_guides : float
+            Simulations of all its guides.
+        """
+        self.reset()
+        for coords in batches:
+            self.count(coords)
+        self._earlier = of_earlier_guides
+        self._made_before = len(self._seen) + of_guides + ROUNDING
+
+    def begin(self, guide: CountsSimulations) -> None:
+        """Count the simulations of a new guide from now on, besides those of earlier ones."""
+        self._earlier = self.of_guides
+        self.guide, self.refused, self._granted = guide, False, 0.0
 
     def _keys(self, coords: np.ndarray) -> list[int]:
         """A hash of the slow parameters of each point, the same in every process."""
@@ -108,18 +132,30 @@ class Budget:
         return (keys ^ (keys >> np.uint64(29))).tolist()
 
     @property
+    def of_guides(self) -> float:
+        """Simulations that guides have made by themselves."""
+        return self._earlier + (0.0 if self.guide is None else self.guide.simulations)
+
+    @property
+    def of_guides_with_batch(self) -> float:
+        """As `of_guides`, with the batch that `fits` has allowed last, which a guide counts after it is made."""
+        return max(self.of_guides, self._granted)
+
+    @property
     def simulations(self) -> float:
-        """Distinct points in the slow parameters, the simulations of the guide, and the unused ones."""
-        return len(self._seen) + (0.0 if self.guide is None else self.guide.simulations) + self.unused
+        """Distinct points in the slow parameters, and the simulations of guides."""
+        return len(self._seen) + self.of_guides
 
     @property
     def remaining(self) -> float:
         """Simulations left; inf without a limit."""
-        return np.inf if self.limit is None else max(self.limit - self.simulations, 0.0)
+        return np.inf if self.limit is None else max(max(self.limit, self._made_before) - self.simulations, 0.0)
 
     def fits(self, simulations: float) -> bool:
-        """Whether that many more simulations fit; a refusal is noted in `refused`."""
+        """Whether that many more simulations of the guide fit; a refusal is noted in `refused`."""
         fit = simulations <= self.remaining
+        if fit:
+            self._granted = self.of_guides + simulations
         self.refused = self.refused or not fit
         return fit
 

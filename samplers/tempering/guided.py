@@ -17,7 +17,7 @@ import numpy as np
 from .adaptive_importance import StartingDensity
 from .budget import Budget, BudgetExhausted
 from .guide import AdaptedGuide, GuideSession
-from .population import Density, GuidedRound, Population, Report, Sweep
+from .population import Density, GuidedRound, GuideTick, Population, Report
 from .rounds import PooledRounds, Round, pool_rounds
 from .settings import GuidedSettings
 from .stopping import LARGEST_SHAPE
@@ -47,8 +47,12 @@ class Guidance(NamedTuple):
 
 def lend(guide: AdaptedGuide, random: np.random.RandomState, remember: Callable, budget: Budget) -> Guidance:
     """A fresh guide with what it is lent; its simulations count from now on."""
-    budget.guide, budget.refused = guide, False
-    return Guidance(guide, GuideSession(random, remember, budget.fits, lambda: budget.remaining), budget)
+    budget.begin(guide)
+
+    def remember_with_count(key: str, compute: Callable) -> list[np.ndarray]:
+        return remember(key, compute, lambda: budget.of_guides_with_batch)
+
+    return Guidance(guide, GuideSession(random, remember_with_count, budget.fits, lambda: budget.remaining), budget)
 
 
 class RoundsOfGuide(NamedTuple):
@@ -108,8 +112,9 @@ def draw_rounds(
 
     Yields
     ------
-    Population, Sweep or GuidedRound
-        A tick of the progress bar, or a round.
+    Population, GuideTick or GuidedRound
+        The draws of the prior with the effective sample size of all rounds so far, and a tick of the progress bar or a
+        round.
 
     Returns
     -------
@@ -117,10 +122,16 @@ def draw_rounds(
     """
     guide, session, budget = guidance
     size, rounds = len(population.coords), []
+    population = population._replace(effective_sample_size=0.0)
+
+    def tick(phase: str, finished: bool) -> tuple[Population, GuideTick]:
+        return population, GuideTick(phase, budget.simulations, size, finished)
+
+    yield tick("search", False)
     for _ in guide.prepare(session):
-        yield population, Sweep(0.0)
-    before = budget.simulations
+        yield tick("search", True)
     while True:
+        yield tick(f"round {len(rounds) + 1}", False)
         coords = guide.draw(_next_size(rounds, size, settings, guide), random)
         latest, complete = _evaluate_round(coords, density, guide, session)
         if latest is not None:
@@ -141,22 +152,20 @@ def draw_rounds(
                 pooled.effective_sample_size,
             ),
         )
-        yield population, Sweep(last.effective_share)
-        if budget.refused:  # the search was cut short: with a larger limit the guide goes on searching, and draws later
-            budget.off_path += budget.simulations - before
-        if not complete or budget.refused:
+        yield tick(f"round {len(rounds)}", True)
+        if not complete or budget.refused:  # a search that was cut short goes on first, if the limit is raised
             return RoundsOfGuide("", "", pooled, last, True)
         enough = pooled.effective_sample_size >= size
         if enough and trusted(last, settings) and _even(pooled, settings):
             return RoundsOfGuide("", "", pooled, last)
-        if doubt := _hopeless(rounds, settings):
+        if doubt := _impossible(rounds) or _hopeless(rounds, settings):
             return RoundsOfGuide(doubt, "", pooled, last)
         if len(rounds) >= settings.most_rounds:
             shortfall = _describe(last, pooled, settings)
             usable = last.effective_share >= settings.usable_share and pooled.pareto_shape < LARGEST_SHAPE
             return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
         for _ in guide.refine(last.coords, last.records["log_prob"].copy(), session):
-            yield population, Sweep(last.effective_share)
+            yield tick(f"after round {len(rounds)}", True)
         if budget.refused:
             return RoundsOfGuide("", "", pooled, last, True)
 
@@ -173,6 +182,8 @@ def _next_size(rounds: Sequence[Round], size: int, settings: GuidedSettings, gui
     if not rounds:
         return first
     last = rounds[-1]
+    if _all_impossible(rounds):  # perhaps all simulations fail: find out with few more
+        return settings.fewest_draws
     if trusted(last, settings):
         missing = size - pool_rounds(rounds, guide.log_density_error).effective_sample_size
         return int(np.clip(np.ceil(missing / last.effective_share), first, max(size, first)))
@@ -204,6 +215,18 @@ def _evaluate_round(
     alive = log_prob > -np.inf
     log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density[:n], -np.inf)
     return Round(coords[:n], records, log_weights), complete
+
+
+def _all_impossible(rounds: Sequence[Round]) -> bool:
+    """Whether no draw has a finite log-probability."""
+    return all(np.max(r.log_weights) == -np.inf for r in rounds)
+
+
+def _impossible(rounds: Sequence[Round]) -> str:
+    """Why to give up after two rounds without one possible draw; empty if there is no reason."""
+    if len(rounds) < 2 or not _all_impossible(rounds):
+        return ""
+    return f"none of their first {sum(len(r.coords) for r in rounds)} has a finite log-probability"
 
 
 def _hopeless(rounds: Sequence[Round], settings: GuidedSettings) -> str:

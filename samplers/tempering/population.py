@@ -15,6 +15,7 @@ from .evidence_check import EvidenceCheck
 __all__ = [
     "Density",
     "Doubt",
+    "GuideTick",
     "GuidedRound",
     "GuidedStart",
     "Halt",
@@ -156,6 +157,27 @@ class Sweep(NamedTuple):
     acceptance: float
 
 
+class GuideTick(NamedTuple):
+    """A tick of the progress bar while a guide is in use.
+
+    Attributes
+    ----------
+    phase : str
+        What the guide does: "search", "round 3", or "after round 3" while it learns.
+    simulations : float
+        Simulations so far.
+    target : int
+        Effective sample size that is wanted of all rounds; that of the population is the present one.
+    finished : bool
+        Whether a batch is finished; False where a phase begins.
+    """
+
+    phase: str
+    simulations: float
+    target: int
+    finished: bool
+
+
 class Restart(NamedTuple):
     """Annealing starts again: the stages reported so far are void.
 
@@ -258,4 +280,4 @@ class Halt(NamedTuple):
     from_guide: bool = False
 
 
-Report = Stage | Sweep | Restart | EvidenceCheck | GuidedRound | GuidedStart | Halt | Doubt
+Report = Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | Halt | Doubt

@@ -42,7 +42,9 @@ class Verdict(NamedTuple):
     more_simulations : float, optional
         About how many more simulations a converged result takes; 0 if it is converged, None if that is not known.
     effective_sample_size : float
-        Of the walkers when beta = 1 was reached.
+        Of the points that `sample` names, when beta = 1 was reached.
+    sample : str
+        Which points these are: the walkers, or weighted ones that the walkers were resampled from.
     """
 
     status: str
@@ -50,10 +52,11 @@ class Verdict(NamedTuple):
     simulations: float
     more_simulations: float | None
     effective_sample_size: float
+    sample: str
 
     def __str__(self) -> str:
         first = (
-            f"{self.status.capitalize()}: effective sample size {self.effective_sample_size:.0f} from "
+            f"{self.status.capitalize()}: effective sample size {self.effective_sample_size:.0f} ({self.sample}) from "
             f"{self.simulations:.6g} simulations."
         )
         more = []
@@ -72,6 +75,7 @@ def judge(
     simulations: float,
     missing_steps: int = 0,
     failures: str = "",
+    searched: float = 0.0,
 ) -> Verdict:
     """Judge an annealing that has reached beta = 1.
 
@@ -89,6 +93,8 @@ def judge(
         Steps at beta = 1 that the limit of simulations did not allow.
     failures : str
         How many evaluations failed, for the reasons; empty if none did.
+    searched : float
+        Simulations that the guide made by itself.
 
     Returns
     -------
@@ -97,6 +103,8 @@ def judge(
     stage = result.ladder[-1]
     found = list(result.doubts)
     reasons: list[str] = []
+    if searched > 0.0:
+        reasons.append(f"the guide used {searched:.6g} of the {simulations:.6g} simulations for its search")
     more: float | None = 0.0
     halt = result.halt
     if halt is not None and not halt.complete:
@@ -142,7 +150,17 @@ def judge(
         float(simulations),
         None if more is None else float(more),
         float(stage.effective_sample_size if result.independent_points is None else result.independent_points),
+        _sample(result, nwalkers),
     )
+
+
+def _sample(result: AnnealingResult, nwalkers: int) -> str:
+    """The points that `independent_points` gives the effective sample size of."""
+    if result.halt is not None and not result.halt.complete:
+        return f"of {result.halt.points} weighted points, resampled to {nwalkers} walkers"
+    if result.start is not None and result.start.used:
+        return f"of {sum(r.draws for r in result.rounds)} weighted draws, resampled to {nwalkers} walkers"
+    return f"of {nwalkers} walkers"
 
 
 def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
@@ -160,11 +178,31 @@ def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
     return float(np.min((spread / error)[error > 0.0] ** 2, initial=len(coords)))
 
 
-def describe_halt(verdict: Verdict, limit: float | None) -> str:
-    """The warning when the limit of simulations has ended a call."""
+def describe_halt(verdict: Verdict, limit: float, made: int, missing: int, before_sweeps: bool) -> str:
+    """The warning when the limit of simulations has ended a call.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        The verdict.
+    limit : float
+        The limit.
+    made, missing : int
+        Steps at beta = 1 that were made, and that were not.
+    before_sweeps : bool
+        Whether the limit ended the run before the sweeps at beta = 1.
+    """
+    if before_sweeps:
+        ended = f"max_simulations={limit:g} ended the run"
+    else:
+        ended = f"max_simulations={limit:g} allowed {made} of {made + missing} steps at beta = 1"
+    if verdict.simulations > limit:
+        ended += f" (the stored run has made {verdict.simulations:.6g} simulations, which are kept)"
+    if verdict.status == CONVERGED:
+        return f"{ended}. The chain holds draws of the posterior: no further simulation is necessary"
     return (
-        f"max_simulations={limit:g} ended the run. {verdict} To go on from here, set the attribute max_simulations of "
-        "the sampler to a larger number, or make a new sampler with the same file, and call run_mcmc again"
+        f"{ended}. {verdict} To go on from here, set the attribute max_simulations of the sampler to a larger number, "
+        "or make a new sampler with the same file, and call run_mcmc again"
     )
 
 

@@ -20,6 +20,7 @@ Chan & Lai (2013), Ann. Stat. 41(6), doi:10.1214/13-AOS1172 (standard error of t
 import numpy as np
 
 __all__ = [
+    "WHERE_TO_LOOK",
     "EvidenceError",
     "coarse_weights",
     "effective_sample_size",
@@ -28,6 +29,10 @@ __all__ = [
     "normalised_weights",
 ]
 
+WHERE_TO_LOOK = (
+    "check the model and the prior, and see the failures that log_prob_fn reports (posterior.report() for a posterior "
+    "of fe_likelihoods)"
+)
 BISECTIONS = 20
 WEIGHT_GRID = 4096.0
 
@@ -60,7 +65,7 @@ def normalised_weights(log_weights: np.ndarray) -> np.ndarray:
     """
     weights, top = _scaled(log_weights)
     if top == -np.inf:
-        raise ValueError("every weight is zero: no point has a finite log-likelihood; check the model and the prior")
+        raise ValueError(f"every weight is zero: no point has a finite log-likelihood; {WHERE_TO_LOOK}")
     return weights / weights.sum()
 
 
@@ -120,7 +125,7 @@ def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.n
     """
     top = np.max(log_likelihood)
     if top == -np.inf:
-        raise ValueError("no point of the population has a finite log-likelihood; check the model and the prior")
+        raise ValueError(f"no point of the population has a finite log-likelihood; {WHERE_TO_LOOK}")
     alive = log_likelihood > -np.inf
     relative = log_likelihood[alive] - top
     if base is None:

@@ -40,3 +40,25 @@ def test_the_points_that_fit():
     assert budget.remaining == 3 and budget.fits(3) and not budget.refused
     assert budget.fitting(coords) == 6 and budget.fitting(coords[::-1]) == 3
     assert not budget.fits(4) and budget.refused
+
+
+class Counts:
+    simulations = 0.0
+
+
+def test_simulations_of_an_interrupted_run_cost_nothing():
+    """Ten points, and 7.5 simulations of a guide, which makes them again from the journal."""
+    coords = np.arange(10.0)[:, None]
+    budget, guide = Budget(limit=12), Counts()
+    budget.restore([coords[:4], coords[3:]], 0.0, 7.5)
+    budget.begin(guide)
+    assert budget.simulations == 10
+    for cost in (0.1,) * 25 + (5.0,):
+        assert budget.fits(cost)
+        guide.simulations += cost
+    assert abs(budget.simulations - 17.5) < 1e-9
+    assert not budget.fits(0.1)
+    assert budget.fitting(coords) == 10 and budget.fitting(coords + 0.5) == 0
+    budget.limit = 20.0
+    assert budget.fitting(coords + 0.5) == 2
+    assert budget.fits(2) and budget.of_guides_with_batch == 9.5 and budget.of_guides < 7.6

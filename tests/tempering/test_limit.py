@@ -38,7 +38,7 @@ def make(path, limit, file=None, seed=4):
 
 
 def halted(sampler, steps):
-    with pytest.warns(SamplingWarning, match="max_simulations=.* ended the run"):
+    with pytest.warns(SamplingWarning, match="max_simulations=.* (ended the run|allowed)"):
         sampler.run_mcmc(None, steps)
 
 
@@ -112,7 +112,7 @@ def test_steps_that_fit_are_kept():
     sampler.run_mcmc(None, 0)
     annealing = sampler.simulations
     sampler = make("guide", annealing + 2.5 * N)
-    with pytest.warns(SamplingWarning, match="3 of the steps at beta = 1 were not made"):
+    with pytest.warns(SamplingWarning, match="allowed 2 of 5 steps at beta = 1"):
         sampler.run_mcmc(None, 5)
     assert sampler.iteration == 2 and sampler.simulations == annealing + 2 * N
     sampler = make("guide", annealing + 0.5 * N)
@@ -120,6 +120,167 @@ def test_steps_that_fit_are_kept():
     assert sampler.iteration == 1 and sampler.simulations == annealing
     assert sampler.verdict.status == "converged"
     assert "5 of the steps at beta = 1 were not made" in str(sampler.verdict)
+
+
+def test_the_warning_of_a_converged_run_is_calm():
+    plain = make("guide", None)
+    plain.run_mcmc(None, 0)
+    annealing = plain.simulations
+    sampler = make("guide", annealing)
+    with pytest.warns(SamplingWarning) as caught:
+        sampler.run_mcmc(None, 5)
+    message = str(caught[0].message)
+    assert len(caught) == 1 and message == (
+        f"max_simulations={annealing:g} allowed 0 of 5 steps at beta = 1. The chain holds draws of the posterior: no "
+        "further simulation is necessary"
+    )
+    sampler = make("guide", 0.5 * annealing)  # control
+    with pytest.warns(SamplingWarning, match="ended the run. .*sable: .*To go on from here"):
+        sampler.run_mcmc(None, 5)
+
+
+def test_the_verdict_says_of_what_the_effective_sample_size_is():
+    sampler = make("guide", None)
+    sampler.run_mcmc(None, 1)
+    draws = sum(r.draws for r in sampler.rounds)
+    assert sampler.verdict.effective_sample_size > N
+    assert f"(of {draws} weighted draws, resampled to {N} walkers)" in str(sampler.verdict)
+    sampler = make("moves", None)
+    sampler.run_mcmc(None, 1)
+    assert f"(of {N} walkers)" in str(sampler.verdict)
+    assert "for its search" not in str(sampler.verdict)
+
+
+@pytest.mark.parametrize("limit", [20, 30, None])
+def test_the_verdict_says_what_the_search_took(limit):
+    """Cut after two of its three batches, before the first draws, or never."""
+    sampler = make("searching guide", limit)
+    if limit is None:
+        sampler.run_mcmc(None, 1)
+    else:
+        halted(sampler, 1)
+    made = sampler.guide.simulations
+    assert made == {20: 16, 30: 24}.get(limit, made) and made >= 16
+    words = f"The guide used {made:g} of the {sampler.simulations:g} simulations for its search."
+    assert words in str(sampler.verdict)
+
+
+class Recorded(Gaussian):
+    """Keeps the points that were evaluated, as a model that counts its runs."""
+
+    def __init__(self, points, **target):
+        super().__init__(**target)
+        self.points = points
+
+    def __call__(self, x):
+        self.points.update(row.tobytes() for row in np.atleast_2d(x))
+        return super().__call__(x)
+
+
+class TwiceSearchingGuide(SearchingGuide):
+    """A search that leaves the random numbers alone: what is drawn after a cut search is drawn again later."""
+
+    def search(self, session):
+        state = session.random.get_state()
+        session.random.seed(len(self.found))
+        super().search(session)
+        session.random.set_state(state)
+
+
+@pytest.mark.parametrize("guide", [SearchingGuide, TwiceSearchingGuide])
+@pytest.mark.parametrize("where", ["memory", "file"])
+def test_the_count_is_that_of_the_model(guide, where, tmp_path):
+    """Whatever the limits before: a search is cut twice, then rounds, then sweeps."""
+
+    def make(points, limit, seed=4):
+        posterior = Recorded(points, ndim=3, sd=0.05)
+        backend = None if where == "memory" else emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+        return SMCSampler(
+            N, 3, posterior, vectorize=True, seed=seed, guide=guide(posterior), max_simulations=limit, backend=backend
+        )
+
+    whole = make(set(), None)
+    whole.run_mcmc(None, 2)
+    chain, evidence, total = whole.get_chain(), whole.log_evidence, whole.simulations
+    assert total == len(whole.log_prob_fn.f.points)
+    if where == "file":
+        whole.backend.close()
+        (tmp_path / "run.h5").unlink()
+    points = set()
+    sampler, counted = make(points, 13), []
+    for limit in (13, 22, 60, 150, None):
+        if where == "file":
+            sampler.backend.close()
+            sampler = make(points, limit, seed=4 + len(points))
+        sampler.max_simulations = limit
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            sampler.run_mcmc(None, 2)
+        assert sampler.simulations == sampler.verdict.simulations == len(points) <= (limit or np.inf)
+        counted.append(len(points))
+    assert counted[:2] == [13, 22] and sampler.verdict.status == "converged"
+    # draws after a cut search that the long run does not make are not lost from the count
+    assert counted[-1] == total if guide is TwiceSearchingGuide else counted[-1] > total
+    assert np.array_equal(sampler.get_chain(), chain) and sampler.log_evidence == evidence
+
+
+@pytest.mark.parametrize("path", ["searching guide", "recycling", "moves"])
+@pytest.mark.parametrize("first", ["limited", "killed", "finished"])
+def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
+    """Simulations in the file cost nothing."""
+    file = tmp_path / "run.h5"
+    whole = make(path, None, tmp_path / "whole.h5")
+    whole.run_mcmc(None, 2)
+    limit = np.ceil(0.6 * whole.simulations)
+    sampler = make(path, None if first == "finished" else limit, file)
+    if first == "finished":
+        sampler.run_mcmc(None, 2)
+    else:
+        halted(sampler, 2)
+    chain, evidence, made = sampler.get_chain(), sampler.log_evidence, sampler.simulations
+    sampler.backend.close()
+    if first == "killed":
+        journal = file.with_name("run.h5.mcmc.journal")
+        data = journal.read_bytes()
+        journal.write_bytes(data[: data.rindex(b"HALT")])
+    sampler = make(path, 10, file, seed=77)
+    halted(sampler, 3)
+    assert sampler.simulations == sampler.verdict.simulations == made
+    assert sampler.log_prob_fn.f.calls <= 2  # to check that the posterior is the same
+    assert sampler.log_evidence == evidence
+    assert np.array_equal(sampler.get_chain()[: len(chain)], chain)
+    assert np.array_equal(sampler.get_chain()[-1], chain[-1])  # shown again where the chain was finished
+    assert sampler.max_simulations == 10
+    sampler.backend.close()
+    sampler = make(path, None, file, seed=78)
+    sampler.run_mcmc(None, 2)
+    if first == "finished":
+        whole.run_mcmc(None, 2)
+    assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.simulations == whole.simulations
+
+
+def test_a_smaller_limit_in_memory():
+    sampler = make("searching guide", 200)
+    halted(sampler, 2)
+    chain, verdict = sampler.get_chain(), sampler.verdict
+    sampler.max_simulations = 30
+    with pytest.warns(SamplingWarning, match="stored run has made 200 simulations, which are kept"):
+        sampler.run_mcmc(None, 2)
+    assert np.array_equal(sampler.get_chain(), chain) and sampler.verdict == verdict
+
+
+def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
+    file = tmp_path / "run.h5"
+    sampler = make("searching guide", None, file)
+    sampler.run_mcmc(None, 1)
+    first, searched = sampler.simulations, sampler.guide.simulations
+    sampler.run_mcmc(sampler.log_prob_fn.f.sample_prior(N, np.random.default_rng(3)), 1)
+    made = sampler.simulations
+    assert made == sampler.log_prob_fn.f.calls and made > first + searched
+    sampler.backend.close()
+    sampler = make("searching guide", None, file)
+    sampler.run_mcmc(None, 1)
+    assert sampler.simulations == made + N
 
 
 def test_no_step_is_stored_where_none_was_wanted():
@@ -192,7 +353,8 @@ def test_the_verdict_is_stored_with_the_chain(tmp_path):
     again = make("guide", 60, tmp_path / "run.h5")
     assert again.verdict == sampler.verdict and isinstance(again.verdict, Verdict)
     assert json.dumps(again.verdict)
-    assert str(again.verdict).startswith("Usable: effective sample size 22 from 60 simulations.")
+    begin = "Usable: effective sample size 22 (of 60 weighted points, resampled to 100 walkers) from 60 simulations."
+    assert str(again.verdict).startswith(begin)
 
 
 @pytest.mark.parametrize("limit", [0, -5, True, "many", np.nan])
