@@ -45,6 +45,7 @@ from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import GuideTick, Population, Sweep, check_size, check_start
 from .tempering.results import AnnealingResult
 from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
+from .tempering.stopping import NothingToReport
 from .tempering.verdict import describe_halt, independent_points, judge
 
 __all__ = ["TemperedSampler"]
@@ -338,10 +339,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
                         setattr(advanced, name, getattr(stored, name))
                 self.random_state = stored.random_state
                 self._checkpoint.halt(stored, store and missing > 0 and made + new == 0)
-                before_sweeps = self._result.halt is not None
-                warn(describe_halt(self.verdict, self._budget.limit, made + new, missing, before_sweeps))
+                warn(describe_halt(self.verdict, self._budget.limit, self._result, made + new, missing))
                 if new == 0 and missing > 0:
                     yield stored
+        except NothingToReport:
+            self._checkpoint.prepare_to_continue()
+            raise
         except GeneratorExit:  # the user wants no more states
             complete = True
             raise
@@ -356,12 +359,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def _judge(self, missing: int) -> None:
         """Store the verdict on an annealing of this object, or keep that of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
-            result, settings = self._result, self.settings.guided
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
+            numbers = self.nwalkers, self.ndim, self.simulations
             searched = self._budget.of_guides
-            self._verdict = judge(
-                result, settings, self.nwalkers, self.ndim, self.simulations, missing, failed, searched
-            )
+            self._verdict = judge(self._result, self.settings.guided, *numbers, missing, failed, searched)
             self._checkpoint.store_verdict(self._verdict)
 
     def compute_log_prob(self, coords):

@@ -51,7 +51,7 @@ def ladder_plot(sampler: Any) -> "Figure":
     top.set_ylabel(r"$\beta$ [-]")
     if stages[-1].beta == 1.0:
         top.set_title(
-            f"{len(stages)} stages, {column['evaluations'].sum()} evaluations, "
+            f"{len(stages)} stage{'s' if len(stages) > 1 else ''}, {column['evaluations'].sum()} evaluations, "
             rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2f}",
             fontsize="medium",
         )
@@ -64,14 +64,15 @@ def ladder_plot(sampler: Any) -> "Figure":
     middle.legend(frameon=False, fontsize="small", ncols=3, loc="lower left")
     bottom.bar(number, column["moves"], color=GREY, alpha=0.35, width=0.7)
     bottom.set_ylabel("sweeps per stage (bars)")
-    bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
+    bottom.set_ylim(0, 1.05 * max(column["moves"].max(), 1))
+    bottom.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     share = bottom.twinx()
     share.plot(number, column["acceptance"], "o-", color=BLUE, markersize=4)
     share.set_ylim(0, 1)
     share.set_ylabel("acceptance [-]", color=BLUE)
     bottom.set_xlabel("stage")
     bottom.set_xlim(0.3, len(stages) + 0.7)
-    bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
+    bottom.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     for axes in (top, middle):
         axes.grid(alpha=0.25)
     return figure

@@ -253,6 +253,10 @@ class Checkpoint:
         if show:
             self.backend.grow(1, state.blobs)
             self.backend.save_step(state, np.zeros(len(state.coords), dtype=bool))
+        self.prepare_to_continue()
+
+    def prepare_to_continue(self) -> None:
+        """Let the next call of this object continue the run."""
         if self._journal is not None:
             self._journal.prepare_to_continue()
 

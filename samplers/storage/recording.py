@@ -109,15 +109,16 @@ def show_progress(
     if isinstance(tick, GuideTick):
         figures = {"simulations": f"{tick.simulations:.6g}"}
         figures["ESS"] = f"{population.effective_sample_size:.0f}/{tick.target}"
-        bar.set_description(f"guide: {tick.phase}", refresh=False)
-        bar.set_postfix(figures, refresh=not tick.finished)  # the next batch may take minutes
-        bar.update(int(tick.finished))
+        bar.set_description_str(f"guide: {tick.phase}", refresh=False)
+        bar.set_postfix(figures, refresh=not tick.finished)  # shown before the first batch, which may take minutes
+        if tick.finished:
+            bar.update(1)
     else:
         figures = {"beta": f"{population.beta:.3g}", "ESS": f"{population.effective_sample_size:.0f}"}
         figures |= {"acceptance": f"{tick.acceptance:.2f}", "evaluations": str(evaluations)}
         simulations = None if report is None else report().get("simulations")
         if simulations is not None:
             figures["simulations"] = str(simulations)
-        bar.set_description(label, refresh=False)
+        bar.set_description_str(label, refresh=False)
         bar.set_postfix(figures, refresh=False)
         bar.update(1)

@@ -33,7 +33,7 @@ from .mutation import MoveSchedule, Mutated, grow_chains, move_together
 from .population import Density, Doubt, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from .resampling import systematic
 from .settings import Settings
-from .stopping import StoppedEarly, stop_at, usable
+from .stopping import NothingToReport, StoppedEarly, stop_at, usable
 from .weights import (
     WHERE_TO_LOOK,
     EvidenceError,
@@ -147,7 +147,7 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState) 
     log_weights = population.log_weights
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
         advice = f", or {WHERE_TO_LOOK}" if len(log_weights) > 0 else ""
-        raise ValueError(
+        raise NothingToReport(
             f"the limit of simulations (max_simulations) ended the run after {len(log_weights)} evaluated points, none "
             "of which has a finite log-probability: there is nothing to report. Call run_mcmc again with a larger "
             f"limit (the simulations made so far are kept){advice}"

@@ -6,7 +6,15 @@ from .population import Population
 from .rounds import tail_variance
 from .weights import effective_sample_size, log_mean_weight
 
-__all__ = ["LARGEST_ERROR", "LARGEST_SHAPE", "StoppedEarly", "fewest_points", "stop_at", "usable"]
+__all__ = [
+    "LARGEST_ERROR",
+    "LARGEST_SHAPE",
+    "NothingToReport",
+    "StoppedEarly",
+    "fewest_points",
+    "stop_at",
+    "usable",
+]
 
 
 # Weights of a larger Pareto shape have no useful mean (Vehtari et al. 2024, JMLR 25(72)).
@@ -27,6 +35,10 @@ def usable(effective_sample_size: float, pareto_shape: float, error: float, ndim
     """Whether weighted points give means and an evidence with errors that can be stated."""
     enough = effective_sample_size >= fewest_points(ndim)
     return enough and pareto_shape < LARGEST_SHAPE and error <= LARGEST_ERROR
+
+
+class NothingToReport(ValueError):
+    """The limit of simulations has ended an annealing in which no possible point is known."""
 
 
 class StoppedEarly(Exception):

@@ -178,7 +178,7 @@ def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
     return float(np.min((spread / error)[error > 0.0] ** 2, initial=len(coords)))
 
 
-def describe_halt(verdict: Verdict, limit: float, made: int, missing: int, before_sweeps: bool) -> str:
+def describe_halt(verdict: Verdict, limit: float, result: AnnealingResult, made: int, missing: int) -> str:
     """The warning when the limit of simulations has ended a call.
 
     Parameters
@@ -187,12 +187,12 @@ def describe_halt(verdict: Verdict, limit: float, made: int, missing: int, befor
         The verdict.
     limit : float
         The limit.
+    result : AnnealingResult
+        What the annealing has found.
     made, missing : int
         Steps at beta = 1 that were made, and that were not.
-    before_sweeps : bool
-        Whether the limit ended the run before the sweeps at beta = 1.
     """
-    if before_sweeps:
+    if result.halt is not None:
         ended = f"max_simulations={limit:g} ended the run"
     else:
         ended = f"max_simulations={limit:g} allowed {made} of {made + missing} steps at beta = 1"

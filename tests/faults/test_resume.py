@@ -219,28 +219,48 @@ def test_a_damaged_file_without_a_journal_is_refused(finished):
         make(path, "smc")
 
 
-@pytest.mark.parametrize("chain", ["empty", "finished"])
-def test_killed_before_the_start_was_in_the_journal(finished, chain, tmp_path):
-    """The journal then has only its header: there is no run yet, and an existing chain is kept."""
-    path, whole = finished
-    data = journal_of(path).read_bytes()
-    journal_of(path).write_bytes(data[: data.index(b"INIT")])
-    if chain == "empty":
-        import h5py
+@pytest.mark.parametrize("left", ["nothing", "half a name", "half a header", "header"])
+def test_killed_before_the_start_was_in_the_journal(finished, left, tmp_path):
+    """There is no run yet, and the chain is empty."""
+    import h5py
 
-        run = read_run(path)
-        emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
-        with h5py.File(path, "a") as file:
-            file["mcmc"].attrs["run"] = run
-        sampler = make(path, "smc")
-        sampler.run_mcmc(None, STEPS)
-        assert same(sampler, whole)
-        assert read_journal(journal_of(path)).steps
-    else:
-        sampler = make(path, "smc")
-        assert np.array_equal(sampler.get_chain(), whole.get_chain())
+    path, whole = finished
+    journal_of(path).write_bytes(beginning(path, left))
+    run = read_run(path)
+    emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+    with h5py.File(path, "a") as file:
+        file["mcmc"].attrs["run"] = run
+    sampler = make(path, "smc")
+    sampler.run_mcmc(None, STEPS)
+    assert same(sampler, whole)
+    assert read_journal(journal_of(path)).steps
+
+
+@pytest.mark.parametrize("left", ["nothing", "half a name", "half a header", "header"])
+@pytest.mark.parametrize("steps", [0, 2])
+def test_a_journal_that_ends_before_the_start_of_a_stored_run_is_refused(left, steps, tmp_path):
+    """The start is entered before any stage or step, so the rest was lost; removed, the chain alone is continued."""
+    path = tmp_path / "run.h5"
+    whole = make(path, "smc")
+    whole.run_mcmc(None, steps)
+    chain = whole.get_chain() if steps > 0 else None
+    whole.backend.close()
+    journal_of(path).write_bytes(beginning(path, left))
+    with pytest.raises(ValueError, match="it ends before the start of the run.*remove it to continue from the chain"):
+        make(path, "smc")
+    journal_of(path).unlink()
+    sampler = make(path, "smc")
+    assert sampler.ladder == whole.ladder
+    if steps > 0:
         sampler.run_mcmc(None, 2)
-        assert sampler.iteration == STEPS + 2 and sampler.ladder == whole.ladder
+        assert np.array_equal(sampler.get_chain()[:steps], chain) and sampler.iteration == steps + 2
+
+
+def beginning(path, left):
+    """The first bytes of a journal."""
+    data = journal_of(path).read_bytes()
+    end = data.index(b"INIT")
+    return data[: {"nothing": 0, "half a name": 10, "half a header": 40, "header": end}[left]]
 
 
 def read_run(path):

@@ -7,6 +7,7 @@ import pytest
 
 from samplers import SMCSampler, ladder_plot, ladder_table, pair_plot
 from tests.contract.targets import Gaussian
+from tests.tempering.test_guided import laplace
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -57,6 +58,17 @@ def test_ladder_plot_shows_every_stage():
     assert [bar.get_height() for bar in moves.patches] == [stage.moves for stage in stages]
     assert moves.get_xlabel() == "stage" and moves.get_ylabel() == "sweeps per stage (bars)"
     assert list(acceptance.lines[0].get_ydata()) == [stage.acceptance for stage in stages]
+
+
+def test_ladder_plot_shows_an_effective_sample_size_above_the_number_of_walkers():
+    """As of the weighted draws of a guide."""
+    posterior = Gaussian()
+    sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1, guide=laplace(posterior))
+    sampler.run_mcmc(None, 1)
+    beta, sizes, moves, _ = ladder_plot(sampler).axes
+    assert beta.get_title().startswith("1 stage, ") and moves.get_ylim() == (0, 1.05)
+    assert [tick for tick in moves.get_xticks() if 0.3 < tick < 1.7] == [1]
+    assert 100 < sampler.ladder[0].effective_sample_size < sizes.get_ylim()[1]
 
 
 @pytest.mark.parametrize("function", [ladder_plot, ladder_table])

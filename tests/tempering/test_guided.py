@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from contextlib import nullcontext
 from dataclasses import fields, replace
 
 import emcee
@@ -159,7 +160,49 @@ def test_the_progress_bar_counts_searches_rounds_and_sweeps(capfd):
     sampler = SMCSampler(N, 3, posterior, vectorize=True, seed=1, guide=SearchingGuide(posterior))
     sampler.run_mcmc(None, 2, progress=True)
     shown = capfd.readouterr().err
-    assert "ladder" in shown and f"{3 + 2 * len(sampler.rounds) - 1} sweeps" in shown and "2/2" in shown
+    rounds = len(sampler.rounds)
+    assert f"guide: round {rounds}: {3 + rounds + rounds - 1} batches" in shown and "2/2" in shown
+
+
+class Bar:
+    """What tqdm was given."""
+
+    def __init__(self):
+        self.label, self.count, self.shown = "", 0, []
+
+    def set_description_str(self, text, refresh):
+        self.label = text
+
+    def set_postfix(self, figures, refresh):
+        self.figures = figures
+        if refresh:
+            self.update(0)
+
+    def update(self, n):
+        self.count += n
+        self.shown.append((self.label, self.count, self.figures))
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("good", [True, False])
+def test_the_progress_bar_shows_what_a_guide_does(good, monkeypatch):
+    bar = Bar()
+    monkeypatch.setattr("samplers.tempered.get_progress_bar", lambda *args, **kwargs: nullcontext(bar))
+    posterior = Gaussian(2)
+    guide = SearchingGuide(posterior) if good else laplace(posterior, scale=0.3, shift=4.0)
+    sampler = run(posterior, guide, steps=0)
+    labels = list(dict.fromkeys(label for label, _, _ in bar.shown))
+    learning = ["guide: after round 1"] if good else []
+    assert labels[: 3 + good] == ["guide: search", "guide: round 1", *learning, "guide: round 2"]
+    assert f"guide: round {len(sampler.rounds)}" in labels
+    simulations = [float(figures["simulations"]) for label, _, figures in bar.shown if label.startswith("guide")]
+    assert simulations == sorted(simulations)
+    if good:
+        assert [figures["simulations"] for _, _, figures in bar.shown[:4]] == ["0", "8", "16", "24"]
+        assert simulations[-1] == sampler.simulations
+        assert bar.shown[-1][2]["ESS"] == f"{sampler.rounds[-1].effective_sample_size:.0f}/{N}"
+    else:  # recycling follows
+        assert labels[-1] == "ladder" and set(bar.shown[-1][2]) == {"beta", "ESS", "acceptance", "evaluations"}
 
 
 def test_shares_of_rounds_depend_on_earlier_rounds_only():
@@ -265,6 +308,80 @@ def test_failed_draws_count_as_impossible_and_are_reported():
     assert sampler.get_chain()[..., 0].max() <= posterior.mean[0]
     assert abs(sampler.log_evidence - posterior.log_evidence - np.log(0.5)) < 4.0 * sampler.log_evidence_error
     assert f"{sampler.failure_count} of {sampler.evaluations} evaluations failed" in str(sampler.verdict)
+
+
+class PartlyImpossible(Gaussian):
+    """A share of the parameter space has zero likelihood, as where simulations fail."""
+
+    def __init__(self, share, ndim=2, sd=0.3):
+        super().__init__(ndim, sd)
+        self.share, self.points = share, set()
+
+    def __call__(self, x):
+        rows = np.atleast_2d(x)
+        self.points.update(row.tobytes() for row in rows)
+        chance = np.array([np.random.default_rng(np.abs(row.view(np.int64))).uniform() for row in rows])
+        values = np.where(chance < self.share, -np.inf, super().__call__(rows))
+        return values if np.ndim(x) == 2 else values[0]
+
+
+class DrawsOfThePrior:
+    concerns = ()
+
+    def __init__(self, posterior, shift=0.0):
+        self.posterior, self.shift = posterior, shift
+
+    def draw(self, n, random):
+        return self.posterior.sample_prior(n, random) + self.shift
+
+    def log_density(self, coords):
+        return self.posterior.log_prior(coords - self.shift)
+
+    def refine(self, coords, log_prob, session):
+        return None
+
+
+@pytest.mark.parametrize("shift", [0.0, 3.0])
+def test_a_model_that_always_fails_is_noticed_soon(shift):
+    posterior = PartlyImpossible(1.0)
+    with pytest.raises(ValueError, match="none of 55 draws of the guide and of 25 draws of the prior has a finite"):
+        run(posterior, DrawsOfThePrior(posterior, shift))
+    assert len(posterior.points) == 80
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_a_model_that_often_fails_is_sampled(share):
+    """Control: 20 % or 90 % of all points are impossible; the run ends with an answer, in each of ten cases."""
+    for seed in range(10):
+        posterior = PartlyImpossible(share)
+        sampler = run(posterior, DrawsOfThePrior(posterior), seed=seed)
+        assert np.all(np.isfinite(sampler.get_log_prob()))
+        error = sampler.log_evidence - (posterior.log_evidence + np.log(1.0 - share))
+        assert abs(error) < 5.0 * sampler.log_evidence_error + 0.1 or sampler.verdict.status == "not usable"
+
+
+def test_a_guide_whose_draws_are_all_impossible_is_given_up():
+    """Half of the prior is possible, but none of the draws."""
+
+    class HalfPossible(Gaussian):
+        def __call__(self, x):
+            return np.where(x[..., 0] < 0.0, -np.inf, super().__call__(x))
+
+    posterior = HalfPossible(2, sd=0.3)
+    guide = FixedGuide(posterior, [-6.0, 0.0], [0.01 * np.eye(2)])
+    with pytest.warns(SamplingWarning, match="the run goes on without them, by annealing from the prior"):
+        sampler = run(posterior, guide)
+    assert len(sampler.rounds) == 2 and "none of their first 55 has a finite log-prob" in str(sampler.verdict)
+    assert sampler.verdict.status == "usable"
+    assert abs(sampler.log_evidence - Gaussian(2, sd=0.3).log_evidence) < 5.0 * sampler.log_evidence_error + 0.1
+    halted = SMCSampler(N, 2, posterior, vectorize=True, seed=1, guide=guide, max_simulations=70)
+    with pytest.raises(ValueError, match="after 55 evaluated points, none.*larger limit.*posterior.report"):
+        halted.run_mcmc(None, 1)
+    halted.max_simulations = None
+    with pytest.warns(SamplingWarning, match="the run goes on without them"):
+        halted.run_mcmc(None, 1)
+    assert halted.log_evidence == sampler.log_evidence
 
 
 def test_evidences_that_disagree_are_reported(monkeypatch):

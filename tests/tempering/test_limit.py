@@ -344,6 +344,20 @@ def test_nothing_known_is_an_error_that_keeps_what_was_made():
     assert "the search was not finished" in str(sampler.verdict)
 
 
+@pytest.mark.parametrize("where", ["memory", "file"])
+def test_a_run_goes_on_after_this_error(where, tmp_path):
+    whole = make("searching guide", None)
+    whole.run_mcmc(None, 2)
+    sampler = make("searching guide", 0.5, None if where == "memory" else tmp_path / "run.h5")
+    for limit in (0.5, 0.9):
+        sampler.max_simulations = limit
+        with pytest.raises(ValueError, match="after 0 evaluated points.*simulations made so far are kept.$"):
+            sampler.run_mcmc(None, 2)
+    sampler.max_simulations = None
+    sampler.run_mcmc(None, 2)
+    assert same(sampler, whole)
+
+
 def test_the_verdict_is_stored_with_the_chain(tmp_path):
     sampler = make("guide", 60, tmp_path / "run.h5")
     with pytest.raises(ValueError, match="no verdict before a run"):
