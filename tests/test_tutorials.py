@@ -26,14 +26,14 @@ ROOT = Path(__file__).parents[1]
 TUTORIALS = sorted((ROOT / "tutorials").glob("[0-9]*.py"))
 
 
-def run_tutorial(name: str, *arguments: str) -> str:
-    """Output of a tutorial in its fast setting; its figures are pickled beside the pictures."""
+def run_tutorial(name: str, *arguments: str, timeout: float = 570.0) -> str:
+    """Output of a tutorial in its fast setting; its figures are pickled beside the pictures (timeout in seconds)."""
     done = subprocess.run(
         [sys.executable, ROOT / "tests" / "tutorial_runner.py", ROOT / "tutorials" / name, *arguments],
         env=os.environ | {"FAST": "1"},
         capture_output=True,
         text=True,
-        timeout=570,
+        timeout=timeout,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
@@ -267,13 +267,13 @@ def test_bridge_column_on_another_record(shared, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(3600)
 def test_main_job_has_the_evidence_and_the_posterior_of_the_annealing(tmp_path):
     """`make update` uses a guide and a twentieth of the simulations."""
     runs = {}
     for name, options in {"guide": (), "annealing": ("--no-guide", "--walkers", "500")}.items():
         out = tmp_path / name
-        output = run_tutorial("02_bridge_column.py", "--preset", "reduced", "--out", str(out), *options)
+        output = run_tutorial("02_bridge_column.py", "--preset", "reduced", "--out", str(out), *options, timeout=1750.0)
         runs[name] = json.loads((out / "summary.json").read_text())
         assert runs[name]["verdict"].capitalize() in output and runs[name]["verdict"] != "not usable"
     guide, annealing = runs["guide"], runs["annealing"]
