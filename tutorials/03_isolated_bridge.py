@@ -231,7 +231,7 @@ figure, axes = plt.subplots(
 for axis in axes.flat[len(names) :]:
     axis.axis("off")
 for i, axis in enumerate(axes.flat[: len(names)]):
-    axis.hist(samples[:, i], bins=40, density=True, color=BLUE, alpha=0.35)
+    axis.hist(samples[:, i], bins=int(np.clip(len(samples) / 20, 10, 40)), density=True, color=BLUE, alpha=0.35)
     if np.ptp(samples[:, i]) > 0.0:
         x = np.linspace(samples[:, i].min(), samples[:, i].max(), 300)
         axis.plot(x, gaussian_kde(samples[:, i])(x), color=BLUE)
@@ -252,6 +252,8 @@ figure = corner.corner(
     samples,
     range=list(zip(lowest - margin, highest + margin, strict=True)),  # the true values are always inside
     labels=LABELS,
+    label_kwargs={"fontsize": 18},
+    labelpad=0.1,
     truths=truths,
     smooth=1.0,
     max_n_ticks=3,
