@@ -1,15 +1,15 @@
-"""Emulator of the response near a mode: principal components of simulated responses, a Gaussian process for each.
+"""Emulator of the response near a mode: principal components of simulated residuals, a Gaussian process for each.
 
-The response at structural coordinates z is R(z) = R_0 + sum_k c_k(w) P_k, with the mean R_0 of the training responses,
-their principal components P_k in units of the noise of each channel, and coefficients c_k that a Gaussian process
-predicts from the whitened coordinates w (`fe_likelihoods.emulation.gaussian_process`). A response is a smooth function
+The residual, measured minus response, at structural coordinates z is r(z) = r_0 + sum_k c_k(w) P_k, with the mean r_0
+of the training residuals, their principal components P_k in units of the noise of each channel, and coefficients c_k
+that a Gaussian process predicts from the whitened coordinates w (`fe_likelihoods.emulation.gaussian_process`). The
+emulated response is R(z) = y - r(z). A response is a smooth function
 of the parameters where its misfit, summed over thousands of samples, is a narrow and curved one; and the same emulator
 serves every noise.
 
-With means m_k and variances v_k of the coefficients, the statistics of the residuals at the mean response are, in
-closed form,
+With means m_k and variances v_k of the coefficients, the statistics of the mean residual are, in closed form,
 
-    S = S(y - R_0) - 2 sum_k m_k B(y - R_0, P_k) + sum_kl m_k m_l B(P_k, P_l),
+    S = S(r_0) + 2 sum_k m_k B(r_0, P_k) + sum_kl m_k m_l B(P_k, P_l),
 
 where B is the bilinear form of the statistics. The uncertainty of the emulator enters through the expected likelihood.
 The log-likelihood is nearly quadratic in each coefficient, with the curvature h_k = -2 sum_a f_a B_a(P_k, P_k) for the
@@ -51,12 +51,12 @@ class TrainingSet(NamedTuple):
     ----------
     coords : (m, d) float
         Structural coordinates.
-    responses : (m, n_channels, n_steps) float32
-        Responses [SI].
+    residuals : (m, n_channels, n_steps) float32
+        Measured minus simulated response [SI].
     """
 
     coords: np.ndarray
-    responses: np.ndarray
+    residuals: np.ndarray
 
 
 class _Forms(NamedTuple):
@@ -100,14 +100,14 @@ class ResponseEmulator:
         self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
         self.left_out = left_out_errors(process)
         self._coefficients = coefficients
-        self._forms = self._bilinear(target.measured)
+        self._forms = self._bilinear()
         self._curvature = np.maximum(-2.0 * np.diagonal(self._forms.quadratic @ slopes), 0.0)
 
-    def _bilinear(self, measured: np.ndarray) -> _Forms:
-        statistic, origin = self._target.statistic, measured - self._mean
+    def _bilinear(self) -> _Forms:
+        statistic = self._target.statistic
         return _Forms(
-            statistic(origin),
-            bilinear_form(statistic, self._components, origin[None])[:, 0],
+            statistic(self._mean),
+            bilinear_form(statistic, self._components, self._mean[None])[:, 0],
             bilinear_form(statistic, self._components),
         )
 
@@ -171,7 +171,7 @@ class ResponseEmulator:
         """Statistics (n, n_numbers) at coefficients (n, k)."""
         constant, linear, quadratic = self._forms
         columns = [
-            constant[a] - 2.0 * mean @ linear[:, a] + ((mean @ quadratic[:, :, a]) * mean).sum(axis=1)
+            constant[a] + 2.0 * mean @ linear[:, a] + ((mean @ quadratic[:, :, a]) * mean).sum(axis=1)
             for a in range(len(constant))
         ]
         return np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
@@ -192,7 +192,8 @@ class ResponseEmulator:
         coords = self._target.structural_coordinates(np.asarray(thetas, dtype=float))
         inside = self.squared_distance(coords) <= self.reach
         mean, _ = predict(self.process, self.whitened(np.where(inside[:, None], coords, self.centre)))
-        response = self._mean + np.einsum("nk,kct->nct", mean, self._components, optimize=True)
+        residuals = self._mean + np.einsum("nk,kct->nct", mean, self._components, optimize=True)
+        response = self._target.measured - residuals
         response[~inside] = np.nan
         reason = "the parameters are outside the region that the emulator was fitted to"
         return SimulationBatch(response, ["" if good else reason for good in inside])
@@ -207,7 +208,7 @@ def fit_emulator(
     slopes: np.ndarray,
     earlier: ResponseEmulator | None = None,
 ) -> ResponseEmulator:
-    """Fit an emulator to simulated responses.
+    """Fit an emulator to simulations.
 
     Parameters
     ----------
@@ -228,8 +229,8 @@ def fit_emulator(
     -------
     ResponseEmulator
     """
-    mean = training.responses.mean(axis=0, dtype=float)
-    scaled = ((training.responses - mean) / scales[:, None]).reshape(len(training.coords), -1)
+    mean = training.residuals.mean(axis=0, dtype=float)
+    scaled = ((training.residuals - mean) / scales[:, None]).reshape(len(training.coords), -1)
     values, vectors = np.linalg.eigh(scaled @ scaled.T)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     left_out = values.sum() - np.cumsum(values)

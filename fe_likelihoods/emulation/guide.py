@@ -300,9 +300,9 @@ class ResponseGuide:
             if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
                 continue
             best = rows[0]
-            residuals = self._target.measured - archive.responses[best]
+            residuals = archive.residuals[best].astype(float)
             scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max(axis=1)
-            training = TrainingSet(coords[rows], np.array([archive.responses[row] for row in rows]))
+            training = TrainingSet(coords[rows], np.array([archive.residuals[row] for row in rows]))
             slopes = self._target.slopes(statistics[best], self._target.fit_noise(statistics[best], noise).coords)
             centre, covariance = region.centre[:d], region.covariance[:d, :d]
             try:

@@ -114,8 +114,9 @@ class Archive:
     ----------
     coords : (n, n_structural) float
         Structural coordinates.
-    responses : list of n (n_channels, n_steps) float32
-        Responses [SI].
+    residuals : list of n (n_channels, n_steps) float32
+        Measured minus simulated response [SI]. Computed in double precision and then rounded, it keeps its digits where
+        a channel has an offset of a million times its noise; a rounded response would not.
     statistics : (n, n_numbers) float
         Statistics of the residuals.
     """
@@ -123,10 +124,10 @@ class Archive:
     def __init__(self) -> None:
         self._coords: list[np.ndarray] = []
         self._statistics: list[np.ndarray] = []
-        self.responses: list[np.ndarray] = []
+        self.residuals: list[np.ndarray] = []
 
     def __len__(self) -> int:
-        return len(self.responses)
+        return len(self.residuals)
 
     @property
     def coords(self) -> np.ndarray:
@@ -136,10 +137,10 @@ class Archive:
     def statistics(self) -> np.ndarray:
         return np.array(self._statistics)
 
-    def add(self, coords: np.ndarray, responses: np.ndarray, statistics: np.ndarray) -> None:
+    def add(self, coords: np.ndarray, residuals: np.ndarray, statistics: np.ndarray) -> None:
         """Add runs."""
         self._coords += list(coords)
-        self.responses += list(responses)
+        self.residuals += list(residuals)
         self._statistics += list(statistics)
 
 
@@ -231,7 +232,7 @@ class ResponseTarget:
     def run_parameters(self, thetas: np.ndarray, coords: np.ndarray, remember: Remember = run_at_once) -> Runs:
         """Simulate structural parameters (n, n_structural), whose coordinates are `coords`; the archive keeps the runs.
 
-        Responses are rounded to single precision, in which they are stored, so that a resumed run is the same.
+        Residuals are rounded to single precision, in which they are stored, so that a resumed run is the same.
         """
         computed = []
 
@@ -239,17 +240,18 @@ class ResponseTarget:
             batch = self._likelihood.simulate(thetas)
             computed.append(True)
             with np.errstate(over="ignore"):
-                response = batch.response.astype(np.float32)
+                residuals = (self.measured - batch.response).astype(np.float32)
             reasons = np.frombuffer(json.dumps(list(batch.reasons)).encode(), dtype=np.uint8)
-            return [response, self._likelihood.statistics(thetas), reasons]
+            return [residuals, self._likelihood.statistics(thetas), reasons]
 
-        key = hashlib.blake2b(self.model.fingerprint.encode() + thetas.tobytes(), digest_size=16).hexdigest()
-        response, statistics, reasons = remember(key, compute)
+        text = f"residuals of {self.model.fingerprint}".encode()  # earlier journals have responses
+        key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
+        residuals, statistics, reasons = remember(key, compute)
         if not computed:
             self._likelihood.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
-        failed = ~(np.isfinite(response).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
-        self.archive.add(coords[~failed], response[~failed], statistics[~failed])
-        return Runs(self.measured - response, statistics, failed)
+        failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
+        self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
+        return Runs(residuals.astype(float), statistics, failed)
 
     # ------------------------------------------------------------------ the noise
 

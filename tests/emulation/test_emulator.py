@@ -18,7 +18,7 @@ def emulator_of(posterior, n=40, seed=1):
     centre = target.structural_coordinates(np.array([[1.2, 0.8]]))[0]
     coords = centre + SCALE * np.random.default_rng(seed).standard_normal((n, 2))
     target.run(coords)
-    training = TrainingSet(target.archive.coords, np.array(target.archive.responses))
+    training = TrainingSet(target.archive.coords, np.array(target.archive.residuals))
     statistics = target.archive.statistics
     slopes = target.slopes(statistics[0], target.fit_noise(statistics[0]).coords)
     return target, fit_emulator(target, training, centre, np.diag(SCALE**2), np.array([2e-3, 5.0]), slopes)

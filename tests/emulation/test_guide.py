@@ -1,11 +1,14 @@
 """The guide behind the samplers: right on small posteriors, exact counts, budgets, refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fe_likelihoods import FELikelihood, Posterior, ResponseGuide
 from samplers import SMCSampler, TMCMCSampler
 from tests.faults import guided_run
+from tests.statistics.hard_posteriors import CASES
 
 from .problems import free_vibration, vibration
 
@@ -128,3 +131,23 @@ def test_a_second_sampler_in_memory(tmp_path):
     SMCSampler(50, 2, marginal, vectorize=True, seed=1, guide=marginal.guide(2)).run_mcmc(None, 1)
     runs = guided_run.runs(tmp_path / "log")
     assert len(set(runs)) == len(runs) > 100
+
+
+def test_a_channel_with_an_offset_of_a_million_times_its_noise():
+    """Residuals keep the digits that responses in single precision lose."""
+    results = []
+    for offset in (0.0, 1e6):
+        case = CASES["smooth"]
+        posterior = replace(case, offset=offset * case.noise).posterior(1)
+        sampler = SMCSampler(
+            100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide(2), max_simulations=500
+        )
+        sampler.run_mcmc(None, 1)
+        assert sampler.verdict.status == "converged"
+        results.append((sampler.log_evidence, sampler.verdict.simulations))
+        (emulator,) = sampler.guide.emulators
+        mean = sampler.get_chain(flat=True).mean(axis=0)
+        error = emulator.simulate(mean) - posterior.likelihood.model.simulate(mean)
+        assert np.abs(error).max() < 0.1 * case.noise
+    assert results[0][1] == results[1][1] <= 500
+    assert abs(results[0][0] - results[1][0]) < 1e-4

@@ -96,6 +96,8 @@ class HardPosterior:
         Function of theta (n, d) that returns the number of the mode (n,), from 0.
     n_modes : int
         Number of modes.
+    offset : float
+        Constant in the responses and in the data [m].
     balanced : bool
         Whether the noise has no component along the shapes, so that it does not change the shares of the modes.
     """
@@ -112,6 +114,7 @@ class HardPosterior:
     error_model: str = "marginal"
     label: Callable[[np.ndarray], np.ndarray] | None = None
     n_modes: int = 1
+    offset: float = 0.0
     balanced: bool = False
 
     @property
@@ -124,8 +127,8 @@ class HardPosterior:
     def responses(self, theta: np.ndarray) -> np.ndarray:
         """Responses of many parameter sets (n, d) at once: (n, n_channels, n_steps), NaN where a simulation fails."""
         if self.respond is not None:
-            return self.respond(theta)
-        return _combine(self.features, self.shapes, theta)
+            return self.offset + self.respond(theta)
+        return self.offset + _combine(self.features, self.shapes, theta)
 
     def labels(self, theta: np.ndarray) -> np.ndarray:
         """Number of the mode (n,) of every point (n, ndim)."""
@@ -142,7 +145,7 @@ class HardPosterior:
             rows = self.shapes.reshape(len(self.target), -1)
             along = np.linalg.lstsq(rows.T, noise.ravel(), rcond=None)[0]
             noise -= (along @ rows).reshape(noise.shape)
-        return clean + self.noise * noise
+        return self.offset + clean + self.noise * noise
 
     def posterior(self, seed: int, name: str = "hard") -> Posterior:
         """Posterior given the data of a seed, with a model that runs one simulation per call."""
