@@ -98,7 +98,8 @@ def anneal(
     try:
         yield from _without_limit(population, density, random, schedule, settings, coarse, guidance)
     except StoppedEarly as stop:
-        yield from _finish_early(stop, len(population.coords), random)
+        searched = 0.0 if guidance is None else guidance.budget.of_guides
+        yield from _finish_early(stop, len(population.coords), random, searched)
 
 
 def _without_limit(
@@ -138,19 +139,20 @@ def _evaluate_all(coords: np.ndarray, density: Density) -> np.ndarray:
         raise stop_at(Population(0.0, few, stop.records, float(len(few))), 0.0, 0.0) from None
 
 
-def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState) -> Steps:
-    """Resample the points that are known to `size` points at beta = 1."""
+def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
+    """Resample the points that are known to `size` points at beta = 1; `searched`: simulations made by guides."""
     population = stop.population
     if stop.complete:
         yield population, Halt(1.0, len(population.coords), population.effective_sample_size, float("-inf"), True)
         return
     log_weights = population.log_weights
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
+        search = f", besides {searched:.6g} simulations of the search by the guide" if searched > 0.0 else ""
         advice = f", or {WHERE_TO_LOOK}" if len(log_weights) > 0 else ""
         raise NothingToReport(
             f"the limit of simulations (max_simulations) ended the run after {len(log_weights)} evaluated points, none "
-            "of which has a finite log-probability: there is nothing to report. Call run_mcmc again with a larger "
-            f"limit (the simulations made so far are kept){advice}"
+            f"of which has a finite log-probability{search}: there is nothing to report. Call run_mcmc again with a "
+            f"larger limit (the simulations made so far are kept){advice}"
         )
     ancestors = systematic(normalised_weights(log_weights), random, size)
     effective, known = stop.effective_sample_size, len(log_weights)

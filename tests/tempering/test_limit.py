@@ -2,11 +2,21 @@
 
 import json
 import warnings
+from collections import Counter
 
 import emcee
 import numpy as np
 import pytest
 
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    TruncatedNormal,
+)
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, Verdict
 from tests.contract.targets import Gaussian
 from tests.tempering.guides import LearningGuide, SearchingGuide
@@ -224,6 +234,57 @@ def test_the_count_is_that_of_the_model(guide, where, tmp_path):
     assert np.array_equal(sampler.get_chain(), chain) and sampler.log_evidence == evidence
 
 
+def oscillators(runs):
+    """Free vibration of two oscillators; `runs` counts the runs of each point."""
+    t = np.arange(150) * 0.02
+
+    def response(theta):
+        first, second = 2.0 * np.pi * np.sqrt(theta[0]), 4.6 * np.pi * np.sqrt(theta[1])
+        decay = np.exp(-0.05 * theta[2] * first * t), np.exp(-0.03 * second * t)
+        return 0.01 * (decay[0] * np.cos(first * t) + 0.4 * theta[3] * decay[1] * np.cos(second * t))[None]
+
+    def counted(theta):
+        runs[theta.tobytes()] += 1
+        return response(theta)
+
+    channels = (Channel("top", "displacement", "mm"),)
+    model = FunctionModel(counted, ("k1", "k2", "damping", "share"), channels, dt=0.02, n_steps=150, version="1")
+    noise = 0.0005 * np.random.default_rng(1).normal(size=(1, 150))
+    widths = {"k1": 0.3, "k2": 0.3, "damping": 0.5, "share": 0.5}
+    prior = {name: TruncatedNormal(1.0, width) for name, width in widths.items()} | {"sigma_top": HalfNormal(0.002)}
+    measurements = Measurements(channels, 0.02, response([1.1, 0.9, 0.9, 1.1]) + noise)
+    return Posterior(FELikelihood(model, measurements), prior)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["memory", "file"])
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_the_count_is_that_of_a_model_with_responses(where, tmp_path):
+    """The search takes 274 simulations, so two limits cut it; each file is read by a new sampler and posterior."""
+
+    def make(limit, runs, backend=None, seed=1):
+        posterior = oscillators(runs)
+        kwargs = {"guide": posterior.guide(), "max_simulations": limit, "backend": backend, "seed": seed}
+        return SMCSampler(100, 5, posterior, vectorize=True, **kwargs)
+
+    whole, runs, made = make(None, Counter()), Counter(), []
+    whole.run_mcmc(None, 2)
+    sampler = make(100, runs)
+    for limit in (100, 250, 430, None):
+        if where == "file":
+            sampler = make(limit, runs, emcee.backends.HDFBackend(str(tmp_path / "run.h5")), 1 + len(runs))
+        sampler.max_simulations = limit
+        sampler.run_mcmc(None, 2)
+        made.append(len(runs))
+        assert sampler.simulations == sampler.verdict.simulations == len(runs) <= (limit or np.inf)
+        if where == "file":
+            sampler.backend.close()
+    assert made[:2] == [100, 250] and made[-1] >= whole.simulations
+    assert sum(runs.values()) <= 1.02 * len(runs)  # without a cache on disk, a few points are run again
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+    assert (sampler.log_evidence, sampler.log_evidence_error) == (whole.log_evidence, whole.log_evidence_error)
+
+
 @pytest.mark.parametrize("path", ["searching guide", "recycling", "moves"])
 @pytest.mark.parametrize("first", ["limited", "killed", "finished"])
 def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
@@ -353,6 +414,9 @@ def test_a_run_goes_on_after_this_error(where, tmp_path):
         sampler.max_simulations = limit
         with pytest.raises(ValueError, match="after 0 evaluated points.*simulations made so far are kept.$"):
             sampler.run_mcmc(None, 2)
+    sampler.max_simulations = 24
+    with pytest.raises(ValueError, match="finite log-probability, besides 24 simulations of the search by the guide"):
+        sampler.run_mcmc(None, 2)
     sampler.max_simulations = None
     sampler.run_mcmc(None, 2)
     assert same(sampler, whole)
