@@ -104,7 +104,10 @@ class RunResults:
 
     @property
     def max_simulations(self) -> float | None:
-        """Largest number of simulations; None for no limit."""
+        """Largest number of simulations; None for no limit.
+
+        Where a run is continued, a number below that of the simulations it has made acts as their number.
+        """
         return self._budget.limit
 
     @max_simulations.setter
