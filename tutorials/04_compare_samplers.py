@@ -192,6 +192,53 @@ def other_mode(posterior: Posterior, truth: np.ndarray) -> np.ndarray:
     return np.append(posterior.likelihood.model.exchange_piers(truth[:10]), truth[10])
 
 
+def plot_corner(name: str, problem: Problem, posterior: Posterior, runs: dict[str, Run]) -> None:
+    """Corner plot of the samplers whose result is reliable, on common axes."""
+    shown = ["SMC", "TMCMC", GUIDED]
+    if runs[GUIDED].sampler.verdict.status == "not usable":
+        shown.remove(GUIDED)
+    if name != "means":  # where emcee has one mode, or walkers at many places
+        shown.append("emcee")
+    points = {label: draws(label, runs[label].sampler) for label in shown}
+    quantiles = np.array([np.quantile(x, [0.001, 0.999], axis=0) for x in points.values()])
+    low = np.minimum(quantiles[:, 0].min(axis=0), problem.truth)
+    high = np.maximum(quantiles[:, 1].max(axis=0), problem.truth)
+    limits = list(zip(low - 0.02 * (high - low), high + 0.02 * (high - low), strict=True))
+    figure = None
+    for label, x in points.items():
+        figure = corner.corner(
+            x,
+            fig=figure,
+            labels=posterior.parameter_names,
+            range=limits,
+            color=COLOURS[label],
+            weights=np.full(len(x), 1.0 / len(x)),
+            plot_datapoints=label == GUIDED,  # its draws are too few for contours
+            plot_contours=label != GUIDED,
+            data_kwargs={"alpha": 0.7, "ms": 4},
+            plot_density=False,
+            no_fill_contours=True,  # a white interior would hide the samplers drawn before
+            levels=(0.5, 0.9),
+            smooth=1.0,
+            truths=problem.truth,
+            truth_color="0.6",
+            label_kwargs={"fontsize": 16 if max(map(len, posterior.parameter_names)) < 12 else 11},
+            max_n_ticks=3,
+        )
+    for axes in figure.axes[:: posterior.ndim + 1]:  # corner scales each diagonal panel to the last histogram only
+        axes.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches))
+    handles = [Line2D([], [], color=COLOURS[label], label=label) for label in shown]
+    title = f"{name} (synthetic data; grey: truth)\ncontours contain 50 and 90 %"
+    if GUIDED in shown:
+        handles[shown.index(GUIDED)].set(marker="o", linestyle="")
+        title += "\npoints: draws with a guide"
+    if FAST:
+        title += "\n" + TOO_SHORT.replace(": ", ":\n").replace("; ", ";\n")
+    size = 2 * posterior.ndim  # the panels have a fixed size
+    figure.legend(handles=handles, loc="upper right", title=title, fontsize=size, title_fontsize=size, frameon=False)
+    figure.savefig(args.out / f"corner_{name}.png", dpi=70)
+
+
 def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict[str, Run]) -> None:
     """Samples of two parameters, one panel per sampler on common axes, with the known errors in the titles."""
     i, j = (posterior.parameter_names.index(parameter) for parameter in problem.pair)
@@ -284,48 +331,7 @@ for name in args.problem or PROBLEMS:
         for label, run in runs.items()
     }
 
-    # corner plots of the reliable samplers on common axes
-    shown = ["SMC", "TMCMC", GUIDED]
-    if runs[GUIDED].sampler.verdict.status == "not usable":
-        shown.remove(GUIDED)
-    if name != "means":  # where emcee has one mode, or walkers at many places
-        shown.append("emcee")
-    pool = np.concatenate([draws(label, samplers[label]) for label in shown])
-    low, high = np.quantile(pool, [0.001, 0.999], axis=0)
-    low, high = np.minimum(low, problem.truth), np.maximum(high, problem.truth)
-    limits = list(zip(low - 0.02 * (high - low), high + 0.02 * (high - low), strict=True))
-    figure = None
-    for label in shown:
-        x = draws(label, samplers[label])
-        figure = corner.corner(
-            x,
-            fig=figure,
-            labels=posterior.parameter_names,
-            range=limits,
-            color=COLOURS[label],
-            weights=np.full(len(x), 1.0 / len(x)),
-            plot_datapoints=label == GUIDED,  # its draws are too few for contours
-            plot_contours=label != GUIDED,
-            data_kwargs={"alpha": 0.7, "ms": 4},
-            plot_density=False,
-            no_fill_contours=True,  # a white interior would hide the samplers drawn before
-            levels=(0.5, 0.9),
-            smooth=1.0,
-            truths=problem.truth,
-            truth_color="0.6",
-            label_kwargs={"fontsize": 16},
-            max_n_ticks=3,
-        )
-    for axes in figure.axes[:: posterior.ndim + 1]:  # corner scales each diagonal panel to the last histogram only
-        axes.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches))
-    handles = [Line2D([], [], color=COLOURS[label], label=label) for label in shown]
-    for handle in handles:
-        if handle.get_label() == GUIDED:
-            handle.set(marker="o", linestyle="")
-    figure.legend(handles=handles, loc="upper right", fontsize=22, frameon=False)
-    title = f"{name}: contours contain 50 and 90 %; points: draws with a guide (synthetic data; grey: truth)"
-    figure.suptitle(title + (f"\n{TOO_SHORT}" if FAST else ""), fontsize=22, color="#b03a48" if FAST else "k")
-    figure.savefig(args.out / f"corner_{name}.png", dpi=70)
+    plot_corner(name, problem, posterior, runs)
     plot_failures(name, problem, posterior, runs)
 
 (args.out / "comparison.json").write_text(json.dumps(results, indent=2) + "\n")
