@@ -1,6 +1,6 @@
 """Gaussian process for several outputs that share their inputs and length scales.
 
-Each output is a linear function of the inputs plus a Gaussian process with squared exponential covariance
+Each output is a linear function of the inputs plus a Gaussian process with squared exponential covariance::
 
     y_k(w) = b_k0 + b_k . w + f_k(w) + e_k,    cov f_k = s_k^2 exp(-|(w - w') / l|^2 / 2),    var e_k = s_k^2 g_k,
 

@@ -1,8 +1,8 @@
 """Levenberg-Marquardt on the responses: ascents to modes, run side by side.
 
-The log-density in the coordinates of `fe_likelihoods.emulation.target` is log L(S(r)) - |z|^2 / 2 with residuals r of
+The log-density in the coordinates of `fe_likelihoods.emulation.target` is log L(S(r)) - z.z / 2 with residuals r of
 which the log-likelihood is a function through quadratic statistics S. With J = dr/dz by finite differences and
-f = d log L / dS at the noise parameters that fit best, its gradient and its Gauss-Newton Hessian are
+f = d log L / dS at the noise parameters that fit best, its gradient and its Gauss-Newton Hessian are::
 
     g = 2 sum_a f_a B_a(J, r) - z,        H = -2 sum_a f_a B_a(J, J) + 1,
 

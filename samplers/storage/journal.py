@@ -2,7 +2,7 @@
 
 A journal is a sequence of blocks: kind, length and CRC-32 of the content, CRC-32 of these three, content. A block is
 written in one piece and never changed. So whatever kills the process can leave only the last block incomplete, which is
-then dropped. Arrays are stored in NumPy's own format, texts as JSON; nothing is pickled.
+then dropped. Arrays are stored in NumPy's own format, texts as JSON; nothing is pickled::
 
     HEAD  what is sampled and how (JSON)
     INIT  start of the annealing: draws of the prior, their log-prior, state of the random generator
