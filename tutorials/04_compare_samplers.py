@@ -242,7 +242,7 @@ def plot_corner(name: str, problem: Problem, posterior: Posterior, runs: dict[st
 def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict[str, Run]) -> None:
     """Samples of two parameters, one panel per sampler on common axes, with the known errors in the titles."""
     i, j = (posterior.parameter_names.index(parameter) for parameter in problem.pair)
-    trusted = np.concatenate([draws(label, runs[label].sampler) for label in ("SMC", "TMCMC", GUIDED)])[:, [i, j]]
+    trusted = np.concatenate([draws(label, runs[label].sampler) for label in ("SMC", "TMCMC")])[:, [i, j]]
     distinct = [np.unique(draws(label, run.sampler), axis=0) for label, run in runs.items()]
     everything = np.concatenate(distinct)[:, [i, j]]
     low, high = np.quantile(everything, [0.01, 0.99], axis=0)

@@ -25,7 +25,7 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
-__all__ = ["HOPELESS", "TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "squared_distance"]
+__all__ = ["HOPELESS", "TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "is_same_mode"]
 
 _DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 _FIRST_DAMPING = 1e-2
@@ -37,9 +37,14 @@ _DIFFERENCE_LIMITS = 3e-4, 2e-2
 _RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
-_PATIENCE = 8  # iterations after which an ascent that is far below a known end is given up
+_PATIENCE = 3  # iterations after which an ascent that is far below a known end and slow is given up
+_LEFT = 6.0  # iterations like the last one that would be needed to reach the known end
+_STALLED = 0.1  # gain in log-density below which a step counts as failed
 HOPELESS = 200.0  # log-density below the best end at which another one is given up
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
+_NEAR = 20.0  # log-density below a known end from which on the straight line to it is examined
+_ALONG = np.array([0.25, 0.5, 0.75])  # points of this line
+_DIP = 3.0  # log-density that the line may lose between two points of one mode
 
 
 class Ascent(NamedTuple):
@@ -92,6 +97,7 @@ def ascend(
     centre: np.ndarray,
     known: Sequence[Ascent] = (),
     tolerance: float = TOLERANCE,
+    apart: float = np.inf,
 ) -> Generator[np.ndarray, Runs, Ascent | None]:
     """Levenberg-Marquardt from one start.
 
@@ -107,6 +113,8 @@ def ascend(
         Ends of other ascents so far (the sequence grows): an ascent that would end in one of them stops.
     tolerance : float
         Log-density still to gain at which to stop.
+    apart : float
+        Distance of one coordinate, in prior standard deviations, from which ends are different (`is_same_mode`).
 
     Yields
     ------
@@ -126,9 +134,13 @@ def ascend(
     noise = target.fit_noise(statistics)
     value = noise.log_density + target.log_prior(coords - centre)
     differences, damping, failures, slopes = np.full(d, _FIRST_DIFFERENCE), _FIRST_DAMPING, 0, None
-    gain_left, merged, iteration = np.inf, -1, 0
+    gain_left, merged, iteration, earlier = np.inf, -1, 0, -np.inf
     for iteration in range(_MAX_ITERATIONS):  # noqa: B007  the number of iterations is part of the result
         if slopes is None:
+            merged = yield from _connected(target, coords, value, noise, centre, known, apart)
+            if merged >= 0:
+                unknown = np.zeros((d, *residuals.shape))
+                return Ascent(coords, float(value), np.eye(d), noise, residuals, unknown, 0.0, iteration, merged)
             slopes = yield from _difference(target, coords, residuals, differences)
             weights = target.slopes(statistics, noise.coords)
             gradient = 2.0 * bilinear_form(target.statistic, slopes, residuals[None])[:, 0] @ weights - (
@@ -138,14 +150,13 @@ def ascend(
             scale = np.diag(np.diag(hessian))
             whole = np.linalg.solve(hessian, gradient)
             gain_left = 0.5 * float(gradient @ whole)
-            merged = next(
-                (k for k, end in enumerate(known) if squared_distance(coords + whole, end) < _SAME_MODE * d), -1
-            )
+            merged = next((k for k, end in enumerate(known) if is_same_mode(coords + whole, end, apart)), -1)
             if gain_left < tolerance or merged >= 0:
                 break
             behind = max((end.log_density for end in known), default=-np.inf) - value
-            if iteration >= _PATIENCE and behind > HOPELESS:
+            if iteration >= _PATIENCE and behind > max(HOPELESS, _LEFT * (value - earlier)):
                 return None
+            earlier = value
         dampings = damping * _DAMPINGS
         steps = np.array([np.linalg.solve(hessian + each * scale, gradient) for each in dampings])
         steps *= np.minimum(1.0, _LARGEST_STEP / np.abs(steps).max(axis=1, keepdims=True))
@@ -156,20 +167,21 @@ def ascend(
             reached = fit.log_density + target.log_prior(coords + steps[k] - centre)
             if reached > (value if best is None else best[0]):
                 best = reached, k, fit
+        stalled = best is None or best[0] < value + _STALLED
         if best is not None:
             value, k, noise = best
             coords, residuals, statistics = coords + steps[k], runs.residuals[k], runs.statistics[k]
             damping = float(np.clip(dampings[k], 1e-8, _LARGEST_DAMPING))
             spread = np.sqrt(np.diag(np.linalg.inv(hessian)))
-            differences, slopes, failures = np.clip(_DIFFERENCE_SHARE * spread, *_DIFFERENCE_LIMITS), None, 0
+            differences, slopes = np.clip(_DIFFERENCE_SHARE * spread, *_DIFFERENCE_LIMITS), None
+        if not stalled:
+            failures = 0
+        elif best is None and failures == 0:
+            failures, damping = 1, min(damping * 1e5, _LARGEST_DAMPING)
+        elif failures < 2:  # the differences may have met roughness: take larger ones
+            failures, differences, slopes, damping = 2, 3.0 * differences, None, 0.1
         else:
-            failures += 1
-            if failures == 1:
-                damping = min(damping * 1e5, _LARGEST_DAMPING)
-            elif failures == 2:  # the differences may have met roughness: take larger ones
-                differences, slopes, damping = 3.0 * differences, None, 0.1
-            else:
-                break
+            break
     if slopes is None:  # stopped after a step
         slopes = yield from _difference(target, coords, residuals, differences)
         weights = target.slopes(statistics, noise.coords)
@@ -177,10 +189,43 @@ def ascend(
     return Ascent(coords, float(value), hessian, noise, residuals, slopes, gain_left, iteration, merged)
 
 
-def squared_distance(coords: np.ndarray, end: Ascent) -> float:
-    """Squared distance from the end of an ascent, in units of its Laplace approximation."""
-    apart = coords - end.coords
-    return float(apart @ end.hessian @ apart)
+def _connected(
+    target: ResponseTarget,
+    coords: np.ndarray,
+    value: float,
+    noise: NoiseFit,
+    centre: np.ndarray,
+    known: Sequence[Ascent],
+    apart: float,
+) -> Generator[np.ndarray, Runs, int]:
+    """Number of the known end that a straight line without a valley leads to from nearly the same height; -1 if none.
+
+    On a rough or curved likelihood, the Laplace approximation of an end does not contain the other points of its mode.
+    """
+    for number, end in enumerate(known):
+        difference = end.coords - coords
+        if value < end.log_density - _NEAR or np.abs(difference).max() >= apart:
+            continue
+        points = coords + _ALONG[:, None] * difference
+        runs = yield points
+        if runs.failed.any():
+            continue
+        fits = [target.fit_noise(statistics, noise.coords).log_density for statistics in runs.statistics]
+        if (fits + target.log_prior(points - centre)).min() > min(value, end.log_density) - _DIP:
+            return number
+    return -1
+
+
+def is_same_mode(coords: np.ndarray, end: Ascent, apart: float) -> bool:
+    """Whether coordinates (n_structural,) belong to the mode at the end of an ascent.
+
+    Their distance is measured in units of the Laplace approximation. A part of the record does not determine all
+    coordinates: in those that it leaves as they are, this distance is small, although a longer part may lead to
+    different modes. On a part of the record, no coordinate may therefore differ by `apart` or more.
+    """
+    difference = coords - end.coords
+    near = float(difference @ end.hessian @ difference) < _SAME_MODE * len(coords)
+    return near and float(np.abs(difference).max()) < apart
 
 
 def _difference(
@@ -241,12 +286,14 @@ class Batches:
                 advance(index, Runs(*(column[rows] for column in runs)))
 
 
-def distinct_ends(ends: Sequence[Ascent]) -> list[Ascent]:
-    """Ends that are different modes, the highest first; each carries the starts of those that it stands for."""
+def distinct_ends(ends: Sequence[Ascent], apart: float = np.inf) -> list[Ascent]:
+    """Ends that are different modes, the highest first; each carries the starts of those that it stands for.
+
+    `apart` is that of `is_same_mode`.
+    """
     kept: list[Ascent] = []
     for end in sorted(ends, key=lambda end: -end.log_density):
-        d = len(end.coords)
-        same = next((k for k, other in enumerate(kept) if squared_distance(end.coords, other) < _SAME_MODE * d), None)
+        same = next((k for k, other in enumerate(kept) if is_same_mode(end.coords, other, apart)), None)
         if same is None:
             kept.append(end)
         else:

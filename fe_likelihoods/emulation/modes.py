@@ -24,7 +24,8 @@ _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
 _ROUNDS_OF_STEPS = 4
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
-_SHARES = 0.05, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
+_APART = 0.5  # prior standard deviations in one coordinate from which ends on a part of the record are different
+_SHARES = 0.03, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
 
 class Mode(NamedTuple):
@@ -163,11 +164,15 @@ def search_modes(
         whole = part is target
         ends: list[Ascent] = []
         tolerance = TOLERANCE if whole else min(TOLERANCE / share, _LOOSEST)
+        apart = np.inf if whole else _APART
         origin = np.zeros(target.n_structural)
         batches = Batches(part, remember, lambda points, share=share: fits(share * points))
         # two waves: the ascents of the second one stop as soon as they head for an end of the first
-        for wave in (fronts[:_FIRST_WAVE], fronts[_FIRST_WAVE:]):
-            ascents = [ascend(part, start, origin if whole else centre, ends, tolerance) for start, centre, _ in wave]
+        first = _FIRST_WAVE if part is parts[0] else 1
+        for wave in (fronts[:first], fronts[first:]):
+            ascents = [
+                ascend(part, start, origin if whole else centre, ends, tolerance, apart) for start, centre, _ in wave
+            ]
             for points in batches.complete(ascents, partial(_finish, wave, ends)):
                 spent += share * points
                 yield share * points
@@ -176,7 +181,9 @@ def search_modes(
         interrupted = batches.interrupted
         if not ends or interrupted:
             break
-        kept = [end for end in distinct_ends(ends) if end.log_density > max(e.log_density for e in ends) - HOPELESS]
+        kept = [
+            end for end in distinct_ends(ends, apart) if end.log_density > max(e.log_density for e in ends) - HOPELESS
+        ]
         fronts = [(end.coords, end.coords, end.starts) for end in kept]
     modes: list[Mode] = []
     if part is target and ends:

@@ -54,3 +54,38 @@ def vibration(noise="marginal", function=free_vibration, seed=1):
         return Posterior(FELikelihood(model, measured, AutoregressiveNoise(CHANNELS)), prior | sigmas | rho)
     options = {"sensor": {"sensor": {"top": 1e-3}}, "effective": {"effective_samples": {"top": 60.0}}, "white": {}}
     return Posterior(FELikelihood(model, measured, GaussianNoise(CHANNELS, **options[noise])), prior | sigmas)
+
+
+class ActsLate:
+    """A model that can be shortened, in which the third parameter acts late, through its square.
+
+    The first half of the record leaves the third parameter as it is, and the second half fits both of its signs alike.
+    """
+
+    parameter_names = ("amplitude", "ratio", "late")
+    channels = (Channel("top", "displacement", "mm"),)
+    dt = DT
+
+    def __init__(self, n_steps=400):
+        self.n_steps = n_steps
+        self.fingerprint = f"ActsLate {n_steps}"
+
+    def first(self, seconds):
+        """The same model for the first part of the record."""
+        return ActsLate(round(seconds / self.dt) + 1)
+
+    def simulate(self, theta):
+        """Displacement of the first `n_steps` samples of 400."""
+        amplitude, ratio, late = theta
+        phase = np.arange(self.n_steps) / 400.0
+        early = amplitude * (np.sin(40.0 * phase) + ratio * np.cos(33.0 * phase))
+        return (early + (phase > 0.5) * late**2 * np.sin(25.0 * phase))[None]
+
+
+def acts_late(seed=1):
+    """Posterior of `ActsLate` with noise integrated out: two modes of equal shares, late = 1 and late = -1."""
+    model = ActsLate()
+    measured = noisy(model, np.array([1.2, 0.8, 1.0]), np.array([0.05]), seed)
+    prior = {"amplitude": TruncatedNormal(1.0, 0.3), "ratio": TruncatedNormal(1.0, 0.3), "late": Uniform(-2.0, 2.0)}
+    prior |= {"sigma_top": HalfNormal(0.5)}
+    return Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()

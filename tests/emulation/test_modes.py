@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, find_modes, problems
 from fe_likelihoods.emulation.target import ResponseTarget
 
-from .problems import free_vibration, vibration
+from .problems import acts_late, free_vibration, vibration
 
 
 def _log_density(posterior, coords):
@@ -96,6 +96,26 @@ def test_parts_of_the_record_count_as_fractions():
     assert len(search.modes) == 1 and search.ends[0] == 0 and set(search.ends) <= {0, -1}
     whole = posterior.report()["simulations"]
     assert whole < search.simulations < 300
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_starts_that_differ_only_in_what_the_end_of_the_record_determines_stay_apart(seed):
+    search = find_modes(acts_late(seed), seed=seed)
+    assert sorted(round(float(mode.parameters[2])) for mode in search.modes) == [-1, 1]
+    shares = [mode.log_evidence for mode in search.modes]
+    assert shares[0] == pytest.approx(shares[1], abs=1.0)  # ascents stop when 0.5 is left to gain
+
+
+def test_a_rough_likelihood_neither_splits_a_mode_nor_prolongs_an_ascent():
+    """Differences of the response by 1e-4 of its size, at random, move the end of every ascent."""
+
+    def rough(theta):
+        jump = np.sin(1e7 * theta[0]) + np.cos(1e7 * theta[1])
+        return free_vibration(theta) * (1.0 + 3e-3 * jump)
+
+    search, smooth = (find_modes(vibration(function=function), seed=2) for function in (rough, free_vibration))
+    assert len(search.modes) == len(smooth.modes) == 1
+    assert search.simulations < 4.0 * smooth.simulations
 
 
 def test_starts_must_be_a_whole_number():
