@@ -171,9 +171,13 @@ def draw_rounds(
 
 
 def _even(pooled: PooledRounds, settings: GuidedSettings) -> bool:
-    """Whether no few weights of all rounds carry the result."""
+    """Whether no few weights of all rounds carry the result.
+
+    The early rounds of a poor guide have weights of heavy tails, and their part in the result is small: the error of
+    the log-evidence takes account of it, so that the shape need only be one for which a mean is useful.
+    """
     n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
-    return pooled.pareto_shape < settings.largest_pareto_shape or (n < FEW_DRAWS and share >= settings.short_tail_share)
+    return pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= settings.short_tail_share)
 
 
 def _next_size(rounds: Sequence[Round], size: int, settings: GuidedSettings, guide: AdaptedGuide) -> int:

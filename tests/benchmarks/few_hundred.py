@@ -78,9 +78,14 @@ def _rounded(values: Any) -> Any:
     return np.asarray([float(f"{value:.6g}") for value in np.ravel(values)]).tolist()
 
 
+def key_of(name: str, seed: int) -> str:
+    """Key of a problem and seed in the file: measured data have one reference for all seeds."""
+    return f"{name} {1 if PROBLEMS[name].measured else seed}"
+
+
 def reference_named(name: str, seed: int, posterior: Posterior) -> Any:
     """Reference of a problem and seed from the file, or None; ValueError if the data are not those it was made with."""
-    entry = load().get("references", {}).get(f"{name} {seed}")
+    entry = load().get("references", {}).get(key_of(name, seed))
     if entry is None:
         return None
     if entry["data"] != posterior.data_fingerprint:
@@ -168,7 +173,7 @@ def make_reference(name: str, problem: Problem, seed: int) -> None:
         "failures": report["failure_count"],
         "method": method,
     }
-    _store("references", f"{name} {seed}", entry)
+    _store("references", key_of(name, seed), entry)
     print(
         f"{name} {seed}: log Z {found.log_evidence:.3f} +- {found.log_evidence_error:.3f}, effective "
         f"{found.effective_sample_size:.0f} of {found.draws}, shares {np.round(found.shares, 3)}, "
@@ -200,7 +205,7 @@ def make_default(name: str, problem: Problem, seed: int) -> None:
     }
     if problem.labels is not None:
         entry["shares"] = _rounded(np.bincount(problem.labels(samples)) / len(samples))
-    _store("default SMC", f"{name} {seed}", entry)
+    _store("default SMC", key_of(name, seed), entry)
     print(
         f"{name} {seed}: default SMC, {entry['simulations']} simulations, log Z {entry['log_evidence']:.3f} +- "
         f"{entry['log_evidence_error']:.3f} in {entry['seconds']:.0f} s",
@@ -264,7 +269,7 @@ def main() -> None:
             print(f"NOT RUN: {name}: {reason}", flush=True)
             continue
         for seed in range(arguments.first, arguments.first + arguments.seeds):
-            key = f"{name} {seed}"
+            key = key_of(name, seed)
             if arguments.references or arguments.default:
                 if arguments.references and key not in load().get("references", {}):
                     make_reference(name, problem, seed)

@@ -48,6 +48,8 @@ class Problem(NamedTuple):
         Returns why the problem cannot be run here, or an empty string.
     walkers : int
         Of the default sampler.
+    measured : bool
+        Whether the data are measured ones, the same for every seed, so that all seeds have one reference.
     reference_draws, reference_rounds : int
         Draws per round of the reference by importance sampling, and rounds. No draws: the reference is a longer run of
         the default sampler, where importance sampling from a known mode fails (many local modes).
@@ -60,6 +62,7 @@ class Problem(NamedTuple):
     labels: Callable[[np.ndarray], np.ndarray] | None = None
     needs: Callable[[], str] = str
     walkers: int = 500
+    measured: bool = False
     reference_draws: int = 400
     reference_rounds: int = 8
 
@@ -177,6 +180,7 @@ PROBLEMS = {
         tested_column.start,
         800,
         needs=tested_column.missing,
+        measured=True,
         reference_draws=0,
     ),
     "lehman_ar1": Problem(
@@ -185,6 +189,7 @@ PROBLEMS = {
         tested_column.start,
         800,
         needs=tested_column.missing,
+        measured=True,
         reference_draws=0,
     ),
 }
