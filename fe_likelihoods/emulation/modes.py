@@ -25,7 +25,7 @@ _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
 _ROUNDS_OF_STEPS = 4
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
 _APART = 0.5  # prior standard deviations in one coordinate from which ends on a part of the record are different
-_SHARES = 0.03, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
+_SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
 
 class Mode(NamedTuple):

@@ -2,9 +2,10 @@
 
 Samples every problem of `few_hundred_problems` with a guide and a budget, ``SMCSampler(100, ndim, posterior,
 vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=N)``, and prints one line per problem and seed:
-simulations of the whole record (parts count as fractions), effective sample size, log Z, errors against the reference,
-verdict, wall time, CPU time of this process outside simulations, and simulations per effective sample; beside it, cost
-and log Z of the default sampler on the same data.
+simulations of the whole record (parts count as fractions) up to the weighted draws and with the first sweep of the
+walkers, effective sample size of these draws, simulations per effective sample, log Z, errors against the reference,
+verdict, wall time and CPU time of this process outside simulations; beside it, cost and log Z of the default sampler on
+the same data.
 
 References and runs of the default sampler take minutes to hours. They are our own results, kept in
 ``few_hundred_references.json``: ``--references`` makes those that are missing (`importance_reference`), ``--default``
@@ -42,6 +43,7 @@ HEADER = (
     "judgement",
     "runs",
     "goal",
+    "with sweep",
     "ESS",
     "runs/ESS",
     "log Z",
@@ -235,10 +237,11 @@ def line(
         str(seed),
         outcome.status,
         errors.judgement if errors else "",
-        f"{outcome.simulations:.0f}",
+        f"{outcome.weighted:.0f}",
         str(problem.goal),
+        f"{outcome.simulations:.0f}",
         f"{effective:.0f}",
-        f"{outcome.simulations / effective:.1f}" if effective else "",
+        f"{outcome.weighted / effective:.1f}" if effective else "",
         f"{outcome.log_evidence:.3f}",
         f"{outcome.log_evidence_error:.3f}",
         *against,

@@ -35,6 +35,8 @@ class Outcome(NamedTuple):
         Of the verdict.
     simulations : float
         Simulations of the whole record (parts count as fractions).
+    weighted : float
+        Those among them before the first sweep, when the posterior is known as weighted draws.
     status, reasons : str
         The verdict.
     seconds, overhead : float
@@ -53,6 +55,7 @@ class Outcome(NamedTuple):
     samples: Any = None
     effective_sample_size: float = 0.0
     simulations: float = 0.0
+    weighted: float = 0.0
     status: str = ""
     reasons: str = ""
     seconds: float = 0.0
@@ -117,6 +120,8 @@ def run(posterior: Any, seed: int, budget: float | None, *, guided: bool = True,
         warnings.simplefilter("always", UserWarning)
         try:
             sampler = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=seed, **settings)
+            sampler.run_mcmc(None, 0)
+            weighted = float(sampler.verdict.simulations)
             sampler.run_mcmc(None, 1)
         except Exception as error:  # reported in the table
             message = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
@@ -133,6 +138,7 @@ def run(posterior: Any, seed: int, budget: float | None, *, guided: bool = True,
         samples=samples,
         effective_sample_size=float(verdict.effective_sample_size),
         simulations=float(verdict.simulations),
+        weighted=weighted,
         status=verdict.status,
         reasons="; ".join(verdict.reasons),
         seconds=time.perf_counter() - start,
