@@ -39,6 +39,7 @@ TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approxi
 _MAX_ITERATIONS = 40
 _PATIENCE = 3  # iterations after which an ascent that is far below a known end and slow is given up
 _LEFT = 6.0  # iterations like the last one that would be needed to reach the known end
+_ROUGH = 5.0  # gain that the quadratic approximation may promise where no step gains anything
 _STALLED = 0.1  # gain in log-density below which a step counts as failed
 HOPELESS = 200.0  # log-density below the best end at which another one is given up
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
@@ -87,8 +88,8 @@ class Ascent(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether little is left to gain."""
-        return self.gain_left < TOLERANCE or self.merged >= 0
+        """Whether little is left to gain; differences of a rough likelihood promise a few units at its top as well."""
+        return self.gain_left < _ROUGH or self.merged >= 0
 
 
 def ascend(
