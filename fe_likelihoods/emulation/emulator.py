@@ -233,6 +233,8 @@ def fit_emulator(
     scaled = ((training.residuals - mean) / scales[:, None]).reshape(len(training.coords), -1)
     values, vectors = np.linalg.eigh(scaled @ scaled.T)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    if values[0] <= 0.0:
+        raise np.linalg.LinAlgError("the responses of all runs are equal")
     left_out = values.sum() - np.cumsum(values)
     enough = 1 + int(np.argmax(left_out < _NEGLIGIBLE_VARIANCE * len(values)))
     k = max(1, min(enough, _MAX_COMPONENTS, int((values > _SMALLEST_SHARE * values[0]).sum()), len(values) - 1))

@@ -43,6 +43,7 @@ _ALWAYS = 5  # best runs per dimension that train in any case
 _IMPLAUSIBLE = 10.0  # emulated log-density above that of all runs, besides 1 per dimension, at which a fit is refused
 _SURPRISE = 10.0  # log-density above that of any known mode minus this, at which a far point starts an ascent
 _MOST_ASCENTS = 2  # of these, per refinement
+_NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
 
 class ResponseGuide:
@@ -134,12 +135,19 @@ class ResponseGuide:
         starts = draw_starts(self._target, self._starts, session.random)
         self.search = yield from self._counted(search_modes(self._target, starts, session.remember, session.fits))
         self._add_modes(self.search.modes)
+        residuals = self._target.archive.residuals
+        if len(residuals) > 1 and all(np.array_equal(residuals[0], other) for other in residuals):
+            raise ValueError(
+                f"expected responses that depend on the parameters; all {len(residuals)} simulations of the search "
+                f"gave the same one. Check where the model reads {', '.join(self._target.model.parameter_names)}, "
+                "and whether an old file of results is read"
+            )
         if not self.search.finished:
             self._add_concern("the budget ended the search for modes")
         elif not self.search.modes:
             self._add_concern("no start of the search led to a mode: the simulations of all starts fail")
         elif not all(mode.converged for mode in self.search.modes):
-            self._add_concern("the search for modes ended before the top of a mode")
+            self._add_concern(_NOT_AT_THE_TOP)
         elif any(self.search.ends.count(number) == 1 for number in range(len(self.search.modes))) and self._starts > 1:
             self._add_concern(
                 f"only one of {self._starts} starts led to one of the modes, so there may be modes to which none led: "
@@ -268,6 +276,7 @@ class ResponseGuide:
         if self._modes:
             best = max(mode.log_density for mode in self._modes)
             surprising = self._far(structural) & (density > best - _SURPRISE)
+            surprising |= (density >= density.max()) & (density > best + _IMPLAUSIBLE + self._target.ndim)
         else:
             surprising = density >= density.max()
         for row in np.flatnonzero(surprising)[np.argsort(-density[surprising])][:_MOST_ASCENTS]:
@@ -278,6 +287,18 @@ class ResponseGuide:
             elif not self._modes or self._far(found.coords[None, : self._target.n_structural])[0]:
                 self._add_modes([found])
                 self._emulated = None
+            elif found.log_density > max(mode.log_density for mode in self._modes) + _IMPLAUSIBLE:
+                self._replace_nearest(found)
+
+    def _replace_nearest(self, mode: Mode) -> None:
+        """Enter a mode instead of the nearest one, whose ascent ended early, such as where simulations fail."""
+        number = int(np.argmin(self._distances(mode.coords[None, : self._target.n_structural])[:, 0]))
+        self._modes[number] = mode
+        self._regions[number] = Region(mode.coords, mode.covariance, None, mode.log_evidence)
+        self._best = max(self._best, mode.log_density)
+        self._emulated, self._wide = None, self._wide_mixture()
+        if all(mode.converged for mode in self._modes):
+            self.concerns = tuple(concern for concern in self.concerns if concern != _NOT_AT_THE_TOP)
 
     def _fit_emulators(self) -> None:
         archive, d = self._target.archive, self._target.n_structural

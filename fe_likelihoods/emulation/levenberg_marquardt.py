@@ -25,7 +25,7 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
-__all__ = ["HOPELESS", "TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "is_same_mode"]
+__all__ = ["TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "is_same_mode"]
 
 _DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 _FIRST_DAMPING = 1e-2
@@ -41,11 +41,11 @@ _PATIENCE = 3  # iterations after which an ascent that is far below a known end 
 _LEFT = 6.0  # iterations like the last one that would be needed to reach the known end
 _ROUGH = 5.0  # gain that the quadratic approximation may promise where no step gains anything
 _STALLED = 0.1  # gain in log-density below which a step counts as failed
-HOPELESS = 200.0  # log-density below the best end at which another one is given up
+_HOPELESS = 200.0  # log-density below the best end at which another one is given up
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
-_NEAR = 20.0  # log-density below a known end from which on the straight line to it is examined
+_NEAR = 20.0  # largest log-density below a known end at which the straight line to it is examined
 _ALONG = np.array([0.25, 0.5, 0.75])  # points of this line
-_DIP = 3.0  # log-density that the line may lose between two points of one mode
+_DIP = 3.0  # depth of a valley in log-density that separates modes
 
 
 class Ascent(NamedTuple):
@@ -155,7 +155,7 @@ def ascend(
             if gain_left < tolerance or merged >= 0:
                 break
             behind = max((end.log_density for end in known), default=-np.inf) - value
-            if iteration >= _PATIENCE and behind > max(HOPELESS, _LEFT * (value - earlier)):
+            if iteration >= _PATIENCE and behind > max(_HOPELESS, _LEFT * (value - earlier)):
                 return None
             earlier = value
         dampings = damping * _DAMPINGS
@@ -205,16 +205,24 @@ def _connected(
     """
     for number, end in enumerate(known):
         difference = end.coords - coords
-        if value < end.log_density - _NEAR or np.abs(difference).max() >= apart:
+        level = end.log_density - _NEAR <= value <= end.log_density + _DIP
+        if not level or np.abs(difference).max() >= apart:
             continue
         points = coords + _ALONG[:, None] * difference
         runs = yield points
         if runs.failed.any():
             continue
         fits = [target.fit_noise(statistics, noise.coords).log_density for statistics in runs.statistics]
-        if (fits + target.log_prior(points - centre)).min() > min(value, end.log_density) - _DIP:
+        if not _has_valley(np.array([value, *(fits + target.log_prior(points - centre)), end.log_density])):
             return number
     return -1
+
+
+def _has_valley(values: np.ndarray) -> bool:
+    """Whether one of the values lies deeper than `_DIP` below values on both sides of it."""
+    before = np.maximum.accumulate(values)[:-2]
+    after = np.maximum.accumulate(values[::-1])[::-1][2:]
+    return bool((np.minimum(before, after) - values[1:-1]).max() >= _DIP)
 
 
 def is_same_mode(coords: np.ndarray, end: Ascent, apart: float) -> bool:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .levenberg_marquardt import HOPELESS, TOLERANCE, Ascent, Batches, ascend, distinct_ends
+from .levenberg_marquardt import TOLERANCE, Ascent, Batches, ascend, distinct_ends
 from .quadratic import bilinear_form
 from .target import Remember, ResponseTarget, run_at_once
 
@@ -24,7 +24,8 @@ _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
 _ROUNDS_OF_STEPS = 4
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
-_APART = 0.5  # prior standard deviations in one coordinate from which ends on a part of the record are different
+_APART = 0.25  # prior standard deviations in one coordinate from which ends on a part of the record are different
+_HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
 
@@ -181,10 +182,9 @@ def search_modes(
         interrupted = batches.interrupted
         if not ends or interrupted:
             break
-        kept = [
-            end for end in distinct_ends(ends, apart) if end.log_density > max(e.log_density for e in ends) - HOPELESS
-        ]
-        fronts = [(end.coords, end.coords, end.starts) for end in kept]
+        # a model that is not exact may fit a part of the record best where it does not fit the whole one
+        least = max(end.log_density for end in ends) - _HOPELESS * part.measured.size
+        fronts = [(end.coords, end.coords, end.starts) for end in distinct_ends(ends, apart) if end.log_density > least]
     modes: list[Mode] = []
     if part is target and ends:
         modes = sorted((laplace(target, end) for end in distinct_ends(ends)), key=lambda mode: -mode.log_evidence)

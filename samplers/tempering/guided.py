@@ -25,6 +25,8 @@ from .stopping import LARGEST_SHAPE
 __all__ = ["Guidance", "RoundsOfGuide", "draw_rounds", "lend", "start_from_guide", "trusted"]
 
 FEW_DRAWS = 100
+# mean effective sample size of rounds below which the guide is given up
+FEWEST_OF_ROUND = 1.5
 
 
 class Guidance(NamedTuple):
@@ -177,7 +179,8 @@ def _even(pooled: PooledRounds, settings: GuidedSettings) -> bool:
     the log-evidence takes account of it, so that the shape need only be one for which a mean is useful.
     """
     n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
-    return pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= settings.short_tail_share)
+    even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= settings.short_tail_share)
+    return even and bool(np.isfinite(pooled.log_evidence_error))
 
 
 def _next_size(rounds: Sequence[Round], size: int, settings: GuidedSettings, guide: AdaptedGuide) -> int:
@@ -235,10 +238,13 @@ def _impossible(rounds: Sequence[Round]) -> str:
 
 def _hopeless(rounds: Sequence[Round], settings: GuidedSettings) -> str:
     """Why to give up; empty if there is no reason."""
-    recent = [r.effective_share for r in rounds[-settings.hopeless_rounds :]]
-    if len(recent) < settings.hopeless_rounds or np.mean(recent) >= settings.hopeless_share:
+    recent = rounds[-settings.hopeless_rounds :]
+    share = np.mean([r.effective_share for r in recent])
+    # a round of few draws has an effective share of at least one over their number
+    hopeless = share < settings.hopeless_share or np.mean([r.effective_sample_size for r in recent]) < FEWEST_OF_ROUND
+    if len(recent) < settings.hopeless_rounds or not hopeless:
         return ""
-    return f"the effective sample size of the last {len(recent)} rounds is {100 * np.mean(recent):.2g} % of their draws"
+    return f"the effective sample size of the last {len(recent)} rounds is {100 * share:.2g} % of their draws"
 
 
 def _describe(last: Round, pooled: PooledRounds, settings: GuidedSettings) -> str:

@@ -56,36 +56,66 @@ def vibration(noise="marginal", function=free_vibration, seed=1):
     return Posterior(FELikelihood(model, measured, GaussianNoise(CHANNELS, **options[noise])), prior | sigmas)
 
 
-class ActsLate:
-    """A model that can be shortened, in which the third parameter acts late, through its square.
+class Shortened:
+    """A model of one displacement that can be shortened.
 
-    The first half of the record leaves the third parameter as it is, and the second half fits both of its signs alike.
+    Parameters
+    ----------
+    respond : callable
+        Function of theta (d,) and phase (n,), from 0 to 1 over the whole record, that returns the displacement (n,).
+    parameter_names : tuple of str
+        Names.
+    whole, n_steps : int
+        Samples of the whole record, and of this part.
     """
 
-    parameter_names = ("amplitude", "ratio", "late")
     channels = (Channel("top", "displacement", "mm"),)
     dt = DT
 
-    def __init__(self, n_steps=400):
-        self.n_steps = n_steps
-        self.fingerprint = f"ActsLate {n_steps}"
+    def __init__(self, respond, parameter_names, whole=400, n_steps=None):
+        self.respond, self.parameter_names, self.whole = respond, parameter_names, whole
+        self.n_steps = n_steps or whole
+        self.fingerprint = f"{respond.__name__} {self.n_steps}"
 
     def first(self, seconds):
         """The same model for the first part of the record."""
-        return ActsLate(round(seconds / self.dt) + 1)
+        return Shortened(self.respond, self.parameter_names, self.whole, round(seconds / self.dt) + 1)
 
     def simulate(self, theta):
-        """Displacement of the first `n_steps` samples of 400."""
-        amplitude, ratio, late = theta
-        phase = np.arange(self.n_steps) / 400.0
-        early = amplitude * (np.sin(40.0 * phase) + ratio * np.cos(33.0 * phase))
-        return (early + (phase > 0.5) * late**2 * np.sin(25.0 * phase))[None]
+        """Displacement of the first `n_steps` samples."""
+        return self.respond(theta, np.arange(self.n_steps) / self.whole)[None]
+
+
+def _late(theta, phase):
+    amplitude, ratio, late = theta
+    early = amplitude * (np.sin(40.0 * phase) + ratio * np.cos(33.0 * phase))
+    return early + (phase > 0.5) * late**2 * np.sin(25.0 * phase)
 
 
 def acts_late(seed=1):
-    """Posterior of `ActsLate` with noise integrated out: two modes of equal shares, late = 1 and late = -1."""
-    model = ActsLate()
+    """Two modes of equal shares, late = 1 and late = -1; the first half of the record does not depend on `late`."""
+    model = Shortened(_late, ("amplitude", "ratio", "late"))
     measured = noisy(model, np.array([1.2, 0.8, 1.0]), np.array([0.05]), seed)
     prior = {"amplitude": TruncatedNormal(1.0, 0.3), "ratio": TruncatedNormal(1.0, 0.3), "late": Uniform(-2.0, 2.0)}
-    prior |= {"sigma_top": HalfNormal(0.5)}
+    return _marginal(model, measured, prior)
+
+
+def _misled(theta, phase):
+    a, b = theta
+    first, last = 0.25 * (a - 1.4) * np.cos(33.0 * phase), 0.6 * (a - 0.8) * np.cos(25.0 * phase)
+    two_tops = 2.0 * (a - 0.8) * (a - 1.4) * np.sin(57.0 * phase)
+    return b * np.sin(40.0 * phase) + (phase < 0.3) * first + (phase > 0.6) * last + two_tops
+
+
+def misleading(seed=1):
+    """The first part of the record fits exactly at a = 1.4, and with an error at a = 0.8; the rest excludes a = 1.4."""
+    model = Shortened(_misled, ("a", "b"), whole=1500)
+    phase = np.arange(1500) / 1500
+    noise = 0.05 * np.random.default_rng(seed).standard_normal((1, 1500))
+    measured = Measurements(model.channels, model.dt, np.sin(40.0 * phase)[None] + noise)
+    return _marginal(model, measured, {"a": TruncatedNormal(1.1, 0.4), "b": TruncatedNormal(1.0, 0.3)})
+
+
+def _marginal(model, measured, prior):
+    prior = prior | {"sigma_top": HalfNormal(0.5)}
     return Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()

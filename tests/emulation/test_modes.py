@@ -5,9 +5,10 @@ import pytest
 from scipy.optimize import minimize
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, find_modes, problems
+from fe_likelihoods.emulation.levenberg_marquardt import Ascent, _connected, _has_valley
 from fe_likelihoods.emulation.target import ResponseTarget
 
-from .problems import acts_late, free_vibration, vibration
+from .problems import acts_late, free_vibration, misleading, vibration
 
 
 def _log_density(posterior, coords):
@@ -116,6 +117,32 @@ def test_a_rough_likelihood_neither_splits_a_mode_nor_prolongs_an_ascent():
     search, smooth = (find_modes(vibration(function=function), seed=2) for function in (rough, free_vibration))
     assert len(search.modes) == len(smooth.modes) == 1
     assert search.simulations < 4.0 * smooth.simulations
+
+
+def test_a_valley_is_a_point_below_points_on_both_sides():
+    assert not _has_valley(np.array([480.0, 300.0, 100.0, 0.0, -98.0]))  # descends: left to the check of the height
+    assert not _has_valley(np.array([0.0, -2.0, 1.0, -1.0, 0.5]))
+    assert _has_valley(np.array([-15.0, 0.0, -18.0, -2.0, 0.0]))  # over the top of a mode, and a valley, to another one
+
+
+@pytest.mark.parametrize("value", [100.0, 480.0])
+def test_an_ascent_does_not_join_an_end_of_another_height(value):
+    """The end of an ascent that is stuck in a local maximum is not the end of one that is already far above it."""
+    target = ResponseTarget(vibration())
+    start, *_ = find_modes(vibration(), starts=1, seed=1).modes
+    coords = start.coords[:2]
+    nothing = np.zeros((2, 2, 200))
+    low = Ascent(coords + 0.1, 300.0, np.eye(2), target.fit_noise(np.ones(2)), nothing[0], nothing, 0.0, 3)
+    search = _connected(target, coords, value, low.noise, np.zeros(2), [low], np.inf)
+    with pytest.raises(StopIteration) as end:
+        next(search)
+    assert end.value.value == -1
+
+
+def test_an_end_that_fits_only_the_first_part_worse_is_kept():
+    """The model is not exact in its first part: there another region fits better, which the rest excludes."""
+    search = find_modes(misleading(), seed=1)
+    assert search.modes[0].parameters[0] == pytest.approx(0.8, abs=0.05)
 
 
 def test_starts_must_be_a_whole_number():
