@@ -218,7 +218,7 @@ def test_impossible_noise_parameters_are_not_simulated(rng):
 
 @pytest.mark.parametrize("responses", [False, True])
 def test_the_cache_separates_statistics(tmp_path, rng, responses):
-    """Rows stored for white noise are not used for another noise, in either order; stored responses serve every noise."""
+    """Rows stored for white noise are not used for another noise, in either order; responses serve every noise."""
     measurements, thetas = measured_by(Line(), rng), rng.uniform(-1.0, 1.0, size=(6, 2))
     cache = SimulationCache(tmp_path / "lines.sqlite", responses=responses)
     expected = {}
