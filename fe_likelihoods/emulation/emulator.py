@@ -3,9 +3,8 @@
 The residual, measured minus response, at structural coordinates z is r(z) = r_0 + sum_k c_k(w) P_k, with the mean r_0
 of the training residuals, their principal components P_k in units of the noise of each channel, and coefficients c_k
 that a Gaussian process predicts from the whitened coordinates w (`fe_likelihoods.emulation.gaussian_process`). The
-emulated response is R(z) = y - r(z). A response is a smooth function
-of the parameters where its misfit, summed over thousands of samples, is a narrow and curved one; and the same emulator
-serves every noise.
+emulated response is R(z) = y - r(z). A response is a smooth function of the parameters where its misfit, summed over
+thousands of samples, is a narrow and curved one; and the same emulator serves every noise.
 
 With means m_k and variances v_k of the coefficients, the statistics of the mean residual are, in closed form,
 
@@ -100,16 +99,12 @@ class ResponseEmulator:
         self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
         self.left_out = left_out_errors(process)
         self._coefficients = coefficients
-        self._forms = self._bilinear()
-        self._curvature = np.maximum(-2.0 * np.diagonal(self._forms.quadratic @ slopes), 0.0)
-
-    def _bilinear(self) -> _Forms:
-        statistic = self._target.statistic
-        return _Forms(
-            statistic(self._mean),
-            bilinear_form(statistic, self._components, self._mean[None])[:, 0],
-            bilinear_form(statistic, self._components),
+        self._forms = _Forms(
+            target.statistic(mean),
+            bilinear_form(target.statistic, components, mean[None])[:, 0],
+            bilinear_form(target.statistic, components),
         )
+        self._curvature = np.maximum(-2.0 * np.diagonal(self._forms.quadratic @ slopes), 0.0)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

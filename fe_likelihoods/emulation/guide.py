@@ -234,11 +234,15 @@ class ResponseGuide:
 
     def _add_modes(self, modes: Any) -> None:
         for mode in modes:
-            self._best = max(self._best, mode.log_density)
             self._modes.append(mode)
-            self._regions.append(Region(mode.coords, mode.covariance, None, mode.log_evidence))
+            self._regions.append(self._region_of(mode))
         if self._regions:
             self._wide = self._wide_mixture()
+
+    def _region_of(self, mode: Mode) -> Region:
+        """The region of a new mode, which has no emulator yet."""
+        self._best = max(self._best, mode.log_density)
+        return Region(mode.coords, mode.covariance, None, mode.log_evidence)
 
     def _wide_mixture(self) -> StudentMixture:
         shares = np.array([region.log_evidence for region in self._regions])
@@ -293,9 +297,7 @@ class ResponseGuide:
     def _replace_nearest(self, mode: Mode) -> None:
         """Enter a mode instead of the nearest one, whose ascent ended early, such as where simulations fail."""
         number = int(np.argmin(self._distances(mode.coords[None, : self._target.n_structural])[:, 0]))
-        self._modes[number] = mode
-        self._regions[number] = Region(mode.coords, mode.covariance, None, mode.log_evidence)
-        self._best = max(self._best, mode.log_density)
+        self._modes[number], self._regions[number] = mode, self._region_of(mode)
         self._emulated, self._wide = None, self._wide_mixture()
         if all(mode.converged for mode in self._modes):
             self.concerns = tuple(concern for concern in self.concerns if concern != _NOT_AT_THE_TOP)

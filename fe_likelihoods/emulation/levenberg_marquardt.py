@@ -25,7 +25,7 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
-__all__ = ["TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends", "is_same_mode"]
+__all__ = ["TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends"]
 
 _DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 _FIRST_DAMPING = 1e-2
@@ -115,7 +115,7 @@ def ascend(
     tolerance : float
         Log-density still to gain at which to stop.
     apart : float
-        Distance of one coordinate, in prior standard deviations, from which ends are different (`is_same_mode`).
+        Distance of one coordinate, in prior standard deviations, from which ends are different (`_is_same_mode`).
 
     Yields
     ------
@@ -151,7 +151,7 @@ def ascend(
             scale = np.diag(np.diag(hessian))
             whole = np.linalg.solve(hessian, gradient)
             gain_left = 0.5 * float(gradient @ whole)
-            merged = next((k for k, end in enumerate(known) if is_same_mode(coords + whole, end, apart)), -1)
+            merged = next((k for k, end in enumerate(known) if _is_same_mode(coords + whole, end, apart)), -1)
             if gain_left < tolerance or merged >= 0:
                 break
             behind = max((end.log_density for end in known), default=-np.inf) - value
@@ -225,7 +225,7 @@ def _has_valley(values: np.ndarray) -> bool:
     return bool((np.minimum(before, after) - values[1:-1]).max() >= _DIP)
 
 
-def is_same_mode(coords: np.ndarray, end: Ascent, apart: float) -> bool:
+def _is_same_mode(coords: np.ndarray, end: Ascent, apart: float) -> bool:
     """Whether coordinates (n_structural,) belong to the mode at the end of an ascent.
 
     Their distance is measured in units of the Laplace approximation. A part of the record does not determine all
@@ -298,11 +298,11 @@ class Batches:
 def distinct_ends(ends: Sequence[Ascent], apart: float = np.inf) -> list[Ascent]:
     """Ends that are different modes, the highest first; each carries the starts of those that it stands for.
 
-    `apart` is that of `is_same_mode`.
+    `apart` is that of `_is_same_mode`.
     """
     kept: list[Ascent] = []
     for end in sorted(ends, key=lambda end: -end.log_density):
-        same = next((k for k, other in enumerate(kept) if is_same_mode(end.coords, other, apart)), None)
+        same = next((k for k, other in enumerate(kept) if _is_same_mode(end.coords, other, apart)), None)
         if same is None:
             kept.append(end)
         else:

@@ -18,7 +18,7 @@ from .target import Remember, ResponseTarget, run_at_once
 
 __all__ = ["Mode", "ModeSearch", "draw_starts", "find_modes", "laplace", "search_from", "search_modes"]
 
-_FIRST_WAVE = 3  # starts whose ascents are made first
+_FIRST_WAVE = 3  # starts whose ascents are made first, on the first part of the record
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
@@ -180,7 +180,7 @@ def search_modes(
             if batches.interrupted:
                 break
         interrupted = batches.interrupted
-        if not ends or interrupted:
+        if not ends or interrupted or whole:
             break
         # a model that is not exact may fit a part of the record best where it does not fit the whole one
         least = max(end.log_density for end in ends) - _HOPELESS * part.measured.size

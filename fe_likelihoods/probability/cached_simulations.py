@@ -312,7 +312,7 @@ class CachedSimulations:
         thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(n, self._n_structural).copy()
         if misfit is None:
             misfit, known = np.full((n, self._width), np.nan), np.zeros(n, dtype=bool)
-        return _Requested(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, dtype=bool), np.zeros(n, bool))
+        return _Requested(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, bool), np.zeros(n, bool))
 
     def _obtain(self, requested: _Requested) -> None:
         """Fill in what was requested, from the caches or by simulation."""
@@ -322,7 +322,7 @@ class CachedSimulations:
         requested.cached[:] = requested.known if requested.response is None else failed
         self._name_failures(requested, np.flatnonzero(failed))
         left = np.flatnonzero(~requested.cached)
-        size = max(1, _RESPONSE_VALUES // self.measurements.values.size)
+        size = self._most_responses
         for start in range(0, len(left), size):
             self._read_responses(requested, left[start : start + size])
         for rows, batch in self._chunks(requested, np.flatnonzero(~requested.cached)):
@@ -415,11 +415,16 @@ class CachedSimulations:
             self.chunk_size = min(4 * size, 1 + int(_SECONDS_PER_CHUNK * len(rows) / (time.perf_counter() - start)))
             yield rows, batch
 
+    @property
+    def _most_responses(self) -> int:
+        """Number of responses that are held at once where they are cached."""
+        return max(1, _RESPONSE_VALUES // self.measurements.values.size)
+
     def _chunk_limits(self, n: int, responses: bool) -> tuple[int, int]:
         """Smallest (all workers are busy) and largest number of simulations, of n, between two writes to disk."""
         if self.cache is None:
             return n, n
-        largest = max(1, _RESPONSE_VALUES // self.measurements.values.size) if responses or self.cache.responses else n
+        largest = self._most_responses if responses or self.cache.responses else n
         if self.pool is not None:
             workers = self.pool.n_workers or n
         elif has_batch_method(self.model):
