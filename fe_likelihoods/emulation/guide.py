@@ -20,7 +20,7 @@ import numpy as np
 
 from .density import EmulatedPosterior, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
-from .modes import Mode, ModeSearch, draw_starts, search_from, search_modes
+from .modes import Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes
 from .student import StudentMixture, draw_mixture, mixture_log_density
 from .target import ResponseTarget
 
@@ -73,15 +73,14 @@ class ResponseGuide:
     """
 
     def __init__(self, posterior: Any, starts: int = 8) -> None:
-        if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
-            raise ValueError(f"starts must be a whole number of at least one; got {starts!r}")
+        starts = check_starts(starts)
         if posterior.likelihood.memory_cache.rows < _FEWEST_CACHED:
             raise ValueError(
                 f"a guide needs a likelihood with memory_rows of {_FEWEST_CACHED} or more, so that no simulation is "
                 f"run twice; got {posterior.likelihood.memory_cache.rows}"
             )
         self._target = ResponseTarget(posterior)
-        self._posterior, self._starts = posterior, int(starts)
+        self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
         self.simulations = 0.0
         self.concerns: tuple[str, ...] = ()

@@ -16,7 +16,7 @@ from .levenberg_marquardt import TOLERANCE, Ascent, Batches, ascend, distinct_en
 from .quadratic import bilinear_form
 from .target import Remember, ResponseTarget, run_at_once
 
-__all__ = ["Mode", "ModeSearch", "draw_starts", "find_modes", "laplace", "search_from", "search_modes"]
+__all__ = ["Mode", "ModeSearch", "check_starts", "draw_starts", "find_modes", "laplace", "search_from", "search_modes"]
 
 _FIRST_WAVE = 3  # starts whose ascents are made first, on the first part of the record
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
@@ -208,6 +208,13 @@ def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
     return starts
 
 
+def check_starts(starts: Any) -> int:
+    """A number of starts as int; ValueError for anything but a whole number of at least one."""
+    if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
+        raise ValueError(f"starts must be a whole number of at least one; got {starts!r}")
+    return int(starts)
+
+
 def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulations: float | None = None) -> ModeSearch:
     """Find the modes of a posterior from the responses of its model.
 
@@ -241,8 +248,7 @@ def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulation
     >>> search = find_modes(posterior, seed=1)
     >>> [(mode.parameters, mode.log_evidence) for mode in search.modes]
     """
-    if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
-        raise ValueError(f"starts must be a whole number of at least one; got {starts!r}")
+    starts = check_starts(starts)
     target = ResponseTarget(posterior)
     budget = np.inf if max_simulations is None else float(max_simulations)
     spent = 0.0

@@ -9,6 +9,7 @@ import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,13 @@ def distinct_keys(rows: np.ndarray) -> tuple[list[bytes], list[int]]:
     first: dict[bytes, int] = {}
     which = [first.setdefault(row.tobytes(), len(first)) for row in rows + 0.0]  # adding zero makes 0.0 of -0.0
     return list(first), which
+
+
+def _as_limit(name: str, what: str, value: Any) -> int:
+    """The limit of a cache as int; ValueError for anything but a whole number of 0 or more."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise ValueError(f"{name} must be the {what}, a whole number of 0 or more; got {value!r}")
+    return int(value)
 
 
 class MemoryCache:
@@ -45,12 +53,7 @@ class MemoryCache:
     """
 
     def __init__(self, rows: int) -> None:
-        if isinstance(rows, bool) or not isinstance(rows, int | np.integer) or rows < 0:
-            raise ValueError(
-                f"memory_rows must be the number of simulations to cache in memory, a whole number of 0 or more; got "
-                f"{rows!r}"
-            )
-        self.rows = int(rows)
+        self.rows = _as_limit("memory_rows", "number of simulations to cache in memory", rows)
         self._misfits: OrderedDict[bytes, bytes] = OrderedDict()  # from the least to the most recently used
         self._lock = threading.Lock()
 
@@ -119,12 +122,7 @@ class ResponseMemory:
     """
 
     def __init__(self, max_bytes: int) -> None:
-        if isinstance(max_bytes, bool) or not isinstance(max_bytes, int | np.integer) or max_bytes < 0:
-            raise ValueError(
-                f"memory_bytes must be the size of the responses to keep in memory [bytes], a whole number of 0 or "
-                f"more; got {max_bytes!r}"
-            )
-        self.max_bytes = int(max_bytes)
+        self.max_bytes = _as_limit("memory_bytes", "size of the responses to keep in memory [bytes]", max_bytes)
         self.dropped = 0
         self._outcomes: OrderedDict[tuple[str, bytes], np.ndarray | str] = OrderedDict()  # the oldest first
         self._bytes = 0
