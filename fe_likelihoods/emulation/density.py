@@ -106,15 +106,12 @@ class EmulatedPosterior:
 
     def log_density(self, coords: np.ndarray) -> np.ndarray:
         """Logarithm of prior times emulated likelihood (n,) at coordinates (n, ndim); not normalised."""
-        d = self._target.n_structural
-        structural, noise = coords[:, :d], coords[:, d:]
         nearest, squared = self._nearest(coords)
         result = np.full(len(coords), -np.inf)
         for k, region in enumerate(self._regions):
             rows = np.flatnonzero((nearest == k) & (squared[k] <= region.emulator.reach))
             if len(rows):
-                statistics, correction = region.emulator.statistics(structural[rows])
-                result[rows] = self._target.log_likelihood(statistics, noise[rows]) + correction
+                result[rows] = region.emulator.log_likelihood(coords[rows])
         return np.where(np.isnan(result), -np.inf, result) + self._target.log_prior(coords)
 
     def _nearest(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

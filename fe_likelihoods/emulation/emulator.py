@@ -1,21 +1,27 @@
 """Emulator of the response near a mode: principal components of simulated residuals, a Gaussian process for each.
 
-The residual, measured minus response, at structural coordinates z is r(z) = r_0 + sum_k c_k(w) P_k, with the mean r_0
+The residual, measured minus response, at structural parameters u is r(u) = r_0 + sum_k c_k(w) P_k, with the mean r_0
 of the training residuals, their principal components P_k in units of the noise of each channel, and coefficients c_k
-that a Gaussian process predicts from the whitened coordinates w (`fe_likelihoods.emulation.gaussian_process`). The
-emulated response is R(z) = y - r(z). A response is a smooth function of the parameters where its misfit, summed over
-thousands of samples, is a narrow and curved one; and the same emulator serves every noise.
+that a Gaussian process predicts from the whitened parameters w (`fe_likelihoods.emulation.gaussian_process`). The
+emulated response is R(u) = y - r(u). A response is a smooth function of the parameters where its misfit, summed over
+thousands of samples, is a narrow and curved one; and the same emulator serves every noise. It is a function of the
+parameters, not of their standard normal coordinates: near a bound of a prior the coordinates go to infinity while the
+response hardly changes, and an emulator in coordinates extrapolates there.
 
-With means m_k and variances v_k of the coefficients, the statistics of the mean residual are, in closed form,
+With means m_k of the coefficients, the statistics of the mean residual are, in closed form,
 
-    S = S(r_0) + 2 sum_k m_k B(r_0, P_k) + sum_kl m_k m_l B(P_k, P_l),
+    S(m) = S(r_0) + 2 sum_k m_k B(r_0, P_k) + sum_kl m_k m_l B(P_k, P_l),
 
-where B is the bilinear form of the statistics. The uncertainty of the emulator enters through the expected likelihood.
-The log-likelihood is nearly quadratic in each coefficient, with the curvature h_k = -2 sum_a f_a B_a(P_k, P_k) for the
-slopes f = d log L / dS at the mode. Averaged over the coefficients it decreases by sum_k log(1 + h_k v_k) / 2 at its
-maximum, and this is subtracted everywhere. (The likelihood of the expected misfit, E S = S + sum_k v_k B(P_k, P_k), is
-lower by sum_k h_k v_k / 2: far too small where the emulator is uncertain, and a density of draws must not be too small
-anywhere.)
+where B is the bilinear form of the statistics. The uncertainty of the emulator, with variances v_k of the coefficients,
+enters through the expected likelihood. With the slopes f = d log L / dS at the mode, the log-likelihood is nearly
+quadratic in the coefficients, with the gradient g and the Hessian -H, H_kl = -2 sum_a f_a B_a(P_k, P_l). By the method
+of Laplace, the expectation over the coefficients is
+
+    log E L = max over s of [log L(S(m + s)) - sum_k s_k^2 / (2 v_k)] - sum_k log(1 + H_kk v_k) / 2,
+
+which is exact for a quadratic with a diagonal H. The steps s_k = t v_k g_k / (1 + H_kk v_k) are tried, with t = 0 and
+with the t that is best for the quadratic. Where the emulator is certain, this is log L at the mean; where it is not, residuals within its own
+uncertainty cost little, so that draws are made there and the emulator is trained there next.
 
 References
 ----------
@@ -40,6 +46,8 @@ _MAX_COMPONENTS = 60
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
 _REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the largest of the training points
+_SMALLEST_SLOPE = 1e-6  # of a parameter by its coordinate, in units of its spread in the prior
+_TINY = 1e-300
 _ROWS = 4096  # points evaluated at once
 
 
@@ -58,6 +66,36 @@ class TrainingSet(NamedTuple):
     residuals: np.ndarray
 
 
+class Whitening(NamedTuple):
+    """Linear map of parameters to inputs of about unit variance.
+
+    Attributes
+    ----------
+    centre : (d,) float
+        Scaled parameters that map to zero, see `ResponseTarget.scaled_parameters`.
+    matrix : (d, d) float
+        Inputs are (scaled parameters - centre) @ matrix.
+    """
+
+    centre: np.ndarray
+    matrix: np.ndarray
+
+
+def fit_whitening(target: ResponseTarget, centre: np.ndarray, covariance: np.ndarray) -> Whitening:
+    """Whitening for a mean (d,) and covariance (d, d) of structural coordinates."""
+    sd = np.sqrt(np.diag(covariance))
+    low, at, high = target.scaled_parameters(np.stack([centre - sd, centre, centre + sd]))
+    below, above = target.scaled_parameters(np.array([[-1.0], [1.0]]) * np.ones_like(sd))
+    # d u / d z over two standard deviations; on a bound it can vanish, where any scale will do
+    slope = np.maximum((high - low) / (2.0 * sd), _SMALLEST_SLOPE * (above - below))
+    return Whitening(at, np.linalg.inv(np.linalg.cholesky(covariance)).T / slope[:, None])
+
+
+def whitened(target: ResponseTarget, whitening: Whitening, coords: np.ndarray) -> np.ndarray:
+    """Inputs (n, d) of the Gaussian process at structural coordinates (n, d)."""
+    return (target.scaled_parameters(coords) - whitening.centre) @ whitening.matrix
+
+
 class _Forms(NamedTuple):
     """What the expected statistics are computed from."""
 
@@ -73,10 +111,8 @@ class ResponseEmulator:
 
     Attributes
     ----------
-    centre : (d,) float
-        Origin of the whitened coordinates.
     reach : float
-        Largest squared distance from `centre`, in whitened coordinates, at which the emulator is used.
+        Largest squared distance, see `squared_distance`, at which the emulator is used.
     process : GaussianProcess
         Predicts the coefficients of the components.
     left_out : (m, k) float
@@ -86,15 +122,14 @@ class ResponseEmulator:
     def __init__(
         self,
         target: ResponseTarget,
-        centre: np.ndarray,
-        whitening: np.ndarray,
+        whitening: Whitening,
         process: GaussianProcess,
         mean: np.ndarray,
         components: np.ndarray,
         coefficients: np.ndarray,
         slopes: np.ndarray,
     ) -> None:
-        self._target, self.centre, self._whitening, self.process = target, centre, whitening, process
+        self._target, self._whitening, self.process = target, whitening, process
         self._mean, self._components = mean, components
         self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
         self.left_out = left_out_errors(process)
@@ -104,7 +139,8 @@ class ResponseEmulator:
             bilinear_form(target.statistic, components, mean[None])[:, 0],
             bilinear_form(target.statistic, components),
         )
-        self._curvature = np.maximum(-2.0 * np.diagonal(self._forms.quadratic @ slopes), 0.0)
+        self._gradient = 2.0 * self._forms.linear @ slopes
+        self._hessian = 2.0 * self._forms.quadratic @ slopes
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -132,35 +168,42 @@ class ResponseEmulator:
         inputs = self.process.inputs.tobytes() + self._coefficients.tobytes()
         return hashlib.blake2b(self._target.model.fingerprint.encode() + inputs, digest_size=16).hexdigest()
 
-    def whitened(self, coords: np.ndarray) -> np.ndarray:
-        """Whitened coordinates (n, d) of structural coordinates (n, d)."""
-        return (coords - self.centre) @ self._whitening
-
     def squared_distance(self, coords: np.ndarray) -> np.ndarray:
-        """Squared distance (n,) of structural coordinates (n, d) from the centre, in whitened coordinates."""
-        return np.square(self.whitened(coords)).sum(axis=1)
+        """Squared distance (n,) of structural coordinates (n, d) from the centre, in whitened parameters."""
+        return np.square(self._inputs(coords)).sum(axis=1)
 
-    def statistics(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Statistics of the residuals, and what the uncertainty of the emulator adds to the log-likelihood.
+    def _inputs(self, coords: np.ndarray) -> np.ndarray:
+        return whitened(self._target, self._whitening, coords)
+
+    def statistics(self, coords: np.ndarray) -> np.ndarray:
+        """Statistics (n, n_numbers) of the residuals of the mean response at structural coordinates (n, d)."""
+        return self._at(predict(self.process, self._inputs(coords))[0])
+
+    def log_likelihood(self, coords: np.ndarray) -> np.ndarray:
+        """Logarithm (n,) of the likelihood that is expected in view of the uncertainty of the emulator.
 
         Parameters
         ----------
-        coords : (n, d) float
-            Structural coordinates.
-
-        Returns
-        -------
-        statistics : (n, n_numbers) float
-            At the mean response.
-        correction : (n,) float
-            Not positive, see the module.
+        coords : (n, ndim) float
+            Coordinates of all parameters, the structural ones first.
         """
-        parts = [self._statistics(coords[k : k + _ROWS]) for k in range(0, len(coords), _ROWS)]
-        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+        parts = [self._log_likelihood(coords[k : k + _ROWS]) for k in range(0, len(coords), _ROWS)]
+        return np.concatenate(parts) if parts else np.zeros(0)
 
-    def _statistics(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        mean, variance = predict(self.process, self.whitened(coords))
-        return self._at(mean), -0.5 * np.log1p(self._curvature * variance).sum(axis=1)
+    def _log_likelihood(self, coords: np.ndarray) -> np.ndarray:
+        d = self._target.n_structural
+        mean, variance = predict(self.process, self._inputs(coords[:, :d]))
+        curvature = np.maximum(-np.diagonal(self._hessian), 0.0)
+        gradient = self._gradient + mean @ self._hessian
+        step = variance * gradient / (1.0 + curvature * variance)
+        cost = (np.square(step) / np.maximum(variance, _TINY)).sum(axis=1)
+        bend = cost - ((step @ self._hessian) * step).sum(axis=1)
+        best = (gradient * step).sum(axis=1) / np.maximum(bend, _TINY)
+        unmoved = self._target.log_likelihood(self._at(mean), coords[:, d:])
+        moved = self._target.log_likelihood(self._at(mean + best[:, None] * step), coords[:, d:])
+        # far from the mode the quadratic is not good enough for a step, and any step gives a lower bound
+        top = np.fmax(unmoved, moved - 0.5 * best**2 * cost)
+        return top - 0.5 * np.log1p(curvature * variance).sum(axis=1)
 
     def _at(self, mean: np.ndarray) -> np.ndarray:
         """Statistics (n, n_numbers) at coefficients (n, k)."""
@@ -186,7 +229,7 @@ class ResponseEmulator:
         """Predicted responses of parameters (n, d)."""
         coords = self._target.structural_coordinates(np.asarray(thetas, dtype=float))
         inside = self.squared_distance(coords) <= self.reach
-        mean, _ = predict(self.process, self.whitened(np.where(inside[:, None], coords, self.centre)))
+        mean, _ = predict(self.process, np.where(inside[:, None], self._inputs(coords), 0.0))
         residuals = self._mean + np.einsum("nk,kct->nct", mean, self._components, optimize=True)
         response = self._target.measured - residuals
         response[~inside] = np.nan
@@ -212,7 +255,7 @@ def fit_emulator(
     training : TrainingSet
         Simulations, at least d + 4.
     centre, covariance : (d,) float, (d, d) float
-        About the mean and covariance of the posterior, for whitening.
+        About the mean and covariance of the posterior in structural coordinates, for whitening.
     scales : (n_channels,) float
         Standard deviations of the noise [SI]; components are in these units.
     slopes : (n_numbers,) float
@@ -236,9 +279,9 @@ def fit_emulator(
     lengths = np.sqrt(values[:k])
     components = ((vectors[:, :k] / lengths).T @ scaled).reshape(k, *mean.shape) * scales[:, None]
     coefficients = vectors[:, :k] * lengths
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance)).T
-    inputs = (training.coords - centre) @ whitening
+    whitening = fit_whitening(target, centre, covariance)
+    inputs = whitened(target, whitening, training.coords)
     importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
     log_scales = None if earlier is None else earlier.process.log_scales
     process = fit_process(inputs, coefficients, importance, log_scales)
-    return ResponseEmulator(target, centre, whitening, process, mean, components, coefficients, slopes)
+    return ResponseEmulator(target, whitening, process, mean, components, coefficients, slopes)

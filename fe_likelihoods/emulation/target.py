@@ -28,6 +28,7 @@ _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise par
 _WIDTHS_AROUND_START = 1.0, 0.1
 _GRID = np.linspace(-1.0, 1.0, 41)
 _SLOPE_STEP = 1e-4
+_SMALLEST = 1e-300  # positive parameters are at least this before their logarithm is taken
 _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
 _NEWTON_STEPS = 12
 _NEWTON_GAIN = 1e-4
@@ -178,6 +179,7 @@ class ResponseTarget:
         self.n_steps = self.measured.shape[1]
         self.statistic: Callable[[np.ndarray], np.ndarray] = getattr(self.noise, "statistic", None) or sums_of_squares
         check_quadratic(self.statistic, self.measured)
+        self._logarithmic = [d.logarithmic for d in list(self._prior.distributions.values())[: self.n_structural]]
         self._median = self._prior.from_normal(np.zeros(self.ndim))
         self.archive = Archive()
 
@@ -218,6 +220,16 @@ class ResponseTarget:
         full = np.repeat(self._median[None], len(thetas), axis=0)
         full[:, : self.n_structural] = thetas
         return _finite(self._prior.to_normal(full)[:, : self.n_structural])
+
+    def scaled_parameters(self, coords: np.ndarray) -> np.ndarray:
+        """Structural parameters (n, n_structural), or their logarithms where the prior says that they vary by factors.
+
+        Responses are smooth functions of these. They are not of the coordinates, which go to infinity as a parameter
+        goes to a bound of its prior.
+        """
+        parameters = self.structural_parameters(coords)
+        parameters[:, self._logarithmic] = np.log(np.maximum(parameters[:, self._logarithmic], _SMALLEST))
+        return parameters
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""

@@ -17,6 +17,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -53,7 +54,15 @@ class Distribution(ABC):
 
     A subclass is a frozen dataclass with `bounds`, `moments`, `_log_density` and `_quantile`. For accuracy in the upper
     tail it may add `_upper_quantile`, and for closed forms `_from_normal` and `_to_normal`.
+
+    Attributes
+    ----------
+    logarithmic : bool
+        Whether the parameter varies by factors rather than by differences: an emulator of the response is then a
+        function of its logarithm. The parameter must be positive. False by default.
     """
+
+    logarithmic: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -431,6 +440,8 @@ class LogNormal(Distribution):
     log_sd : float
         Standard deviation of the natural logarithm (> 0); if small, about the coefficient of variation.
     """
+
+    logarithmic: ClassVar[bool] = True
 
     median: float
     log_sd: float

@@ -37,11 +37,11 @@ def noisy(model, truth=TRUTH, sd=SD, seed=1):
     return Measurements(model.channels, model.dt, model.simulate(truth) + errors)
 
 
-def vibration(noise="marginal", function=free_vibration, seed=1):
-    """Posterior of stiffness and damping of a vibrating mass, with one of the noises of the library."""
+def vibration(noise="marginal", function=free_vibration, seed=1, truth=TRUTH, damping=None):
+    """Posterior of stiffness and damping of a vibrating mass, with one of the noises and priors of the library."""
     model = FunctionModel(function, ["stiffness", "damping"], CHANNELS, DT, N_STEPS)
-    measured = noisy(FunctionModel(free_vibration, ["stiffness", "damping"], CHANNELS, DT, N_STEPS), seed=seed)
-    prior = {name: TruncatedNormal(1.0, 0.3) for name in model.parameter_names}
+    measured = noisy(FunctionModel(free_vibration, ["stiffness", "damping"], CHANNELS, DT, N_STEPS), truth, seed=seed)
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": damping or TruncatedNormal(1.0, 0.3)}
     sigmas = {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
     if noise == "marginal":
         return Posterior(FELikelihood(model, measured, MarginalNoise(GaussianNoise(CHANNELS), sigmas)), prior)

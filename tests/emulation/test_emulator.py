@@ -4,18 +4,20 @@ interface; errors away from the training points."""
 import numpy as np
 import pytest
 
-from fe_likelihoods import FELikelihood, SimulationFailed
+from fe_likelihoods import FELikelihood, HalfNormal, LogNormal, SimulationFailed, TruncatedNormal, Uniform
 from fe_likelihoods.emulation.emulator import TrainingSet, fit_emulator
+from fe_likelihoods.emulation.gaussian_process import predict
 from fe_likelihoods.emulation.target import ResponseTarget
 
 from .problems import free_vibration, vibration
 
+AT = np.array([1.2, 0.8])
 SCALE = np.array([0.01, 0.05])  # of the training points, in standard deviations of the prior
 
 
 def emulator_of(posterior, n=40, seed=1):
     target = ResponseTarget(posterior)
-    centre = target.structural_coordinates(np.array([[1.2, 0.8]]))[0]
+    centre = target.structural_coordinates(AT[None])[0]
     coords = centre + SCALE * np.random.default_rng(seed).standard_normal((n, 2))
     target.run(coords)
     training = TrainingSet(target.archive.coords, np.array(target.archive.residuals))
@@ -27,15 +29,14 @@ def emulator_of(posterior, n=40, seed=1):
 @pytest.mark.parametrize("noise", ["marginal", "autoregressive"])
 def test_statistics_and_responses_near_the_training_points(noise):
     target, emulator = emulator_of(vibration(noise))
-    coords = emulator.centre + 0.7 * SCALE * np.random.default_rng(2).standard_normal((20, 2))
+    coords = target.structural_coordinates(AT[None]) + 0.7 * SCALE * np.random.default_rng(2).standard_normal((20, 2))
     true = target.run(coords)
-    predicted, correction = emulator.statistics(coords)
+    predicted = emulator.statistics(coords)
     error = target.log_likelihood(predicted, np.tile(target.fit_noise(true.statistics[0]).coords, (20, 1)))
     error = error - target.log_likelihood(
         true.statistics, np.tile(target.fit_noise(true.statistics[0]).coords, (20, 1))
     )
     assert np.abs(error).max() < 0.05
-    assert (correction <= 0.0).all() and correction.min() > -0.5
     thetas = target.structural_parameters(coords)
     batch = emulator.simulate_batch(thetas)
     assert not any(batch.reasons)
@@ -48,8 +49,8 @@ def test_errors_of_left_out_runs_are_those_of_new_ones_or_larger():
     target, emulator = emulator_of(vibration())
     predicted, true = emulator.left_out_statistics()
     left_out = np.abs(predicted - true).max(axis=0)
-    coords = emulator.centre + 0.7 * SCALE * np.random.default_rng(3).standard_normal((20, 2))
-    new = np.abs(emulator.statistics(coords)[0] - target.run(coords).statistics).max(axis=0)
+    coords = target.structural_coordinates(AT[None]) + 0.7 * SCALE * np.random.default_rng(3).standard_normal((20, 2))
+    new = np.abs(emulator.statistics(coords) - target.run(coords).statistics).max(axis=0)
     assert (new < 3.0 * left_out + 1e-6 * true.max(axis=0)).all()
 
 
@@ -57,9 +58,8 @@ def test_an_emulator_is_a_model():
     posterior = vibration()
     _, emulator = emulator_of(posterior)
     likelihood = FELikelihood(emulator, posterior.likelihood.measurements, posterior.likelihood.noise)
-    at = np.array([1.2, 0.8])
-    assert likelihood(at) == pytest.approx(posterior.likelihood(at), abs=0.05)
-    difference = emulator.simulate(at) - free_vibration(at)
+    assert likelihood(AT) == pytest.approx(posterior.likelihood(AT), abs=0.05)
+    difference = emulator.simulate(AT) - free_vibration(AT)
     assert (np.abs(difference).max(axis=1) < 1e-2 * np.array([5e-3, 1e3])).all()
     assert emulator.fingerprint != emulator_of(posterior, seed=2)[1].fingerprint
 
@@ -68,3 +68,49 @@ def test_it_refuses_points_that_it_was_not_fitted_to():
     _, emulator = emulator_of(vibration())
     with pytest.raises(SimulationFailed, match="outside the region"):
         emulator.simulate(np.array([0.5, 0.8]))
+
+
+@pytest.mark.parametrize("prior", [TruncatedNormal(1.0, 1.0), HalfNormal(1.0), Uniform(0.0, 3.0)])
+def test_near_a_bound_the_emulator_follows_the_response(prior):
+    """There the coordinates go to infinity: these are up to 12 standard deviations from the training points."""
+    posterior = vibration(truth=np.array([1.2, 0.03]), damping=prior)
+    target = ResponseTarget(posterior)
+    centre = target.structural_coordinates(np.array([[1.2, 0.05]]))[0]
+    covariance = np.diag(np.square([0.01, 0.3]))
+    target.run(centre + np.random.default_rng(4).standard_normal((40, 2)) @ np.sqrt(covariance))
+    training = TrainingSet(target.archive.coords, np.array(target.archive.residuals))
+    slopes = target.slopes(target.archive.statistics[0], np.zeros(0))
+    emulator = fit_emulator(target, training, centre, covariance, np.array([2e-3, 5.0]), slopes)
+    coords = target.structural_coordinates(np.array([[1.2, 1e-2], [1.2, 1e-3], [1.203, 1e-6], [1.198, 1e-9]]))
+    emulated = emulator.log_likelihood(coords)
+    true = target.log_likelihood(target.run(coords).statistics, np.zeros((4, 0)))
+    assert (emulator.squared_distance(coords) < emulator.reach).all()
+    assert np.abs(emulated - true).max() < 0.3
+
+
+def test_a_parameter_that_varies_by_factors_enters_by_its_logarithm():
+    posterior = vibration(damping=LogNormal(0.8, 1.0))
+    target = ResponseTarget(posterior)
+    coords = np.array([[0.0, -2.0], [0.0, 0.0], [0.0, 2.0]])
+    scaled = target.scaled_parameters(coords)
+    np.testing.assert_allclose(scaled[:, 1], np.log(0.8) + coords[:, 1])
+    np.testing.assert_allclose(scaled[:, 0], target.structural_parameters(coords)[:, 0])
+
+
+def test_uncertainty_enters_through_the_expected_likelihood():
+    """Against a Monte Carlo average over the coefficients, with variances that are as large as those of the noise."""
+    target, emulator = emulator_of(vibration("white"))
+    emulator.process = emulator.process._replace(variances=emulator.process.variances * 1e8)
+    noise = target.fit_noise(target.archive.statistics[0]).coords
+    offsets = np.array([[0.0, 0.0], [0.02, 0.0], [0.05, 0.2], [-0.08, 0.1]])
+    structural = target.structural_coordinates(AT[None]) + SCALE * offsets
+    coords = np.concatenate([structural, np.tile(noise, (4, 1))], axis=1)
+    mean, variance = predict(emulator.process, emulator._inputs(structural))
+    gains = []
+    for k, expected in enumerate(emulator.log_likelihood(coords)):
+        draws = mean[k] + np.sqrt(variance[k]) * np.random.default_rng(5).standard_normal((100_000, mean.shape[1]))
+        values = target.log_likelihood(emulator._at(draws), np.tile(noise, (len(draws), 1)))
+        average = np.log(np.mean(np.exp(values - values.max()))) + values.max()
+        gains.append(average - target.log_likelihood(emulator._at(mean[k : k + 1]), noise[None])[0])
+        assert expected == pytest.approx(average, abs=0.02)
+    assert min(gains) < -1.0 and max(gains) > 1.0
