@@ -9,7 +9,7 @@ import time
 import numpy as np
 
 from fe_likelihoods import TruncatedNormal
-from tests.statistics.hard_posteriors import HardPosterior
+from tests.statistics.case import HardPosterior
 
 from .guided import run
 from .rows import Row

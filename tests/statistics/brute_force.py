@@ -13,7 +13,7 @@ from scipy.special import gammaln
 
 from fe_likelihoods.probability.noise import noise_statistic
 
-from .hard_posteriors import HardPosterior
+from .case import HardPosterior
 
 __all__ = ["Reference", "log_prob_function", "reference"]
 
@@ -212,7 +212,7 @@ def _estimate(case: HardPosterior, x: np.ndarray, log_weights: np.ndarray, draws
         return np.sqrt(draws * terms.var(axis=1).sum(axis=0))
 
     inside = case.labels(x)[:, None] == np.arange(case.n_modes)
-    shares = w @ inside
+    shares = np.minimum(w @ inside, 1.0)  # rounding
     return Reference(
         float(top + np.log(total)),
         float(error),

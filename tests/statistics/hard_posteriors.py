@@ -1,41 +1,22 @@
 """Small posteriors on which a sampler that spends few simulations must be right, or refuse.
 
-Every case is a cheap Python function behind a `FunctionModel`, so that a posterior takes seconds. Most responses are
-linear combinations of smooth shapes over time, with nonlinear functions of the parameters as coefficients
-(*features*). With n samples, noise sigma and shapes of mean square one, a feature has the standard deviation
-sigma / sqrt(n). `reference` gives evidence, moments and mode shares of a case by brute force, with their errors.
+Every case is a cheap Python function behind a `FunctionModel` (see `HardPosterior`), so that a posterior takes seconds.
+`brute_force.reference` gives evidence, moments and mode shares of a case, with their errors.
 
-No model can be shortened (there is no method ``first``), and most have one channel. The cases are those in which a
-search from few starts, a smooth emulator or a Gaussian approximation goes wrong: several modes, bounds, failing
-simulations, likelihoods with jumps, curved and flat posteriors, few samples, noisy runs.
+The cases are those in which a search from few starts, a smooth emulator or a Gaussian approximation goes wrong: several
+modes, bounds, failing simulations, likelihoods with jumps, curved and flat posteriors, few samples, noisy runs. The
+models of this module cannot be shortened (there is no method ``first``), and most have one channel. The cases of
+`late_posteriors`, whose models can be shortened, are added to `CASES`.
 """
-
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from fe_likelihoods import (
-    AutoregressiveNoise,
-    Channel,
-    Distribution,
-    FELikelihood,
-    FunctionModel,
-    GaussianNoise,
-    HalfNormal,
-    LogNormal,
-    Measurements,
-    Posterior,
-    SimulationFailed,
-    TruncatedNormal,
-    Uniform,
-)
+from fe_likelihoods import Distribution, LogNormal, TruncatedNormal, Uniform
 
-__all__ = ["CASES", "HardPosterior", "hash_uniform"]
+from .case import HardPosterior
+from .late_posteriors import LATE_CASES
 
-DT = 0.02  # s
-Features = Callable[[np.ndarray], np.ndarray]
+__all__ = ["CASES", "hash_uniform"]
 
 
 def hash_uniform(x: np.ndarray, salt: int = 0) -> np.ndarray:
@@ -48,116 +29,6 @@ def hash_uniform(x: np.ndarray, salt: int = 0) -> np.ndarray:
         state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         state = state ^ (state >> np.uint64(31))
     return (state >> np.uint64(11)) / 2.0**53
-
-
-def _combine(features: Features, shapes: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Responses (n, n_channels, n_steps) from features (n, k) and shapes (k, n_channels, n_steps)."""
-    return np.tensordot(features(theta), shapes, axes=1)
-
-
-class _OneRun:
-    """One simulation: a row of the responses, or `SimulationFailed` where it is NaN."""
-
-    def __init__(self, respond: Callable[[np.ndarray], np.ndarray]) -> None:
-        self.respond = respond
-
-    def __call__(self, theta: np.ndarray) -> np.ndarray:
-        response = self.respond(theta[None])[0]
-        if np.isnan(response).any():
-            raise SimulationFailed("the solution did not converge")
-        return response
-
-
-@dataclass(frozen=True)
-class HardPosterior:
-    """A small posterior that is hard in one way.
-
-    Attributes
-    ----------
-    what : str
-        What makes it hard.
-    prior : dict of str to Distribution
-        Priors of the structural parameters.
-    features : callable, optional
-        Function of theta (n, d) that returns the coefficients (n, k) of the shapes; NaN where a simulation fails.
-    target : (k,) array_like
-        Features of the noise-free data; need not be features of any theta.
-    respond : callable, optional
-        Function of theta (n, d) that returns (n, n_channels, n_steps), instead of `features`.
-    truth : (d,) array_like, optional
-        Parameters of the noise-free data where `respond` is given.
-    noise : float
-        Standard deviation of the noise of the data.
-    n_steps, n_channels : int
-        Size of the data.
-    error_model : {"marginal", "white", "autoregressive"}
-        White noise with sigmas integrated out, or with sigmas as parameters, or autoregressive noise.
-    label : callable, optional
-        Function of theta (n, d) that returns the number of the mode (n,), from 0.
-    n_modes : int
-        Number of modes.
-    offset : float
-        Constant in the responses and in the data [m].
-    balanced : bool
-        Whether the noise has no component along the shapes, so that it does not change the shares of the modes.
-    """
-
-    what: str
-    prior: Mapping[str, Distribution]
-    features: Features | None = None
-    target: Any = None
-    respond: Callable[[np.ndarray], np.ndarray] | None = None
-    truth: Any = None
-    noise: float = 0.05
-    n_steps: int = 200
-    n_channels: int = 1
-    error_model: str = "marginal"
-    label: Callable[[np.ndarray], np.ndarray] | None = None
-    n_modes: int = 1
-    offset: float = 0.0
-    balanced: bool = False
-
-    @property
-    def shapes(self) -> np.ndarray:
-        """Shapes of the features over time (k, n_channels, n_steps), of mean square one per channel."""
-        t = (np.arange(self.n_steps) + 0.5) / self.n_steps
-        k, c = np.arange(len(self.target))[:, None, None], np.arange(self.n_channels)[:, None]
-        return np.sqrt(2.0) * np.sin(np.pi * (k + 1 + c) * t)
-
-    def responses(self, theta: np.ndarray) -> np.ndarray:
-        """Responses of many parameter sets (n, d) at once: (n, n_channels, n_steps), NaN where a simulation fails."""
-        if self.respond is not None:
-            return self.offset + self.respond(theta)
-        return self.offset + _combine(self.features, self.shapes, theta)
-
-    def labels(self, theta: np.ndarray) -> np.ndarray:
-        """Number of the mode (n,) of every point (n, ndim)."""
-        return np.zeros(len(theta), dtype=int) if self.label is None else self.label(theta)
-
-    def data(self, seed: int) -> np.ndarray:
-        """Noise-free response plus white noise of a seed: (n_channels, n_steps)."""
-        if self.respond is not None:
-            clean = self.respond(np.array([self.truth], dtype=float))[0]
-        else:
-            clean = np.tensordot(np.asarray(self.target, dtype=float), self.shapes, axes=1)
-        noise = np.random.default_rng([seed, 7]).standard_normal(clean.shape)
-        if self.balanced:
-            rows = self.shapes.reshape(len(self.target), -1)
-            along = np.linalg.lstsq(rows.T, noise.ravel(), rcond=None)[0]
-            noise -= (along @ rows).reshape(noise.shape)
-        return self.offset + clean + self.noise * noise
-
-    def posterior(self, seed: int, name: str = "hard") -> Posterior:
-        """Posterior given the data of a seed, with a model that runs one simulation per call."""
-        channels = tuple(Channel(f"c{i + 1}", "displacement", "m") for i in range(self.n_channels))
-        model = FunctionModel(_OneRun(self.responses), tuple(self.prior), channels, DT, self.n_steps, version=name)
-        measurements = Measurements(channels, DT, self.data(seed), f"SYNTHETIC, {name}, seed {seed}")
-        prior = dict(self.prior) | {f"sigma_{channel.name}": HalfNormal(0.5) for channel in channels}
-        if self.error_model == "autoregressive":
-            prior |= {f"rho_{channel.name}": Uniform(-1.0, 1.0) for channel in channels}
-            return Posterior(FELikelihood(model, measurements, AutoregressiveNoise(channels)), prior)
-        posterior = Posterior(FELikelihood(model, measurements, GaussianNoise(channels)), prior)
-        return posterior.marginal() if self.error_model == "marginal" else posterior
 
 
 def _three(mean: float = 1.0, sd: float = 0.4) -> dict[str, Distribution]:
@@ -432,5 +303,6 @@ CASES = {
     "uninformative": HardPosterior(
         "data that say almost nothing", _three(), _uninformative, [0.009, 0.011, 0.007], noise=0.1
     ),
+    **LATE_CASES,
 }
 """All cases by name."""

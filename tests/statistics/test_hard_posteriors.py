@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from .brute_force import log_prob_function, reference
+from tests.benchmarks.guided import compare, run
+
+from .brute_force import Reference, log_prob_function, reference
 from .hard_posteriors import CASES, hash_uniform
+from .late_posteriors import LATE_CASES
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -18,6 +21,72 @@ def test_the_vectorised_density_is_that_of_the_posterior(name):
         np.testing.assert_allclose(log_prior(x) + log_likelihood(x), expected, rtol=1e-9)
     if name.startswith("failing"):
         assert 0.03 < np.mean(~np.isfinite(expected)) < 0.3
+
+
+@pytest.mark.parametrize("name", LATE_CASES)
+def test_a_shortened_model_gives_the_first_samples(name):
+    posterior = CASES[name].posterior(1)
+    model = posterior.likelihood.model
+    theta = posterior.sample_prior(1, 1)[0, : len(model.parameter_names)]
+    part = model.first(100 * model.dt)
+    assert part.n_steps == 101 and part.fingerprint != model.fingerprint
+    np.testing.assert_array_equal(part.simulate(theta), model.simulate(theta)[:, :101])
+
+
+KNOWN = {  # reference(CASES[name], 1)
+    "late_wave": Reference(
+        449.011,
+        0.0016,
+        np.array([1.10047, 1.0003, 0.500033]),
+        np.array([8.5e-06, 4.5e-06, 0.0004]),
+        np.array([0.003735, 0.001993, 0.2695]),
+        np.array([6.8e-06, 3.4e-06, 0.00018]),
+        np.array([0.1738, 0.212, 0.2274, 0.2128, 0.1739]),
+        np.array([0.00055, 0.00065, 0.0007, 0.00074, 0.00053]),
+        216392,
+        500000,
+    ),
+    "misleading": Reference(
+        630.039,
+        0.0034,
+        np.array([0.786633, 0.997387, 1.01355]),
+        np.array([8.4e-06, 1.6e-05, 1.9e-05]),
+        np.array([0.001808, 0.003379, 0.003392]),
+        np.array([6.4e-06, 1.2e-05, 1.6e-05]),
+        np.array([1.0, 0.0]),
+        np.zeros(2),
+        46678,
+        200000,
+    ),
+    "all_misled": Reference(
+        607.708,
+        0.0036,
+        np.array([0.805996, 0.993068, 1.01362]),
+        np.array([1.2e-05, 1.9e-05, 1.9e-05]),
+        np.array([0.00254, 0.003567, 0.003493]),
+        np.array([8.5e-06, 1.3e-05, 1.4e-05]),
+        np.array([1.0, 0.0]),
+        np.zeros(2),
+        43746,
+        200000,
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "late_wave",
+        "misleading",
+        pytest.param("all_misled", marks=pytest.mark.xfail(reason="all starts end where the first part leads them")),
+    ],
+)
+def test_a_posterior_that_is_decided_late_is_right_or_refused(name):
+    case = CASES[name]
+    outcome = run(case.posterior(1, name), 1, 500)
+    errors = compare(outcome, KNOWN[name], case.labels)
+    print(errors, outcome.status, outcome.reasons)
+    assert errors.judgement in ("right", "refused")
 
 
 def test_hashes_are_uniform_and_repeatable(rng):
