@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 __all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict"]
 
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
-_LOG_SCALES = -1.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs
+_LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs
 _FIRST_LOG_SCALE = 1.2
 _TINY = 1e-300
 

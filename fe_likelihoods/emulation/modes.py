@@ -25,6 +25,7 @@ _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
 _ROUNDS_OF_STEPS = 4
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
 _APART = 0.25  # prior standard deviations in one coordinate from which ends on a part of the record are different
+_APART_OF_ALL = 2.0  # the same, times the number of starts
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
@@ -165,7 +166,8 @@ def search_modes(
         whole = part is target
         ends: list[Ascent] = []
         tolerance = TOLERANCE if whole else min(TOLERANCE / share, _LOOSEST)
-        apart = np.inf if whole else _APART
+        # the more starts, the closer they are, and none may be lost before the part that its difference acts in
+        apart = np.inf if whole else min(_APART, _APART_OF_ALL / len(starts))
         origin = np.zeros(target.n_structural)
         batches = Batches(part, remember, lambda points, share=share: fits(share * points))
         # two waves: the ascents of the second one stop as soon as they head for an end of the first
