@@ -362,8 +362,9 @@ def _blocks(data: bytes, path: Path) -> Iterator[tuple[bytes, bytes, int]]:
 def describe_damage(path: Path, what: str) -> str:
     """The message of the error for a damaged journal."""
     return (
-        f"{path} is damaged ({what}), so the run cannot be continued from it: restore it from a copy, or remove it to "
-        "continue from the chain alone"
+        f"{path} is damaged ({what}), so the run cannot be continued from it: restore it from a copy; or remove it to "
+        "continue from the chain alone; or remove it and the file of the chain to start again, where simulations that "
+        "are in a cache on disk are not repeated"
     )
 
 
