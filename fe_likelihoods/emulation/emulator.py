@@ -48,6 +48,7 @@ _SMALLEST_SHARE = 1e-10  # of the leading component
 _REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the largest of the training points
 _SMALLEST_SLOPE = 1e-6  # of a parameter by its coordinate, in units of its spread in the prior
 _TINY = 1e-300
+_SMALLEST_GAIN = 0.02  # in log-likelihood, for which a step is tried
 _ROWS = 4096  # points evaluated at once
 
 
@@ -199,10 +200,14 @@ class ResponseEmulator:
         cost = (np.square(step) / np.maximum(variance, _TINY)).sum(axis=1)
         bend = cost - ((step @ self._hessian) * step).sum(axis=1)
         best = (gradient * step).sum(axis=1) / np.maximum(bend, _TINY)
-        unmoved = self._target.log_likelihood(self._at(mean), coords[:, d:])
-        moved = self._target.log_likelihood(self._at(mean + best[:, None] * step), coords[:, d:])
-        # far from the mode the quadratic is not good enough for a step, and any step gives a lower bound
-        top = np.fmax(unmoved, moved - 0.5 * best**2 * cost)
+        top = self._target.log_likelihood(self._at(mean), coords[:, d:])
+        # far from the mode the quadratic may promise too much, but any step gives a lower bound
+        rows = np.flatnonzero(0.5 * best * (gradient * step).sum(axis=1) > _SMALLEST_GAIN)
+        if len(rows):
+            best = best[rows]
+            moved = self._at(mean[rows] + best[:, None] * step[rows])
+            moved = self._target.log_likelihood(moved, coords[rows, d:]) - 0.5 * best**2 * cost[rows]
+            top[rows] = np.fmax(top[rows], moved)
         return top - 0.5 * np.log1p(curvature * variance).sum(axis=1)
 
     def _at(self, mean: np.ndarray) -> np.ndarray:

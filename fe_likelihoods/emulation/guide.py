@@ -43,6 +43,10 @@ _ALWAYS = 5  # best runs per dimension that train in any case
 _IMPLAUSIBLE = 10.0  # emulated log-density above that of all runs, besides 1 per dimension, at which a fit is refused
 _SURPRISE = 10.0  # log-density above that of any known mode minus this, at which a far point starts an ascent
 _MOST_ASCENTS = 2  # of these, per refinement
+_NOT_A_MODE = (
+    "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: use "
+    "more starts"
+)
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
 
@@ -296,6 +300,8 @@ class ResponseGuide:
     def _replace_nearest(self, mode: Mode) -> None:
         """Enter a mode instead of the nearest one, whose ascent ended early, such as where simulations fail."""
         number = int(np.argmin(self._distances(mode.coords[None, : self._target.n_structural])[:, 0]))
+        if self._modes[number].converged:
+            self._add_concern(_NOT_A_MODE)
         self._modes[number], self._regions[number] = mode, self._region_of(mode)
         self._emulated, self._wide = None, self._wide_mixture()
         if all(mode.converged for mode in self._modes):

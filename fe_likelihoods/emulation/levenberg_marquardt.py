@@ -45,6 +45,7 @@ _HOPELESS = 200.0  # log-density below the best end at which another one is give
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
 _NEAR = 20.0  # largest log-density below a known end at which the straight line to it is examined
 _ALONG = np.array([0.25, 0.5, 0.75])  # points of this line
+_PRIOR_ALONE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1, with little of the data's
 _DIP = 3.0  # depth of a valley in log-density that separates modes
 
 
@@ -152,8 +153,15 @@ def ascend(
             whole = np.linalg.solve(hessian, gradient)
             gain_left = 0.5 * float(gradient @ whole)
             merged = next((k for k, end in enumerate(known) if _is_same_mode(coords + whole, end, apart)), -1)
-            if gain_left < tolerance or merged >= 0:
+            if merged >= 0:
                 break
+            if gain_left < tolerance:
+                higher = yield from _leave_saddle(target, coords, value, hessian, noise, centre, tolerance)
+                if higher is None:
+                    break
+                coords, residuals, statistics, noise, value = higher
+                slopes, damping, earlier = None, _FIRST_DAMPING, -np.inf
+                continue
             behind = max((end.log_density for end in known), default=-np.inf) - value
             if iteration >= _PATIENCE and behind > max(_HOPELESS, _LEFT * (value - earlier)):
                 return None
@@ -216,6 +224,36 @@ def _connected(
         if not _has_valley(np.array([value, *(fits + target.log_prior(points - centre)), end.log_density])):
             return number
     return -1
+
+
+def _leave_saddle(
+    target: ResponseTarget,
+    coords: np.ndarray,
+    value: float,
+    hessian: np.ndarray,
+    noise: NoiseFit,
+    centre: np.ndarray,
+    tolerance: float,
+) -> Generator[np.ndarray, Runs, tuple | None]:
+    """A higher point near an end of zero gradient that is a saddle or a minimum; None at a top.
+
+    Where a response is an even function of a parameter, its derivative is zero on the axis of symmetry and the
+    Gauss-Newton Hessian has the curvature of the prior alone, also where the likelihood increases on both sides. One
+    simulation in every direction of such a curvature, one standard deviation of the prior away, shows it.
+    """
+    values, vectors = np.linalg.eigh(hessian)
+    flat = vectors[:, values < _PRIOR_ALONE].T
+    if not len(flat):
+        return None
+    points = coords + flat
+    runs = yield points
+    best = None
+    for k in np.flatnonzero(~runs.failed):
+        fit = target.fit_noise(runs.statistics[k], noise.coords)
+        reached = fit.log_density + target.log_prior(points[k] - centre)
+        if reached > value + tolerance and (best is None or reached > best[-1]):
+            best = points[k], runs.residuals[k], runs.statistics[k], fit, reached
+    return best
 
 
 def _has_valley(values: np.ndarray) -> bool:
