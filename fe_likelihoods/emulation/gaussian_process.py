@@ -170,14 +170,17 @@ def predict(process: GaussianProcess, inputs: np.ndarray) -> tuple[np.ndarray, n
     return mean, variance * process.variances
 
 
-def left_out_errors(process: GaussianProcess) -> np.ndarray:
-    """Error (m, k) of every training output as predicted from the other training points, in closed form.
+def left_out_errors(process: GaussianProcess) -> tuple[np.ndarray, np.ndarray]:
+    """Error (m, k) of every training output as predicted from the other training points, and its variance.
 
-    With P the inverse of the covariance after the linear part has been projected out, the error is (P y)_i / P_ii.
+    With P the inverse of the covariance after the linear part has been projected out, the error is (P y)_i / P_ii, and
+    its variance is s^2 / P_ii, both in closed form.
     """
-    errors = np.empty_like(process.weights)
+    errors, variances = np.empty_like(process.weights), np.empty_like(process.weights)
     for members, _, root, solved, gram in process.levels:
         inverse = np.square(root).sum(axis=0)
         projected = inverse - (solved * cho_solve(gram, solved.T).T).sum(axis=1)
-        errors[:, members] = process.weights[:, members] / np.maximum(projected, _TINY)[:, None]
-    return errors
+        projected = np.maximum(projected, _TINY)[:, None]
+        errors[:, members] = process.weights[:, members] / projected
+        variances[:, members] = process.variances[members] / projected
+    return errors, variances

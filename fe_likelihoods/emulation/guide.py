@@ -44,8 +44,8 @@ _IMPLAUSIBLE = 10.0  # emulated log-density above that of all runs, besides 1 pe
 _SURPRISE = 10.0  # log-density above that of any known mode minus this, at which a far point starts an ascent
 _MOST_ASCENTS = 2  # of these, per refinement
 _NOT_A_MODE = (
-    "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: use "
-    "more starts"
+    "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: "
+    "use more starts"
 )
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 

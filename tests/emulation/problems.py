@@ -100,6 +100,21 @@ def acts_late(seed=1):
     return _marginal(model, measured, prior)
 
 
+def symmetric(seed=1, first=True):
+    """Two modes of equal shares, offset = 1.2 and -1.2; the response is even in `offset`, whose prior median is 0."""
+    model = Shortened(_even, ("offset", "amplitude"))
+    if not first:
+        model = FunctionModel(model.simulate, model.parameter_names, model.channels, DT, 400, version="symmetric")
+    measured = noisy(model, np.array([1.2, 1.0]), np.array([0.05]), seed)
+    prior = {"offset": TruncatedNormal(0.0, 1.0, lower=-4.0, upper=4.0), "amplitude": TruncatedNormal(1.0, 0.3)}
+    return _marginal(model, measured, prior)
+
+
+def _even(theta, phase):
+    offset, amplitude = theta
+    return amplitude * np.sin(40.0 * phase) + 0.05 * offset**2 * np.cos(33.0 * phase)
+
+
 def _misled(theta, phase):
     a, b = theta
     first, last = 0.25 * (a - 1.4) * np.cos(33.0 * phase), 0.6 * (a - 0.8) * np.cos(25.0 * phase)

@@ -31,7 +31,7 @@ def test_left_out_errors_are_those_of_processes_without_the_point():
     inputs = rng.standard_normal((25, 2))
     outputs = _smooth(inputs) + 0.1 * rng.standard_normal((25, 2))
     process = fit_process(inputs, outputs, np.ones(2))
-    errors = left_out_errors(process)
+    errors, variances = left_out_errors(process)
     for i in (0, 7, 24):
         rest = np.delete(np.arange(25), i)
         # iterations=0 keeps the length scales; the nuggets are those of the whole fit if the choice is clear

@@ -8,7 +8,7 @@ from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, P
 from fe_likelihoods.emulation.levenberg_marquardt import Ascent, _connected, _has_valley
 from fe_likelihoods.emulation.target import ResponseTarget
 
-from .problems import acts_late, free_vibration, misleading, vibration
+from .problems import acts_late, free_vibration, misleading, symmetric, vibration
 
 
 def _log_density(posterior, coords):
@@ -105,6 +105,16 @@ def test_starts_that_differ_only_in_what_the_end_of_the_record_determines_stay_a
     assert sorted(round(float(mode.parameters[2])) for mode in search.modes) == [-1, 1]
     shares = [mode.log_evidence for mode in search.modes]
     assert shares[0] == pytest.approx(shares[1], abs=1.0)  # ascents stop when 0.5 is left to gain
+
+
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_search_leaves_the_axis_of_symmetry(seed, first):
+    """The prior's median lies on it: a point without a gradient, lower than the modes on both sides."""
+    search = find_modes(symmetric(first=first), seed=seed)
+    assert sorted(round(mode.parameters[0], 1) for mode in search.modes) == [-1.2, 1.2]
+    alone = find_modes(symmetric(first=first), starts=1, seed=seed)
+    assert [round(abs(mode.parameters[0]), 1) for mode in alone.modes] == [1.2]
 
 
 def test_a_rough_likelihood_neither_splits_a_mode_nor_prolongs_an_ascent():
