@@ -170,12 +170,7 @@ def ascend(
         steps = np.array([np.linalg.solve(hessian + each * scale, gradient) for each in dampings])
         steps *= np.minimum(1.0, _LARGEST_STEP / np.abs(steps).max(axis=1, keepdims=True))
         runs = yield coords + steps
-        best = None
-        for k in np.flatnonzero(~runs.failed):
-            fit = target.fit_noise(runs.statistics[k], noise.coords)
-            reached = fit.log_density + target.log_prior(coords + steps[k] - centre)
-            if reached > (value if best is None else best[0]):
-                best = reached, k, fit
+        best = _highest(target, coords + steps, runs, noise, centre, value)
         stalled = best is None or best[0] < value + _STALLED
         if best is not None:
             value, k, noise = best
@@ -247,12 +242,23 @@ def _leave_saddle(
         return None
     points = coords + flat
     runs = yield points
+    best = _highest(target, points, runs, noise, centre, value + tolerance)
+    if best is None:
+        return None
+    reached, k, fit = best
+    return points[k], runs.residuals[k], runs.statistics[k], fit, reached
+
+
+def _highest(
+    target: ResponseTarget, points: np.ndarray, runs: Runs, noise: NoiseFit, centre: np.ndarray, least: float
+) -> tuple[float, int, NoiseFit] | None:
+    """Log-density, number and noise parameters of the highest simulated point; None if none is above `least`."""
     best = None
     for k in np.flatnonzero(~runs.failed):
         fit = target.fit_noise(runs.statistics[k], noise.coords)
         reached = fit.log_density + target.log_prior(points[k] - centre)
-        if reached > value + tolerance and (best is None or reached > best[-1]):
-            best = points[k], runs.residuals[k], runs.statistics[k], fit, reached
+        if reached > (least if best is None else best[0]):
+            best = reached, k, fit
     return best
 
 

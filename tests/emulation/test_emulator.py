@@ -32,11 +32,12 @@ def test_statistics_and_responses_near_the_training_points(noise):
     coords = target.structural_coordinates(AT[None]) + 0.7 * SCALE * np.random.default_rng(2).standard_normal((20, 2))
     true = target.run(coords)
     predicted = emulator.statistics(coords)
-    error = target.log_likelihood(predicted, np.tile(target.fit_noise(true.statistics[0]).coords, (20, 1)))
-    error = error - target.log_likelihood(
-        true.statistics, np.tile(target.fit_noise(true.statistics[0]).coords, (20, 1))
-    )
+    noises = np.tile(target.fit_noise(true.statistics[0]).coords, (20, 1))
+    plain = target.log_likelihood(predicted, noises)
+    error = plain - target.log_likelihood(true.statistics, noises)
     assert np.abs(error).max() < 0.05
+    correction = emulator.log_likelihood(np.concatenate([coords, noises], axis=1)) - plain
+    assert (correction <= 0.0).all() and correction.min() > -0.5
     thetas = target.structural_parameters(coords)
     batch = emulator.simulate_batch(thetas)
     assert not any(batch.reasons)
