@@ -269,7 +269,7 @@ def test_bridge_column_on_another_record(shared, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_main_job_has_the_evidence_and_the_posterior_of_the_annealing(tmp_path):
-    """`make update` uses a guide and less than a tenth of the simulations."""
+    """`make update` uses a guide and a tenth of the simulations."""
     runs = {}
     for name, options in {"guide": (), "annealing": ("--no-guide", "--walkers", "500")}.items():
         out = tmp_path / name
@@ -278,7 +278,7 @@ def test_main_job_has_the_evidence_and_the_posterior_of_the_annealing(tmp_path):
         assert runs[name]["verdict"].capitalize() in output and runs[name]["verdict"] != "not usable"
     guide, annealing = runs["guide"], runs["annealing"]
     assert guide["verdict"] == "converged"
-    assert 10_000 < annealing["simulations"] and guide["simulations"] < 0.1 * annealing["simulations"]
+    assert guide["simulations"] < 1000 < 10_000 < annealing["simulations"]
     error = np.hypot(guide["log_evidence_error"], annealing["log_evidence_error"])
     assert abs(guide["log_evidence"] - annealing["log_evidence"]) < 4.0 * error < 1.0
     for name, mean in annealing["posterior_mean"].items():
