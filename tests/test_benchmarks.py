@@ -5,9 +5,10 @@ import json
 import emcee
 import numpy as np
 import pytest
+from scipy import integrate, stats
 
 from samplers import SMCSampler
-from tests.benchmarks import job, peers
+from tests.benchmarks import job, peers, truth, truth_targets
 from tests.benchmarks.comparison import compare
 from tests.benchmarks.growth import exponent
 from tests.benchmarks.rows import Row, as_table, machine, write_json
@@ -122,3 +123,64 @@ def test_two_settings_are_compared_in_cost_and_result():
     default = {"simulations": 10, "seconds": 2.0, "cpu": 2.0, "mean": [1.0, 5.0], "sd": [1.0, 2.0]}
     paper = {"simulations": 40, "seconds": 6.0, "cpu": 4.0, "mean": [1.5, 4.0], "sd": [1.1, 1.0]}
     assert [row.value for row in job.compare_settings(default, paper, "")] == pytest.approx([4.0, 3.0, 2.0, 0.5, 50.0])
+
+
+# ------------------------------------------------------------------ truth
+
+
+def test_modes_have_the_stated_shares_moments_and_evidence(rng):
+    posterior = truth_targets.modes(3, 2, 1, 4.0, 3.0, 2.0, "box")
+    grid = np.linspace(-3.0, 3.0, 200_001)
+    density = np.exp(posterior(grid[:, None]))
+    shares = integrate.trapezoid(density[:, None] * posterior.responsibilities(grid[:, None]), grid, axis=0)
+    mean = integrate.trapezoid(density * grid, grid)
+    assert integrate.trapezoid(density, grid) == pytest.approx(np.exp(posterior.log_evidence))
+    np.testing.assert_allclose(shares, posterior.shares, rtol=1e-6)
+    assert max(shares) / min(shares) == pytest.approx(3.0)
+    assert mean == pytest.approx(posterior.mean[0])
+    assert integrate.trapezoid(density * (grid - mean) ** 2, grid) == pytest.approx(posterior.sd[0] ** 2)
+
+
+def test_posterior_on_bounds_has_the_stated_moments_and_evidence(rng):
+    posterior = truth_targets.bounds(1)
+    grid = np.linspace(0.0, 1.0, 100_001)
+    log_evidence = posterior(posterior.mean[None])[0]
+    for i in range(posterior.ndim):  # a product: one dimension after the other, the others at their means
+        points = np.tile(posterior.mean, (len(grid), 1))
+        points[:, i] = grid
+        relative = np.exp(posterior(points) - posterior(posterior.mean[None]))
+        integral = integrate.trapezoid(relative, grid)
+        mean = integrate.trapezoid(relative * grid, grid) / integral
+        log_evidence += np.log(integral)
+        assert mean == pytest.approx(posterior.mean[i], rel=1e-4)
+        assert integrate.trapezoid(relative * (grid - mean) ** 2, grid) / integral == pytest.approx(
+            posterior.sd[i] ** 2, rel=1e-3
+        )
+    assert log_evidence == pytest.approx(posterior.log_evidence, abs=1e-3)
+
+
+def test_densities_of_the_other_families_are_those_of_scipy(rng):
+    x = rng.uniform(-3.0, 3.0, (20, 10))
+    student = truth_targets.student(1)
+    np.testing.assert_allclose(student(x), stats.multivariate_t(student.mean, df=3.0).logpdf(x))
+    bent = truth_targets.banana(1)
+    steps = [stats.norm(0.0, 1.0).logpdf(x[:, 0])]
+    steps += [stats.norm(x[:, 0] ** 2, 0.1).logpdf(x[:, i]) for i in (1, 2)]
+    steps += [stats.norm(0.0, 0.1).logpdf(x[:, i]) for i in (3, 4)]
+    np.testing.assert_allclose(bent(x[:, :5]), np.sum(steps, axis=0))
+    rough = truth_targets.rough(1, 1.0)
+    draws = rough.mean + rough.sd * rng.standard_normal((20_000, 5))
+    jumps = rough(draws) - stats.multivariate_normal(rough.mean, np.diag(rough.sd**2)).logpdf(draws)
+    assert np.log(np.mean(np.exp(jumps))) == pytest.approx(rough.log_evidence, abs=0.05)
+    assert np.std(jumps) == pytest.approx(1.0, abs=0.03)
+
+
+def test_run_of_the_truth_benchmark_is_compared_with_the_truth():
+    (cell,) = truth.cells(["sharp"], ["SMC"], [300], everything=False)
+    right = truth.run(cell, 1, steps=2)
+    assert not truth.is_lost(right)
+    assert not truth.is_doubted(right)
+    wrong = right | {"log_evidence_error": 20.0 * right["stated_error"] + 1.0}
+    lost = right | {"shares": [0.3, 0.7], "true_shares": [0.5, 0.5], "status": "usable"}
+    line = truth.table([right, wrong, lost]).splitlines()[-1].split()
+    assert line[:8] == ["sharp", "SMC", "300", "3", "2", "1", "1", "0"]  # runs, lost, silent, doubted, false

@@ -1,6 +1,10 @@
-"""``python -m tests.benchmarks [names] [--repeats 3] [--out FILE]``, or ``--compare BEFORE AFTER``: see --help."""
+"""``python -m tests.benchmarks [names] [--repeats 3] [--out FILE]``, or ``--compare BEFORE AFTER``: see --help.
+
+``python -m tests.benchmarks truth`` has options of its own (`tests.benchmarks.truth`).
+"""
 
 import argparse
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +22,7 @@ from . import (
     samplers,
     startup,
     storage,
+    truth,
 )
 from .comparison import compare
 from .rows import as_table, machine, write_json
@@ -44,8 +49,11 @@ BENCHMARKS = {
 
 def main() -> None:
     """Run the selected benchmarks, print their table and store it."""
+    if sys.argv[1:2] == ["truth"]:
+        truth.main(sys.argv[2:])
+        return
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", help=f"some of {', '.join(BENCHMARKS)}; all by default")
+    parser.add_argument("names", nargs="*", help=f"some of {', '.join(BENCHMARKS)} (all by default); truth")
     parser.add_argument("--repeats", type=int, default=3, help="number of repeats; the median is reported (default 3)")
     parser.add_argument("--out", type=Path, default=Path("results") / "benchmarks.json")
     parser.add_argument(

@@ -1,0 +1,274 @@
+"""``python -m tests.benchmarks truth [families] [--cells all] [--walkers 250 500]``: is a run right, or doubted?
+
+Samplers run on analytic posteriors (`tests.benchmarks.truth_targets`) with exact answers and a new seed each time. A
+run is *doubted* if it issued a `SamplingWarning` or if its verdict is not "converged". Otherwise it is *silent*.
+
+Families: ``two`` and ``three`` (Gaussian modes at random positions; dimensions, separations, ratios of masses and
+priors vary from seed to seed, the ratio of volumes is part of the cell), ``narrow`` and ``shapes`` (single hard cases
+of several modes), ``sharp``, ``banana``, ``bounds``, ``student``, ``rough1``, ``rough2``, ``rough3`` (coverage),
+``growth`` (a Gaussian in 2 to 50 dimensions).
+
+Columns: ``lost``, runs in which the share of a mode differs from the truth by more than 0.15, or, without modes, whose
+log-evidence is off by more than four stated errors and 0.5; ``silent``, those among them that are not doubted;
+``doubted``, all doubted runs; ``false``, the doubted runs that are right; ``log Z``, ``means``, percentage within two
+stated errors; ``or doubted``, percentage of the runs whose log-evidence and means (90 % of them) are within two stated
+errors, or that are doubted; ``z``, root mean square error of the log-evidence in stated errors; ``sd``, smallest ratio,
+over the parameters, of the median standard deviation to the truth; ``evaluations``, the median.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
+
+from . import truth_targets as targets
+from .rows import aligned, number
+
+__all__ = ["Cell", "cells", "main", "run", "table"]
+
+SAMPLERS = {"SMC": SMCSampler, "TMCMC": TMCMCSampler}
+LOST_SHARE = 0.15
+DIMENSIONS = (4, 7, 10)
+SEPARATIONS = (3.0, 6.0, 10.0, 18.0, 30.0)
+MASS_RATIOS = (1.0, 3.0, 10.0)
+VOLUME_RATIOS = (1.0, 5.0, 20.0, 100.0)
+GROWTH = (2, 5, 10, 20, 30, 40, 50)
+SINGLE = {
+    "narrow": targets.narrow_mode,
+    "shapes": targets.three_shapes,
+    "sharp": targets.gaussian,
+    "banana": targets.banana,
+    "bounds": targets.bounds,
+    "student": targets.student,
+    "rough1": lambda seed: targets.rough(seed, 1.0),
+    "rough2": lambda seed: targets.rough(seed, 2.0),
+    "rough3": lambda seed: targets.rough(seed, 3.0),
+}
+FAMILIES = ("two", "three", *SINGLE, "growth")
+# the cells that are run by default
+FEW_RATIOS = (1.0, 20.0)
+FEW_DIMENSIONS = (5, 20)
+HEADER = (
+    "posterior",
+    "sampler",
+    "walkers",
+    "runs",
+    "lost",
+    "silent",
+    "doubted",
+    "false",
+    "log Z [%]",
+    "means [%]",
+    "or doubted [%]",
+    "z",
+    "sd",
+    "evaluations",
+)
+
+
+class Cell(NamedTuple):
+    """One line of the table: a family, its parameter (ratio of volumes, or dimension), a sampler and its walkers."""
+
+    family: str
+    parameter: float
+    sampler: str
+    walkers: int
+
+    @property
+    def name(self) -> str:
+        """Name of the posterior in the table."""
+        if self.family in ("two", "three"):
+            return f"{self.family} modes, volumes 1:{self.parameter:g}"
+        return f"Gaussian, {self.parameter:g}-D" if self.family == "growth" else self.family
+
+
+def cells(families: Sequence[str], samplers: Sequence[str], walkers: Sequence[int], everything: bool) -> Iterator[Cell]:
+    """The cells of some families; without `everything`, few of their parameters."""
+    for family in families:
+        parameters: Sequence[float] = (0.0,)
+        if family in ("two", "three"):
+            parameters = VOLUME_RATIOS if everything else FEW_RATIOS
+        if family == "growth":
+            parameters = GROWTH if everything else FEW_DIMENSIONS
+        for parameter, n, sampler in itertools.product(parameters, walkers, samplers):
+            yield Cell(family, parameter, sampler, n)
+
+
+def _posterior(cell: Cell, seed: int) -> targets.Posterior:
+    """The posterior of one run. Modes: the combinations follow each other in a fixed random order."""
+    if cell.family in SINGLE:
+        return SINGLE[cell.family](seed)
+    if cell.family == "growth":
+        return targets.gaussian(seed, int(cell.parameter))
+    combinations = list(itertools.product(DIMENSIONS, SEPARATIONS, MASS_RATIOS, ("normal", "box")))
+    chosen = np.random.RandomState(0).permutation(len(combinations))[seed % len(combinations)]
+    ndim, separation, mass_ratio, prior = combinations[chosen]
+    count = 2 if cell.family == "two" else 3
+    return targets.modes(seed, count, ndim, separation, mass_ratio, cell.parameter, prior)
+
+
+def run(cell: Cell, seed: int, steps: int = 5, settings: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Run a sampler once and compare with the truth.
+
+    Parameters
+    ----------
+    cell : Cell
+        What to run.
+    seed : int
+        Of the posterior and of the sampler.
+    steps : int
+        Length of the chain.
+    settings : dict, optional
+        Settings of the sampler.
+
+    Returns
+    -------
+    dict
+        Errors of the result and what the run said about itself; JSON can store it.
+    """
+    posterior, start = _posterior(cell, seed), time.perf_counter()
+    sampler = SAMPLERS[cell.sampler](
+        cell.walkers, posterior.ndim, posterior, vectorize=True, seed=1000 + seed, **(settings or {})
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sampler.run_mcmc(None, steps)
+    warned = [str(each.message) for each in caught if issubclass(each.category, SamplingWarning)]
+    chain = sampler.get_chain(flat=True)
+    mean_error = np.maximum(sampler.mean_error(), 1e-300)
+    check = sampler.log_evidence_check
+    found: dict[str, Any] = {
+        **cell._asdict(),
+        "seed": seed,
+        "ndim": posterior.ndim,
+        "seconds": time.perf_counter() - start,
+        "evaluations": sampler.evaluations,
+        "log_evidence_error": sampler.log_evidence - posterior.log_evidence,
+        "stated_error": sampler.log_evidence_error,
+        "ladder_error": sampler.log_evidence_ladder - posterior.log_evidence,
+        "ladder_stated": sampler.ladder[-1].log_evidence_error,
+        "check": None if check is None else check._asdict() | {"reliable": check.reliable},
+        "recycled": sampler.ladder[0].moves == 0,
+        "mean_z": ((chain.mean(axis=0) - posterior.mean) / mean_error).tolist(),
+        "mean_off": ((chain.mean(axis=0) - posterior.mean) / posterior.sd).tolist(),
+        "sd_ratio": (chain.std(axis=0) / posterior.sd).tolist(),
+        "warnings": warned,
+        "status": sampler.verdict.status,
+        "reasons": list(sampler.verdict.reasons),
+        "effective_sample_size": sampler.verdict.effective_sample_size,
+    }
+    if posterior.responsibilities is not None:
+        shares = posterior.responsibilities(chain).mean(axis=0)
+        found |= {"shares": shares.tolist(), "true_shares": posterior.shares.tolist()}
+    return found
+
+
+def is_doubted(found: dict[str, Any]) -> bool:
+    """Whether a run has said that its result is doubtful."""
+    return bool(found["warnings"]) or found["status"] != "converged"
+
+
+def is_lost(found: dict[str, Any]) -> bool:
+    """Whether the result of a run is wrong: a mode lost or with a wrong share, or else the evidence."""
+    if "shares" in found:
+        return bool(np.max(np.abs(np.subtract(found["shares"], found["true_shares"]))) > LOST_SHARE)
+    return abs(found["log_evidence_error"]) > max(4.0 * found["stated_error"], 0.5)
+
+
+def _line(cell: Cell, runs: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """The runs of one cell as a line of the table."""
+    lost = np.array([is_lost(each) for each in runs])
+    doubted = np.array([is_doubted(each) for each in runs])
+    z = np.array([each["log_evidence_error"] / max(each["stated_error"], 1e-300) for each in runs])
+    means = np.array([np.mean(np.abs(each["mean_z"]) < 2.0) for each in runs])
+    covered = (np.abs(z) < 2.0) & (means >= 0.9)
+    # dimensions vary within the families of modes
+    sd = np.min(np.median([each["sd_ratio"] for each in runs], axis=0)) if len({r["ndim"] for r in runs}) == 1 else None
+    numbers = (
+        100.0 * np.mean(np.abs(z) < 2.0),
+        100.0 * np.mean(means),
+        100.0 * np.mean(covered | doubted),
+        np.sqrt(np.mean(z**2)),
+        sd,
+        np.median([each["evaluations"] for each in runs]),
+    )
+    counts = (len(runs), lost.sum(), (lost & ~doubted).sum(), doubted.sum(), (doubted & ~lost).sum())
+    return cell.name, cell.sampler, str(cell.walkers), *(str(n) for n in counts), *(number(value) for value in numbers)
+
+
+def table(runs: Sequence[dict[str, Any]]) -> str:
+    """Stored runs as a table, one line per cell."""
+    groups: dict[Cell, list[dict[str, Any]]] = {}
+    for each in runs:
+        groups.setdefault(Cell(*(each[name] for name in Cell._fields)), []).append(each)
+    return aligned([HEADER, *(_line(cell, group) for cell, group in groups.items())], right=range(2, len(HEADER)))
+
+
+def _run(job: tuple[Cell, int, int, dict[str, Any]]) -> dict[str, Any]:
+    return run(*job)
+
+
+def _results(jobs: Sequence[tuple], processes: int) -> Iterator[dict[str, Any]]:
+    """Run the jobs in new processes with one thread each."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(_run, jobs)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the cells, store every run and print the table."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmarks truth",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("families", nargs="*", help=f"some of {', '.join(FAMILIES)}; all by default")
+    parser.add_argument("--cells", choices=("few", "all"), default="few", help="ratios of volumes, dimensions")
+    parser.add_argument("--walkers", nargs="+", type=int, default=[500])
+    parser.add_argument("--samplers", nargs="+", choices=SAMPLERS, default=["SMC"])
+    parser.add_argument("--seeds", type=int, default=10, help="runs of each cell (default 10)")
+    parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=5, help="length of the chain (default 5)")
+    parser.add_argument("--settings", type=json.loads, default={}, help='settings of the samplers, as {"max_moves": 9}')
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument(
+        "--everything", action="store_true", help="all cells of both samplers, 250, 500 and 1000 walkers, 100 seeds"
+    )
+    parser.add_argument("--out", type=Path, default=Path("results") / "truth.json", help="file of all runs")
+    parser.add_argument("--read", type=Path, nargs="+", help="print the table of stored runs instead")
+    given = parser.parse_args(arguments)
+    if given.read:
+        print(table([each for path in given.read for each in json.loads(path.read_text())]))
+        return
+    if unknown := set(given.families) - set(FAMILIES):
+        parser.error(f"expected families among {', '.join(FAMILIES)}; got {', '.join(sorted(unknown))}")
+    if given.everything:
+        given.cells, given.samplers, given.walkers, given.seeds = "all", list(SAMPLERS), [250, 500, 1000], 100
+    wanted = list(cells(given.families or FAMILIES, given.samplers, given.walkers, given.cells == "all"))
+    seeds = range(given.first_seed, given.first_seed + given.seeds)
+    jobs = [(cell, seed, given.steps, given.settings) for cell in wanted for seed in seeds]
+    stored: list[dict[str, Any]] = []
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    for found in _results(jobs, given.jobs):
+        stored.append(found)
+        if len(stored) % given.seeds == 0:
+            print(*_line(wanted[len(stored) // given.seeds - 1], stored[-given.seeds :]), sep="  ", flush=True)
+            given.out.write_text(json.dumps(stored) + "\n")
+    print()
+    print(table(stored))
+
+
+if __name__ == "__main__":
+    main()
