@@ -35,6 +35,9 @@ class SMCSampler(TemperedSampler):
     log_prior_fn : callable, optional
         Log-density of the normalised prior, called like `log_prob_fn` but without `args` and `kwargs`, always in this
         process. By default ``log_prob_fn.log_prior``.
+    log_likelihood_fn : callable, optional
+        Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
+        blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
     coarse_log_prob_fn : callable, optional
         A cheaper `log_prob_fn` to anneal on first, such as ``posterior.coarse``. The result is that of `log_prob_fn`; a
         `SamplingWarning` says where the coarse model did not help. Requires recycling.

@@ -31,10 +31,12 @@ from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import header
 from .storage.emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
-from .storage.evaluation import CallingConvention, Evaluator, FailureLimit, OptionalAttributes
+from .storage.evaluation import CallingConvention, Evaluator, FailureLimit
+from .storage.first_evaluations import FirstEvaluations
 from .storage.journal import RunStart
 from .storage.recording import record, show_progress
 from .storage.returned_values import ErrorCapturing
+from .storage.user_functions import UserFunctions
 from .tempering.anneal import anneal
 from .tempering.budget import Budget, BudgetExhausted, as_limit
 from .tempering.diagnostics import warn
@@ -69,6 +71,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
         It is always called in this process.
+    log_likelihood_fn : callable, optional
+        Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
+        blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
     coarse_log_prob_fn : callable, optional
         A cheaper version of `log_prob_fn` to anneal on first, called in the same way
         (`samplers.tempering.multilevel`); a posterior may provide one as ``posterior.coarse``. Chain and evidence are
@@ -129,6 +134,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         parameter_names=None,
         *,
         log_prior_fn: Callable | None = None,
+        log_likelihood_fn: Callable | None = None,
         coarse_log_prob_fn: Callable | None = None,
         guide: Guide | None = None,
         max_simulations: float | None = None,
@@ -136,17 +142,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         settings: Settings | None = None,
         **overrides: Any,
     ):
-        if not callable(log_prob_fn):
-            raise ValueError(f"log_prob_fn must be callable; got {log_prob_fn!r}")
-        self._optional = OptionalAttributes.of(log_prob_fn)
-        self.log_prior_fn = self._optional.log_prior if log_prior_fn is None else log_prior_fn
-        if not callable(self.log_prior_fn):
-            raise ValueError(
-                "annealing starts from the prior: pass log_prior_fn, or a log_prob_fn with a method log_prior (a "
-                f"posterior object itself, not its bound method); got {self.log_prior_fn!r}"
-            )
+        functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn)
+        self._functions, self._optional, self.log_prior_fn = functions, functions.optional, functions.log_prior
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
-        self._optional.check_ndim(ndim)
+        self._optional.check_ndim(ndim, functions.name)
         check_size(nwalkers, ndim)
         given = combine_settings(type(self).__name__, settings, overrides)
         recycle, moves = self._choose(given, moves, nwalkers)
@@ -157,7 +156,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self.coarse_log_prob_fn = coarse_log_prob_fn
         self._given_guide, self._guide = guide, None
         if guide is not None:
-            check_guide(guide, log_prob_fn, vectorize)
+            check_guide(guide, functions.function, vectorize)
 
         self._budget = Budget(limit=as_limit(max_simulations))
         self._checkpoint = Checkpoint(backend, limited=max_simulations is not None)
@@ -168,7 +167,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         super().__init__(
             nwalkers,
             ndim,
-            log_prob_fn,
+            functions.function,
             pool=pool,
             moves=copy.deepcopy(moves),
             args=args,
@@ -191,18 +190,21 @@ class TemperedSampler(RunResults, EnsembleSampler):
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
 
         convention = CallingConvention(vectorize, self.parameter_names if self.params_are_named else None, blobs_dtype)
+        arguments = self.log_prob_fn.args, self.log_prob_fn.kwargs
         self._evaluator = Evaluator(
-            ErrorCapturing(log_prob_fn, self.log_prob_fn.args, self.log_prob_fn.kwargs, vectorize),
-            self.log_prior_fn,
+            ErrorCapturing(functions.function, *arguments, vectorize),
+            functions.log_prior,
             convention,
             self._checkpoint,
             FailureLimit(self.settings.max_failure_share, nwalkers, ndim),
             budget=self._budget,
+            name=functions.name,
+            check=FirstEvaluations(functions, any(arguments), blobs_dtype is not None),
         )
         self._coarse_evaluator = None
         if coarse_log_prob_fn is not None:
-            function = ErrorCapturing(coarse_log_prob_fn, self.log_prob_fn.args, self.log_prob_fn.kwargs, vectorize)
-            self._coarse_evaluator = Evaluator(function, self.log_prior_fn, convention, keep_blobs=False)
+            function = ErrorCapturing(coarse_log_prob_fn, *arguments, vectorize)
+            self._coarse_evaluator = Evaluator(function, functions.log_prior, convention, keep_blobs=False)
         self._result, self._verdict = self._checkpoint.stored_result(), self._checkpoint.stored_verdict()
         if self.backend.random_state is None:
             get_random(self).seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
@@ -402,15 +404,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _header(self) -> dict:
         """What this run is started with."""
-        functions = self.log_prob_fn.f, self.coarse_log_prob_fn
-        return header(
-            self.nwalkers,
-            self.ndim,
-            *functions,
-            self.settings,
-            *(self._usual_moves or get_moves(self)),
-            self._given_guide,
-        )
+        functions, moves = (self._functions.function, self.coarse_log_prob_fn), self._usual_moves or get_moves(self)
+        described = header(self.nwalkers, self.ndim, *functions, self.settings, *moves, self._given_guide)
+        return described | self._functions.described()
 
     def _resume(self, state: State, iterations: int | None, bar: dict) -> tuple[State, int]:
         """Continue the interrupted run: repeat the annealing without evaluations, and go to the last stored step.

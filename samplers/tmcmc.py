@@ -34,6 +34,9 @@ class TMCMCSampler(TemperedSampler):
     log_prior_fn : callable, optional
         Log-density of the normalised prior, called like `log_prob_fn` but without `args` and `kwargs`, always in this
         process. By default ``log_prob_fn.log_prior``.
+    log_likelihood_fn : callable, optional
+        Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
+        blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
     guide : Guide, optional
         An object that proposes draws near the posterior, such as ``posterior.guide()`` (`samplers.tempering.guide`).
         Its weighted draws replace the annealing, and the sweeps at beta = 1 are proposals of the guide. Where its draws

@@ -6,8 +6,7 @@ counts as -inf, and its reason is recorded.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from numbers import Integral
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,58 +15,12 @@ from emcee.ensemble import ndarray_to_list_of_dicts
 from ..tempering.budget import Budget, BudgetExhausted
 from .checkpoint import Checkpoint
 from .journal import EvaluatedBatch, merge_batches
-from .returned_values import ErrorCapturing, log_probabilities, outcomes
+from .returned_values import ErrorCapturing, log_densities, log_probabilities, outcomes
 
-__all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures", "OptionalAttributes"]
+__all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures"]
 
 KEPT_FAILURES = 1000
 KEPT_REASONS = 100
-
-
-class OptionalAttributes(NamedTuple):
-    """What a user's `log_prob_fn` may offer besides being callable.
-
-    Attributes
-    ----------
-    log_prior : callable, optional
-        Log-prior of a point or a batch.
-    sample_prior : callable, optional
-        Function of (n, random) that returns n draws of the prior.
-    report : callable, optional
-        Function that returns a dictionary, such as ``{"simulations": 120}``.
-    fast_parameters : sequence of int
-        Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
-    ndim : int, optional
-        Number of parameters.
-    parameter_names : sequence of str
-        Names of the parameters.
-    """
-
-    log_prior: Callable | None
-    sample_prior: Callable | None
-    report: Callable[[], Mapping[str, Any]] | None
-    fast_parameters: Sequence[int]
-    ndim: int | None
-    parameter_names: Sequence[str]
-
-    @classmethod
-    def of(cls, log_prob_fn: Callable) -> "OptionalAttributes":
-        """Read the attributes of a function."""
-        found = (getattr(log_prob_fn, name, None) for name in ("log_prior", "sample_prior", "report"))
-        return cls(
-            *found,
-            getattr(log_prob_fn, "fast_parameters", ()),
-            getattr(log_prob_fn, "ndim", None),
-            getattr(log_prob_fn, "parameter_names", ()),
-        )
-
-    def check_ndim(self, ndim: int) -> None:
-        """Raise ValueError if the function states another number of parameters than `ndim`."""
-        if isinstance(self.ndim, Integral) and self.ndim != ndim:
-            names = f" ({', '.join(map(str, self.parameter_names))})" if self.parameter_names else ""
-            raise ValueError(
-                f"ndim is {ndim}, but log_prob_fn has {self.ndim} parameters{names}: pass ndim={self.ndim}"
-            )
 
 
 class Failures:
@@ -200,7 +153,7 @@ class Evaluator:
     Parameters
     ----------
     function : ErrorCapturing
-        The log-density.
+        The log-density, or the log-likelihood.
     log_prior_fn : callable
         The log-prior.
     convention : CallingConvention
@@ -213,6 +166,10 @@ class Evaluator:
         Whether the records contain the blobs.
     budget : Budget, optional
         Counts simulations and limits them; no limit by default.
+    name : str
+        Name of the function in messages. The log-prior is added to the values of a "log_likelihood_fn".
+    check : callable, optional
+        Called with this object and the first batch that it evaluates; raises ValueError for a wrong function.
 
     Attributes
     ----------
@@ -237,7 +194,10 @@ class Evaluator:
         limit: FailureLimit | None = None,
         keep_blobs: bool = True,
         budget: Budget | None = None,
+        name: str = "log_prob_fn",
+        check: Callable[["Evaluator", EvaluatedBatch], None] | None = None,
     ):
+        self._name, self._check = name, check
         self._function, self._log_prior_fn, self._convention = function, log_prior_fn, convention
         self._checkpoint, self._limit, self._keep_blobs = checkpoint, limit, keep_blobs
         self._records = EvaluationRecords()
@@ -261,7 +221,7 @@ class Evaluator:
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Log-prior (n,) of points (n, ndim), always computed in this process; -inf for NaN."""
         results = self._convention.call(self._log_prior_fn, coords)
-        log_prior, _ = log_probabilities(results, len(coords), "log_prior_fn")
+        log_prior = log_densities(results, len(coords), "log_prior_fn")
         return np.where(np.isnan(log_prior), -np.inf, log_prior)
 
     def log_prior_of_start(self, coords: np.ndarray) -> np.ndarray:
@@ -316,6 +276,8 @@ class Evaluator:
             if observe is not None and len(part) > 0:
                 observe(part)
             if len(part) > 0:
+                if known is not None:
+                    self._check = None  # the interrupted run has checked its first batch
                 batches.append(self._compute_and_store(part) if known is None else known)
                 self.count(batches[-1])
             if len(part) < len(wanted):
@@ -326,6 +288,9 @@ class Evaluator:
         batch = self.compute(coords)
         if self._limit is not None:
             self._limit.check(batch, self.evaluations, self.failures.count)
+        if self._check is not None:
+            self._check(self, batch)
+            self._check = None
         if self._checkpoint is not None:
             self._checkpoint.evaluated(batch)
         return batch
@@ -337,10 +302,16 @@ class Evaluator:
         batch = merge_batches(batches) if batches else None
         return self._records.pack_batch(log_prior[first], inside[first], batch)
 
+    def call(self, function: Callable, coords: np.ndarray) -> np.ndarray:
+        """Values (n,) of another function of points (n, ndim) that is called like the log-density."""
+        return log_densities(self._convention.call(function, coords, self.pool), len(coords), "the function")
+
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""
         results = self._convention.call(self._function, coords, self.pool)
-        log_prob, blobs, reasons = outcomes(results, len(coords), self._convention.blobs_dtype)
+        log_prob, blobs, reasons = outcomes(results, len(coords), self._convention.blobs_dtype, self._name)
+        if self._name == "log_likelihood_fn":
+            log_prob = log_prob + self.log_prior(coords)
         return EvaluatedBatch(coords, log_prob, blobs if self._keep_blobs else None, reasons)
 
     def count(self, batch: EvaluatedBatch) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["ErrorCapturing", "Failed", "log_probabilities", "outcomes"]
+__all__ = ["ErrorCapturing", "Failed", "log_densities", "log_probabilities", "outcomes"]
 
 logger = logging.getLogger(__name__)
 
@@ -109,6 +109,21 @@ def log_probabilities(
     return log_prob, blobs
 
 
+def log_densities(results: Any, n: int, name: str) -> np.ndarray:
+    """Log-densities (n,) of `n` points from a function that must return one number per point, without blobs.
+
+    Parameters and errors are those of `log_probabilities`.
+    """
+    values, blobs = log_probabilities(results, n, name)
+    if blobs is not None:
+        row = next(row for row in results if _is_row(row) and len(row) > 1)
+        raise ValueError(
+            f"{name} must return one number per point; got {type(row).__name__} of shape {np.shape(row)} for a point. "
+            "If these are the log-densities of the single parameters, return their sum, np.sum(..., axis=-1)"
+        )
+    return values
+
+
 class Failed:
     """Takes the place of a result where a function raised an exception.
 
@@ -165,7 +180,9 @@ class ErrorCapturing:
         return [result[0] if _is_row(result) and len(result) == 1 else result for result in results]
 
 
-def outcomes(results: Any, n: int, blobs_dtype: Any = None) -> tuple[np.ndarray, np.ndarray | None, dict[int, str]]:
+def outcomes(
+    results: Any, n: int, blobs_dtype: Any = None, name: str = "log_prob_fn"
+) -> tuple[np.ndarray, np.ndarray | None, dict[int, str]]:
     """Log-probabilities and blobs as in `log_probabilities`, and the reasons of failures by row.
 
     A point fails by an exception (`ErrorCapturing`) or by NaN. Its log-probability is NaN; its blobs are zero or empty.
@@ -174,17 +191,15 @@ def outcomes(results: Any, n: int, blobs_dtype: Any = None) -> tuple[np.ndarray,
     if isinstance(results, list):
         reasons = {row: result.reason for row, result in enumerate(results) if isinstance(result, Failed)}
     if not reasons:
-        log_prob, blobs = log_probabilities(results, n, "log_prob_fn", blobs_dtype)
+        log_prob, blobs = log_probabilities(results, n, name, blobs_dtype)
     else:
         good = [row for row in range(len(results)) if row not in reasons]
         log_prob, blobs = np.full(n, np.nan), None
         if good:
-            log_prob[good], found = log_probabilities(
-                [results[row] for row in good], len(good), blobs_dtype=blobs_dtype
-            )
+            log_prob[good], found = log_probabilities([results[row] for row in good], len(good), name, blobs_dtype)
             if found is not None:
                 blobs = np.zeros((n, *found.shape[1:]), dtype=found.dtype)
                 blobs[good] = found
     for row in np.flatnonzero(np.isnan(log_prob)):
-        reasons.setdefault(int(row), "log_prob_fn returned NaN")
+        reasons.setdefault(int(row), f"{name} returned NaN")
     return log_prob, blobs, reasons

@@ -372,7 +372,7 @@ def test_impossible_problems():
     with pytest.raises(ValueError, match="log_prior_fn"):
         SMCSampler(N, 3, lambda x: 0.0)
     with pytest.raises(ValueError, match="callable"):
-        SMCSampler(N, 3, None, log_prior_fn=posterior.log_prior)
+        SMCSampler(N, 3, 0.0, log_prior_fn=posterior.log_prior)
     unsampled = SMCSampler(N, 3, posterior.__call__, log_prior_fn=posterior.log_prior)
     with pytest.raises(ValueError, match="sample_prior"):
         unsampled.run_mcmc(None, 1)

@@ -1,0 +1,126 @@
+"""The functions of a user: the posterior as one function or as prior and likelihood, and what belongs to it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral
+from typing import Any, NamedTuple
+
+__all__ = ["OptionalAttributes", "UserFunctions"]
+
+
+class OptionalAttributes(NamedTuple):
+    """What a user's log-posterior or log-likelihood may offer besides being callable.
+
+    Attributes
+    ----------
+    log_prior : callable, optional
+        Log-prior of a point or a batch.
+    sample_prior : callable, optional
+        Function of (n, random) that returns n draws of the prior.
+    report : callable, optional
+        Function that returns a dictionary, such as ``{"simulations": 120}``.
+    fast_parameters : sequence of int
+        Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
+    ndim : int, optional
+        Number of parameters.
+    parameter_names : sequence of str
+        Names of the parameters.
+    """
+
+    log_prior: Callable | None
+    sample_prior: Callable | None
+    report: Callable[[], Mapping[str, Any]] | None
+    fast_parameters: Sequence[int]
+    ndim: int | None
+    parameter_names: Sequence[str]
+
+    @classmethod
+    def of(cls, function: Callable) -> "OptionalAttributes":
+        """Read the attributes of a function."""
+        found = (getattr(function, name, None) for name in ("log_prior", "sample_prior", "report"))
+        return cls(
+            *found,
+            getattr(function, "fast_parameters", ()),
+            getattr(function, "ndim", None),
+            getattr(function, "parameter_names", ()),
+        )
+
+    def check_ndim(self, ndim: int, name: str) -> None:
+        """Raise ValueError if the function states another number of parameters than `ndim`."""
+        if isinstance(self.ndim, Integral) and self.ndim != ndim:
+            names = f" ({', '.join(map(str, self.parameter_names))})" if self.parameter_names else ""
+            raise ValueError(f"ndim is {ndim}, but {name} has {self.ndim} parameters{names}: pass ndim={self.ndim}")
+
+
+class UserFunctions(NamedTuple):
+    """The functions that a user gave to a sampler.
+
+    Attributes
+    ----------
+    name : str
+        "log_prob_fn" or "log_likelihood_fn": which of them was given.
+    function : callable
+        That function.
+    log_prior : callable
+        Log-density of the prior.
+    own_prior : bool
+        Whether `log_prior` is the method of `function`.
+    optional : OptionalAttributes
+        What `function` offers besides being callable.
+    start_density : callable, optional
+        Log-density that the initial state is drawn from; that of the prior by default.
+    """
+
+    name: str
+    function: Callable
+    log_prior: Callable
+    own_prior: bool
+    optional: OptionalAttributes
+    start_density: Callable | None = None
+
+    @classmethod
+    def of(
+        cls,
+        log_prob_fn: Callable | None,
+        log_likelihood_fn: Callable | None,
+        log_prior_fn: Callable | None,
+        start_density: Callable | None = None,
+    ) -> "UserFunctions":
+        """Check and combine the arguments of a sampler.
+
+        Raises
+        ------
+        ValueError
+            Unless exactly one of `log_prob_fn` and `log_likelihood_fn` is given, and a log-prior is known.
+        """
+        if (log_prob_fn is None) == (log_likelihood_fn is None):
+            given = "neither" if log_prob_fn is None else "both"
+            raise ValueError(
+                "exactly one of log_prob_fn (log-prior plus log-likelihood) and log_likelihood_fn must be given; got "
+                f"{given}. To pass a log-likelihood, use SMCSampler(nwalkers, ndim, None, log_likelihood_fn=..., "
+                "log_prior_fn=...)"
+            )
+        name = "log_likelihood_fn" if log_prob_fn is None else "log_prob_fn"
+        function = log_likelihood_fn if log_prob_fn is None else log_prob_fn
+        for label, value in ((name, function), ("start_density", start_density)):
+            if not callable(value) and value is not None:
+                raise ValueError(f"{label} must be callable; got {value!r}")
+        optional = OptionalAttributes.of(function)
+        log_prior = optional.log_prior if log_prior_fn is None else log_prior_fn
+        if not callable(log_prior):
+            raise ValueError(
+                f"annealing starts from the prior: pass log_prior_fn, or a {name} with a method log_prior (a posterior "
+                f"object itself, not its bound method); got {log_prior!r}"
+            )
+        return cls(name, function, log_prior, log_prior_fn is None, optional, start_density)
+
+    @property
+    def is_likelihood(self) -> bool:
+        """Whether the log-prior must be added to what `function` returns."""
+        return self.name == "log_likelihood_fn"
+
+    def described(self) -> dict:
+        """What the header of a run contains of this besides fingerprints; None for what is not used."""
+        return {
+            "log_likelihood_fn": "used" if self.is_likelihood else None,
+            "start_density": None if self.start_density is None else "used",
+        }

@@ -1,0 +1,285 @@
+"""Functions that a user can get wrong: shapes, a log-likelihood in place of a log-posterior, and the reverse."""
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SMCSampler, TemperedSampler, TMCMCSampler
+from tests.contract.targets import Box, Gaussian, WithBlobs
+
+N = 24
+SAMPLERS = [SMCSampler, TMCMCSampler]
+every = pytest.mark.parametrize("Sampler", SAMPLERS, ids=lambda s: s.__name__)
+
+
+def draws(posterior, n=N):
+    return posterior.sample_prior(n, np.random.default_rng(1))
+
+
+def terms(x):
+    """Log-densities of the single parameters, not summed."""
+    return -0.5 * x**2 - 0.5 * np.log(2 * np.pi)
+
+
+def run(Sampler, log_prob_fn, posterior=None, nsteps=1, n=N, **kwargs):
+    posterior = posterior or Gaussian()
+    sampler = Sampler(n, posterior.ndim, log_prob_fn, **{"seed": 1, **kwargs})
+    sampler.run_mcmc(draws(posterior, n), nsteps)
+    return sampler
+
+
+# ---------------------------------------------------------------- shapes
+
+
+@every
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_a_log_prior_that_is_not_summed_is_refused(Sampler, vectorize):
+    with pytest.raises(ValueError, match=r"log_prior_fn must return one number per point; got ndarray of shape \(3,\)"):
+        run(Sampler, lambda x: Gaussian()(x), log_prior_fn=terms, vectorize=vectorize)
+
+
+@pytest.mark.parametrize("wrong", [lambda x: (0.0, "blob"), lambda x: [0.0, 1.0], lambda x: None, lambda x: "0"])
+def test_a_log_prior_is_one_number(wrong):
+    with pytest.raises(ValueError, match="log_prior_fn must return (one|a) number"):
+        run(SMCSampler, lambda x: Gaussian()(x), log_prior_fn=wrong)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+def test_a_log_prior_may_be_an_array_of_one_number(shape):
+    posterior = Gaussian()
+    sampler = run(SMCSampler, lambda x: posterior(x), log_prior_fn=lambda x: np.full(shape, posterior.log_prior(x)))
+    assert np.array_equal(sampler.get_chain(), run(SMCSampler, posterior).get_chain())
+
+
+@every
+@pytest.mark.parametrize("vectorize", [False, True])
+@pytest.mark.parametrize(("ndim", "shared"), [(2, False), (3, False), (3, True), (5, True)])
+def test_a_log_prob_that_is_not_summed_is_refused(Sampler, vectorize, ndim, shared):
+    """One term per parameter, alone or with a `shared` number added to each."""
+    posterior = Gaussian(ndim)
+
+    def not_summed(x):
+        return terms(x) + (np.expand_dims(posterior.log_likelihood(x), -1) if shared else 0.0)
+
+    with pytest.raises(ValueError, match=r"log_prob_fn must return one number per point, and blobs .* their sum"):
+        run(Sampler, not_summed, posterior, log_prior_fn=posterior.log_prior, vectorize=vectorize)
+    with pytest.raises(ValueError, match=r"log_likelihood_fn must return one number per point, and blobs"):
+        run(
+            Sampler,
+            None,
+            posterior,
+            log_likelihood_fn=lambda x: 2.0 * not_summed(x),
+            log_prior_fn=posterior.log_prior,
+            vectorize=vectorize,
+        )
+
+
+@pytest.mark.parametrize("vectorize", [False, True])
+@pytest.mark.parametrize("dtype", [None, float])
+def test_as_many_values_as_parameters_may_be_blobs(vectorize, dtype):
+    """The number and two blobs of three parameters, in an array, as emcee accepts them."""
+    sampler = run(SMCSampler, WithBlobs(), vectorize=vectorize, blobs_dtype=dtype)
+    chain, blobs = sampler.get_chain(flat=True), sampler.get_blobs(flat=True)
+    assert np.allclose(blobs[:, 0], np.sum(chain**2, axis=1)) and np.array_equal(blobs[:, 1], chain[:, 0])
+
+    def coordinates(x):  # each blob changes with one parameter only, the number with all
+        return np.concatenate([np.expand_dims(Gaussian()(x), -1), x[..., 1:]], axis=-1)
+
+    sampler = run(SMCSampler, coordinates, log_prior_fn=Gaussian().log_prior, vectorize=vectorize)
+    assert np.array_equal(sampler.get_blobs(flat=True), sampler.get_chain(flat=True)[:, 1:])
+
+
+def test_a_sum_of_arrays_of_different_shapes_is_refused():
+    posterior = Gaussian()
+
+    def outer(x):
+        return posterior.log_prior(x)[:, None] + posterior.log_likelihood(x)
+
+    with pytest.raises(ValueError, match=r"got an array of shape \(24, 24\), the sum of each"):
+        run(SMCSampler, outer, log_prior_fn=posterior.log_prior, vectorize=True)
+
+    def with_blobs(x):  # 23 blobs for 24 points
+        return np.column_stack([posterior(x), np.sin(np.outer(x[:, 0], np.arange(23)))])
+
+    with_23 = run(SMCSampler, with_blobs, log_prior_fn=posterior.log_prior, vectorize=True, nsteps=1, recycle=False)
+    assert with_23.get_blobs().shape == (1, N, 23)
+
+
+# ---------------------------------------------------------------- log_likelihood_fn
+
+
+@pytest.mark.parametrize("Sampler", [*SAMPLERS, TemperedSampler])
+@pytest.mark.parametrize("vectorize", [False, True])
+@pytest.mark.parametrize("n", [N, 250])
+def test_a_log_likelihood_gives_the_run_of_its_posterior(Sampler, vectorize, n):
+    posterior = Gaussian()
+    expected = run(Sampler, posterior, vectorize=vectorize, n=n)
+    sampler = run(
+        Sampler,
+        None,
+        log_likelihood_fn=posterior.log_likelihood,
+        log_prior_fn=posterior.log_prior,
+        vectorize=vectorize,
+        n=n,
+    )
+    assert np.allclose(sampler.get_chain(), expected.get_chain(), rtol=1e-9)
+    assert np.allclose(sampler.get_log_prob(), expected.get_log_prob(), rtol=1e-9)
+    assert sampler.log_evidence == pytest.approx(expected.log_evidence, rel=1e-9)
+    chain = sampler.get_chain(flat=True)
+    assert np.allclose(sampler.compute_log_prob(chain)[0], posterior(chain))
+
+
+def test_the_likelihood_is_not_evaluated_outside_the_prior():
+    seen = []
+
+    def log_likelihood(x):
+        seen.append(x.copy())
+        return -0.5 * np.sum((x / 0.3) ** 2, axis=-1)
+
+    box = Box([0.0, 0.0], [1.0, 1.0], log_likelihood)
+    sampler = run(
+        SMCSampler, None, box, log_likelihood_fn=log_likelihood, log_prior_fn=box.log_prior, vectorize=True, n=100
+    )
+    assert np.all(np.isfinite(box.log_prior(np.concatenate(seen))))
+    assert sum(map(len, seen)) == sampler.evaluations
+
+
+class Likelihood:
+    """A likelihood with what a posterior may offer beside it, and blobs."""
+
+    ndim, fast_parameters, parameter_names = 3, (2,), ["a", "b", "c"]
+
+    def __init__(self):
+        self.posterior = Gaussian()
+        self.log_prior, self.sample_prior = self.posterior.log_prior, self.posterior.sample_prior
+
+    def __call__(self, x, factor=1.0):
+        return factor * self.posterior.log_likelihood(x), float(x[0])
+
+    def report(self):
+        return {"simulations": 7}
+
+
+def test_attributes_of_a_log_likelihood_count():
+    sampler = SMCSampler(N, 3, None, log_likelihood_fn=Likelihood(), kwargs={"factor": 1.0}, seed=1)
+    sampler.run_mcmc(None, 2)
+    chain = sampler.get_chain(flat=True)
+    assert np.array_equal(sampler.get_blobs(flat=True), chain[:, 0])
+    assert np.allclose(sampler.get_log_prob(flat=True), Gaussian()(chain))
+    assert sampler.simulations < sampler.evaluations  # the fast parameter
+    with pytest.raises(ValueError, match="log_likelihood_fn has 3 parameters"):
+        SMCSampler(N, 2, None, log_likelihood_fn=Likelihood())
+
+
+def test_a_run_of_a_likelihood_is_continued_as_such(tmp_path):
+    posterior = Gaussian()
+
+    def fail_late(x):
+        if len(calls) > 8:
+            raise KeyboardInterrupt
+        calls.append(1)
+        return posterior.log_likelihood(x)
+
+    calls, path = [], str(tmp_path / "run.h5")
+    prior = {"log_prior_fn": posterior.log_prior, "vectorize": True}
+    with pytest.raises(KeyboardInterrupt):
+        run(SMCSampler, None, log_likelihood_fn=fail_late, backend=emcee.backends.HDFBackend(path), **prior)
+    with pytest.raises(ValueError, match="log_likelihood_fn was used, is None"):
+        run(SMCSampler, lambda x: posterior(x), backend=emcee.backends.HDFBackend(path), **prior)
+    likelihood = {"log_likelihood_fn": lambda x: posterior.log_likelihood(x), **prior}
+    resumed = run(SMCSampler, None, backend=emcee.backends.HDFBackend(path), **likelihood)
+    assert np.array_equal(resumed.get_chain(), run(SMCSampler, None, **likelihood).get_chain())
+
+
+@every
+def test_exactly_one_function_is_given(Sampler):
+    posterior = Gaussian()
+    with pytest.raises(ValueError, match="exactly one of log_prob_fn .* got neither"):
+        Sampler(N, 3, None, log_prior_fn=posterior.log_prior)
+    with pytest.raises(ValueError, match="exactly one of log_prob_fn .* got both"):
+        Sampler(N, 3, posterior, log_likelihood_fn=posterior.log_likelihood)
+    with pytest.raises(ValueError, match="pass log_prior_fn, or a log_likelihood_fn with a method log_prior"):
+        Sampler(N, 3, None, log_likelihood_fn=posterior.log_likelihood)
+    with pytest.raises(ValueError, match="log_likelihood_fn must be callable"):
+        Sampler(N, 3, None, log_likelihood_fn=3.0, log_prior_fn=posterior.log_prior)
+
+
+# ---------------------------------------------------------------- one taken for the other
+
+
+class CallsItsLikelihood(Gaussian):
+    def __call__(self, x):
+        return self.log_likelihood(x)
+
+
+class Shifted(Gaussian):
+    """A posterior that is not the sum of its parts."""
+
+    def __call__(self, x):
+        return super().__call__(x) + 2.0
+
+
+class Noisy(Gaussian):
+    """A likelihood that is estimated, with other random numbers in each call."""
+
+    def __init__(self):
+        super().__init__()
+        self.random = np.random.default_rng(1)
+
+    def log_likelihood(self, x):
+        return super().log_likelihood(x) + 0.1 * self.random.standard_normal(np.shape(x)[:-1])
+
+
+@every
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_a_log_likelihood_as_log_prob_is_refused(Sampler, vectorize):
+    posterior, how = Gaussian(), {"vectorize": vectorize}
+    for function in (CallsItsLikelihood(), posterior.log_likelihood, lambda x: posterior.log_likelihood(x)):
+        with pytest.raises(ValueError, match=r"log_prob_fn returns the log-likelihood without .* log_likelihood_fn="):
+            run(Sampler, function, log_prior_fn=posterior.log_prior, **how)
+    with pytest.raises(ValueError, match=r"log_prob_fn must return log_prior \+ log_likelihood"):
+        run(Sampler, Shifted(), **how)
+    for function in (posterior, lambda x: posterior(x)):
+        with pytest.raises(ValueError, match="the log-prior would be counted twice"):
+            run(Sampler, None, log_likelihood_fn=function, log_prior_fn=posterior.log_prior, **how)
+
+
+@every
+def test_what_is_not_certain_is_not_refused(Sampler):
+    posterior, how = Gaussian(), {"vectorize": True}
+    run(Sampler, Noisy(), **how)
+    run(Sampler, posterior.__call__, log_prior_fn=posterior.log_prior, **how)
+    run(Sampler, lambda x: posterior(x) + 2.0, log_prior_fn=posterior.log_prior, **how)
+    run(Sampler, Shifted(), log_prior_fn=lambda x: posterior.log_prior(x), **how)  # a prior of the user's own
+    box = Box([0.0, 0.0], [1.0, 1.0], lambda x: -np.sum(x, axis=-1))
+    run(Sampler, box.log_likelihood, box, log_prior_fn=box.log_prior, **how)  # the log-prior is 0
+
+
+def test_the_comparison_costs_two_evaluations():
+    counted, posterior, plain = [], Gaussian(), Gaussian()
+    posterior.log_likelihood = lambda x: counted.append(len(x)) or Gaussian.log_likelihood(posterior, x)
+    posterior.__class__ = type("Own", (Gaussian,), {"__call__": lambda self, x: plain(x)})
+    run(SMCSampler, posterior, vectorize=True)
+    assert counted == [2]
+
+
+def test_an_object_that_names_all_densities_is_not_compared():
+    class Named(Gaussian):
+        def log_likelihood(self, x):
+            raise AssertionError("not to be called")
+
+        def log_prob(self, x):
+            return self.log_prior(x) + Gaussian.log_likelihood(self, x)
+
+        __call__ = log_prob
+
+    posterior = Named()
+    for function in (posterior, posterior.log_prob):
+        run(SMCSampler, function, log_prior_fn=posterior.log_prior, vectorize=True)
+
+
+def test_a_log_likelihood_that_cannot_be_called_is_not_compared():
+    posterior = Gaussian()
+    posterior.log_likelihood = lambda residuals, sigma: 0.0
+    posterior.__class__ = type("Other", (Gaussian,), {"__call__": lambda self, x: self.log_prior(x) - np.sum(x**2, -1)})
+    assert np.isfinite(run(SMCSampler, posterior, vectorize=True).log_evidence)
