@@ -27,6 +27,7 @@ from emcee.pbar import get_progress_bar
 from .moves.fast_parameters import with_fast_sweeps
 from .moves.guided import GuideMove
 from .moves.kernels import RandomWalkMove, calibrate_move
+from .moves.snooker import with_snooker_moves
 from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import header
@@ -177,15 +178,15 @@ class TemperedSampler(RunResults, EnsembleSampler):
             blobs_dtype=blobs_dtype,
             parameter_names=parameter_names,
         )
-        own_moves, _ = get_moves(self)
-        check_moves(own_moves, given.chains)
+        check_moves(get_moves(self)[0], given.chains)
+        own_moves = with_snooker_moves(get_moves(self)[0])
         fast = self._optional.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(own_moves, fast, ndim, self.settings.fast_sweeps)
         set_moves(self, followed)
         self._usual_moves: MoveSchedule | None = None  # those that the moves of a guide have replaced
         self._fast, self._first_moves = fast, copy.deepcopy(followed)
         self._budget.fast = self._optional.fast_parameters
-        refuse_unused(given, recycle, followed != list(own_moves), self.unused_settings, guide is not None)
+        refuse_unused(given, recycle, followed != own_moves, self.unused_settings, guide is not None)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
 

@@ -1,0 +1,113 @@
+"""Every move of emcee, alone and mixed, with both samplers: the right evidence, means and variances."""
+
+import emcee
+import numpy as np
+import pytest
+from emcee import moves
+
+from samplers import SMCSampler, TMCMCSampler
+from samplers.moves.snooker import SnookerMove, with_snooker_moves
+from tests.contract.targets import Gaussian
+from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
+
+POSTERIOR = Gaussian(3, sd=0.2)
+
+
+def jump(coords, random):
+    return coords + 0.1 * random.standard_normal(coords.shape), np.zeros(len(coords))
+
+
+MOVES = {
+    "StretchMove": moves.StretchMove(),
+    "WalkMove": moves.WalkMove(s=8),
+    "DEMove": moves.DEMove(),
+    "DESnookerMove": moves.DESnookerMove(),
+    "KDEMove": moves.KDEMove(),
+    "GaussianMove": moves.GaussianMove(0.01),
+    "MHMove": moves.MHMove(jump),
+    "de and snooker": [(moves.DEMove(), 0.8), (moves.DESnookerMove(), 0.2)],
+    "stretch and snooker": [moves.StretchMove(), moves.DESnookerMove()],
+    "all": [
+        moves.StretchMove(),
+        moves.WalkMove(s=8),
+        moves.DEMove(),
+        moves.DESnookerMove(),
+        moves.KDEMove(),
+        moves.GaussianMove([0.01, 0.02, 0.03], mode="random"),
+        moves.MHMove(jump),
+    ],
+}
+
+
+def is_right(samplers):
+    centred = deviations(samplers, POSTERIOR.sd**2, lambda x: (x - POSTERIOR.mean) ** 2)
+    return (
+        within(deviations(samplers, POSTERIOR.mean), samplers)
+        and within(centred, samplers)
+        and within(evidence_deviation(samplers, POSTERIOR.log_evidence), samplers)
+    )
+
+
+def test_all_moves_of_emcee_are_here():
+    exported = {getattr(moves, name) for name in moves.__all__}
+    abstract = {moves.Move, moves.RedBlueMove}
+    used = {type(move) for move in MOVES.values() if not isinstance(move, list)}
+    assert exported - abstract == used
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler], ids=lambda s: s.__name__)
+@pytest.mark.parametrize("name", MOVES)
+def test_every_move_of_emcee(name, Sampler, seed):
+    samplers = runs(POSTERIOR, seed, count=6, nwalkers=100, Sampler=Sampler, moves=MOVES[name], max_moves=12)
+    assert is_right(samplers)
+    assert all(0.0 < sampler.acceptance_fraction.mean() <= 1.0 for sampler in samplers)
+
+
+def test_a_wrong_move_is_caught(seed):
+    """Negative control: a snooker move without its factor in the acceptance probability."""
+
+    class Unbalanced(SnookerMove):
+        def get_proposal(self, s, c, random):
+            proposed, factors = super().get_proposal(s, c, random)
+            return proposed, 0.0 * np.where(np.isfinite(factors), factors, 0.0)
+
+    assert not is_right(runs(POSTERIOR, seed, count=6, nwalkers=100, moves=Unbalanced(), max_moves=25, min_moves=25))
+
+
+# ---------------------------------------------------------------- the snooker move
+
+
+def variances(move, ndim, start, nsteps=600):
+    """Variances of a standard normal target, by a plain sampler of emcee."""
+    np.random.seed(4)  # noqa: NPY002
+    sampler = emcee.EnsembleSampler(
+        len(start), ndim, lambda x: -0.5 * np.sum(x**2, axis=-1), vectorize=True, moves=move
+    )
+    sampler.run_mcmc(start, nsteps, skip_initial_state_check=True)
+    return sampler.get_chain(discard=nsteps // 5, flat=True).var(axis=0)
+
+
+@pytest.mark.parametrize("ndim", [1, 3])
+def test_the_snooker_move_keeps_its_target(ndim, rng):
+    start = rng.standard_normal((80, ndim))
+    start[40:] = start[:40]  # copies, as after resampling
+    assert np.allclose(variances(SnookerMove(), ndim, start), 1.0, atol=0.15)
+
+
+def test_why_emcees_snooker_move_is_replaced(rng):
+    """Fails with a version of emcee that has corrected it; then the replacement is no longer needed."""
+    start = rng.standard_normal((80, 3))
+    assert np.all(variances(moves.DESnookerMove(), 3, start) < 0.9)
+    start[40:] = start[:40]
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match="infinite|NaN"):
+        variances(moves.DESnookerMove(), 3, start)
+
+
+def test_the_replacement_has_the_same_settings():
+    class Own(moves.DESnookerMove):
+        pass
+
+    given = [moves.DESnookerMove(gammas=1.2, randomize_split=False, live_dangerously=True), Own(), moves.DEMove()]
+    replaced = with_snooker_moves(given)
+    assert type(replaced[0]) is SnookerMove and vars(replaced[0]) == vars(given[0])
+    assert replaced[1:] == given[1:]
