@@ -20,6 +20,8 @@ LOW_YIELD = 0.05
 HIGH_CORRELATION = 0.9
 LARGE_ERROR = 0.35
 LARGE_SHARE = 0.8
+# Difference of two log-evidences that is reported even where the error of the second one is not known.
+LARGE_DIFFERENCE = 1.0
 OUR_PACKAGES = ("samplers", "emcee")
 
 
@@ -102,22 +104,47 @@ def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlati
 
 
 def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> list[Doubt]:
-    """Doubts if the independent estimate is unusable, or differs from the other by more than three joint errors."""
-    doubts = []
+    """Doubts if the independent estimate of the evidence is unusable or differs from that of the stages.
+
+    They differ if a reliable check is more than three joint errors away, or any check more than 1. The second rule
+    finds posteriors with heavy tails: their weights are never reliable, and the moves do not reach the tails.
+
+    Parameters
+    ----------
+    log_evidence, error : float
+        Log-evidence of the stages and its standard error.
+    check : EvidenceCheck
+        The independent estimate.
+
+    Returns
+    -------
+    list of Doubt
+    """
+    difference, joint = abs(log_evidence - check.log_evidence), float(np.hypot(error, check.error))
+    both = (
+        f"the stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
+        f"points gives {check.log_evidence:.2f} +- {check.error:.2f}"
+    )
+    if check.reliable and difference > 3.0 * joint + 1e-6:
+        message = (
+            f"{both}. The posterior may still be right. Check first that log_prior is normalised, which only the "
+            "second estimate depends on; otherwise use more walkers or more moves for the evidence"
+        )
+        return [Doubt(message, False)]
+    if not check.reliable and difference > LARGE_DIFFERENCE:
+        message = (
+            f"{both}, and the weights of the second estimate are uneven (effective sample size "
+            f"{check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f}). The "
+            "posterior may have heavier tails, or more modes, than the final points show, so evidence, means and "
+            "standard deviations may be wrong by more than their errors. Check first that log_prior is normalised; "
+            "otherwise use more walkers and more moves, and compare two runs"
+        )
+        return [Doubt(message, True)]
     if not check.reliable and check.effective_sample_size < LOW_YIELD * check.evaluations:
         message = (
             f"no mixture fits the final points: {check.evaluations} draws from the best one have an effective sample "
             f"size of {check.effective_sample_size:.2g}, so evidence and posterior could not be checked. Use more "
             "walkers or more moves, and compare two runs"
         )
-        doubts.append(Doubt(message, False))
-    joint = float(np.hypot(error, check.error))
-    if check.reliable and abs(log_evidence - check.log_evidence) > 3.0 * joint + 1e-6:
-        message = (
-            f"the stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
-            f"points gives {check.log_evidence:.2f} +- {check.error:.2f}. The posterior may still be right. "
-            "Check first that log_prior is normalised, which only the second estimate depends on; otherwise use more "
-            "walkers or more moves for the evidence"
-        )
-        doubts.append(Doubt(message, False))
-    return doubts
+        return [Doubt(message, False)]
+    return []

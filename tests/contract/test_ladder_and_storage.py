@@ -469,9 +469,10 @@ def test_collapse_is_reported():
         posterior = Gaussian()
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, moves=emcee.moves.GaussianMove(1e6)).run_mcmc(None, 1)
     messages = [str(w.message) for w in caught]
-    assert len(messages) == 2  # each reason once, for any number of stages
+    assert len(messages) == 3  # each reason once, for any number of stages
     assert "were accepted, so the points did not move" in messages[0]
     assert "survived the resampling" in messages[1]
+    assert "the weights of the second estimate are uneven" in messages[2]
     with pytest.warns(SamplingWarning, match="distinct points of 40 survived"):
         posterior = Gaussian(sd=1e-3)
         SMCSampler(N, 3, posterior, vectorize=True, seed=1, ess_ratio=0.03, recycle=False).run_mcmc(None, 1)

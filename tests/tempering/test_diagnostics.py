@@ -1,0 +1,57 @@
+"""Alarms: each one on runs that are wrong and on runs that are right."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from samplers import EvidenceCheck, SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.tempering.diagnostics import check_evidence
+from tests.benchmarks import truth_targets
+
+
+def _check(log_evidence, error=0.05, effective=200.0, shape=0.3):
+    return EvidenceCheck(log_evidence, error, effective, shape, 500)
+
+
+def test_equal_evidences_raise_no_doubt():
+    assert check_evidence(-10.0, 0.1, _check(-10.2)) == []
+    assert check_evidence(-10.0, 0.1, _check(-10.9, effective=30.0, shape=0.9)) == []
+
+
+def test_reliable_check_that_differs_by_three_joint_errors_is_reported_without_condemning_the_posterior():
+    (doubt,) = check_evidence(-10.0, 0.1, _check(-10.5))
+    assert "log_prior is normalised" in doubt.message
+    assert not doubt.grave
+
+
+@pytest.mark.parametrize("value", [-8.5, float("-inf")])
+def test_unreliable_check_that_differs_by_more_than_one_is_grave(value):
+    (doubt,) = check_evidence(-10.0, 0.1, _check(value, error=0.4, effective=12.0, shape=0.9))
+    assert "heavier tails" in doubt.message
+    assert doubt.grave
+
+
+def test_check_without_information_is_reported():
+    (doubt,) = check_evidence(-10.0, 0.1, _check(-10.4, error=0.5, effective=3.0, shape=1.1))
+    assert "no mixture fits the final points" in doubt.message
+
+
+@pytest.mark.parametrize(("Sampler", "walkers", "seed"), [(TMCMCSampler, 500, 1), (SMCSampler, 250, 82)])
+def test_run_that_does_not_reach_heavy_tails_says_so(Sampler, walkers, seed):
+    """Annealing by moves ends with tenfold standard deviations on a Student t in a wide box; nothing said so before."""
+    posterior = truth_targets.student(seed)
+    sampler = Sampler(walkers, posterior.ndim, posterior, vectorize=True, recycle=False, seed=seed)
+    with pytest.warns(SamplingWarning):
+        sampler.run_mcmc(None, 1)
+    assert abs(sampler.log_evidence - posterior.log_evidence) > 4.0 * sampler.log_evidence_error
+    assert sampler.verdict.status == "not usable"
+
+
+def test_runs_by_moves_on_a_gaussian_are_not_doubted():
+    posterior = truth_targets.gaussian(1, ndim=4)
+    sampler = SMCSampler(300, 4, posterior, vectorize=True, recycle=False, seed=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SamplingWarning)
+        sampler.run_mcmc(None, 1)
+    assert np.abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
