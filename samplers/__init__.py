@@ -22,6 +22,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         RAMANCHA_2022_CONSTANT,
         RAMANCHA_2022_LITERAL,
     )
+    from .reporting.diagnosis import (
+        Diagnostics,
+    )
     from .reporting.figures import (
         ladder_plot,
         pair_plot,
@@ -56,6 +59,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         Guide,
         GuideSession,
     )
+    from .tempering.modes import (
+        Mode,
+    )
     from .tempering.population import (
         GuidedRound,
         Stage,
@@ -74,6 +80,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
 
 __all__ = [
     "CHING_CHEN_2007",
+    "Diagnostics",
     "EvidenceCheck",
     "Guide",
     "GuideMove",
@@ -81,6 +88,7 @@ __all__ = [
     "GuidedRound",
     "GuidedSettings",
     "MixtureMove",
+    "Mode",
     "ModelComparison",
     "RAMANCHA_2022_CONSTANT",
     "RAMANCHA_2022_LITERAL",
@@ -118,6 +126,7 @@ _EXPORTS = {
         "RAMANCHA_2022_CONSTANT",
         "RAMANCHA_2022_LITERAL",
     ),
+    "reporting.diagnosis": ("Diagnostics",),
     "reporting.figures": (
         "ladder_plot",
         "pair_plot",
@@ -142,6 +151,7 @@ _EXPORTS = {
         "Guide",
         "GuideSession",
     ),
+    "tempering.modes": ("Mode",),
     "tempering.population": (
         "GuidedRound",
         "Stage",

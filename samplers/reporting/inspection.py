@@ -7,7 +7,7 @@ log-posterior. Everything that such an object may or may not have is determined 
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["data_fingerprint_of", "is_tempered", "parameter_names_of"]
+__all__ = ["data_fingerprint_of", "is_tempered", "parameter_names_of", "summary_of"]
 
 
 def is_tempered(sampler: Any) -> bool:
@@ -23,6 +23,11 @@ def parameter_names_of(sampler: Any) -> Sequence[str] | None:
 def data_fingerprint_of(sampler: Any) -> str | None:
     """Digest of the measurements, from the log-posterior that the sampler was given; None if it has no digest."""
     return getattr(_log_posterior(sampler), "data_fingerprint", None)
+
+
+def summary_of(sampler: Any) -> str:
+    """The sentence of ``sampler.diagnostics``; empty for another object, or a sampler without a chain."""
+    return sampler.diagnostics.summary if is_tempered(sampler) and sampler.ladder and sampler.iteration else ""
 
 
 def _log_posterior(sampler: Any) -> Any:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit, logsumexp
 from scipy.stats import norm
 
-from .inspection import data_fingerprint_of
+from .inspection import data_fingerprint_of, summary_of
 
 __all__ = ["ModelComparison", "compare_models"]
 
@@ -51,6 +51,8 @@ class ModelComparison(NamedTuple):
     rough : bool
         Whether the error of any log-odds exceeds 0.5. In that case `probability_error` is only an order of magnitude,
         and longer runs are needed.
+    summaries : tuple of str
+        The sentence of ``sampler.diagnostics`` of each model; empty for a pair of numbers.
     """
 
     names: tuple[str, ...]
@@ -64,6 +66,7 @@ class ModelComparison(NamedTuple):
     log_bayes_factor: np.ndarray
     log_bayes_factor_error: np.ndarray
     rough: bool
+    summaries: tuple[str, ...] = ()
 
     @property
     def best(self) -> str:
@@ -76,7 +79,7 @@ class ModelComparison(NamedTuple):
         return dict(zip(self.names, self.probability.tolist(), strict=True))
 
     def table(self) -> str:
-        """Table with one line per model, the most probable first."""
+        """Table with one line per model, the most probable first, and what each run says of itself."""
         width = max(len("model"), *(len(name) for name in self.names))
         head = f"{'model':<{width}} {'log evidence':>20} {'log Bayes factor':>20} {'prior':>7} "
         rows = [head + f"{'probability':>22} {'95 % interval':>22}"]
@@ -89,6 +92,8 @@ class ModelComparison(NamedTuple):
             rows.append(row + f"{probability:>22} {interval:>22}")
         if self.rough:
             rows.append("the errors of the log-evidences are large, so the probabilities are rough: make longer runs")
+        named = zip(self.names, self.summaries, strict=False)
+        rows += [f"{name:<{width}} {text}" for name, text in named if text]
         return "\n".join(rows)
 
     def __str__(self) -> str:
@@ -163,6 +168,7 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
         log_bayes_factor=log_evidence - log_evidence[best],
         log_bayes_factor_error=factor_error,
         rough=bool(np.any(odds_error[possible] > _LARGE_ERROR)),
+        summaries=tuple(summary_of(model) for model in models.values()),
     )
 
 

@@ -1,5 +1,7 @@
 """Results of a tempered run: evaluations, failures, the stages, the evidence and Monte Carlo errors."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ..storage.checkpoint import Checkpoint
@@ -11,6 +13,7 @@ from ..tempering.guide import AdaptedGuide, Guide
 from ..tempering.population import GuidedRound, Stage
 from ..tempering.results import AnnealingResult
 from ..tempering.verdict import Verdict
+from .diagnosis import Diagnostics, diagnose
 
 __all__ = ["RunResults"]
 
@@ -19,6 +22,8 @@ class RunResults:
     """Base class of `samplers.tempered.TemperedSampler`: what a user reads after a run, and the limit to go on with."""
 
     nwalkers: int
+    iteration: int
+    get_chain: Callable[..., np.ndarray]
     _evaluator: Evaluator
     _coarse_evaluator: Evaluator | None
     _budget: Budget
@@ -132,3 +137,15 @@ class RunResults:
         if self._verdict is None:
             raise ValueError("there is no verdict before a run: call run_mcmc first")
         return self._verdict
+
+    @property
+    def diagnostics(self) -> Diagnostics:
+        """What the run found, whether its parts agree, and what it cannot know; ``.summary`` is one sentence.
+
+        Modes and their shares, the estimates of the evidence, the effective sample size in the worst direction and the
+        failures are computed from the whole chain. At least one step at beta = 1 is needed.
+        """
+        self._result.require_finished()
+        if self.iteration == 0:
+            raise ValueError("diagnostics are those of a chain, which is empty: call run_mcmc with one step or more")
+        return diagnose(self.get_chain(), self._result, self._verdict, self.evaluations, self.failure_count)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..tempering.population import Stage
-from .inspection import is_tempered, parameter_names_of
+from .inspection import is_tempered, parameter_names_of, summary_of
 
 __all__ = ["SamplerComparison", "Summary", "comparison_table", "finished_ladder", "ladder_table", "summary", "to_arviz"]
 
@@ -178,7 +178,7 @@ def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
 
 
 def ladder_table(sampler: Any) -> str:
-    """Table of the tempering stages, followed by the evidence and the two estimates it was chosen from.
+    """Table of the tempering stages, then the two estimates of the evidence, and a sentence of the diagnostics.
 
     The columns are the fields of `samplers.tempering.population.Stage`: exponent, effective sample size, acceptance,
     sweeps of the ensemble, distinct points after the resampling, increment of the log-evidence, evaluations, and wall
@@ -225,6 +225,8 @@ def ladder_table(sampler: Any) -> str:
             f"of {check.evaluations} independent draws {check.log_evidence:.3f} +- {check.error:.3f} "
             f"(effective sample size {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
         )
+    if text := summary_of(sampler):
+        rows.append(text)
     return "\n".join(rows)
 
 

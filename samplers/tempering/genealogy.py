@@ -22,9 +22,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["standard_error_of_mean", "trace_founders"]
+__all__ = ["standard_error_of_mean", "trace_founders", "worst_effective_sample_size"]
 
 MIN_FOUNDER_SHARE = 0.1
+# eigenvalues of the correlation matrix below which a direction has no variance
+SMALLEST_VARIANCE = 1e-12
 
 
 def trace_founders(
@@ -79,12 +81,56 @@ def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarra
             f"expected a chain (nsteps, nwalkers, ndim) and the founder of each walker (nwalkers,); got {chain.shape} "
             f"and {founders.shape}"
         )
-    _, group = np.unique(founders, return_inverse=True)
-    count = group.max() + 1
+    sums = _sums_of_groups(chain, founders)
+    count = len(sums)
     if count == 1:
         return np.full(chain.shape[2], np.inf)
+    return np.sqrt(count / (count - 1) * np.sum(sums**2, axis=0)) / chain.shape[1]
+
+
+def worst_effective_sample_size(chain: np.ndarray, founders: np.ndarray) -> float:
+    r"""Effective sample size of a chain for the linear combination of the parameters where it is smallest.
+
+    That of a direction is the variance of the posterior along it divided by the squared standard error of its mean. The
+    errors per parameter do not show a bad direction if several parameters are correlated. The smallest of estimates
+    over all directions tends to be too small, by a factor of :math:`(1 + \sqrt{d / K})^{-2}` at most for K groups with
+    different founders (Marchenko & Pastur 1967, doi:10.1070/SM1967v001n04ABEH001994).
+
+    Parameters
+    ----------
+    chain : (nsteps, nwalkers, ndim) float
+        Positions of the walkers.
+    founders : (nwalkers,) int
+        Founder of each walker.
+
+    Returns
+    -------
+    float
+        At most nsteps * nwalkers; 0 if all walkers have one founder.
+    """
+    nsteps, nwalkers, ndim = chain.shape
+    sums = _sums_of_groups(chain, founders)
+    count = len(sums)
+    if count == 1:
+        return 0.0
+    flat = chain.reshape(-1, ndim)
+    varied = flat.std(axis=0) > 0.0
+    if not varied.any():
+        return 0.0
+    scale = flat[:, varied].std(axis=0)
+    correlation = np.cov(flat[:, varied] / scale, rowvar=False, bias=True).reshape(varied.sum(), varied.sum())
+    values, directions = np.linalg.eigh(correlation)
+    kept = values > SMALLEST_VARIANCE
+    white = (sums[:, varied] / scale) @ (directions[:, kept] / np.sqrt(values[kept]))
+    largest = count / (count - 1) * np.linalg.norm(white, ord=2) ** 2 / nwalkers**2
+    return float(min(1.0 / max(largest, 1e-300), nsteps * nwalkers))
+
+
+def _sums_of_groups(chain: np.ndarray, founders: np.ndarray) -> np.ndarray:
+    """Sum (groups, ndim) of the deviations of the walkers' means from the mean, for each group with one founder."""
+    _, group = np.unique(founders, return_inverse=True)
     deviations = chain.mean(axis=0)
     deviations -= deviations.mean(axis=0)
-    sums = np.zeros((count, chain.shape[2]))
+    sums = np.zeros((group.max() + 1, chain.shape[2]))
     np.add.at(sums, group, deviations)
-    return np.sqrt(count / (count - 1) * np.sum(sums**2, axis=0)) / chain.shape[1]
+    return sums

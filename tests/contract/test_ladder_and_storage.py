@@ -563,10 +563,11 @@ def test_table_and_figures():
 
     sampler = annealed()
     table = ladder_table(sampler).splitlines()
-    assert len(table) == len(sampler.ladder) + 3
-    assert f"{sampler.log_evidence:.3f}" in table[-2]
-    assert f"{sampler.log_evidence_ladder:.3f}" in table[-1]
-    assert f"{sampler.log_evidence_check.log_evidence:.3f}" in table[-1]
+    assert len(table) == len(sampler.ladder) + 4
+    assert f"{sampler.log_evidence:.3f}" in table[-3]
+    assert f"{sampler.log_evidence_ladder:.3f}" in table[-2]
+    assert f"{sampler.log_evidence_check.log_evidence:.3f}" in table[-2]
+    assert table[-1] == sampler.diagnostics.summary
     figure = ladder_plot(sampler)
     assert len(figure.axes[0].lines[0].get_xdata()) == len(sampler.ladder)
     samples = sampler.get_chain(flat=True)
