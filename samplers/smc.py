@@ -38,6 +38,9 @@ class SMCSampler(TemperedSampler):
     log_likelihood_fn : callable, optional
         Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
         blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
+    start_density : callable, optional
+        Normalised log-density that the initial state is drawn from, if that is not the prior, called like
+        `log_prior_fn`; finite wherever the log-prior is. The annealing then leads from it to the posterior.
     coarse_log_prob_fn : callable, optional
         A cheaper `log_prob_fn` to anneal on first, such as ``posterior.coarse``. The result is that of `log_prob_fn`; a
         `SamplingWarning` says where the coarse model did not help. Requires recycling.

@@ -32,11 +32,10 @@ from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import header
 from .storage.emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
-from .storage.evaluation import CallingConvention, Evaluator, FailureLimit
-from .storage.first_evaluations import FirstEvaluations
+from .storage.evaluation import CallingConvention, FailureLimit
+from .storage.evaluators import make_evaluators
 from .storage.journal import RunStart
 from .storage.recording import record, show_progress
-from .storage.returned_values import ErrorCapturing
 from .storage.user_functions import UserFunctions
 from .tempering.anneal import anneal
 from .tempering.budget import Budget, BudgetExhausted, as_limit
@@ -75,6 +74,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
     log_likelihood_fn : callable, optional
         Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
         blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
+    start_density : callable, optional
+        Normalised log-density that the initial state is drawn from, if that is not the prior, called like
+        `log_prior_fn`; finite wherever the log-prior is. The annealing then leads from it to the posterior.
     coarse_log_prob_fn : callable, optional
         A cheaper version of `log_prob_fn` to anneal on first, called in the same way
         (`samplers.tempering.multilevel`); a posterior may provide one as ``posterior.coarse``. Chain and evidence are
@@ -136,6 +138,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         *,
         log_prior_fn: Callable | None = None,
         log_likelihood_fn: Callable | None = None,
+        start_density: Callable | None = None,
         coarse_log_prob_fn: Callable | None = None,
         guide: Guide | None = None,
         max_simulations: float | None = None,
@@ -143,7 +146,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         settings: Settings | None = None,
         **overrides: Any,
     ):
-        functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn)
+        functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn, start_density)
         self._functions, self._optional, self.log_prior_fn = functions, functions.optional, functions.log_prior
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         self._optional.check_ndim(ndim, functions.name)
@@ -191,21 +194,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
 
         convention = CallingConvention(vectorize, self.parameter_names if self.params_are_named else None, blobs_dtype)
-        arguments = self.log_prob_fn.args, self.log_prob_fn.kwargs
-        self._evaluator = Evaluator(
-            ErrorCapturing(functions.function, *arguments, vectorize),
-            functions.log_prior,
-            convention,
-            self._checkpoint,
-            FailureLimit(self.settings.max_failure_share, nwalkers, ndim),
-            budget=self._budget,
-            name=functions.name,
-            check=FirstEvaluations(functions, any(arguments), blobs_dtype is not None),
-        )
-        self._coarse_evaluator = None
-        if coarse_log_prob_fn is not None:
-            function = ErrorCapturing(coarse_log_prob_fn, *arguments, vectorize)
-            self._coarse_evaluator = Evaluator(function, functions.log_prior, convention, keep_blobs=False)
+        limit = FailureLimit(self.settings.max_failure_share, nwalkers, ndim)
+        given = (self.log_prob_fn.args, self.log_prob_fn.kwargs), convention, self._checkpoint, limit, self._budget
+        self._evaluator, self._coarse_evaluator = make_evaluators(functions, coarse_log_prob_fn, *given)
+        self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._result, self._verdict = self._checkpoint.stored_result(), self._checkpoint.stored_verdict()
         if self.backend.random_state is None:
             get_random(self).seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
@@ -237,9 +229,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Parameters
         ----------
         initial_state : (nwalkers, ndim) float, State or None
-            Draws of the prior. None: continue from the last state if there is one, else draw
+            Draws of the prior, or of `start_density`. None: continue from the last state if there is one, else draw
             ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
-            of its last one) is continued; other coordinates start a new annealing.
+            of its last one) is continued; other coordinates start a new annealing. Points that cannot be such draws,
+            as a ball near the posterior, are refused with a ValueError (`samplers.tempering.starts`).
         nsteps : int
             Number of sweeps stored in the chain; 0 for the annealing only.
         **kwargs
@@ -382,12 +375,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             return get_previous_state(self)
         if self.backend.iteration > 0:
             return self.get_last_sample()
-        if self._optional.sample_prior is None:
-            raise ValueError(
-                "initial_state is None and log_prob_fn has no method sample_prior(n, random): "
-                f"pass {self.nwalkers} draws of the prior"
-            )
-        return np.asarray(self._optional.sample_prior(self.nwalkers, get_random(self)), dtype=float)
+        self._drawn = self._functions.draw_prior(self.nwalkers, get_random(self))
+        return self._drawn
 
     def _needs_annealing(self, state: State) -> bool:
         """Whether a state consists of draws of the prior; ValueError where that is not known."""
@@ -428,7 +417,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 f"{self.backend.filename} contains a run from other draws of the prior: pass None as initial_state to "
                 "continue it, or use another file; backend.reset(nwalkers, ndim) discards it"
             )
-        contents = self._checkpoint.resume(self._header(), self._evaluator.log_prior, self._evaluator.compute)
+        contents = self._checkpoint.resume(self._header(), self._evaluator.log_base, self._evaluator.compute)
         self.random_state = start.random_state
         if self.evaluations > 0:  # a run of this object: its moves have adapted
             _, probabilities = self._usual_moves or get_moves(self)
@@ -436,6 +425,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.reset()
         known = (batch.coords for batch in contents.evaluated)
         self._budget.restore(known, contents.of_earlier_guides, contents.of_guides)
+        self._drawn = start.coords  # tested when the run began
         state = self._anneal(State(start.coords, copy=True), True, bar)
         if last is not None and self._result.halt is None:
             state = State(last.coords, log_prob=last.log_prob, blobs=last.blobs, random_state=last.random_state)
@@ -447,16 +437,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
         return state, contents.made if same_call else 0
 
     def _start(self, state: State, skip_check: bool) -> Population:
-        """Draws of the prior as a population, checked and entered in the journal."""
+        """Draws of the prior, or of the start density, as a population, checked and entered in the journal."""
         check_start(state.coords, self.nwalkers, self.ndim, skip_check)
         self.random_state = state.random_state
         coords = np.asarray(state.coords, dtype=float)
-        log_prior = self._evaluator.log_prior_of_start(coords)
+        log_base = self._evaluator.log_base_of_start(coords)
+        if not np.array_equal(coords, self._drawn):
+            self._functions.check_start(coords, self._evaluator.log_base)
         if self._checkpoint.wants_start:
-            self._checkpoint.begin(self._header(), RunStart(coords, log_prior, self.random_state))
+            self._checkpoint.begin(self._header(), RunStart(coords, log_base, self.random_state))
         records = None
         if state.log_prob is not None:
-            records = self._evaluator.pack(state.log_prob, log_prior, state.blobs)
+            records = self._evaluator.pack(state.log_prob, log_base, state.blobs)
         return Population(0.0, coords, records, float(self.nwalkers))
 
     def _anneal(self, state: State, skip_check: bool, bar: dict) -> State:

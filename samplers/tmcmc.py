@@ -37,6 +37,9 @@ class TMCMCSampler(TemperedSampler):
     log_likelihood_fn : callable, optional
         Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
         blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
+    start_density : callable, optional
+        Normalised log-density that the initial state is drawn from, if that is not the prior, called like
+        `log_prior_fn`; finite wherever the log-prior is. The annealing then leads from it to the posterior.
     guide : Guide, optional
         An object that proposes draws near the posterior, such as ``posterior.guide()`` (`samplers.tempering.guide`).
         Its weighted draws replace the annealing, and the sweeps at beta = 1 are proposals of the guide. Where its draws

@@ -113,7 +113,8 @@ class CallingConvention(NamedTuple):
 class EvaluationRecords:
     """Evaluated points as structured arrays with the fields log_prob, log_prior and, if there are any, blobs.
 
-    In this form, a walker carries all three through moves and resampling.
+    The field log_prior is the log-density at beta = 0, which is not that of the prior where the sampler has a
+    `start_density`. In this form, a walker carries all three through moves and resampling.
     """
 
     def __init__(self):
@@ -170,6 +171,8 @@ class Evaluator:
         Name of the function in messages. The log-prior is added to the values of a "log_likelihood_fn".
     check : callable, optional
         Called with this object and the first batch that it evaluates; raises ValueError for a wrong function.
+    start_density : callable, optional
+        Log-density at beta = 0, which takes the place of the log-prior in the records; the log-prior by default.
 
     Attributes
     ----------
@@ -196,8 +199,9 @@ class Evaluator:
         budget: Budget | None = None,
         name: str = "log_prob_fn",
         check: Callable[["Evaluator", EvaluatedBatch], None] | None = None,
+        start_density: Callable | None = None,
     ):
-        self._name, self._check = name, check
+        self._name, self._check, self._start_density = name, check, start_density
         self._function, self._log_prior_fn, self._convention = function, log_prior_fn, convention
         self._checkpoint, self._limit, self._keep_blobs = checkpoint, limit, keep_blobs
         self._records = EvaluationRecords()
@@ -224,8 +228,29 @@ class Evaluator:
         log_prior = log_densities(results, len(coords), "log_prior_fn")
         return np.where(np.isnan(log_prior), -np.inf, log_prior)
 
-    def log_prior_of_start(self, coords: np.ndarray) -> np.ndarray:
-        """Log-prior (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the support."""
+    def log_base(self, coords: np.ndarray) -> np.ndarray:
+        """Log-density (n,) at beta = 0 of points (n, ndim): of the prior, unless a `start_density` is given."""
+        return self._with_start_density(coords, self.log_prior(coords))
+
+    def _with_start_density(self, coords: np.ndarray, log_prior: np.ndarray) -> np.ndarray:
+        inside = log_prior > -np.inf
+        if self._start_density is None or not inside.any():
+            return log_prior
+        values = self._convention.call(self._start_density, coords[inside])
+        log_start = log_densities(values, int(np.sum(inside)), "start_density")
+        if not np.all(np.isfinite(log_start)):
+            first = np.flatnonzero(~np.isfinite(log_start))[0]
+            raise ValueError(
+                "start_density must be finite wherever the log-prior is, since annealing cannot reach other points; "
+                f"got {log_start[first]} at {coords[inside][first]}. Mix it with the prior: "
+                "numpy.logaddexp(log(0.95) + start_density, log(0.05) + log_prior), for draws of this mixture"
+            )
+        log_base = np.full(len(coords), -np.inf)
+        log_base[inside] = log_start
+        return log_base
+
+    def log_base_of_start(self, coords: np.ndarray) -> np.ndarray:
+        """`log_base` (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the prior."""
         log_prior = self.log_prior(coords)
         outside = np.flatnonzero(log_prior == -np.inf)
         if len(outside) > 0:
@@ -233,7 +258,7 @@ class Evaluator:
                 f"{len(outside)} of {len(coords)} initial points lie outside the prior's support (log_prior -inf or "
                 f"NaN), the first of them {coords[outside[0]]}: pass draws of the prior"
             )
-        return log_prior
+        return self._with_start_density(coords, log_prior)
 
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior."""
@@ -259,10 +284,10 @@ class Evaluator:
         """
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
-        log_prior = self.log_prior(coords)
-        inside = log_prior > -np.inf
+        log_base = self.log_base(coords)
+        inside = log_base > -np.inf
         if not inside.any():
-            return self._records.pack_batch(log_prior, inside, None)
+            return self._records.pack_batch(log_base, inside, None)
         points = coords[inside]
         parts = [(slice(None), None)] if self._checkpoint is None else self._checkpoint.find(points)
         batches: list[EvaluatedBatch] = []
@@ -281,8 +306,8 @@ class Evaluator:
                 batches.append(self._compute_and_store(part) if known is None else known)
                 self.count(batches[-1])
             if len(part) < len(wanted):
-                raise BudgetExhausted(self._first_records(log_prior, inside, batches))
-        return self._records.pack_batch(log_prior, inside, merge_batches(batches))
+                raise BudgetExhausted(self._first_records(log_base, inside, batches))
+        return self._records.pack_batch(log_base, inside, merge_batches(batches))
 
     def _compute_and_store(self, coords: np.ndarray) -> EvaluatedBatch:
         batch = self.compute(coords)
@@ -295,12 +320,12 @@ class Evaluator:
             self._checkpoint.evaluated(batch)
         return batch
 
-    def _first_records(self, log_prior: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
+    def _first_records(self, log_base: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
         """Records of the points before the first one that was not evaluated."""
         done = sum(len(batch.coords) for batch in batches)
         first = slice(0, int(np.flatnonzero(inside)[done]))
         batch = merge_batches(batches) if batches else None
-        return self._records.pack_batch(log_prior[first], inside[first], batch)
+        return self._records.pack_batch(log_base[first], inside[first], batch)
 
     def call(self, function: Callable, coords: np.ndarray) -> np.ndarray:
         """Values (n,) of another function of points (n, ndim) that is called like the log-density."""

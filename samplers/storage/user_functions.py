@@ -1,10 +1,17 @@
 """The functions of a user: the posterior as one function or as prior and likelihood, and what belongs to it."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from ..tempering.starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
+
 __all__ = ["OptionalAttributes", "UserFunctions"]
+
+logger = logging.getLogger(__name__)
 
 
 class OptionalAttributes(NamedTuple):
@@ -124,3 +131,68 @@ class UserFunctions(NamedTuple):
             "log_likelihood_fn": "used" if self.is_likelihood else None,
             "start_density": None if self.start_density is None else "used",
         }
+
+    def draw_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (n, ndim) of the prior; ValueError without `sample_prior`, or where there is a `start_density`."""
+        if self.start_density is not None:
+            raise ValueError(f"initial_state is None, but start_density is given: pass {n} draws of it")
+        if self.optional.sample_prior is None:
+            raise ValueError(
+                f"initial_state is None and {self.name} has no method sample_prior(n, random): pass {n} draws of the "
+                "prior"
+            )
+        return np.asarray(self.optional.sample_prior(n, random), dtype=float)
+
+    def check_start(self, coords: np.ndarray, log_base: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Raise ValueError for points that cannot be draws of their density (`samplers.tempering.starts`).
+
+        Parameters
+        ----------
+        coords : (n, ndim) float
+            The points.
+        log_base : callable
+            Function of points (n, ndim) that returns the log-density (n,) that they are said to be drawn from.
+        """
+        fresh = self._fresh_draws(*coords.shape)
+        found = spread_by_metropolis(coords, log_base) if fresh is None else compare_with_draws(coords, fresh)
+        if not found.reason:
+            return
+        if self.start_density is not None:
+            density, remedy = "start_density", "Pass the log-density that they were drawn from"
+        else:
+            known = "None, so that the sampler draws the prior" if fresh is not None else "draws of the prior"
+            density = "the prior"
+            remedy = (
+                f"Pass {known}, not points near the posterior; or declare what they were drawn from: "
+                "start_density=log_density"
+            )
+        names, j = list(self.optional.parameter_names or ()), found.parameter
+        where = "" if j is None else f" in parameter {names[j] if j < len(names) else j}"
+        compared = "" if fresh is None else f" They differ from {len(fresh)} draws by sample_prior{where}:"
+        raise ValueError(
+            f"initial_state must consist of draws of {density}; got points that cannot be.{compared} {found.reason}. "
+            f"The evidence would be wrong. {remedy}"
+        )
+
+    def _fresh_draws(self, n: int, ndim: int) -> np.ndarray | None:
+        """Draws of the prior to compare n points with; None if there are none."""
+        if self.start_density is not None or self.optional.sample_prior is None:
+            return None
+        state, count = np.random.get_state(), draws_to_compare(n)  # noqa: NPY002
+        try:
+            fresh = np.asarray(self.optional.sample_prior(count, np.random.RandomState(SEED)), dtype=float)
+        except Exception as error:
+            logger.warning("initial_state is tested without fresh draws, since sample_prior failed: %r", error)
+            return None
+        finally:
+            np.random.set_state(state)  # noqa: NPY002  a sample_prior that uses the global generator changes no run
+        if fresh.shape != (count, ndim) or not np.all(np.isfinite(fresh)):
+            logger.warning(
+                "initial_state is tested without fresh draws: sample_prior(%d, random) must return finite numbers of "
+                "shape %s; got shape %s",
+                count,
+                (count, ndim),
+                fresh.shape,
+            )
+            return None
+        return fresh

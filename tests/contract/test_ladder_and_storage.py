@@ -142,7 +142,8 @@ def test_annealing_is_done_once():
     ladder = sampler.ladder
     state = sampler.run_mcmc(None, 2)
     sampler.run_mcmc(state, 2)
-    sampler.run_mcmc(state.coords, 0)  # coordinates other than the last: draws of the prior, annealed again
+    other = posterior.sample_prior(N, np.random.default_rng(5))
+    sampler.run_mcmc(other, 0)  # coordinates other than the last: draws of the prior, annealed again
     assert sampler.ladder != ladder
     sampler = annealed(posterior := Gaussian(), nsteps=2)
     last, ladder, calls = sampler.get_last_sample(), sampler.ladder, posterior.calls

@@ -1,0 +1,186 @@
+"""Tests of starting points: what they find, and how often they are wrong."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from samplers.tempering.starts import compare_with_draws, draws_to_compare, spread_by_metropolis
+
+
+class Prior:
+    """A prior that can be drawn from, with its log-density, a centre and a scale."""
+
+    centre, scale = 0.0, 1.0
+
+    def __init__(self, ndim):
+        self.ndim = ndim
+
+    def draw(self, n, random):
+        return random.standard_normal((n, self.ndim))
+
+    def log_density(self, x):
+        return -0.5 * np.sum(x**2, axis=1)
+
+    def fold(self, x):
+        """Points inside the support."""
+        return x
+
+
+class Correlated(Prior):
+    def __init__(self, ndim):
+        super().__init__(ndim)
+        self.root = np.linalg.cholesky(0.9 * np.ones((ndim, ndim)) + 0.1 * np.eye(ndim))
+
+    def draw(self, n, random):
+        return super().draw(n, random) @ self.root.T
+
+    def log_density(self, x):
+        return super().log_density(np.linalg.solve(self.root, x.T).T)
+
+
+class Uniform(Prior):
+    centre, scale = 0.5, 12**-0.5
+
+    def draw(self, n, random):
+        return random.uniform(size=(n, self.ndim))
+
+    def log_density(self, x):
+        return np.where(np.all((x > 0.0) & (x < 1.0), axis=1), 0.0, -np.inf)
+
+    def fold(self, x):
+        x = np.abs(x)
+        return np.where(x > 1.0, 2.0 - x, x)
+
+
+class LogNormal(Prior):
+    centre, scale = 1.65, 2.16
+
+    def draw(self, n, random):
+        return np.exp(super().draw(n, random))
+
+    def log_density(self, x):
+        inside = np.all(x > 0.0, axis=1)
+        log_x = np.log(np.where(inside[:, None], x, 1.0))
+        return np.where(inside, -np.sum(0.5 * log_x**2 + log_x, axis=1), -np.inf)
+
+    def fold(self, x):
+        return np.abs(x)
+
+
+class Cauchy(Prior):
+    def draw(self, n, random):
+        return random.standard_cauchy((n, self.ndim))
+
+    def log_density(self, x):
+        return -np.sum(np.log1p(x**2), axis=1)
+
+
+PRIORS = [Correlated, Uniform, LogNormal, Cauchy]
+
+
+def refused(points, prior, by="draws", seed=1):
+    if by == "density":
+        return spread_by_metropolis(points, prior.log_density)
+    return compare_with_draws(points, prior.draw(draws_to_compare(len(points)), np.random.RandomState(seed)))
+
+
+def ball(prior, n, scale, random, centred):
+    centre = prior.centre if centred else prior.draw(1, random)
+    return prior.fold(centre + scale * prior.scale * random.standard_normal((n, prior.ndim)))
+
+
+@pytest.mark.parametrize("make", [Prior, Uniform, LogNormal])
+@pytest.mark.parametrize("ndim", [1, 3, 10])
+@pytest.mark.parametrize(("n", "by"), [(30, "draws"), (250, "draws"), (100, "density"), (250, "density")])
+def test_balls_are_found(make, ndim, n, by, seed):
+    """Of 0.001 to 0.5 standard deviations, at the centre of the prior and elsewhere."""
+    random, prior = np.random.RandomState(seed), make(ndim)
+    for scale, centred in itertools.product((0.001, 0.01, 0.1, 0.2), (True, False)):
+        assert refused(ball(prior, n, scale, random, centred), prior, by).reason, (scale, centred)
+    if n == 250 and ndim > 1:
+        assert refused(ball(prior, n, 0.5, random, True), prior, by).reason
+
+
+@pytest.mark.parametrize("by", ["draws", "density"])
+def test_honest_starts_pass(by, seed):
+    """A few of the starts of `test_false_alarms`; about one of a thousand may be refused by chance."""
+    random = np.random.RandomState(seed)
+    found = [
+        refused(prior.draw(n, random), prior, by, seed).reason
+        for prior in (make(ndim) for make, ndim in itertools.product(PRIORS, (1, 2, 5)))
+        for n in (12, 40, 300)
+    ]
+    assert sum(map(bool, found)) <= 1, found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_false_alarms(seed):
+    """Below one in a thousand of 10 000 honest starts, by either test."""
+    random = np.random.RandomState(seed)
+    cases = list(itertools.product(PRIORS, (2, 3, 7), (24, 60, 100, 250)))
+    alarms = {"draws": 0, "density": 0}
+    for k in range(10_000):
+        make, ndim, n = cases[k % len(cases)]
+        prior = make(ndim)
+        points, fresh = prior.draw(n, random), prior.draw(draws_to_compare(n), random)
+        alarms["draws"] += bool(compare_with_draws(points, fresh).reason)
+        alarms["density"] += bool(spread_by_metropolis(points, prior.log_density).reason)
+    assert max(alarms.values()) < 10, alarms
+
+
+def test_the_worst_parameter_is_named(rng):
+    points = rng.standard_normal((100, 4))
+    points[:, 2] = 0.3 + 0.05 * points[:, 2]
+    found = refused(points, Prior(4))
+    assert found.parameter == 2
+    assert "the interquartile range is 0.0" in found.reason and "the median differs by 0.2" in found.reason
+
+
+def test_other_shapes_are_found(rng):
+    n, prior = 300, Prior(3)
+    along_a_line = rng.standard_normal((n, 1)) + 0.1 * rng.standard_normal((n, 3))
+    assert "together" in refused(along_a_line / np.std(along_a_line, axis=0), prior).reason
+    assert refused(rng.standard_normal((n, 3)), Correlated(3)).reason
+    assert refused(2.0 * rng.standard_normal((n, 3)), prior).reason
+    assert refused(rng.standard_normal((n, 3)) + 1.0, prior).reason
+
+
+def test_copies_are_found(rng):
+    points = rng.standard_normal((100, 2))
+    points[50:] = points[:50]
+    assert refused(points, Prior(2)).reason == "only 50 of 100 points are different"
+    points = rng.standard_normal((40, 2))
+    points[:, 1] = 0.1
+    assert refused(points, Prior(2)) == ("only 1 of 40 values are different", 1)
+    assert refused(points, Prior(2), by="density").reason == "a parameter has the same value in all points"
+
+
+def test_priors_with_copies_may_have_copies(rng):
+    """Parameters that are whole numbers, and a mass at one value."""
+
+    class Counts(Prior):
+        def draw(self, n, random):
+            return np.column_stack([random.randint(3, size=n), random.poisson(2.0, size=n)]).astype(float)
+
+    assert not refused(Counts(2).draw(200, np.random.RandomState(5)), Counts(2)).reason
+    assert refused(np.ones((200, 2)), Counts(2)).reason
+
+
+def test_points_that_are_more_even_than_draws_pass(rng):
+    n = 200
+    strata = np.column_stack([(rng.permutation(n) + 0.5) / n for _ in range(3)])
+    assert not refused(strata, Uniform(3)).reason
+
+
+def test_too_few_points_for_a_test_of_the_density(rng):
+    def log_density(x):
+        raise AssertionError("not to be called")
+
+    assert not spread_by_metropolis(rng.standard_normal((31, 2)), log_density).reason
+
+
+def test_control_points_that_shrink(rng):
+    """The test of the density finds points that are too far apart as well."""
+    assert "contracts" in refused(3.0 * rng.standard_normal((200, 2)), Prior(2), "density").reason
