@@ -175,6 +175,24 @@ def test_densities_of_the_other_families_are_those_of_scipy(rng):
     assert np.std(jumps) == pytest.approx(1.0, abs=0.03)
 
 
+def test_bent_posteriors_have_the_stated_moments_and_evidence(rng):
+    bent = truth_targets.rotated_banana(2, bend=0.02)
+    y = np.column_stack([10.0 * rng.standard_normal(100_000), rng.standard_normal((100_000, 4))])
+    assert np.exp(bent.log_evidence) == 1.0
+    y[:, 1] -= 0.02 * (y[:, 0] ** 2 - 100.0)
+    rotation = np.linalg.qr(np.random.RandomState(2).standard_normal((5, 5)))[0]
+    draws = y @ rotation.T
+    np.testing.assert_allclose(draws.std(axis=0), bent.sd, rtol=0.02)
+    np.testing.assert_allclose(draws.mean(axis=0), bent.mean, atol=0.15)
+    chain = truth_targets.rosenbrock(1)
+    wide = stats.multivariate_t(chain.mean, 4.0 * np.diag(chain.sd**2), df=5, seed=1)
+    draws = wide.rvs(400_000)
+    log_weights = np.where(chain.log_prior(draws) > -np.inf, chain(draws), -np.inf) - wide.logpdf(draws)
+    assert np.log(np.mean(np.exp(log_weights))) == pytest.approx(chain.log_evidence, abs=0.06)
+    weights = np.exp(log_weights) / np.sum(np.exp(log_weights))
+    assert np.all(np.abs(weights @ draws - chain.mean) < 0.2 * chain.sd)
+
+
 def test_run_of_the_truth_benchmark_is_compared_with_the_truth():
     (cell,) = truth.cells(["sharp"], ["SMC"], [300], everything=False)
     right = truth.run(cell, 1, steps=2)

@@ -5,15 +5,16 @@ run is *doubted* if it issued a `SamplingWarning` or if its verdict is not "conv
 
 Families: ``two`` and ``three`` (Gaussian modes at random positions; dimensions, separations, ratios of masses and
 priors vary from seed to seed, the ratio of volumes is part of the cell), ``narrow`` and ``shapes`` (single hard cases
-of several modes), ``sharp``, ``banana``, ``bounds``, ``student``, ``rough1``, ``rough2``, ``rough3`` (coverage),
-``growth`` (a Gaussian in 2 to 50 dimensions).
+of several modes), ``sharp``, ``banana``, ``rotated``, ``rosenbrock``, ``bounds``, ``student``, ``rough1``, ``rough2``,
+``rough3`` (coverage), ``growth`` (a Gaussian in 2 to 50 dimensions).
 
 Columns: ``lost``, runs in which the share of a mode differs from the truth by more than 0.15, or, without modes, whose
-log-evidence is off by more than four stated errors and 0.5; ``silent``, those among them that are not doubted;
+log-evidence is off by more than four stated errors and 0.5, or a mean by more than four stated errors and a quarter of
+the standard deviation; ``silent``, those among them that are not doubted;
 ``doubted``, all doubted runs; ``false``, the doubted runs that are right; ``log Z``, ``means``, percentage within two
-stated errors; ``or doubted``, percentage of the runs whose log-evidence and means (90 % of them) are within two stated
-errors, or that are doubted; ``z``, root mean square error of the log-evidence in stated errors; ``sd``, smallest ratio,
-over the parameters, of the median standard deviation to the truth; ``evaluations``, the median.
+stated errors; ``or doubted``, the smaller of these percentages if doubted runs count as covered; ``z``, root mean
+square error of the log-evidence in stated errors; ``sd``, smallest ratio, over the parameters, of the median standard
+deviation to the truth; ``evaluations``, the median.
 """
 
 import argparse
@@ -39,6 +40,7 @@ __all__ = ["Cell", "cells", "main", "run", "table"]
 
 SAMPLERS = {"SMC": SMCSampler, "TMCMC": TMCMCSampler}
 LOST_SHARE = 0.15
+FAR = 4.0
 DIMENSIONS = (4, 7, 10)
 SEPARATIONS = (3.0, 6.0, 10.0, 18.0, 30.0)
 MASS_RATIOS = (1.0, 3.0, 10.0)
@@ -49,6 +51,8 @@ SINGLE = {
     "shapes": targets.three_shapes,
     "sharp": targets.gaussian,
     "banana": targets.banana,
+    "rotated": targets.rotated_banana,
+    "rosenbrock": targets.rosenbrock,
     "bounds": targets.bounds,
     "student": targets.student,
     "rough1": lambda seed: targets.rough(seed, 1.0),
@@ -180,10 +184,11 @@ def is_doubted(found: dict[str, Any]) -> bool:
 
 
 def is_lost(found: dict[str, Any]) -> bool:
-    """Whether the result of a run is wrong: a mode lost or with a wrong share, or else the evidence."""
+    """Whether the result of a run is wrong: the shares of the modes, or without modes the evidence or a mean."""
     if "shares" in found:
         return bool(np.max(np.abs(np.subtract(found["shares"], found["true_shares"]))) > LOST_SHARE)
-    return abs(found["log_evidence_error"]) > max(4.0 * found["stated_error"], 0.5)
+    of_means = (np.abs(found["mean_z"]) > FAR) & (np.abs(found["mean_off"]) > 0.25)
+    return abs(found["log_evidence_error"]) > max(FAR * found["stated_error"], 0.5) or bool(np.any(of_means))
 
 
 def _line(cell: Cell, runs: Sequence[dict[str, Any]]) -> tuple[str, ...]:
@@ -192,13 +197,13 @@ def _line(cell: Cell, runs: Sequence[dict[str, Any]]) -> tuple[str, ...]:
     doubted = np.array([is_doubted(each) for each in runs])
     z = np.array([each["log_evidence_error"] / max(each["stated_error"], 1e-300) for each in runs])
     means = np.array([np.mean(np.abs(each["mean_z"]) < 2.0) for each in runs])
-    covered = (np.abs(z) < 2.0) & (means >= 0.9)
+    near = np.abs(z) < 2.0
     # dimensions vary within the families of modes
     sd = np.min(np.median([each["sd_ratio"] for each in runs], axis=0)) if len({r["ndim"] for r in runs}) == 1 else None
     numbers = (
-        100.0 * np.mean(np.abs(z) < 2.0),
+        100.0 * np.mean(near),
         100.0 * np.mean(means),
-        100.0 * np.mean(covered | doubted),
+        100.0 * min(np.mean(near | doubted), np.mean(np.where(doubted, 1.0, means))),
         np.sqrt(np.mean(z**2)),
         sd,
         np.median([each["evaluations"] for each in runs]),

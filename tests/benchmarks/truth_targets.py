@@ -7,6 +7,7 @@ posterior reaches beyond the box of the prior, less than 1e-5 of it is lost.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy import special, stats
@@ -20,6 +21,8 @@ __all__ = [
     "gaussian",
     "modes",
     "narrow_mode",
+    "rosenbrock",
+    "rotated_banana",
     "rough",
     "student",
     "three_shapes",
@@ -193,6 +196,54 @@ def banana(seed: int, thickness: float = 0.1) -> Posterior:
     bent = np.sqrt(2.0 + thickness**2)
     mean, sd = np.array([0.0, 1.0, 1.0, 0.0, 0.0]), np.array([1.0, bent, bent, 0.1, 0.1])
     return Posterior(5, density, 0.0, mean, sd, -25.0, 25.0)
+
+
+def rotated_banana(seed: int, bend: float = 0.03) -> Posterior:
+    """Bent valley in 5-D, random axes: y1 ~ N(0, 10^2), y2 ~ N(bend (100 - y1^2), 1), others N(0, 1); box of +-150."""
+    rotation = np.linalg.qr(np.random.RandomState(seed).standard_normal((5, 5)))[0]
+    constant = -2.5 * LOG_2_PI - np.log(10.0)
+
+    def density(x: np.ndarray) -> np.ndarray:
+        y = x @ rotation
+        bent = y[:, 1] + bend * (y[:, 0] ** 2 - 100.0)
+        return constant - 0.5 * ((y[:, 0] / 10.0) ** 2 + bent**2 + np.sum(y[:, 2:] ** 2, axis=1))
+
+    variances = np.array([100.0, 1.0 + 2e4 * bend**2, 1.0, 1.0, 1.0])
+    return Posterior(5, density, 0.0, np.zeros(5), np.sqrt(rotation**2 @ variances), -150.0, 150.0)
+
+
+@lru_cache
+def _moments_of_rosenbrock(scale: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log-evidence, means and standard deviations of `rosenbrock`, by sums over a grid along the chain."""
+    step = 0.01
+    grid, last = np.arange(-5.0, 5.0, step), np.arange(-3.0, 30.0, step)
+    squares = (1.0 - grid[:, None]) ** 2
+    kernel = np.exp(-(100.0 * (grid - grid[:, None] ** 2) ** 2 + squares) / scale) * step
+    to_last = np.exp(-(100.0 * (last - grid[:, None] ** 2) ** 2 + squares) / scale) * step
+    after = [to_last.sum(axis=1)]
+    for _ in range(3):
+        after.insert(0, kernel @ after[0])
+    before, mean, variance = np.ones(len(grid)), [], []
+    for i in range(5):
+        if i == 4:
+            points, density = last, before @ to_last
+        else:
+            points, density = grid, before * after[i]
+        density = density / density.sum()
+        mean.append(density @ points)
+        variance.append(density @ points**2 - mean[-1] ** 2)
+        before = before @ kernel if i < 3 else before
+    return float(np.log(after[0].sum() * step)), np.array(mean), np.sqrt(variance)
+
+
+def rosenbrock(seed: int, scale: float = 20.0) -> Posterior:
+    """Rosenbrock's function in 5-D, divided by 20 (Goodman & Weare 2010, doi:10.2140/camcos.2010.5.65); box of +-30."""
+    del seed
+
+    def density(x: np.ndarray) -> np.ndarray:
+        return -np.sum(100.0 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1.0 - x[:, :-1]) ** 2, axis=1) / scale
+
+    return Posterior(5, density, *_moments_of_rosenbrock(scale), -30.0, 30.0)
 
 
 def bounds(seed: int) -> Posterior:
