@@ -1,8 +1,9 @@
 """Bounds of the prior's support, and the transformation of bounded parameters to the whole real line.
 
 A posterior that is concentrated at a bound, such as a damping ratio near zero, is truncated there, and a mixture of
-bell-shaped components cannot follow it in many dimensions. The logarithm of the distance from a single bound, or the
-logit between two bounds, has no bound.
+bell-shaped components cannot follow it in many dimensions. For a single bound, a map that is the logarithm of the
+distance near the bound and linear far from it has no bound, and makes an exponential posterior symmetric. Between two
+bounds it is the logit.
 
 The bounds are found numerically, because a sampler knows only whether a point lies in the support. Evaluating that
 needs no simulation. For each parameter the bounds are bracketed and bisected along lines through several points. Where
@@ -45,7 +46,8 @@ class SupportBounds(NamedTuple):
     low, high : ndarray, shape (ndim,)
         Lower and upper bounds; -inf and inf where there is none.
     span : ndarray, shape (ndim,)
-        Length scale of each parameter, which makes the argument of a logarithm dimensionless.
+        Length scale of each parameter. For a single bound, the distance at which the map changes from the logarithm to
+        a linear one.
     """
 
     low: np.ndarray
@@ -107,12 +109,19 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
 
 
 def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
-    """Keep the bounds that lie within four standard deviations of the mean of a weighted population (n, ndim), (n,)."""
+    """Keep the bounds that lie within four standard deviations of the mean of a weighted population (n, ndim), (n,).
+
+    A single bound gets as scale the variance of the parameter divided by the distance of the mean from the bound.
+    """
     mean = weights @ coords
     reach = NEAR * np.sqrt(weights @ (coords - mean) ** 2)
     low = np.where(mean - bounds.low < reach, bounds.low, -np.inf)
     high = np.where(bounds.high - mean < reach, bounds.high, np.inf)
-    return SupportBounds(low, high, bounds.span)
+    distance = np.where(np.isfinite(low), mean - low, high - mean)
+    one_sided = (np.isfinite(low) != np.isfinite(high)) & (reach > 0.0) & (distance > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = (reach / NEAR) ** 2 / distance
+    return SupportBounds(low, high, np.where(one_sided, scale, bounds.span))
 
 
 def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, bool, bool]]:
@@ -122,8 +131,9 @@ def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, bool, bool]]:
 
 
 def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
-    """Transform points (n, ndim) to the whole real line: ``log((x - low) / span)``, or the logit between two bounds.
+    """Transform points (n, ndim) to the whole real line.
 
+    ``log(exp((x - low) / span) - 1)`` for a lower bound, likewise for an upper one, and the logit between two bounds.
     Points on or beyond a bound are mapped to zero; `log_abs_det_jacobian` is -inf for them.
     """
     coords = coords.copy()
@@ -132,8 +142,19 @@ def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
         from_low = np.maximum((x - bounds.low[j]) / bounds.span[j], 0.0) if below else 1.0
         from_high = np.maximum((bounds.high[j] - x) / bounds.span[j], 0.0) if above else 1.0
         good = (from_low > 0.0) & (from_high > 0.0)
-        coords[:, j] = np.log(np.where(good, from_low, 1.0)) - np.log(np.where(good, from_high, 1.0))
+        from_low, from_high = np.where(good, from_low, 1.0), np.where(good, from_high, 1.0)
+        if below and above:
+            coords[:, j] = np.log(from_low) - np.log(from_high)
+        elif below:
+            coords[:, j] = _stretch(from_low)
+        else:
+            coords[:, j] = -_stretch(from_high)
     return coords
+
+
+def _stretch(distance: np.ndarray) -> np.ndarray:
+    """log(exp(t) - 1) for positive numbers t: near log(t) for small ones, near t for large ones."""
+    return distance + np.log(-np.expm1(-distance))
 
 
 def from_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
@@ -146,9 +167,9 @@ def from_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
             # measured from the nearer bound, to keep the last digits
             coords[:, j] = np.where(z < 0.0, bounds.low[j] + width * expit(z), bounds.high[j] - width * expit(-z))
         elif below:
-            coords[:, j] = bounds.low[j] + bounds.span[j] * np.exp(np.minimum(z, 700.0))
+            coords[:, j] = bounds.low[j] + bounds.span[j] * np.logaddexp(0.0, z)
         else:
-            coords[:, j] = bounds.high[j] - bounds.span[j] * np.exp(np.minimum(-z, 700.0))
+            coords[:, j] = bounds.high[j] - bounds.span[j] * np.logaddexp(0.0, -z)
     return coords
 
 
@@ -172,7 +193,11 @@ def log_abs_det_jacobian(bounds: SupportBounds, coords: np.ndarray) -> np.ndarra
         from_low = np.maximum(coords[:, j] - bounds.low[j], 0.0) if below else 1.0
         from_high = np.maximum(bounds.high[j] - coords[:, j], 0.0) if above else 1.0
         good = (from_low > 0.0) & (from_high > 0.0)
-        width = bounds.high[j] - bounds.low[j] if below and above else 1.0
-        slope = np.log(width) - np.log(np.where(good, from_low, 1.0)) - np.log(np.where(good, from_high, 1.0))
+        from_low, from_high = np.where(good, from_low, 1.0), np.where(good, from_high, 1.0)
+        if below and above:
+            slope = np.log(bounds.high[j] - bounds.low[j]) - np.log(from_low) - np.log(from_high)
+        else:
+            distance = from_low if below else from_high
+            slope = -np.log(bounds.span[j]) - np.log(-np.expm1(-distance / bounds.span[j]))
         total = np.where(good, total + slope, -np.inf)
     return total

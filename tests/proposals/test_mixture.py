@@ -13,6 +13,7 @@ from samplers.proposals.support_bounds import (
     find_support_bounds,
     from_unbounded,
     log_abs_det_jacobian,
+    near_bounds,
     to_unbounded,
 )
 
@@ -223,3 +224,13 @@ def test_each_kernel_keeps_a_target_at_a_bound(kernel, rng):
     assert accepted.mean() > 0.1
     for column in range(3):
         assert stats.ks_2samp(x[: n // 2, column], start[n // 2 :, column]).pvalue > 1e-4
+
+
+def test_exponential_at_a_bound_becomes_symmetric_and_a_gaussian_stays_one(rng):
+    weights = np.full(200_000, 1.0 / 200_000)
+    bounds = SupportBounds(np.array([0.0, -np.inf]), np.array([np.inf, 2.0]), np.ones(2))
+    x = np.column_stack([3e10 * rng.exponential(size=len(weights)), 2.0 - np.abs(rng.normal(3.0, 1.0, len(weights)))])
+    z = to_unbounded(near_bounds(bounds, x, weights), x)
+    assert np.abs(stats.skew(z[:, 0])) < 0.05
+    assert np.quantile(z[:, 0], [0.1, 0.9]) == pytest.approx(stats.logistic.ppf([0.1, 0.9]), abs=0.05)
+    assert abs(stats.skew(z[:, 1])) < 0.2 and abs(stats.kurtosis(z[:, 1])) < 0.2
