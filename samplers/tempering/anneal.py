@@ -24,7 +24,7 @@ from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
 from .adaptive_importance import Recycled, StartingDensity, recycle
 from .budget import BudgetExhausted
-from .diagnostics import check_annealing, check_stages, warn
+from .diagnostics import check_annealing, check_fit, check_stages, warn
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights, pareto_shape
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, draw_rounds, start_from_guide
@@ -364,6 +364,8 @@ def _by_recycling(
     population = Population(1.0, found.coords[ancestors], found.records[ancestors], effective, (ancestors,))
     if settings.check_draws != 0:
         yield population, found.check
+    for doubt in check_fit(found.check, found.proposals[-1][1], size):
+        yield population, doubt
     if earlier is not None:
         yield from _disagreement(population, earlier, found.log_evidence, found.log_evidence_error)
     mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)

@@ -9,10 +9,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .evidence_check import EvidenceCheck
+from ..proposals.mixture import Mixture
+from .evidence_check import EvidenceCheck, expected_yield
 from .population import Doubt, Stage
 
-__all__ = ["SamplingWarning", "check_annealing", "check_evidence", "check_stages", "warn"]
+__all__ = ["SamplingWarning", "check_annealing", "check_evidence", "check_fit", "check_stages", "warn"]
 
 LOW_ACCEPTANCE = 0.01
 LOW_YIELD = 0.05
@@ -22,6 +23,9 @@ LARGE_ERROR = 0.35
 LARGE_SHARE = 0.8
 # Difference of two log-evidences that is reported even where the error of the second one is not known.
 LARGE_DIFFERENCE = 1.0
+# Yield of a fitted proposal, as a share of that expected for Gaussian modes, below which the fit misses a part: nearly
+# Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent ones without a shear 0.4 to 0.7.
+POOR_FIT = 0.75
 OUR_PACKAGES = ("samplers", "emcee")
 
 
@@ -148,3 +152,37 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
         )
         return [Doubt(message, False)]
     return []
+
+
+def check_fit(check: EvidenceCheck, mixture: Mixture, points: int) -> list[Doubt]:
+    """A doubt if the proposal of recycling at beta = 1 describes the posterior poorly.
+
+    Where a bent posterior ends in a narrow tail, neither the points nor the draws of a proposal fitted to them reach
+    the end of the tail, and their weights are even. The effective sample size of the draws is then still smaller than
+    expected for Gaussian modes (`samplers.tempering.evidence_check.expected_yield`).
+
+    Parameters
+    ----------
+    check : EvidenceCheck
+        The check with fresh draws of the proposal.
+    mixture : Mixture
+        The proposal.
+    points : int
+        Effective number of points that it was fitted to.
+
+    Returns
+    -------
+    list of Doubt
+    """
+    components, ndim = mixture.means.shape
+    expected = expected_yield(ndim, mixture.dof, components, points)
+    found = check.effective_sample_size / max(check.evaluations, 1)
+    if found >= POOR_FIT * expected:
+        return []
+    message = (
+        f"the posterior is bent, or has tails, in a way that its approximation does not follow: fresh draws have an "
+        f"effective sample size of {100 * found:.2g} % of their number, and {100 * expected:.2g} % are usual for "
+        "Gaussian modes. Ends of the posterior may be missing, so standard deviations may be too small and the errors "
+        "of means and evidence too optimistic. Use more walkers, or recycle=False, and compare"
+    )
+    return [Doubt(message, True)]

@@ -13,18 +13,23 @@ Zhang & Stephens (2009), Technometrics 51(3), doi:10.1198/tech.2009.08017 (estim
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import gammaln
+from scipy.stats import chi2
 
 from ..proposals.mixture import Mixture, draw
 from .weights import effective_sample_size, log_mean_weight
 
-__all__ = ["EvidenceCheck", "draw_inside", "evidence_from_weights", "pareto_shape"]
+__all__ = ["EvidenceCheck", "draw_inside", "evidence_from_weights", "expected_yield", "pareto_shape"]
 
 LARGEST_SHAPE = 0.7
 FEW_WEIGHTS = 10.0
 ROUNDS = 50
+# points of the quadrature over the squared radius of a Gaussian
+QUANTILES = 2000
 
 
 class EvidenceCheck(NamedTuple):
@@ -130,3 +135,42 @@ def pareto_shape(log_weights: np.ndarray) -> float:
     shape = float(np.mean(np.log1p(-theta * tail)))
     # a weak prior towards 0.5 stabilises the estimate from few weights (Vehtari et al. 2024)
     return (count * shape + 5.0) / (count + 10.0)
+
+
+def expected_yield(ndim: int, dof: float, components: int, points: float) -> float:
+    r"""Effective sample size per draw of a mixture that is fitted to draws of a mixture of as many Gaussians.
+
+    Without the noise of the fit it is :math:`1 / \mathrm{E}[p / q]` for a Gaussian p and the Student t q with the same
+    degrees of freedom as the mixture that maximises the likelihood. With K components of d dimensions and n points,
+    each fitted number costs about 1 / n: the yield is divided by :math:`1 + K d (d + 3) / (2 n)`.
+
+    Parameters
+    ----------
+    ndim : int
+        Number of parameters.
+    dof : float
+        Degrees of freedom of the mixture.
+    components : int
+        Number of components.
+    points : float
+        Effective number of points that the mixture was fitted to.
+
+    Returns
+    -------
+    float
+        Between 0 and 1.
+    """
+    return _yield_without_noise(ndim, dof) / (1.0 + components * ndim * (ndim + 3) / (2.0 * points))
+
+
+@lru_cache
+def _yield_without_noise(ndim: int, dof: float) -> float:
+    """1 / E[p / q] for a standard Gaussian p and the Student t q of maximum likelihood."""
+    radii = chi2.ppf((np.arange(QUANTILES) + 0.5) / QUANTILES, ndim)  # squared
+    scale = 1.0  # squared
+    for _ in range(100):  # expectation-maximisation
+        scale = float(np.mean((dof + ndim) / (dof + radii / scale) * radii)) / ndim
+    log_p = -0.5 * (ndim * np.log(2.0 * np.pi) + radii)
+    log_q = gammaln(0.5 * (dof + ndim)) - gammaln(0.5 * dof) - 0.5 * ndim * np.log(dof * np.pi * scale)
+    log_q -= 0.5 * (dof + ndim) * np.log1p(radii / (dof * scale))
+    return float(1.0 / np.mean(np.exp(log_p - log_q)))

@@ -4,9 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from samplers import EvidenceCheck, SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.proposals.mixture import fit_mixture, log_density
 from samplers.tempering.diagnostics import check_evidence
+from samplers.tempering.evidence_check import expected_yield
 from tests.benchmarks import truth_targets
 
 
@@ -55,3 +58,35 @@ def test_runs_by_moves_on_a_gaussian_are_not_doubted():
         warnings.simplefilter("error", SamplingWarning)
         sampler.run_mcmc(None, 1)
     assert np.abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
+
+
+def test_expected_yield_is_that_of_fits_to_gaussian_draws(rng):
+    yields = []
+    for _ in range(8):
+        points, draws = rng.standard_normal((400, 6)), rng.standard_normal((4000, 6))
+        mixture = fit_mixture(points, np.full(400, 1.0 / 400), max_components=1)
+        log_ratio = stats.multivariate_normal(np.zeros(6)).logpdf(draws) - log_density(mixture, draws)
+        yields.append(1.0 / np.mean(np.exp(log_ratio)))
+    assert np.mean(yields) == pytest.approx(expected_yield(6, mixture.dof, 1, 400), rel=0.05)
+
+
+@pytest.mark.parametrize("posterior", [truth_targets.rosenbrock(1), truth_targets.rotated_banana(1, bend=0.1)])
+def test_ends_of_a_bent_posterior_that_may_be_missing_are_reported(posterior):
+    sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=4)
+    with pytest.warns(SamplingWarning, match="Ends of the posterior may be missing"):
+        sampler.run_mcmc(None, 1)
+    assert sampler.ladder[0].moves == 0  # recycling, without a fallback
+    assert sampler.verdict.status == "not usable"
+
+
+@pytest.mark.parametrize(
+    "posterior",
+    [truth_targets.gaussian(1), truth_targets.bounds(1), truth_targets.banana(1), truth_targets.student(3)]
+    + [truth_targets.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal")],
+)
+def test_posteriors_that_are_followed_are_not_doubted(posterior):
+    sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SamplingWarning)
+        sampler.run_mcmc(None, 1)
+    assert sampler.verdict.status == "converged"
