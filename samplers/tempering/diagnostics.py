@@ -111,7 +111,8 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
     """Doubts if the independent estimate of the evidence is unusable or differs from that of the stages.
 
     They differ if a reliable check is more than three joint errors away, or any check more than 1. The second rule
-    finds posteriors with heavy tails: their weights are never reliable, and the moves do not reach the tails.
+    finds posteriors with heavy tails, whose weights are never reliable and whose tails the moves do not reach, and runs
+    with too few walkers for their parameters, in which the errors of the stages accumulate.
 
     Parameters
     ----------
@@ -138,10 +139,11 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
     if not check.reliable and difference > LARGE_DIFFERENCE:
         message = (
             f"{both}, and the weights of the second estimate are uneven (effective sample size "
-            f"{check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f}). The "
-            "posterior may have heavier tails, or more modes, than the final points show, so evidence, means and "
-            "standard deviations may be wrong by more than their errors. Check first that log_prior is normalised; "
-            "otherwise use more walkers and more moves, and compare two runs"
+            f"{check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f}). Either "
+            "the errors of the stages have accumulated, as with many parameters and few walkers, or the posterior has "
+            "heavier tails or more modes than the final points show. Evidence, means and standard deviations may be "
+            "wrong by more than their errors. Check first that log_prior is normalised; otherwise use more walkers and "
+            "more moves, and compare two runs"
         )
         return [Doubt(message, True)]
     if not check.reliable and check.effective_sample_size < LOW_YIELD * check.evaluations:
