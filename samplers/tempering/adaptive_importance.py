@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..proposals.basins import cover_basins
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
 from .budget import BudgetExhausted
@@ -128,11 +129,14 @@ class _Archive:
         """Logarithm of the posterior over the starting density; from the prior, the log-likelihood."""
         return self.records["log_prob"] - self._log_start
 
+    def log_target(self, beta: float) -> np.ndarray:
+        """Logarithm (n,) of the tempered target, not normalised."""
+        alive = self.records["log_prob"] > -np.inf
+        return np.where(alive, self._log_start + beta * np.where(alive, self.log_ratio, 0.0), -np.inf)
+
     def log_weights(self, beta: float) -> np.ndarray:
         """Logarithm of the tempered target over the mixture, (n,); the sum of the weights estimates the evidence."""
-        alive = self.records["log_prob"] > -np.inf
-        tempered = self._log_start + beta * np.where(alive, self.log_ratio, 0.0) - self._log_mixture
-        return np.where(alive, tempered, -np.inf)
+        return self.log_target(beta) - self._log_mixture
 
 
 def recycle(
@@ -218,6 +222,9 @@ def recycle(
         fitted = fit_mixture(archive.coords, coarse_weights(log_weights), settings.max_components, bounds)
         mixture = _with_even_share(fitted, settings.even_share)
         finished = beta == 1.0 and effective >= size
+        if settings.max_basins > 0 and not finished:
+            log_target = archive.log_target(beta) - log_evidence
+            mixture = cover_basins(mixture, archive.coords, log_target, settings.max_basins, settings.basin_share)
         new, made = draw_inside(mixture, size if finished else int(round(2.0 * target)), random, density.inside)
         try:
             new_records = density.evaluate(new)

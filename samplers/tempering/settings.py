@@ -69,6 +69,11 @@ class RecyclingSettings:
     even_share : float
         Share of a proposal's weight that is spread evenly over its components, so that a component of small weight
         receives draws too.
+    max_basins : int
+        Largest number of components that are added to a proposal for parts of the target that it does not explain
+        (`samplers.proposals.basins`); 0 for none. They keep narrow modes, which have little mass at small beta.
+    basin_share : float
+        Smallest share of the draws for such a component.
     min_yield : float
         Recycling is given up when the mean yield of the last `patience` rounds is smaller. Moves then need fewer
         evaluations.
@@ -94,6 +99,8 @@ class RecyclingSettings:
     fresh_share: float = 0.75
     max_components: int = 8
     even_share: float = 0.25
+    max_basins: int = 3
+    basin_share: float = 0.1
     min_yield: float = 0.03
     patience: int = 6
     max_rounds: int = 200
@@ -107,7 +114,7 @@ class RecyclingSettings:
             value = vars(self)[name]
             if not 0.0 < value <= 1.0:
                 raise ValueError(f"{name} must lie in (0, 1]; got {value}")
-        for name in ("even_share", "min_yield", "trusted_yield", "high_yield"):
+        for name in ("even_share", "basin_share", "min_yield", "trusted_yield", "high_yield"):
             value = vars(self)[name]
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1]; got {value}")
@@ -116,6 +123,9 @@ class RecyclingSettings:
             if value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1; got {value}")
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "max_basins", as_whole_number("max_basins", self.max_basins))
+        if self.max_basins < 0:
+            raise ValueError(f"max_basins must be a whole number, 0 for none; got {self.max_basins}")
         if not self.points_per_dimension > 0.0:
             raise ValueError(f"points_per_dimension must be positive; got {self.points_per_dimension}")
         if not self.max_evidence_difference >= 0.0:

@@ -1,0 +1,262 @@
+"""Components for parts of the target that a fitted mixture does not cover.
+
+While the target is annealed, a narrow mode holds little mass: of two modes of equal mass with widths s_1 < s_2 in d
+dimensions, the tempered target gives the narrow one the share (s_1 / s_2)^(d (1 - beta)), relative to the wide one. A
+mixture fitted to weighted points takes the few points there for the tail of the wide mode, and the next draws miss
+them. But these points are out of line: near a mode the logarithm of the target is nearly quadratic, and points of
+another mode lie above that quadratic.
+
+For every component of the mixture, a quadratic
+
+    log p(z) = a + g z - z A z / 2
+
+is fitted to the points that belong to it, in the coordinates in which the component is the standard one, by least
+trimmed squares, which ignores a minority of the points.
+
+1. Points clearly above this quadratic belong to another basin. A second quadratic is fitted to them, about the highest
+   one. Its mode, at a limited distance, is the mean of a new component, and A^-1 its covariance. So points on the flank
+   of a mode suffice to find it, long before a draw hits its top. With fewer points than coefficients, A is drawn towards
+   a multiple of the identity by ridge regression, with the strength that has the smallest leave-one-out error. With
+   fewer than about one point per dimension, the new component is centred at these points and somewhat narrower than
+   the component they were taken from.
+2. If most points agree with the first quadratic, but its mode and A^-1 are far from mean and covariance of the
+   component, which were estimated from few effective points, a component is made from the quadratic too.
+
+The new components only decide where draws are made. The weights of the draws are exact, whatever is proposed.
+Constants are our choice, from trials on two and three modes (``python -m tests.benchmarks truth``).
+
+References
+----------
+Raftery, A. E. & Bao, L. (2010), Estimating and projecting trends in HIV/AIDS generalized epidemics using incremental
+mixture importance sampling, Biometrics 66(4), doi:10.1111/j.1541-0420.2010.01399.x (components at points of large
+weight)
+
+Rousseeuw, P. J. & Van Driessen, K. (2006), Computing LTS regression for large data sets, Data Mining and Knowledge
+Discovery 12, doi:10.1007/s10618-005-0024-4 (least trimmed squares)
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from .covariance import invert_roots
+from .mixture import Mixture, log_responsibilities, to_component_space
+from .support_bounds import log_abs_det_jacobian
+
+__all__ = ["cover_basins"]
+
+# Points whose log-density is this far below the highest, per dimension, are left out.
+DEPTH = 8.0
+# Squared distance, and depth below the highest point per dimension, at which a point has a quarter of the weight.
+CORE, TOP = 10.0, 3.0
+# A point belongs to another basin if it is above the quadratic by this, plus this many times the spread of the others.
+SIGNIFICANT, SPREADS = 2.0, 5.0
+# Least trimmed squares: share of the points that are fitted, and number of concentration steps.
+KEPT, CONCENTRATIONS = 0.7, 4
+# Points needed per coefficient, and largest number of coefficients of a quadratic with all products.
+PER_COEFFICIENT, MOST_COEFFICIENTS = 1.5, 700
+STRENGTHS = (1e-6, 1e-4, 1e-2, 1.0, 100.0)
+# Eigenvalues of A: a basin may be wider than the component by a factor of 1.8, and narrower by 100.
+CURVATURES = (0.3, 1e4)
+# Largest distance of a mode from the highest point, or from the mean of the component, per square root of dimension.
+LONGEST_STEP, LONGEST_SHIFT = 1.5, 2.0
+# Spread up to which most points agree with a quadratic, and Kullback-Leibler divergence per dimension from which on the
+# component is far from it.
+AGREEING, FAR = 1.0, 0.1
+# Covariance of a new component by A^-1, and its scale around very few points by that of the component.
+WIDER, FEW_POINTS_SCALE = 1.2, 0.7
+# Largest share of one basin, and of all together: an estimated mass may be far too large.
+LARGEST_SHARE, LARGEST_SHARE_OF_ALL = 0.25, 0.5
+# Logarithms are rounded to 1 / 4096, so that a constant added to all of them changes nothing.
+GRID = 4096.0
+# Relative size of what keeps systems of equations regular.
+RIDGE = 1e-9
+
+
+class _Basin(NamedTuple):
+    """A new component, in the coordinates in which its neighbour is the standard one, and its estimated log-mass."""
+
+    log_mass: float
+    mean: np.ndarray
+    root: np.ndarray
+
+
+class _Quadratic(NamedTuple):
+    """Coefficients a, g and A."""
+
+    constant: float
+    slope: np.ndarray
+    curvature: np.ndarray
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Values (n,) at points (n, d)."""
+        return self.constant + points @ self.slope - 0.5 * np.einsum("ij,ij->i", points @ self.curvature, points)
+
+
+def cover_basins(
+    mixture: Mixture, coords: np.ndarray, log_target: np.ndarray, most: int = 3, share: float = 0.1
+) -> Mixture:
+    """Add components to a mixture for parts of the target that it does not cover.
+
+    Parameters
+    ----------
+    mixture : Mixture
+        A mixture fitted to the points.
+    coords : ndarray, shape (n, ndim)
+        Points.
+    log_target : ndarray, shape (n,)
+        Logarithm of the target, scaled so that its integral is about 1; -inf is allowed.
+    most : int
+        Largest number of components that are added.
+    share : float
+        Smallest weight of an added component. It is larger, up to 0.25, if the estimated mass of the basin is.
+
+    Returns
+    -------
+    Mixture
+        The mixture itself if it covers all points.
+    """
+    ndim = coords.shape[1]
+    kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)
+    target = np.round(log_target[kept] * GRID) / GRID
+    if mixture.bounds is not None:
+        target = target - log_abs_det_jacobian(mixture.bounds, coords[kept])
+    points = to_component_space(mixture, coords[kept])
+    owner = log_responsibilities(mixture, coords[kept]).argmax(axis=1)
+    variance = mixture.dof / (mixture.dof - 2.0)
+    found: list[tuple[int, _Basin]] = []
+    for k, (mean, root, inverse) in enumerate(zip(mixture.means, mixture.roots, mixture.inverses, strict=True)):
+        rows = owner == k
+        log_volume = float(np.sum(np.log(root.diagonal())))
+        basins = _find_basins((points[rows] - mean) @ inverse.T, target[rows] + log_volume, variance, most)
+        found += [(k, basin) for basin in basins]
+    if not found:
+        return mixture
+    found = sorted(found, key=lambda item: -item[1].log_mass)[:most]
+    shares = np.array([max(share, min(math.exp(min(basin.log_mass, 0.0)), LARGEST_SHARE)) for _, basin in found])
+    shares *= min(1.0, LARGEST_SHARE_OF_ALL / shares.sum())
+    means = np.array([mixture.means[k] + mixture.roots[k] @ basin.mean for k, basin in found])
+    roots = np.array([mixture.roots[k] @ basin.root / math.sqrt(variance) for k, basin in found])
+    return mixture._replace(
+        weights=np.concatenate([(1.0 - shares.sum()) * mixture.weights, shares]),
+        means=np.concatenate([mixture.means, means]),
+        roots=np.concatenate([mixture.roots, roots]),
+        inverses=np.concatenate([mixture.inverses, invert_roots(roots)]),
+    )
+
+
+def _find_basins(points: np.ndarray, target: np.ndarray, variance: float, most: int) -> list[_Basin]:
+    """Basins among points (n, d) in standard coordinates, by the logarithm (n,) of the target there."""
+    n, ndim = points.shape
+    if n < PER_COEFFICIENT * (ndim + 2):
+        return []
+    coefficients = 1 + ndim + ndim * (ndim + 1) // 2
+    full = n >= PER_COEFFICIENT * coefficients and coefficients <= MOST_COEFFICIENTS
+    quadratic, spread = _fit_most(points, target, full)
+    own = _own_basin(quadratic, variance) if full and spread < AGREEING else None
+    found = [] if own is None else [own]
+    left = target - quadratic.at(points) > SIGNIFICANT + SPREADS * spread
+    for _ in range(most):
+        if not left.any():
+            break
+        basin, explained = _highest_basin(points[left], target[left], full)
+        left[left] = ~explained
+        found.append(basin)
+    return found
+
+
+def _terms(points: np.ndarray, full: bool) -> np.ndarray:
+    """Terms of a quadratic: 1, z, |z|^2 / 2 and, if it is full, all products."""
+    columns = [np.ones((len(points), 1)), points, 0.5 * np.sum(points**2, axis=1, keepdims=True)]
+    if full:
+        first, second = np.triu_indices(points.shape[1])
+        columns.append(points[:, first] * points[:, second])
+    return np.concatenate(columns, axis=1)
+
+
+def _quadratic(coefficients: np.ndarray, ndim: int) -> _Quadratic:
+    """The quadratic with given coefficients of its terms."""
+    curvature = -coefficients[1 + ndim] * np.eye(ndim)
+    if len(coefficients) > ndim + 2:
+        products = np.zeros((ndim, ndim))
+        products[np.triu_indices(ndim)] = coefficients[2 + ndim :]
+        curvature -= products + products.T
+    return _Quadratic(float(coefficients[0]), coefficients[1 : 1 + ndim], curvature)
+
+
+def _fit_most(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Quadratic, float]:
+    """The quadratic that fits most of the points, and the spread of the residuals."""
+    terms = _terms(points, full)
+    core = 1.0 / (1.0 + np.sum(points**2, axis=1) / CORE) ** 2
+    regular = np.diag(np.full(terms.shape[1], RIDGE * len(points)))
+    kept = max(int(KEPT * len(points)), terms.shape[1])
+    weights = core
+    for _ in range(CONCENTRATIONS):
+        scaled = terms * weights[:, None]
+        coefficients = np.linalg.solve(scaled.T @ terms + regular, scaled.T @ target)
+        size = np.abs(target - terms @ coefficients)
+        weights = core * (size <= np.partition(size, kept - 1)[kept - 1])
+    return _quadratic(coefficients, points.shape[1]), 1.5 * float(np.median(size))
+
+
+def _log_mass(height: float, curvatures: np.ndarray) -> float:
+    """Logarithm of the integral of the exponential of a quadratic with a given maximum and eigenvalues (d,) of A."""
+    return height + 0.5 * len(curvatures) * math.log(2.0 * math.pi) - 0.5 * float(np.sum(np.log(curvatures)))
+
+
+def _own_basin(quadratic: _Quadratic, variance: float) -> _Basin | None:
+    """The quadratic of a component itself, if it is far from the component: mean 0 and covariance variance times I."""
+    curvatures, vectors = np.linalg.eigh(quadratic.curvature)
+    if curvatures[0] < CURVATURES[0]:
+        return None
+    mean = vectors @ ((vectors.T @ quadratic.slope) / curvatures)
+    ndim, squared = len(mean), float(mean @ mean)
+    scaled = variance * curvatures
+    divergence = 0.5 * float(np.sum(1.0 / scaled + np.log(scaled))) + 0.5 * (squared / variance - ndim)
+    if divergence < FAR * ndim or squared > LONGEST_SHIFT**2 * ndim:
+        return None
+    log_mass = _log_mass(quadratic.constant + 0.5 * float(mean @ quadratic.slope), curvatures)
+    return _Basin(log_mass, mean, math.sqrt(WIDER) * np.linalg.cholesky((vectors / curvatures) @ vectors.T))
+
+
+def _highest_basin(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Basin, np.ndarray]:
+    """The basin of the highest of some points (n, d), and which of them it explains (n,)."""
+    ndim, top = points.shape[1], np.argmax(target)
+    apart, below = points - points[top], target - target[top]
+    squared = np.sum(apart**2, axis=1)
+    if len(points) < PER_COEFFICIENT * (ndim + 2):
+        near = squared < ndim
+        weights = np.exp(below[near])
+        mean = points[top] + weights @ apart[near] / weights.sum()
+        return _Basin(-math.inf, mean, FEW_POINTS_SCALE * np.eye(ndim)), near
+    weights = 1.0 / ((1.0 - below / (TOP * ndim)) * (1.0 + squared / (2.0 * ndim))) ** 2
+    quadratic, spread = _fit_few(apart, below, weights, full)
+    curvatures, vectors = np.linalg.eigh(quadratic.curvature)
+    curvatures = np.clip(curvatures, *CURVATURES)
+    step = vectors @ ((vectors.T @ quadratic.slope) / curvatures)
+    step *= min(1.0, LONGEST_STEP * math.sqrt(ndim) / max(float(np.linalg.norm(step)), 1e-300))
+    height = float(target[top]) + min(0.5 * float(step @ quadratic.slope), float(ndim))
+    root = math.sqrt(WIDER) * np.linalg.cholesky((vectors / curvatures) @ vectors.T)
+    explained = np.abs(below - quadratic.at(apart)) < SIGNIFICANT + 3.0 * spread
+    explained[top] = True
+    return _Basin(_log_mass(height, curvatures), points[top] + step, root), explained
+
+
+def _fit_few(points: np.ndarray, target: np.ndarray, weights: np.ndarray, full: bool) -> tuple[_Quadratic, float]:
+    """The quadratic whose products are penalised by the best strength, and the spread of its leave-one-out errors."""
+    terms, n = _terms(points, full), len(points)
+    weights = weights / weights.mean()
+    penalised = (np.arange(terms.shape[1]) >= points.shape[1] + 2) * 1.0
+    scaled = terms * weights[:, None] / n
+    gram = scaled.T @ terms + RIDGE * np.eye(len(penalised))
+    best, smallest, spread = np.zeros(terms.shape[1]), math.inf, math.inf
+    for strength in STRENGTHS if full else STRENGTHS[:1]:
+        inverse = np.linalg.inv(gram + strength * np.diag(penalised))
+        coefficients = inverse @ (scaled.T @ target)
+        leverage = np.einsum("ij,ij->i", terms @ inverse, scaled)
+        error = (target - terms @ coefficients) / np.maximum(1.0 - leverage, 0.02)
+        mean_square = float(np.mean(weights * error**2))
+        if mean_square < smallest:
+            best, smallest, spread = coefficients, mean_square, 1.5 * float(np.median(np.abs(error)))
+    return _quadratic(best, points.shape[1]), spread
