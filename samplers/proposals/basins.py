@@ -15,10 +15,10 @@ trimmed squares, which ignores a minority of the points.
 
 1. Points clearly above this quadratic belong to another basin. A second quadratic is fitted to them, about the highest
    one. Its mode, at a limited distance, is the mean of a new component, and A^-1 its covariance. So points on the flank
-   of a mode suffice to find it, long before a draw hits its top. With fewer points than coefficients, A is drawn towards
-   a multiple of the identity by ridge regression, with the strength that has the smallest leave-one-out error. With
-   fewer than about one point per dimension, the new component is centred at these points and somewhat narrower than
-   the component they were taken from.
+   of a mode suffice to find it, long before a draw hits its top. With fewer points than coefficients, A is drawn
+   towards a multiple of the identity by ridge regression, with the strength that has the smallest leave-one-out error.
+   With fewer than 1.5 points per dimension, the new component is centred at these points and somewhat narrower than the
+   component they were taken from.
 2. If most points agree with the first quadratic, but its mode and A^-1 are far from mean and covariance of the
    component, which were estimated from few effective points, a component is made from the quadratic too.
 
