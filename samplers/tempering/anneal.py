@@ -364,7 +364,7 @@ def _by_recycling(
     population = Population(1.0, found.coords[ancestors], found.records[ancestors], effective, (ancestors,))
     if settings.check_draws != 0:
         yield population, found.check
-    for doubt in check_fit(found.check, found.proposals[-1][1], size):
+    for doubt in check_fit(found.check, found.proposals[-1][1], size, found.coords, found.log_weights):
         yield population, doubt
     if earlier is not None:
         yield from _disagreement(population, earlier, found.log_evidence, found.log_evidence_error)

@@ -8,7 +8,9 @@ import warnings
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from ..proposals.covariance import invert_roots, location_and_root
 from ..proposals.mixture import Mixture
 from .evidence_check import EvidenceCheck, expected_yield
 from .population import Doubt, Stage
@@ -26,6 +28,10 @@ LARGE_DIFFERENCE = 1.0
 # Yield of a fitted proposal, as a share of that expected for Gaussian modes, below which the fit misses a part: nearly
 # Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent ones without a shear 0.4 to 0.7.
 POOR_FIT = 0.75
+# Correlation of log-weights with those of the nearest points, below which jumps of the likelihood explain a poor yield:
+# 0.2 to 0.44 with jumps of standard deviation 1, 0.45 to 0.9 for bent posteriors.
+SMOOTH_WEIGHTS = 0.45
+NEIGHBOURS = 3
 OUR_PACKAGES = ("samplers", "emcee")
 
 
@@ -156,12 +162,15 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
     return []
 
 
-def check_fit(check: EvidenceCheck, mixture: Mixture, points: int) -> list[Doubt]:
+def check_fit(
+    check: EvidenceCheck, mixture: Mixture, points: int, coords: np.ndarray, log_weights: np.ndarray
+) -> list[Doubt]:
     """A doubt if the proposal of recycling at beta = 1 describes the posterior poorly.
 
     Where a bent posterior ends in a narrow tail, neither the points nor the draws of a proposal fitted to them reach
     the end of the tail, and their weights are even. The effective sample size of the draws is then still smaller than
-    expected for Gaussian modes (`samplers.tempering.evidence_check.expected_yield`).
+    expected for Gaussian modes (`samplers.tempering.evidence_check.expected_yield`), and the weights of neighbouring
+    draws are alike. Where a likelihood with jumps makes the weights uneven, they are not.
 
     Parameters
     ----------
@@ -171,6 +180,8 @@ def check_fit(check: EvidenceCheck, mixture: Mixture, points: int) -> list[Doubt
         The proposal.
     points : int
         Effective number of points that it was fitted to.
+    coords, log_weights : (n, ndim) float, (n,) float
+        Draws at beta = 1 and their log-weights.
 
     Returns
     -------
@@ -179,7 +190,7 @@ def check_fit(check: EvidenceCheck, mixture: Mixture, points: int) -> list[Doubt
     components, ndim = mixture.means.shape
     expected = expected_yield(ndim, mixture.dof, components, points)
     found = check.effective_sample_size / max(check.evaluations, 1)
-    if found >= POOR_FIT * expected:
+    if found >= POOR_FIT * expected or _neighbour_correlation(coords, log_weights) < SMOOTH_WEIGHTS:
         return []
     message = (
         f"the posterior is bent, or has tails, in a way that its approximation does not follow: fresh draws have an "
@@ -188,3 +199,14 @@ def check_fit(check: EvidenceCheck, mixture: Mixture, points: int) -> list[Doubt
         "of means and evidence too optimistic. Use more walkers, or recycle=False, and compare"
     )
     return [Doubt(message, True)]
+
+
+def _neighbour_correlation(coords: np.ndarray, log_weights: np.ndarray) -> float:
+    """Correlation of log-weights (n,) with the mean of those of the three nearest points, in whitened parameters."""
+    possible = log_weights > -np.inf
+    weights = np.where(possible, np.exp(log_weights - log_weights.max()), 0.0)
+    _, root = location_and_root(coords, weights / weights.sum())
+    white, values = coords[possible] @ invert_roots(root[None])[0].T, log_weights[possible]
+    values = np.maximum(values, np.quantile(values, 0.02))  # draws far out in the tails have any log-weight
+    _, nearest = cKDTree(white).query(white, k=NEIGHBOURS + 1)
+    return float(np.corrcoef(values, values[nearest[:, 1:]].mean(axis=1))[0, 1])
