@@ -114,14 +114,17 @@ def cut(path, share):
 def test_cut_off_anywhere(finished, share):
     """Nothing that the journal holds is evaluated again."""
     path, whole = finished
+    points = [row.tobytes() for batch in read_journal(journal_of(path)).evaluated for row in batch.coords]
     cut(path, share)
     contents = read_journal(journal_of(path))
     known = sum(len(batch.coords) for batch in contents.evaluated)
+    proposed_again = sum(point in points[:known] for point in points[known:])  # moves between copies return to a point
     sampler = make(path, "smc", seed=99)
     posterior = sampler.log_prob_fn.f
     sampler.run_mcmc(None, STEPS)
     assert same(sampler, whole)
-    assert posterior.calls == sampler.evaluations - known + (known > 0)  # one to check that the posterior is the same
+    # one to check that the posterior is the same
+    assert posterior.calls == sampler.evaluations - known - proposed_again + (known > 0)
     assert sampler.evaluations == whole.evaluations
 
 
