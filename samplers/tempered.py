@@ -195,8 +195,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
         convention = CallingConvention(vectorize, self.parameter_names if self.params_are_named else None, blobs_dtype)
         limit = FailureLimit(self.settings.max_failure_share, nwalkers, ndim)
-        given = (self.log_prob_fn.args, self.log_prob_fn.kwargs), convention, self._checkpoint, limit, self._budget
-        self._evaluator, self._coarse_evaluator = make_evaluators(functions, coarse_log_prob_fn, *given)
+        common = (self.log_prob_fn.args, self.log_prob_fn.kwargs), convention, self._checkpoint, limit, self._budget
+        self._evaluator, self._coarse_evaluator = make_evaluators(functions, coarse_log_prob_fn, *common)
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._result, self._verdict = self._checkpoint.stored_result(), self._checkpoint.stored_verdict()
         if self.backend.random_state is None:

@@ -24,7 +24,7 @@ from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
 from .adaptive_importance import Recycled, StartingDensity, recycle
 from .budget import BudgetExhausted
-from .diagnostics import check_annealing, check_fit, check_stages, warn
+from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, warn
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights, pareto_shape
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, draw_rounds, start_from_guide
@@ -125,9 +125,12 @@ def _without_limit(
         return
     if population.records is None:
         population = population._replace(records=_evaluate_all(population.coords, density))
-    if settings.recycle and (yield from _by_recycling(population, density, random, schedule, settings)).trusted:
-        return
-    yield from _by_moves(population, density, random, schedule, settings)
+    recycled = None
+    if settings.recycle:
+        recycled = yield from _by_recycling(population, density, random, schedule, settings)
+        if recycled.trusted:
+            return
+    yield from _by_moves(population, density, random, schedule, settings, recycled)
 
 
 def _evaluate_all(coords: np.ndarray, density: Density) -> np.ndarray:
@@ -287,8 +290,9 @@ def _by_moves(
     random: np.random.RandomState,
     schedule: MoveSchedule,
     settings: Settings,
+    recycled: Recycled | None,
 ) -> Steps:
-    """Sequential Monte Carlo."""
+    """Sequential Monte Carlo. Its evidence is compared with that of `recycled`, which could not be trusted."""
     n, ndim = population.coords.shape
     target, stages = float(n), []
     error = EvidenceError(n)
@@ -329,12 +333,16 @@ def _by_moves(
             yield population, doubt
     for doubt in check_annealing(stages, n, ndim, mutated.correlation):
         yield population, doubt
+    check = None
     if settings.check_draws != 0:
         try:
             check = _check_evidence(population.coords, density, random, settings.check_draws)
         except BudgetExhausted:
             raise StoppedEarly(population, 0.0, 0.0, 1.0, complete=True) from None
         yield population, check
+    if recycled is not None and recycled.check is not None:
+        for doubt in check_fallback(stages, check, recycled.log_evidence, recycled.log_evidence_error, recycled.check):
+            yield population, doubt
 
 
 def _by_recycling(

@@ -15,7 +15,15 @@ from ..proposals.mixture import Mixture
 from .evidence_check import EvidenceCheck, expected_yield
 from .population import Doubt, Stage
 
-__all__ = ["SamplingWarning", "check_annealing", "check_evidence", "check_fit", "check_stages", "warn"]
+__all__ = [
+    "SamplingWarning",
+    "check_annealing",
+    "check_evidence",
+    "check_fallback",
+    "check_fit",
+    "check_stages",
+    "warn",
+]
 
 LOW_ACCEPTANCE = 0.01
 LOW_YIELD = 0.05
@@ -25,6 +33,9 @@ LARGE_ERROR = 0.35
 LARGE_SHARE = 0.8
 # Difference of two log-evidences that is reported even where the error of the second one is not known.
 LARGE_DIFFERENCE = 1.0
+# Excess of the log-evidence of recycling over that of the moves after it, from which on a mode may be lost: that of a
+# mode with a quarter of the mass.
+LOST_EVIDENCE = 0.3
 # Yield of a fitted proposal, as a share of that expected for Gaussian modes, below which the fit misses a part: nearly
 # Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent ones without a shear 0.4 to 0.7.
 POOR_FIT = 0.75
@@ -160,6 +171,43 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
         )
         return [Doubt(message, False)]
     return []
+
+
+def check_fallback(
+    stages: Sequence[Stage], check: EvidenceCheck | None, log_evidence: float, error: float, earlier: EvidenceCheck
+) -> list[Doubt]:
+    """A doubt if annealing by moves lost a part of the posterior that recycling before it had found.
+
+    Recycling that could not be trusted may still have found more modes. Both of its estimates of the evidence must
+    exceed that of the moves: the one of their check if that is reliable, else that of the stages.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+        All stages of the annealing by moves.
+    check : EvidenceCheck, optional
+        The check after it.
+    log_evidence, error : float
+        Log-evidence of the recycling and its standard error.
+    earlier : EvidenceCheck
+        The check of the recycling.
+
+    Returns
+    -------
+    list of Doubt
+    """
+    now, own = sum(stage.log_evidence_increment for stage in stages), stages[-1].log_evidence_error
+    if check is not None and check.reliable:
+        now, own = check.log_evidence, check.error
+    excess = min(log_evidence, earlier.log_evidence) - now
+    if excess <= max(3.0 * float(np.hypot(own, max(error, earlier.error))), LOST_EVIDENCE):
+        return []
+    message = (
+        f"annealing by moves gives the log-evidence {now:.2f} +- {own:.2f}, and recycling before it, which could not "
+        f"be trusted, gave {log_evidence:.2f} and {earlier.log_evidence:.2f}: the moves may have lost a mode. Use more "
+        "walkers, so that recycling can be trusted, and compare two runs"
+    )
+    return [Doubt(message, True)]
 
 
 def check_fit(

@@ -38,8 +38,15 @@ class TwoModes:
         return np.logaddexp(*self.parts(x))
 
 
-def run(seed, **settings):
-    posterior = TwoModes(seed)
+class OneMode(TwoModes):
+    """The wide mode alone."""
+
+    def __call__(self, x):
+        return self.parts(x)[1] + np.log(2.0)
+
+
+def run(seed, target=TwoModes, **settings):
+    posterior = target(seed)
     sampler = SMCSampler(500, NDIM, posterior, vectorize=True, seed=seed, recycling=RecyclingSettings(**settings))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -59,3 +66,13 @@ def test_without_components_for_basins_it_is_lost():
     """Negative control: the target is one that the plain mixture gets wrong."""
     sampler, share = run(2, max_basins=0)
     assert share < 0.05 and sampler.log_evidence == pytest.approx(np.log(0.5), abs=0.1)
+
+
+@pytest.mark.parametrize(("target", "lost"), [(TwoModes, True), (OneMode, False)])
+def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, lost):
+    """Recycling finds both modes, is not trusted, and the moves after it find one."""
+    sampler, share = run(2, target, trusted_yield=1.0)
+    assert share < 0.05
+    reported = any("may have lost a mode" in reason for reason in sampler.verdict.reasons)
+    assert reported == lost
+    assert not lost or sampler.verdict.status == "not usable"
