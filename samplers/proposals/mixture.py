@@ -49,6 +49,8 @@ TOLERANCE = 1e-3
 RIDGE = 1e-10
 # Points with less than this share of the mean weight are left out of the fit.
 NEGLIGIBLE = 1e-3
+# Scale of the map of a single bound, as a multiple of the usual one, with which it is a logarithm.
+LOGARITHMIC = 1e3
 # Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
 PARAMETERS_PER_SHEAR = 4
 
@@ -179,13 +181,17 @@ def fit_mixture(
     """
     mixture, criterion = _fit_with_shears(coords, weights, max_components, dof)
     near = None if bounds is None else near_bounds(bounds, coords, weights)
-    if near is not None and np.any(np.isfinite([near.low, near.high])):
-        unbounded, other = _fit_with_shears(to_unbounded(near, coords), weights, max_components, dof)
+    if near is None or not np.any(np.isfinite([near.low, near.high])):
+        return mixture
+    kept = weights > 0.0
+    # near a bound a population may be exponential, or vary by factors: the map with a large scale is the logarithm
+    for scale in (1.0, LOGARITHMIC) if np.any(np.isfinite(near.low) != np.isfinite(near.high)) else (1.0,):
+        tried = near._replace(span=scale * near.span)
+        unbounded, other = _fit_with_shears(to_unbounded(tried, coords), weights, max_components, dof)
         # the criterion of a density in the parameters contains the Jacobian determinant of the transformation
-        kept = weights > 0.0
-        other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(near, coords[kept]))
+        other -= 2.0 / (weights @ weights) * float(weights[kept] @ log_abs_det_jacobian(tried, coords[kept]))
         if other < criterion:
-            return unbounded._replace(bounds=near)
+            mixture, criterion = unbounded._replace(bounds=tried), other
     return mixture
 
 
