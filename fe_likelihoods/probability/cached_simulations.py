@@ -156,6 +156,11 @@ class CachedSimulations:
         return f"{self.fingerprint} {simulation_fingerprint(self.model, self._statistic)}"
 
     @property
+    def cache_keys(self) -> tuple[str, str]:
+        """Keys under which a `SimulationCache` stores the statistics and the responses, as `forget` takes them."""
+        return self.simulation_key, simulation_fingerprint(self.model)
+
+    @property
     def data_fingerprint(self) -> str:
         """Hex digest of the measurements: equal for likelihoods of the same data, in any order of the channels."""
         names = sorted(channel.name for channel in self.measurements.channels)

@@ -15,10 +15,13 @@ import numpy as np
 __all__ = ["read_rows", "write_rows"]
 
 SCHEMA = "fe_likelihoods.cache"  # a name of the format: it stays when modules are moved
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 KEY_BYTES = 16
 COLUMNS = {
     "key": "u1",
+    "source": "<i8",
+    "theta": "<f8",
+    "n_parameters": "<i8",
     "misfit": "<f8",
     "n_channels": "<i8",
     "n_steps": "<i8",
@@ -27,7 +30,7 @@ COLUMNS = {
     "seconds": "<f8",
 }
 
-Row = tuple[bytes, bytes, int, bytes, float]
+Row = tuple[bytes, int, bytes, bytes, int, bytes, float]
 
 
 def write_rows(path: str | os.PathLike, pages: Iterable[list[Row]]) -> int:
@@ -38,7 +41,7 @@ def write_rows(path: str | os.PathLike, pages: Iterable[list[Row]]) -> int:
     path : path
         The HDF5 file.
     pages : iterable of list of tuple
-        Rows (key, misfit, n_steps, reason, seconds), with misfit and reason as bytes.
+        Rows (key, source, theta, misfit, n_steps, reason, seconds), with arrays and reason as bytes.
 
     Returns
     -------
@@ -116,26 +119,38 @@ def read_rows(path: str | os.PathLike) -> list[Row]:
         raise ValueError(f"{path}: not a complete export of a cache ({error}); export or copy it again") from error
     if not whole:
         raise ValueError(f"{path}: the contents do not match their checksums; export or copy it again")
-    keys, misfits, reasons = (columns[name].tobytes() for name in ("key", "misfit", "reason"))
-    ends = [8 * np.cumsum(columns["n_channels"]), np.cumsum(columns["reason_bytes"])]
-    starts = [ends[0] - 8 * columns["n_channels"], ends[1] - columns["reason_bytes"]]
+    keys = columns["key"].tobytes()
+    thetas = _split(columns["theta"], 8 * columns["n_parameters"])
+    misfits = _split(columns["misfit"], 8 * columns["n_channels"])
+    reasons = _split(columns["reason"], columns["reason_bytes"])
     return [
         (
             keys[KEY_BYTES * i : KEY_BYTES * (i + 1)],
-            misfits[starts[0][i] : ends[0][i]],
+            int(columns["source"][i]),
+            thetas[i],
+            misfits[i],
             int(columns["n_steps"][i]),
-            reasons[starts[1][i] : ends[1][i]],
+            reasons[i],
             float(columns["seconds"][i]),
         )
         for i in range(len(columns["n_steps"]))
     ]
 
 
+def _split(values: np.ndarray, sizes: np.ndarray) -> list[bytes]:
+    """Parts of the bytes of an array, of the given sizes [bytes]."""
+    data, ends = values.tobytes(), np.cumsum(sizes)
+    return [data[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+
+
 def _columns(page: list[Row]) -> dict[str, np.ndarray]:
     """Values of the data sets for a list of rows."""
-    keys, misfits, n_steps, reasons, seconds = zip(*page, strict=True) if page else ((),) * 5
+    keys, sources, thetas, misfits, n_steps, reasons, seconds = zip(*page, strict=True) if page else ((),) * 7
     columns = {
         "key": np.frombuffer(b"".join(keys), dtype="u1"),
+        "source": sources,
+        "theta": np.frombuffer(b"".join(thetas), dtype="<f8"),
+        "n_parameters": [len(theta) // 8 for theta in thetas],
         "misfit": np.frombuffer(b"".join(misfits), dtype="<f8"),
         "n_channels": [len(misfit) // 8 for misfit in misfits],
         "n_steps": n_steps,

@@ -1,6 +1,7 @@
 """Rows of the simulation cache: their keys, checksums and SQL statements, and what a cache returns of them."""
 
 import hashlib
+import sqlite3
 import struct
 import zlib
 from pathlib import Path
@@ -10,29 +11,39 @@ import numpy as np
 
 __all__ = [
     "COLUMNS",
+    "REMOVE",
     "STORE",
     "STORE_RESPONSE",
     "CacheInfo",
     "CachedRows",
+    "StoredSimulation",
     "checksum",
+    "insert_rows",
     "is_undamaged",
     "pack_row",
+    "select_rows",
     "simulation_keys",
+    "source_number",
 ]
 
-COLUMNS = "key, misfit, n_steps, reason, seconds, crc"
+COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc"
 KEY_BYTES = 16
+KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_REASON_LENGTH = 2000
-NUMBERS = struct.Struct("<qd")
+NUMBERS = struct.Struct("<qqd")
 
 
 STORE = (
-    "INSERT INTO simulations (key, misfit, n_steps, reason, seconds, crc) VALUES (?, ?, ?, ?, ?, ?) "
+    f"INSERT INTO simulations ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?) "
     "ON CONFLICT (key) DO UPDATE SET misfit = excluded.misfit, n_steps = excluded.n_steps, reason = excluded.reason, "
     "seconds = excluded.seconds, crc = excluded.crc WHERE length(reason) > 0"  # a success is never overwritten
 )
 # replaces a response that an earlier version stored in single precision
-STORE_RESPONSE = "INSERT OR REPLACE INTO responses (key, n_channels, size, crc, response) VALUES (?, ?, ?, ?, ?)"
+STORE_RESPONSE = (
+    "INSERT OR REPLACE INTO responses (key, source, theta, n_channels, size, crc, response) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?)"
+)
+REMOVE = {table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses")}
 
 
 class CachedRows(NamedTuple):
@@ -51,6 +62,24 @@ class CachedRows(NamedTuple):
     misfit: np.ndarray
     reasons: list[str]
     known: np.ndarray
+
+
+class StoredSimulation(NamedTuple):
+    """One simulation of a cache.
+
+    Attributes
+    ----------
+    theta : (n_structural,) float
+        Structural parameters.
+    misfit : (n_channels,) float
+        Sums of squared residuals [SI unit of the channel, squared]; NaN where the simulation failed.
+    reason : str
+        Reason of the failure; empty where the simulation succeeded.
+    """
+
+    theta: np.ndarray
+    misfit: np.ndarray
+    reason: str
 
 
 class CacheInfo(NamedTuple):
@@ -109,26 +138,85 @@ def simulation_keys(fingerprint: str, thetas: np.ndarray) -> list[bytes]:
     return keys
 
 
-def checksum(key: bytes, misfit: bytes, n_steps: int, reason: bytes, seconds: float) -> int:
+def source_number(fingerprint: str) -> int:
+    """Number of 64 bits that identifies all simulations of one model against one set of measurements."""
+    return int.from_bytes(hashlib.blake2b(fingerprint.encode(), digest_size=8).digest(), signed=True)
+
+
+def checksum(key: bytes, source: int, theta: bytes, misfit: bytes, n_steps: int, reason: bytes, seconds: float) -> int:
     """CRC-32 of a stored simulation, its key included, so that values of another key are found to be damaged."""
-    return zlib.crc32(b"".join((key, NUMBERS.pack(n_steps, seconds), misfit, reason)))
+    return zlib.crc32(b"".join((key, NUMBERS.pack(source, n_steps, seconds), theta, misfit, reason)))
 
 
-def is_undamaged(key: Any, misfit: Any, n_steps: Any, reason: Any, seconds: Any, crc: Any) -> bool:
-    """Whether a stored simulation matches its checksum."""
+def is_undamaged(*row: Any) -> bool:
+    """Whether a stored simulation, given by the values of `COLUMNS`, matches its checksum."""
     try:
-        return crc == checksum(key, misfit, n_steps, reason, seconds)
+        return row[-1] == checksum(*row[:-1])
     except (TypeError, struct.error):  # damage may change the type of a value
         return False
 
 
-def pack_row(key: bytes, misfit: np.ndarray, n_steps: int, reason: str, seconds: float) -> tuple:
-    """A simulation as it is stored: the values of `COLUMNS`, with misfit and reason as bytes and the checksum last."""
+def pack_row(
+    key: bytes, source: int, theta: np.ndarray, misfit: np.ndarray, n_steps: int, reason: str, seconds: float
+) -> tuple:
+    """A simulation as it is stored: the values of `COLUMNS`, with arrays and reason as bytes and the checksum last."""
     values = (
         key,
+        source,
+        np.asarray(theta, dtype="<f8").tobytes(),
         np.asarray(misfit, dtype="<f8").tobytes(),
         int(n_steps),
         reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace"),
         float(seconds),
     )
     return (*values, checksum(*values))
+
+
+def select_rows(
+    connection: sqlite3.Connection, keys: list[bytes], columns: str = f"{COLUMNS} FROM simulations"
+) -> list[tuple]:
+    """Rows of a table with given keys, in any order; keys that are not stored have no row."""
+    found = []
+    for start in range(0, len(keys), KEYS_PER_QUERY):
+        part = keys[start : start + KEYS_PER_QUERY]
+        marks = ",".join("?" * len(part))
+        found += connection.execute(f"SELECT {columns} WHERE key IN ({marks})", part).fetchall()
+    return found
+
+
+def insert_rows(
+    connection: sqlite3.Connection, statement: str, rows: list[tuple], max_rows: int, max_response_bytes: int
+) -> tuple[int, int]:
+    """Store rows in one transaction, which also evicts the oldest.
+
+    Parameters
+    ----------
+    connection : sqlite3.Connection
+    statement : str
+        `STORE` or `STORE_RESPONSE`.
+    rows : list of tuple
+        Values of the statement.
+    max_rows, max_response_bytes : int
+        As for `SimulationCache`.
+
+    Returns
+    -------
+    simulations, responses : int
+        Numbers of evicted rows.
+    """
+    connection.execute("BEGIN IMMEDIATE")
+    connection.executemany(statement, rows)
+    evicted = connection.execute(
+        "DELETE FROM simulations WHERE id <= (SELECT max(id) FROM simulations) - ?", (max_rows,)
+    ).rowcount
+    responses = 0
+    if statement is STORE_RESPONSE:
+        ((excess,),) = connection.execute("SELECT total(size) - ? FROM responses", (max_response_bytes,))
+        for age, size in connection.execute("SELECT id, size FROM responses ORDER BY id").fetchall():
+            if excess <= 0:
+                break
+            connection.execute("DELETE FROM responses WHERE id = ?", (age,))
+            excess -= size
+            responses += 1
+    connection.execute("COMMIT")
+    return evicted, responses

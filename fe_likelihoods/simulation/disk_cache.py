@@ -21,40 +21,42 @@ aside, and while the file cannot be written, rows wait in memory.
 import logging
 import os
 import sqlite3
-import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from .cache_exchange import read_rows, write_rows
 from .cache_rows import (
     COLUMNS,
+    REMOVE,
     STORE,
     STORE_RESPONSE,
     CachedRows,
     CacheInfo,
+    StoredSimulation,
     checksum,
+    insert_rows,
     is_undamaged,
     pack_row,
+    select_rows,
     simulation_keys,
+    source_number,
 )
 from .fingerprint import simulation_fingerprint
+from .guarded_file import GuardedFile
 from .model import Model
-from .sqlite_file import CacheFile, is_damage
+from .sqlite_file import CacheFile
 
 __all__ = ["SimulationCache"]
 
 logger = logging.getLogger(__name__)
 
-KEYS_PER_QUERY = 500  # keys in one SELECT
-RETRY_SECONDS = 60.0  # wait after a failed access to the file
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 
 
-class SimulationCache:
+class SimulationCache(GuardedFile):
     """Cache of the sums of squared residuals of simulations, in one SQLite file.
 
     Any number of threads, processes and programs may use a file at the same time, each process through its own
@@ -69,7 +71,7 @@ class SimulationCache:
     path : path
         The file; created if it does not exist. A read-only file is used for reading, with a warning.
     max_rows : int
-        Largest number of stored simulations, of about 120 bytes each. Every write evicts the oldest beyond it.
+        Largest number of stored simulations, of about 160 bytes each. Every write evicts the oldest beyond it.
     retry_failures : bool
         Run failed simulations again, after a change that no fingerprint contains (an external program, memory, a time
         limit).
@@ -130,7 +132,7 @@ class SimulationCache:
 
     def _set_up(self, path, max_rows, retry_failures, responses, max_response_bytes, timeout) -> None:
         """Set all attributes without opening the file."""
-        self.file = CacheFile(path, timeout)
+        super().__init__(CacheFile(path, timeout))
         self.max_rows = max_rows
         self.retry_failures = retry_failures
         self.responses = responses
@@ -138,7 +140,6 @@ class SimulationCache:
         self.hits = self.misses = self.evictions = self.damaged = 0
         self._waiting: list[tuple] = []
         self._warned_read_only = self._said_evicted = False
-        self.retry_times: dict[str, float] = {}  # time before which an action that failed is not tried again
 
     def __getstate__(self) -> tuple:
         return (
@@ -155,11 +156,6 @@ class SimulationCache:
 
     def __repr__(self) -> str:
         return f"SimulationCache({str(self.path)!r})"
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self.file.path
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int) -> CachedRows:
         """Look up simulations, with few queries for the whole batch.
@@ -181,8 +177,8 @@ class SimulationCache:
         misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
         with self.file.lock:
             found, bad = {}, []
-            for row in self._try("read", lambda connection: self._select(connection, keys), []):
-                key, sums, steps, reason = row[:4]
+            for row in self._try("read", lambda connection: select_rows(connection, keys), []):
+                key, _, _, sums, steps, reason = row[:6]
                 if not is_undamaged(*row) or len(sums) != 8 * n_channels or steps != n_steps:
                     bad.append(key)
                 elif not (reason and self.retry_failures):
@@ -224,12 +220,12 @@ class SimulationCache:
         seconds : float
             Wall time of all simulations together [s].
         """
-        keys = simulation_keys(fingerprint, thetas)
+        keys, source = simulation_keys(fingerprint, thetas), source_number(fingerprint)
         self._write(
             STORE,
             [
-                pack_row(key, sums, n_steps, reason, seconds / len(keys))
-                for key, sums, reason in zip(keys, misfit, reasons, strict=True)
+                pack_row(key, source, theta, sums, n_steps, reason, seconds / len(keys))
+                for key, theta, sums, reason in zip(keys, thetas, misfit, reasons, strict=True)
             ],
         )
 
@@ -246,11 +242,13 @@ class SimulationCache:
             [SI]. Responses that are not finite are not stored.
         """
         rows = []
-        keys = simulation_keys(simulation_fingerprint(model), thetas)
-        for key, response in zip(keys, responses, strict=True):
+        fingerprint = simulation_fingerprint(model)
+        keys, source = simulation_keys(fingerprint, thetas), source_number(fingerprint)
+        for key, theta, response in zip(keys, thetas, responses, strict=True):
             if np.isfinite(response).all():
                 data = np.asarray(response, dtype="<f8").tobytes()
-                rows.append((key, len(response), len(data), zlib.crc32(key + data), data))
+                point = np.asarray(theta, dtype="<f8").tobytes()
+                rows.append((key, source, point, len(response), len(data), zlib.crc32(key + data), data))
         if rows:
             self._write(STORE_RESPONSE, rows)
 
@@ -274,13 +272,68 @@ class SimulationCache:
         query = "key, crc, response FROM responses"
         found, bad = {}, []
         with self.file.lock:
-            for key, crc, data in self._try("read", lambda connection: self._select(connection, keys, query), []):
+            for key, crc, data in self._try("read", lambda connection: select_rows(connection, keys, query), []):
                 if not isinstance(data, bytes) or crc != zlib.crc32(key + data) or len(data) not in (size, size // 2):
                     bad.append(key)
                 elif len(data) == size:
                     found[key] = np.frombuffer(data, dtype="<f8").reshape(shape)
             self._drop("responses", bad)
         return [found.get(key) for key in keys]
+
+    def latest(self, fingerprint: str, n_channels: int, n_steps: int) -> StoredSimulation | None:
+        """The undamaged simulation that was stored last.
+
+        Parameters
+        ----------
+        fingerprint : str
+            As for `look_up`.
+        n_channels, n_steps : int
+            Shape of the measurements.
+
+        Returns
+        -------
+        StoredSimulation or None
+            None if no simulation of this fingerprint is stored.
+        """
+        query = f"SELECT {COLUMNS} FROM simulations WHERE source = ? ORDER BY id DESC LIMIT 1"
+        source = source_number(fingerprint)
+        for row in self._try("read", lambda connection: connection.execute(query, (source,)).fetchall(), []):
+            if is_undamaged(*row) and len(row[3]) == 8 * n_channels and row[4] == n_steps:
+                theta, misfit = (np.frombuffer(data, dtype="<f8") for data in row[2:4])
+                return StoredSimulation(theta, misfit, row[5].decode("utf-8", "replace"))
+        return None
+
+    def forget(self, *fingerprints: str) -> int:
+        """Delete the simulations and responses of some models, for all users of the file.
+
+        The caches in memory of likelihoods are not affected: make a new likelihood.
+
+        Parameters
+        ----------
+        *fingerprints : str
+            As for `look_up`; ``cache.forget(*likelihood.cache_keys)`` deletes what a likelihood uses.
+
+        Returns
+        -------
+        int
+            Number of rows deleted.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        sources = [(source_number(fingerprint),) for fingerprint in fingerprints]
+
+        def delete(connection: sqlite3.Connection) -> int:
+            connection.execute("BEGIN IMMEDIATE")
+            deleted = sum(connection.executemany(statement, sources).rowcount for statement in REMOVE.values())
+            connection.execute("COMMIT")
+            return deleted
+
+        with self.file.lock:
+            self._waiting = [row for row in self._waiting if (row[1],) not in sources]
+            return self._insist(delete)
 
     def info(self) -> CacheInfo:
         """State of the cache, and counts of this object."""
@@ -385,33 +438,8 @@ class SimulationCache:
             last = page[-1][0]
             yield [row[1:-1] for row in page if is_undamaged(*row[1:])]
 
-    @staticmethod
-    def _select(
-        connection: sqlite3.Connection, keys: list[bytes], columns: str = f"{COLUMNS} FROM simulations"
-    ) -> list[tuple]:
-        found = []
-        for start in range(0, len(keys), KEYS_PER_QUERY):
-            part = keys[start : start + KEYS_PER_QUERY]
-            marks = ",".join("?" * len(part))
-            found += connection.execute(f"SELECT {columns} WHERE key IN ({marks})", part).fetchall()
-        return found
-
     def _insert(self, connection: sqlite3.Connection, statement: str, rows: list[tuple]) -> None:
-        connection.execute("BEGIN IMMEDIATE")
-        connection.executemany(statement, rows)
-        evicted = connection.execute(
-            "DELETE FROM simulations WHERE id <= (SELECT max(id) FROM simulations) - ?", (self.max_rows,)
-        ).rowcount
-        responses = 0
-        if statement is STORE_RESPONSE:
-            ((excess,),) = connection.execute("SELECT total(size) - ? FROM responses", (self.max_response_bytes,))
-            for age, size in connection.execute("SELECT id, size FROM responses ORDER BY id").fetchall():
-                if excess <= 0:
-                    break
-                connection.execute("DELETE FROM responses WHERE id = ?", (age,))
-                excess -= size
-                responses += 1
-        connection.execute("COMMIT")
+        evicted, responses = insert_rows(connection, statement, rows, self.max_rows, self.max_response_bytes)
         self.evictions += evicted + responses
         if responses and not self._said_evicted:
             self._said_evicted = True
@@ -448,49 +476,3 @@ class SimulationCache:
             return
         delete = f"DELETE FROM {table} WHERE key = ?"
         self._try("repaired", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
-
-    def _try(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
-        """Result of an action on the connection; after an error a warning, `otherwise`, and a pause of this action."""
-        with self.file.lock:
-            if time.monotonic() < self.retry_times.get(what, -np.inf):
-                return otherwise
-            for attempt in range(2):
-                try:
-                    result = action(self.file.connection())
-                    self.retry_times.pop(what, None)
-                    return result
-                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # a damaged size may be huge
-                    self.file.close()  # also ends a transaction
-                    failure = error
-                except BaseException:
-                    self.file.close()
-                    raise
-                if attempt or not self.file.writable or not is_damage(failure):
-                    break
-                try:
-                    self.file.set_aside(str(failure))
-                except (OSError, ValueError) as error:
-                    failure = error
-                    break
-            if what not in self.retry_times:
-                logger.warning(
-                    "%s cannot be %s (%s); the run continues without it and tries again after %g s",
-                    self.path,
-                    what,
-                    failure,
-                    RETRY_SECONDS,
-                )
-            self.retry_times[what] = time.monotonic() + RETRY_SECONDS
-            return otherwise
-
-    def _insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
-        """Result of an action that the user has called explicitly; errors are raised."""
-        with self.file.lock:
-            try:
-                return action(self.file.connection())
-            except (sqlite3.Error, ValueError) as error:
-                self.file.close()
-                raise OSError(f"{self.path} cannot be used: {error}") from error
-            except BaseException:
-                self.file.close()
-                raise

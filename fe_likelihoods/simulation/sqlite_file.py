@@ -30,13 +30,16 @@ __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
 logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 LAYOUT = (
     # the id orders rows by age
-    "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, misfit BLOB NOT NULL, "
-    "n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, crc INTEGER NOT NULL)",
-    "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, n_channels INTEGER NOT NULL, "
-    "size INTEGER NOT NULL, crc INTEGER NOT NULL, response BLOB NOT NULL)",
+    "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "theta BLOB NOT NULL, misfit BLOB NOT NULL, n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, "
+    "crc INTEGER NOT NULL)",
+    "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "theta BLOB NOT NULL, n_channels INTEGER NOT NULL, size INTEGER NOT NULL, crc INTEGER NOT NULL, "
+    "response BLOB NOT NULL)",
+    "CREATE INDEX simulation_sources ON simulations (source)",  # to find the last simulation of a model, or all of them
     "CREATE INDEX response_sizes ON responses (size)",  # for their sum without reading the responses
 )
 CHECK_SECONDS = 2.0  # limit of the integrity check on opening; rows have checksums of their own

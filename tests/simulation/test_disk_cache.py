@@ -312,6 +312,20 @@ def test_info_and_clear(path, thetas):
     assert again.simulations == 300
 
 
+def test_forget_deletes_the_simulations_of_one_model(path, thetas):
+    keep, forgotten = oscillator(path), likelihood_of(Line(), SimulationCache(path, responses=True))
+    keep.misfit([[1.1, 0.9]])
+    forgotten.misfit(thetas)
+    stored = forgotten.cache.info()
+    assert forgotten.cache.latest(forgotten.simulation_key, 2, 8).theta.tolist() == thetas[-1].tolist()
+    assert forgotten.cache.forget(*forgotten.cache_keys) == stored.simulations - 1 + stored.responses
+    assert (forgotten.cache.info().simulations, forgotten.cache.info().responses) == (1, 0)
+    assert forgotten.cache.latest(forgotten.simulation_key, 2, 8) is None
+    again = oscillator(path)
+    again.misfit([[1.1, 0.9]])
+    assert again.disk_hits == 1
+
+
 def test_export_and_import(tmp_path, path, thetas):
     first = likelihood_of(Line(), path)
     first.misfit(thetas)
@@ -348,8 +362,8 @@ def test_exports_that_cannot_be_imported(tmp_path, path, thetas):
     with pytest.raises(ValueError, match="do not match their checksums"):
         SimulationCache(tmp_path / "new.sqlite").import_hdf5(exported)
     with h5py.File(exported, "r+") as file:
-        file.attrs["schema_version"] = 2
-    with pytest.raises(ValueError, match="version 1, got .* version 2"):
+        file.attrs["schema_version"] = 3
+    with pytest.raises(ValueError, match="version 2, got .* version 3"):
         cache.import_hdf5(exported)
     assert cache.info().simulations == 300
 
