@@ -174,6 +174,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .simulation.disk_cache import (
         SimulationCache,
     )
+    from .simulation.faults import (
+        TransientReason,
+    )
     from .simulation.local_pool import (
         LocalPool,
     )
@@ -238,6 +241,7 @@ __all__ = [
     "Steel",
     "SteelCoupon",
     "TooManyFailures",
+    "TransientReason",
     "TruncatedNormal",
     "Uniform",
     "average_predictions",
@@ -398,6 +402,7 @@ _EXPORTS = {
         "response_spectrum",
     ),
     "simulation.disk_cache": ("SimulationCache",),
+    "simulation.faults": ("TransientReason",),
     "simulation.local_pool": ("LocalPool",),
     "simulation.model": (
         "Model",

@@ -22,12 +22,16 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..simulation.code_digest import code_digest
+from ..simulation.faults import TransientReason, reason_of
 from ..simulation.model import SimulationFailed
 from ..simulation.processes import ManagedProcess, RunFailed, TemporaryFolder, describe_exit, last_lines
 from .external import ExternalModel
 from .validation import positive_float
 
 __all__ = ["ExecutableModel"]
+
+_FREE_BYTES = 2**16  # less free space than this may be the reason of a failure
+_EXIT_CODES_OF_SHELLS = {126, 127, *range(129, 160)}  # no program, or a program killed by signal 1 to 31
 
 
 class ExecutableModel(ExternalModel):
@@ -189,7 +193,11 @@ class ExecutableModel(ExternalModel):
                 self._execute(place, [string.Template(part).substitute(values) for part in self.command[1:]])
                 return self._check_response(self._read(folder))
             except Exception as error:
-                self._keep(place, values, error, time.monotonic() - start)
+                reason, seconds = reason_of(error), time.monotonic() - start
+                self._keep(place, values, reason, seconds)
+                if not isinstance(reason, TransientReason) and shutil.disk_usage(place).free < _FREE_BYTES:
+                    text = f"{reason} (the disk of the temporary folder {place.parent} is full)"
+                    raise RunFailed(TransientReason(text), seconds) from error
                 raise
 
     def _write(self, folder: Path, values: dict[str, str]) -> None:
@@ -219,21 +227,25 @@ class ExecutableModel(ExternalModel):
                 while not program.ended():
                     now = time.monotonic()
                     if now - start > self.time_limit:
-                        raise RunFailed(f"stopped at the time limit of {self.time_limit:g} s", now - start)
+                        text = f"stopped at the time limit of {self.time_limit:g} s"
+                        raise RunFailed(TransientReason(text, time_limit=self.time_limit), now - start)
                     if now - checked > 0.1:
                         checked = now
                         if _size(place) > self.max_output:
-                            raise RunFailed(f"stopped because it wrote more than {self.max_output} bytes", now - start)
+                            text = f"stopped because it wrote more than {self.max_output} bytes"
+                            raise RunFailed(TransientReason(text), now - start)
                     time.sleep(min(0.02, 0.001 + 0.05 * (now - start)))
             except BaseException:
                 program.kill()
                 raise
             exit_code = program.kill(everywhere=False)
             if exit_code:
-                reasons = filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)])
-                raise RunFailed(": ".join(reasons), time.monotonic() - start)
+                reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)]))
+                killed = exit_code < 0 or exit_code in _EXIT_CODES_OF_SHELLS
+                raise RunFailed(TransientReason(reason) if killed else reason, time.monotonic() - start)
             if _size(place) > self.max_output:
-                raise RunFailed(f"the program wrote more than {self.max_output} bytes", time.monotonic() - start)
+                reason = TransientReason(f"the program wrote more than {self.max_output} bytes")
+                raise RunFailed(reason, time.monotonic() - start)
 
     def _read(self, folder: Path) -> Any:
         """Read the response from the folder of the run."""
@@ -258,7 +270,7 @@ class ExecutableModel(ExternalModel):
             raise SimulationFailed(f"{self.output} has {table.shape[1]} columns, expected {wanted}")
         return table[:, self.columns].T
 
-    def _keep(self, place: Path, values: dict[str, str], error: Exception, seconds: float) -> None:
+    def _keep(self, place: Path, values: dict[str, str], reason: str, seconds: float) -> None:
         """Move the folder of a failed run to `keep_failures`."""
         if self.keep_failures is None:
             return
@@ -266,7 +278,6 @@ class ExecutableModel(ExternalModel):
             self.keep_failures.mkdir(parents=True, exist_ok=True)
             if len(list(self.keep_failures.glob("failure_*"))) >= self.max_kept:
                 return
-            reason = error.reason if isinstance(error, RunFailed | SimulationFailed) else error
             text = f"{reason}\nafter {seconds:.3g} s\n" + "".join(
                 f"{name} = {value}\n" for name, value in values.items()
             )

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
-from ..simulation.model import SimulationFailed
+from ..simulation.faults import TransientReason, reason_of
+from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest
 from .validation import check_theta, positive_float
 
@@ -78,8 +79,9 @@ class ExternalModel(StructuralModel):
         Raises
         ------
         SimulationFailed
-            If the external code raises an exception, or its response has a wrong shape or is not finite. The reason
-            ends in the duration of the simulation.
+            If the external code raises an exception, or its response has a wrong shape, is complex or is not finite.
+            The reason ends in the duration of the simulation. It is a `TransientReason` if the cause is not the model
+            (see `fe_likelihoods.simulation.faults`).
         ValueError
             If `theta` has another shape.
         """
@@ -88,10 +90,11 @@ class ExternalModel(StructuralModel):
         try:
             return self._check_response(self._respond(theta))
         except Exception as error:  # external code may raise anything
-            reason = getattr(error, "reason", None) or f"{type(error).__name__}: {error}"
+            reason = reason_of(error)
             seconds = getattr(error, "seconds", None)  # excludes the start of a process, where that is known
             seconds = time.perf_counter() - start if seconds is None else seconds
-            raise SimulationFailed(f"{reason} after {seconds:.3g} s") from error
+            text = f"{reason} after {seconds:.3g} s"
+            raise SimulationFailed(reason.with_text(text) if isinstance(reason, TransientReason) else text) from error
 
     def _digest(self, *parts: Any) -> str:
         """Fingerprint of the names, the channels, the step, the length and `parts`, which JSON can represent."""
@@ -101,15 +104,7 @@ class ExternalModel(StructuralModel):
 
     def _check_response(self, response: Any) -> np.ndarray:
         """Convert a response to floats (n_channels, n_steps); raise SimulationFailed if it cannot be used."""
-        expected = (len(self.channels), self.n_steps)
-        try:
-            response = np.asarray(response, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise SimulationFailed(f"the response is not an array of numbers: {error}") from error
-        if response.shape != expected:
-            raise SimulationFailed(
-                f"the response has shape {response.shape}, expected (n_channels, n_steps) = {expected}"
-            )
+        response = real_response(response, self.channels, self.n_steps)
         for channel, values in zip(self.channels, response, strict=True):
             if not np.isfinite(values).all():
                 raise SimulationFailed(f"the response of channel {channel.name!r} is not finite")

@@ -26,11 +26,11 @@ class _WithOpenSees:
     def __init__(self, build_and_run: Callable[[Any, np.ndarray], Any]) -> None:
         self.build_and_run = build_and_run
 
-    def __call__(self, theta: np.ndarray) -> np.ndarray:
+    def __call__(self, theta: np.ndarray) -> Any:
         import openseespy.opensees as ops
 
         ops.wipe()
-        return np.asarray(self.build_and_run(ops, theta), dtype=float)
+        return self.build_and_run(ops, theta)
 
 
 class OpenSeesModel(FunctionModel):

@@ -130,6 +130,11 @@ class CachedSimulations:
         return self._failures.count
 
     @property
+    def transient_failure_count(self) -> int:
+        """Number of failures whose cause is not the model; a likelihood made later simulates these points again."""
+        return self._failures.transient
+
+    @property
     def failures(self) -> list[dict]:
         """The first 1000 failures: ``{"parameters": {name: value}, "reason": str}``, with ``"seconds"`` if known."""
         return self._failures.records
@@ -330,6 +335,7 @@ class CachedSimulations:
         size = self._most_responses
         for start in range(0, len(left), size):
             self._read_responses(requested, left[start : start + size])
+        self._read_failures(requested, np.flatnonzero(~requested.cached & ~requested.known))
         for rows, batch in self._chunks(requested, np.flatnonzero(~requested.cached)):
             requested.misfit[rows] = batch.misfit
             for row, reason in zip(rows, batch.reasons, strict=True):
@@ -389,6 +395,17 @@ class CachedSimulations:
                 n_steps = self.measurements.n_steps
                 self.cache.store(self._key, requested.thetas[rows[new]], n_steps, misfit, reasons_of_new, 0.0)
         requested.cached[rows] = True
+
+    def _read_failures(self, requested: _Requested, rows: np.ndarray) -> None:
+        """Fill in rows whose simulation is known to fail for any measurements."""
+        if self.cache is None or not len(rows):
+            return
+        reasons = self.cache.look_up_failures(self.model, requested.thetas[rows])
+        for row, reason in zip(rows, reasons, strict=True):
+            requested.reasons[row] = reason
+        rows = rows[[bool(reason) for reason in reasons]]
+        requested.known[rows] = requested.cached[rows] = requested.on_disk[rows] = True
+        self._add_outcomes(requested, rows)
 
     def _add_outcomes(self, requested: _Requested, rows: np.ndarray) -> None:
         """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
@@ -471,6 +488,7 @@ class CachedSimulations:
                 # before the statistics, which are computed from them if the program is killed in between
                 self.cache.store_responses(self.model, thetas, batch.response)
             self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
+            self.cache.store_failures(self.model, thetas, reasons)
         if responses:
             batch.response[[bool(reason) for reason in reasons]] = np.nan
         return _Simulated(misfit, reasons, batch.response if responses else None)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..simulation.faults import TransientReason
 from ..simulation.model import split_seconds
 
 __all__ = ["FailureLog", "TooManyFailures"]
@@ -38,7 +39,10 @@ class FailureLog:
         Number of failures.
     records : list of dict
         ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures, with ``"seconds"`` where the
-        duration is known.
+        duration is known, and ``"transient": True`` where the cause is not the model, so that a later run simulates
+        the point again (`fe_likelihoods.simulation.faults`).
+    transient : int
+        Number of failures whose cause is not the model.
     reasons : collections.Counter
         Number of failures per reason; reasons beyond the first 100 are counted together.
 
@@ -52,7 +56,7 @@ class FailureLog:
         if not 0.0 <= max_share <= 1.0:
             raise ValueError(f"FELikelihood: max_failure_share must be in [0, 1]; got {max_share!r}")
         self.max_share = max_share
-        self.count = 0
+        self.count = self.transient = 0
         self.records: list[dict] = []
         self.reasons: Counter[str] = Counter()
         self._names = tuple(parameter_names)
@@ -60,19 +64,24 @@ class FailureLog:
     def add(self, theta: np.ndarray, reason: str) -> None:
         """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
         parameters = dict(zip(self._names, theta.tolist(), strict=True))
+        transient = isinstance(reason, TransientReason)
         reason, seconds = split_seconds(reason)
-        if not self.count:
+        if not self.count or (transient and not self.transient):
             logger.warning(
-                "A simulation failed (%s) at %s; its log-likelihood is -inf. Further failures are counted without a "
+                "A simulation failed (%s) at %s; its log-likelihood is -inf%s. Further failures are counted without a "
                 "message, see posterior.report()",
                 reason,
                 ", ".join(f"{name} = {value:.4g}" for name, value in parameters.items()),
+                " in this run, and a later run simulates the point again" if transient else "",
             )
         self.count += 1
+        self.transient += transient
         if len(self.records) < _MAX_RECORDS:
             self.records.append({"parameters": parameters, "reason": reason})
             if seconds is not None:
                 self.records[-1]["seconds"] = seconds
+            if transient:
+                self.records[-1]["transient"] = True
         known = reason in self.reasons or len(self.reasons) < _MAX_REASONS
         self.reasons[reason if known else _OTHER_REASONS] += 1
 

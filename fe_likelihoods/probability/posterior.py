@@ -303,8 +303,9 @@ class Posterior:
         dict
             ``simulations``, ``cache_hits`` (rows whose statistics were cached), ``disk_hits`` (rows among them that
             came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where
-            known; the first 1000), ``failure_count``, ``failure_reasons`` (count per reason), ``seconds`` (wall time of
-            the simulations).
+            known and ``"transient"`` where the cause is not the model; the first 1000), ``failure_count``,
+            ``transient_failures`` (those of them that a later run simulates again, see `FailureLog`),
+            ``failure_reasons`` (count per reason), ``seconds`` (wall time of the simulations).
         """
         return {
             "simulations": self.likelihood.simulations,
@@ -312,6 +313,7 @@ class Posterior:
             "disk_hits": self.likelihood.disk_hits,
             "failures": list(self.likelihood.failures),
             "failure_count": self.likelihood.failure_count,
+            "transient_failures": self.likelihood.transient_failure_count,
             "failure_reasons": dict(self.likelihood.failure_reasons),
             "seconds": self.likelihood.seconds,
         }

@@ -9,10 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .faults import MisfitReason, TransientReason
+
 __all__ = [
     "COLUMNS",
+    "MIN_STOPS",
     "REMOVE",
     "STORE",
+    "STORE_FAILURE",
     "STORE_RESPONSE",
     "CacheInfo",
     "CachedRows",
@@ -20,10 +24,12 @@ __all__ = [
     "checksum",
     "insert_rows",
     "is_undamaged",
+    "pack_failure",
     "pack_row",
     "select_rows",
     "simulation_keys",
     "source_number",
+    "unpack_failure",
 ]
 
 COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc"
@@ -43,7 +49,15 @@ STORE_RESPONSE = (
     "INSERT OR REPLACE INTO responses (key, source, theta, n_channels, size, crc, response) "
     "VALUES (?, ?, ?, ?, ?, ?, ?)"
 )
-REMOVE = {table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses")}
+REMOVE = {table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses", "failures")}
+# counts how often a simulation was stopped at the same time limit
+STORE_FAILURE = (
+    "INSERT INTO failures (key, source, reason, time_limit, crc, stops) VALUES (?, ?, ?, ?, ?, 1) "
+    "ON CONFLICT (key) DO UPDATE SET "
+    "stops = CASE WHEN time_limit = excluded.time_limit THEN stops + 1 ELSE 1 END, "
+    "reason = excluded.reason, time_limit = excluded.time_limit, crc = excluded.crc"
+)
+MIN_STOPS = 2  # runs that were stopped at a time limit, before the limit is taken as the cause and not a busy machine
 
 
 class CachedRows(NamedTuple):
@@ -156,6 +170,37 @@ def is_undamaged(*row: Any) -> bool:
         return False
 
 
+def pack_failure(key: bytes, source: int, reason: str) -> tuple | None:
+    """A failure as it is stored: key, source, reason, time limit [s], checksum; None if it is not stored.
+
+    Failures that depend on the measurements are not stored, nor are faults of the infrastructure except time limits.
+    """
+    time_limit = reason.time_limit if isinstance(reason, TransientReason) else 0.0
+    if not reason or isinstance(reason, MisfitReason) or (isinstance(reason, TransientReason) and not time_limit):
+        return None
+    text = _encoded(reason)
+    return key, source, text, time_limit, _checksum_of_failure(key, source, text, time_limit)
+
+
+def unpack_failure(key: bytes, source: int, text: bytes, time_limit: float, crc: int) -> str | None:
+    """Reason of a stored failure; None if it is damaged."""
+    try:
+        if crc != _checksum_of_failure(key, source, text, time_limit):
+            return None
+    except (TypeError, struct.error):
+        return None
+    reason = text.decode("utf-8", "replace")
+    return TransientReason(reason, time_limit) if time_limit else reason
+
+
+def _checksum_of_failure(key: bytes, source: int, text: bytes, time_limit: float) -> int:
+    return zlib.crc32(b"".join((key, NUMBERS.pack(source, len(text), time_limit), text)))
+
+
+def _encoded(reason: str) -> bytes:
+    return reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
+
+
 def pack_row(
     key: bytes, source: int, theta: np.ndarray, misfit: np.ndarray, n_steps: int, reason: str, seconds: float
 ) -> tuple:
@@ -166,7 +211,7 @@ def pack_row(
         np.asarray(theta, dtype="<f8").tobytes(),
         np.asarray(misfit, dtype="<f8").tobytes(),
         int(n_steps),
-        reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace"),
+        _encoded(reason),
         float(seconds),
     )
     return (*values, checksum(*values))
@@ -193,7 +238,7 @@ def insert_rows(
     ----------
     connection : sqlite3.Connection
     statement : str
-        `STORE` or `STORE_RESPONSE`.
+        `STORE`, `STORE_RESPONSE` or `STORE_FAILURE`.
     rows : list of tuple
         Values of the statement.
     max_rows, max_response_bytes : int
@@ -206,8 +251,9 @@ def insert_rows(
     """
     connection.execute("BEGIN IMMEDIATE")
     connection.executemany(statement, rows)
+    table = "failures" if statement is STORE_FAILURE else "simulations"
     evicted = connection.execute(
-        "DELETE FROM simulations WHERE id <= (SELECT max(id) FROM simulations) - ?", (max_rows,)
+        f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (max_rows,)
     ).rowcount
     responses = 0
     if statement is STORE_RESPONSE:

@@ -14,6 +14,8 @@ and are stored as computed, in double precision. In single precision, a response
 noise would lose its digits, and the cache knows neither noise nor measurements. Compression without loss would save 10
 to 25 % of their size and is not used.
 
+Failures are stored as well if they are answers of the model (`fe_likelihoods.simulation.failure_table`).
+
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
 """
@@ -44,8 +46,9 @@ from .cache_rows import (
     simulation_keys,
     source_number,
 )
+from .failure_table import FailureTable
+from .faults import TransientReason
 from .fingerprint import simulation_fingerprint
-from .guarded_file import GuardedFile
 from .model import Model
 from .sqlite_file import CacheFile
 
@@ -56,7 +59,7 @@ logger = logging.getLogger(__name__)
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 
 
-class SimulationCache(GuardedFile):
+class SimulationCache(FailureTable):
     """Cache of the sums of squared residuals of simulations, in one SQLite file.
 
     Any number of threads, processes and programs may use a file at the same time, each process through its own
@@ -73,8 +76,7 @@ class SimulationCache(GuardedFile):
     max_rows : int
         Largest number of stored simulations, of about 160 bytes each. Every write evicts the oldest beyond it.
     retry_failures : bool
-        Run failed simulations again, after a change that no fingerprint contains (an external program, memory, a time
-        limit).
+        Run failed simulations again, after a change that no fingerprint contains (an external program, a licence).
     responses : bool
         Store the response of every simulation. By default only the responses that are requested are stored
         (`FELikelihood.simulate`, guides).
@@ -203,7 +205,7 @@ class SimulationCache(GuardedFile):
         reasons: Sequence[str],
         seconds: float,
     ) -> None:
-        """Store simulations, failed ones included, in one transaction that also evicts.
+        """Store simulations in one transaction that also evicts; failed ones unless the reason is a `TransientReason`.
 
         Parameters
         ----------
@@ -221,13 +223,12 @@ class SimulationCache(GuardedFile):
             Wall time of all simulations together [s].
         """
         keys, source = simulation_keys(fingerprint, thetas), source_number(fingerprint)
-        self._write(
-            STORE,
-            [
-                pack_row(key, source, theta, sums, n_steps, reason, seconds / len(keys))
-                for key, theta, sums, reason in zip(keys, thetas, misfit, reasons, strict=True)
-            ],
-        )
+        rows = [
+            pack_row(key, source, theta, sums, n_steps, reason, seconds / len(keys))
+            for key, theta, sums, reason in zip(keys, thetas, misfit, reasons, strict=True)
+            if not isinstance(reason, TransientReason)
+        ]
+        self._write(STORE, rows)
 
     def store_responses(self, model: Model, thetas: np.ndarray, responses: np.ndarray) -> None:
         """Store responses in double precision, in one transaction that also evicts.
@@ -361,8 +362,8 @@ class SimulationCache(GuardedFile):
 
         def delete(connection: sqlite3.Connection) -> None:
             connection.execute("BEGIN IMMEDIATE")
-            connection.execute("DELETE FROM simulations")
-            connection.execute("DELETE FROM responses")
+            for table in ("simulations", "responses", "failures"):
+                connection.execute(f"DELETE FROM {table}")
             connection.execute("COMMIT")
 
         with self.file.lock:

@@ -28,6 +28,7 @@ from multiprocessing.pool import Pool, ThreadPool
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .faults import TransientReason
 from .local_pool import LocalPool, Outcome
 from .processes import PickledFunction, TemporaryFolder, local_definition
 
@@ -36,7 +37,7 @@ __all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 logger = logging.getLogger(__name__)
 
 MAX_LOADED_FUNCTIONS = 8
-_DIED = "the worker process died in every attempt of dask"
+_DIED = TransientReason("the worker process died in every attempt of dask")
 
 
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | PoolExecutor | None":

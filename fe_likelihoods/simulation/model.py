@@ -11,7 +11,7 @@ has a wrong shape, becomes a reason in words and a row of NaN, and does not affe
 
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import cycle
 from typing import Any, NamedTuple, Protocol
@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..signals.channels import Channel
+from .faults import FailedRun, MisfitReason, is_transient, reason_of
 
 __all__ = [
     "MisfitBatch",
@@ -30,6 +31,7 @@ __all__ = [
     "has_batch_method",
     "misfit_batch",
     "misfit_of_responses",
+    "real_response",
     "simulate_batch",
     "split_seconds",
 ]
@@ -45,7 +47,7 @@ It must be defined at the top level of a module, so that it can be sent to worke
 _RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is needed: 64 MiB
 
 
-class SimulationFailed(RuntimeError):
+class SimulationFailed(FailedRun):
     """A simulation that failed.
 
     Parameters
@@ -62,7 +64,7 @@ class SimulationFailed(RuntimeError):
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
-        self.reason = str(reason) or "no reason given"
+        self.reason = (reason if isinstance(reason, str) else str(reason)) or "no reason given"
 
 
 def split_seconds(reason: str) -> tuple[str, float | None]:
@@ -107,7 +109,8 @@ class Model(Protocol):
 
     A model may also have ``simulate_batch(thetas) -> SimulationBatch`` and
     ``misfit_batch(thetas, measured) -> MisfitBatch``, whose rows must be the results of `simulate`, and
-    ``with_record(record)``, which returns the same model under another excitation, for predictions.
+    ``with_record(record)``, which returns the same model under another excitation, for predictions. An attribute
+    ``time_limit`` is the largest duration of a simulation [s], or None.
 
     With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
     returns the same model under the first part of its excitation. The response of that model must be the first samples
@@ -285,23 +288,65 @@ def _misfit_from_responses(model: Model, thetas: np.ndarray, measured: np.ndarra
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
     """Response of one simulation; `SimulationFailed` if it has a wrong shape."""
-    response = np.asarray(model.simulate(theta.copy()), dtype=float)
-    expected = (len(model.channels), model.n_steps)
+    return real_response(model.simulate(theta.copy()), model.channels, model.n_steps)
+
+
+def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
+    """Response of one simulation as floats.
+
+    Parameters
+    ----------
+    response : array_like
+        What a model returned.
+    channels : sequence of Channel
+    n_steps : int
+
+    Returns
+    -------
+    (n_channels, n_steps) float
+        [SI]; its values may be infinite or NaN.
+
+    Raises
+    ------
+    SimulationFailed
+        If it is complex, has another shape, or is not an array of numbers.
+    """
+    try:
+        response = np.asarray(response)
+        if np.iscomplexobj(response):
+            rows = response if response.ndim == 2 else np.zeros((0, 0))
+            named = [channel.name for channel, row in zip(channels, rows, strict=False) if row.imag.any()]
+            which = f"channel {named[0]!r}" if named else f"channels {', '.join(c.name for c in channels)}"
+            raise SimulationFailed(
+                f"the response of {which} is complex, expected real numbers; return its real part if that is the "
+                "response"
+            )
+        response = response.astype(float, copy=False)
+    except (TypeError, ValueError) as error:
+        raise SimulationFailed(f"the response is not an array of numbers: {error}") from error
+    expected = (len(channels), n_steps)
     if response.shape != expected:
         raise SimulationFailed(f"the response has shape {response.shape}, expected (n_channels, n_steps) = {expected}")
     return response
 
 
 def _misfit(measured: np.ndarray, reduce: Statistic, model: Model, theta: np.ndarray) -> np.ndarray:
-    return _reduced(_response(model, theta), measured, reduce)
+    response = _response(model, theta)
+    if reason := _not_finite(model, response):
+        raise SimulationFailed(reason)
+    try:
+        return _reduced(response, measured, reduce)
+    except Exception as error:
+        raise SimulationFailed(reason_of(error) if is_transient(error) else MisfitReason(reason_of(error))) from error
 
 
 def _not_finite(model: Model, values: np.ndarray) -> str:
     """Reason why one row of responses or misfits is not usable, or an empty string."""
     for channel, value in zip(cycle(model.channels), values, strict=False):  # a statistic repeats the channels
         if not np.isfinite(value).all():
-            what = "response" if value.ndim else "misfit"
-            return f"the {what} of channel {channel.name!r} is not finite"
+            if value.ndim:
+                return f"the response of channel {channel.name!r} is not finite"
+            return MisfitReason(f"the misfit of channel {channel.name!r} is not finite")
     return ""
 
 
@@ -311,10 +356,8 @@ def _attempt(
     """Run one simulation; returns its result and an empty reason, or None and the reason. Called in the worker."""
     try:
         result = run(model, theta)
-    except SimulationFailed as error:
-        return None, error.reason
     except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
-        return None, f"{type(error).__name__}: {error}"
+        return None, reason_of(error)
     reason = _not_finite(model, result)
     return (None, reason) if reason else (result, "")
 
@@ -338,7 +381,10 @@ def _run_whole(
     """Results of a model's own batch method, or None if it failed as a whole and the sets must be run one by one."""
     try:
         values, reasons = method()
-        values, reasons = np.array(values, dtype=float), [str(reason) for reason in reasons]
+        if np.iscomplexobj(values):
+            raise ValueError("expected real numbers, got complex ones")
+        values = np.array(values, dtype=float)
+        reasons = [reason if isinstance(reason, str) else str(reason) for reason in reasons]
         if values.shape != shape or len(reasons) != shape[0]:
             raise ValueError(
                 f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"

@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from . import orphan_reaper
+from .faults import FailedRun, TransientReason
 
 __all__ = [
     "ManagedProcess",
@@ -54,13 +55,13 @@ _SCRIPTS = ("__main__", "__mp_main__")  # names of the user's script as it runs,
 _importing_script = False
 
 
-class RunFailed(RuntimeError):
+class RunFailed(FailedRun):
     """A run in another process failed.
 
     Attributes
     ----------
     reason : str
-        Why it failed, in words.
+        Why it failed, in words; a `TransientReason` if the process was stopped, was killed or crashed.
     seconds : float or None
         Duration of the run [s], if known.
     """
@@ -342,7 +343,7 @@ class Worker:
                 return None
         except (EOFError, OSError):
             self.wait_briefly()
-        raise RunFailed(describe_exit(self.kill(), "the worker process"))
+        raise RunFailed(TransientReason(describe_exit(self.kill(), "the worker process")))
 
     def wait_briefly(self) -> None:
         """Wait for a process that has closed its connection to exit by itself, to get its own exit code."""

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from .faults import TransientReason
 from .processes import PickledFunction, RunFailed, Worker, WorkerReply, last_lines
 
 __all__ = ["Sandbox"]
@@ -68,6 +69,9 @@ class Sandbox:
         try:
             worker.submit(item)
             reply = self._wait(worker, output, self._time_limit)
+            if reply is None:
+                limit = self._time_limit
+                raise RunFailed(TransientReason(f"stopped at the time limit of {limit:g} s", time_limit=limit))
         except RunFailed as error:
             worker.kill()
             raise RunFailed(error.reason, time.monotonic() - start) from None
@@ -98,6 +102,8 @@ class Sandbox:
         try:
             worker.load(self._pickled)
             reply = self._wait(worker, output, _START_LIMIT)
+            if reply is None:
+                raise RunFailed(TransientReason(f"the worker process did not start within {_START_LIMIT:g} s"))
         except BaseException:
             worker.kill()
             raise
@@ -106,8 +112,8 @@ class Sandbox:
             raise ValueError(f"{self._function!r} cannot be loaded in another process: {reply.value}")
         return worker, output
 
-    def _wait(self, worker: Worker, output: Any, limit: float) -> WorkerReply:
-        """Reply of a worker; RunFailed if it dies or exceeds a limit."""
+    def _wait(self, worker: Worker, output: Any, limit: float) -> WorkerReply | None:
+        """Reply of a worker, None if there is none within the limit [s]; RunFailed if it dies or prints too much."""
         stop = time.monotonic() + limit
         while (left := stop - time.monotonic()) > 0.0:
             with suppress(OSError):
@@ -115,9 +121,10 @@ class Sandbox:
             try:
                 reply = worker.receive()
             except RunFailed as error:
-                raise RunFailed("; ".join(filter(None, [error.reason, last_lines(output, 1)]))) from None
+                reasons = filter(None, [error.reason, last_lines(output, 1)])
+                raise RunFailed(TransientReason("; ".join(reasons))) from None
             if os.fstat(output.fileno()).st_size > self._max_output:
-                raise RunFailed(f"stopped because it printed more than {self._max_output} bytes")
+                raise RunFailed(TransientReason(f"stopped because it printed more than {self._max_output} bytes"))
             if reply is not None:
                 return reply
-        raise RunFailed(f"stopped at the time limit of {limit:g} s")
+        return None

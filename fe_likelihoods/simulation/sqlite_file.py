@@ -41,6 +41,9 @@ LAYOUT = (
     "response BLOB NOT NULL)",
     "CREATE INDEX simulation_sources ON simulations (source)",  # to find the last simulation of a model, or all of them
     "CREATE INDEX response_sizes ON responses (size)",  # for their sum without reading the responses
+    # simulations that failed, for any measurements; a time limit of 0 is an answer of the model
+    "CREATE TABLE failures (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "reason BLOB NOT NULL, time_limit REAL NOT NULL, stops INTEGER NOT NULL, crc INTEGER NOT NULL)",
 )
 CHECK_SECONDS = 2.0  # limit of the integrity check on opening; rows have checksums of their own
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"

@@ -328,8 +328,9 @@ def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     assert list(reasons) == list(BAD)
     assert reasons[1.0] == "no convergence at step 3"
     assert reasons[2.0] == "ZeroDivisionError: float division by zero"
-    assert reasons[3.0] == "the misfit of channel 'b' is not finite"
-    assert reasons[4.0] == reasons[8.0] == "the misfit of channel 'a' is not finite"
+    assert reasons[3.0] == "the response of channel 'b' is not finite"
+    assert reasons[4.0] == "the response of channel 'a' is not finite"
+    assert reasons[8.0] == "the misfit of channel 'a' is not finite"
     assert "shape (2, 7), expected (n_channels, n_steps) = (2, 8)" in reasons[5.0]
     assert "shape" in reasons[6.0]
     assert reasons[9.0] == "no reason given"

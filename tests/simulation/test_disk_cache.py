@@ -128,14 +128,14 @@ def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
     assert (likelihood.simulations, likelihood.disk_hits) == (300, 600)
 
 
-def test_a_batch_needs_two_queries_and_one_write(path, thetas):
+def test_a_batch_needs_three_queries_and_one_write(path, thetas):
     likelihood = likelihood_of(Batched(), path)
     statements = []
     likelihood.cache.file.connection().set_trace_callback(statements.append)
     likelihood.chunk_size = 1000
     likelihood.misfit(thetas)
     kinds = [statement.split()[0] for statement in statements]
-    assert kinds.count("SELECT") == 2  # of statistics, and of responses where these are missing
+    assert kinds.count("SELECT") == 3  # of statistics, and of responses and failures where these are missing
     assert kinds.count("BEGIN") == kinds.count("COMMIT") == 1
     assert kinds.count("INSERT") == 300
     statements.clear()
@@ -318,7 +318,7 @@ def test_forget_deletes_the_simulations_of_one_model(path, thetas):
     forgotten.misfit(thetas)
     stored = forgotten.cache.info()
     assert forgotten.cache.latest(forgotten.simulation_key, 2, 8).theta.tolist() == thetas[-1].tolist()
-    assert forgotten.cache.forget(*forgotten.cache_keys) == stored.simulations - 1 + stored.responses
+    assert forgotten.cache.forget(*forgotten.cache_keys) == stored.simulations - 1 + stored.responses + stored.failures
     assert (forgotten.cache.info().simulations, forgotten.cache.info().responses) == (1, 0)
     assert forgotten.cache.latest(forgotten.simulation_key, 2, 8) is None
     again = oscillator(path)

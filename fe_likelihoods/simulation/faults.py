@@ -1,0 +1,90 @@
+"""Reasons of failed simulations, and which of them are answers of the model.
+
+A failed simulation has a reason in words. A plain `str` is an answer of the model: the exception that it raised, a
+response with NaN, a wrong shape, the exit code of a program. It depends on the parameters alone and is stored in a
+cache on disk.
+
+A `TransientReason` is a fault of the infrastructure: a process that was killed or crashed, a limit of time, memory or
+output, a full disk, a missing folder or library. The log-likelihood is -inf in this run, but the next run simulates the
+point again. A `MisfitReason` depends on the measurements, so that it says nothing about other measurements.
+"""
+
+import subprocess
+from concurrent.futures import BrokenExecutor
+
+__all__ = ["FailedRun", "MisfitReason", "TransientReason", "is_transient", "reason_of"]
+
+_FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
+
+
+class FailedRun(RuntimeError):
+    """Base of exceptions that say in words why a run failed.
+
+    Attributes
+    ----------
+    reason : str
+        Why it failed; a `TransientReason` or `MisfitReason` keeps its kind.
+    """
+
+    reason: str
+
+
+class TransientReason(str):
+    """Reason of a failure whose cause is not the model.
+
+    Parameters
+    ----------
+    text : str
+        The reason.
+    time_limit : float
+        The limit that stopped the simulation [s]; 0 where no time limit was the cause.
+
+    Attributes
+    ----------
+    time_limit : float
+        As given.
+    """
+
+    time_limit: float
+
+    def __new__(cls, text: str, time_limit: float = 0.0) -> "TransientReason":
+        reason = super().__new__(cls, text)
+        reason.time_limit = float(time_limit)
+        return reason
+
+    def __getnewargs__(self) -> tuple[str, float]:
+        return str(self), self.time_limit
+
+    def with_text(self, text: str) -> "TransientReason":
+        """The same kind of reason in other words."""
+        return TransientReason(text, self.time_limit)
+
+
+class MisfitReason(str):
+    """Reason of a failure that depends on the measurements: the response is usable, its statistics are not."""
+
+
+def is_transient(error: BaseException) -> bool:
+    """Whether an exception is a fault of the infrastructure, such as a full disk, and not an answer of the model."""
+    if isinstance(error, subprocess.CalledProcessError):
+        return error.returncode < 0  # killed by a signal
+    return isinstance(error, _FAULTS)
+
+
+def reason_of(error: Exception) -> str:
+    """Reason of the failure of a simulation that raised an exception.
+
+    Parameters
+    ----------
+    error : Exception
+        The reason of a `FailedRun` is kept, together with its kind.
+
+    Returns
+    -------
+    str
+        A `TransientReason` for faults of the infrastructure.
+    """
+    if isinstance(error, FailedRun):
+        return error.reason
+    text = f"{type(error).__name__}: {error}"
+    return TransientReason(text) if is_transient(error) else text

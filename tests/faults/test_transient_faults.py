@@ -1,0 +1,305 @@
+"""Faults of the infrastructure and time limits: -inf in this run with a reason, and simulated again in a later one."""
+
+import errno
+import logging
+import pickle
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import namedtuple
+from concurrent.futures.process import BrokenProcessPool
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache, SimulationFailed
+from fe_likelihoods.simulation.faults import TransientReason
+from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
+from tests.faults import treacherous as bad
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
+
+NAMES = ("offset", "slope")
+THETAS = np.array([[0.2, 0.1], [0.4, 0.1], [0.6, 0.1]])
+
+
+class Faulty(Treacherous):
+    """Counts its runs; fails at the second of `THETAS` with an exception, if it is given one."""
+
+    fingerprint = "faulty"
+
+    def __init__(self, error=None, time_limit=None):
+        self.error, self.time_limit, self.runs = error, time_limit, 0
+
+    def simulate(self, theta):
+        self.runs += 1
+        if self.error is not None and theta[0] == 0.4:
+            raise self.error
+        return line(theta)
+
+
+class FaultyBatch(Faulty):
+    """The same with a batch method of its own."""
+
+    fingerprint = "faulty batch"
+
+    def simulate_batch(self, thetas):
+        return np.array([self.simulate(theta) for theta in thetas]), [""] * len(thetas)
+
+
+def likelihood_of(model, cache=None, data=0.0, **options):
+    return FELikelihood(model, Measurements(CHANNELS, DT, np.full((1, N_STEPS), data)), cache=cache, **options)
+
+
+FAULTS = {
+    "no space": OSError(errno.ENOSPC, "No space left on device"),
+    "no folder": FileNotFoundError(errno.ENOENT, "No such file or directory", "/scratch/run"),
+    "no memory": MemoryError("Unable to allocate 8 GiB"),
+    "connection": ConnectionResetError("the licence server closed the connection"),
+    "no library": ModuleNotFoundError("No module named 'solver'"),
+    "own pool": BrokenProcessPool("a child process terminated abruptly"),
+    "own time limit": subprocess.TimeoutExpired("solver", 5.0),
+    "own program killed": subprocess.CalledProcessError(-9, "solver"),
+    "declared": SimulationFailed(TransientReason("no licence was free")),
+}
+ANSWERS = {
+    "exception": ZeroDivisionError("float division by zero"),
+    "refused": SimulationFailed("no convergence at step 3"),
+    "exit code": subprocess.CalledProcessError(2, "solver"),
+}
+
+
+@pytest.mark.parametrize("kind", [Faulty, FaultyBatch])
+@pytest.mark.parametrize("name", FAULTS | ANSWERS)
+def test_a_fault_is_simulated_again_in_a_later_run_and_an_answer_is_not(name, kind, tmp_path):
+    error, transient = (FAULTS | ANSWERS)[name], name in FAULTS
+    first = likelihood_of(kind(error), tmp_path / "cache.sqlite")
+    for _ in range(2):  # the run itself does not repeat it
+        assert np.isnan(first.misfit(THETAS)).any(axis=1).tolist() == [False, True, False]
+    assert (first.simulations, first.failure_count, first.transient_failure_count) == (3, 1, int(transient))
+    (failure,) = first.failures
+    assert failure["parameters"] == {"offset": 0.4, "slope": 0.1}
+    assert str(error) in failure["reason"]
+    assert failure.get("transient", False) == transient
+    assert first.cache.info().simulations == 3 - transient
+
+    later = likelihood_of(kind(None if transient else error), tmp_path / "cache.sqlite")
+    values = later.misfit(THETAS)
+    assert np.isfinite(values).all() == transient
+    assert later.simulations == int(transient)
+    assert later.failure_count == int(not transient)
+    again = likelihood_of(kind(), tmp_path / "cache.sqlite")
+    np.testing.assert_array_equal(again.misfit(THETAS), values)
+    assert again.simulations == 0
+
+
+@pytest.mark.parametrize("responses", [False, True])
+def test_a_failure_of_the_model_is_not_repeated_for_other_measurements(responses, tmp_path):
+    cache = SimulationCache(tmp_path / "cache.sqlite", responses=responses)
+    likelihood_of(Faulty(ANSWERS["refused"]), cache).misfit(THETAS)
+    other = likelihood_of(Faulty(ANSWERS["refused"]), cache, data=1.0)
+    assert np.isnan(other.misfit(THETAS)[1]).all()
+    assert other.model.runs == other.simulations == (0 if responses else 2)
+    assert other.failures == [{"parameters": {"offset": 0.4, "slope": 0.1}, "reason": "no convergence at step 3"}]
+    retried = likelihood_of(Faulty(), SimulationCache(cache.path, retry_failures=True), data=2.0)
+    assert np.isfinite(retried.misfit(THETAS)).all()
+
+
+def _undefined(residuals):
+    if residuals.max() < -10.0:
+        raise ZeroDivisionError("the statistic is not defined")
+    return np.square(residuals).sum(axis=-1)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_path):
+    """The misfit overflows with the first data; it does not with the others."""
+    cache = SimulationCache(tmp_path / "cache.sqlite")
+    first = likelihood_of(Faulty(), cache, data=1e200)
+    assert np.isnan(first.misfit(THETAS)).all()
+    assert first.failure_reasons == {"the misfit of channel 'a' is not finite": 3}
+    other = likelihood_of(Faulty(), cache)
+    assert np.isfinite(other.misfit(THETAS)).all()
+    far = misfit_batch(Faulty(), THETAS, np.full((1, N_STEPS), 100.0), statistic=_undefined)
+    cache.store_failures(Faulty(), THETAS, far.reasons)
+    assert far.reasons == ["ZeroDivisionError: the statistic is not defined"] * 3
+    assert cache.look_up_failures(Faulty(), THETAS) == [""] * 3
+
+
+# time limits ---------------------------------------------------------------------------------------------------------
+
+
+def stopped(limit):
+    return Faulty(SimulationFailed(TransientReason(f"stopped at the time limit of {limit:g} s", limit)), limit)
+
+
+def test_a_simulation_stopped_at_a_time_limit(tmp_path):
+    """A longer limit simulates again; the same or a shorter one does so once."""
+    path = tmp_path / "cache.sqlite"
+
+    def runs(model):
+        likelihood = likelihood_of(model, path)
+        failed = bool(np.isnan(likelihood.misfit(THETAS[1:2])).all())
+        assert likelihood.failure_count == likelihood.transient_failure_count == failed
+        return likelihood.simulations, failed
+
+    assert runs(stopped(5.0)) == (1, True)
+    assert runs(stopped(5.0)) == (1, True)  # a busy machine may have been the cause
+    assert runs(stopped(5.0)) == runs(stopped(2.0)) == (0, True)
+    assert runs(stopped(50.0)) == (1, True)
+    assert runs(stopped(5.0)) == (1, True)
+    assert runs(Faulty(time_limit=None)) == (1, False)
+    assert runs(stopped(5.0)) == (0, False)
+
+
+def test_a_damaged_or_evicted_time_limit_is_simulated_again(tmp_path):
+    path = tmp_path / "cache.sqlite"
+    for _ in range(2):
+        likelihood_of(stopped(5.0), path).misfit(THETAS)
+    cache = SimulationCache(path)
+    assert cache.look_up_failures(stopped(5.0), THETAS)[1] == "stopped at the time limit of 5 s"
+    cache.file.connection().execute("UPDATE failures SET time_limit = 500.0")
+    assert cache.look_up_failures(stopped(5.0), THETAS) == [""] * 3
+    assert cache.damaged == 1
+    small = SimulationCache(path, max_rows=2)
+    small.store_failures(Faulty(), THETAS, ["a", "b", "c"])
+    assert small.look_up_failures(Faulty(), THETAS) == ["", "b", "c"]
+    small.clear()
+    assert small.look_up_failures(Faulty(), THETAS) == [""] * 3
+
+
+def sleeps(theta):
+    time.sleep(theta[1])
+    return line(theta)
+
+
+def test_a_function_that_is_stopped_is_run_again_with_a_longer_limit(tmp_path):
+    x = np.array([[0.3, 0.1]])
+    short = likelihood_of(FunctionModel(sleeps, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.005), tmp_path / "c.sqlite")
+    assert np.isnan(short.misfit(x)).all()
+    assert short.failure_reasons == {"stopped at the time limit of 0.005 s": 1}
+    longer = likelihood_of(FunctionModel(sleeps, NAMES, CHANNELS, DT, N_STEPS, time_limit=60.0), short.cache)
+    assert np.isfinite(longer.misfit(x)).all()
+
+
+# real faults ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pool", [None, 1], ids=["isolated", "pool"])
+@pytest.mark.parametrize("what", ["CRASHES", "LEAVES"])
+def test_a_worker_that_dies_is_not_an_answer(what, pool, tmp_path):
+    model = (
+        FunctionModel(bad.treacherous, NAMES, CHANNELS, DT, N_STEPS, isolated=True) if pool is None else Treacherous()
+    )
+    x = np.array([[getattr(bad, what) + 0.5, 0.1], [0.3, 0.1]])
+    first = likelihood_of(model, tmp_path / "cache.sqlite", pool=pool)
+    for n in (1, 2):
+        likelihood = first if n == 1 else likelihood_of(model, tmp_path / "cache.sqlite", pool=first.pool)
+        assert np.isnan(likelihood.misfit(x)).all(axis=1).tolist() == [True, False]
+        assert likelihood.simulations == 3 - n
+        assert likelihood.transient_failure_count == 1
+        assert likelihood.failures[0]["parameters"]["offset"] == x[0, 0]
+    if pool is not None:
+        first.pool.close()
+
+
+SOLVER = "import sys; offset, slope = map(float, open('in.txt').read().split()); {do}; " + (
+    f"open('out.txt', 'w').write(''.join(f'{{{{offset + slope * {DT} * k!r}}}}\\n' for k in range({N_STEPS})))"
+)
+
+
+def program(do="pass", **options):
+    return ExecutableModel(
+        [sys.executable, "-S", "-c", SOLVER.format(do=do)],
+        {"in.txt": "$offset $slope"},
+        "out.txt",
+        NAMES,
+        CHANNELS,
+        DT,
+        N_STEPS,
+        **{"time_limit": 20.0, "version": "1", "hash_executable": False} | options,
+    )
+
+
+def reason_of_run(model):
+    (reason,) = simulate_batch(model, THETAS[:1]).reasons
+    return reason
+
+
+def test_a_program_without_its_temporary_folder(tmp_path, monkeypatch):
+    likelihood = likelihood_of(program(), tmp_path / "cache.sqlite")
+    with monkeypatch.context() as patched:
+        patched.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+        assert np.isnan(likelihood.misfit(THETAS[:1])).all()
+    assert "No such file or directory" in likelihood.failures[0]["reason"]
+    assert np.isfinite(likelihood_of(program(), tmp_path / "cache.sqlite").misfit(THETAS[:1])).all()
+
+
+def test_a_program_on_a_full_disk(monkeypatch):
+    """It ends with exit code 0 and an incomplete output file."""
+    model = program("sys.exit()")
+    assert not isinstance(reason_of_run(model), TransientReason)
+    usage = namedtuple("usage", "total used free")(100, 100, 0)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    reason = reason_of_run(model)
+    assert isinstance(reason, TransientReason)
+    assert reason.startswith("the program succeeded but wrote no file out.txt (the disk of the temporary folder")
+
+
+@pytest.mark.parametrize(
+    ("do", "transient"),
+    [("sys.exit('no convergence')", False), ("sys.exit(137)", True), ("import os; os.kill(os.getpid(), 9)", True)],
+)
+def test_exit_codes_of_programs(do, transient):
+    assert isinstance(reason_of_run(program(do)), TransientReason) == transient
+
+
+def test_a_program_that_is_stopped_keeps_its_limit():
+    reason = reason_of_run(program("import time; time.sleep(60)", time_limit=0.1))
+    assert (reason.time_limit, reason[:33]) == (0.1, "stopped at the time limit of 0.1 s"[:33])
+
+
+def test_reasons_keep_their_kind_in_pickles():
+    reason = TransientReason("stopped", 3.0)
+    for copy in (pickle.loads(pickle.dumps(reason)), pickle.loads(pickle.dumps(SimulationFailed(reason))).reason):
+        assert (copy, type(copy), copy.time_limit) == ("stopped", TransientReason, 3.0)
+
+
+def test_the_first_fault_is_logged(caplog):
+    likelihood = likelihood_of(Faulty(FAULTS["no space"]))
+    with caplog.at_level(logging.WARNING):
+        likelihood.misfit(THETAS)
+    assert "is -inf in this run, and a later run simulates the point again" in caplog.text
+
+
+# complex responses ---------------------------------------------------------------------------------------------------
+
+
+def complex_line(theta):
+    return line(theta) + (1e-20j if theta[0] == 0.4 else 0.0)
+
+
+class ComplexModel(Treacherous):
+    fingerprint = "complex"
+
+    def simulate(self, theta):
+        return complex_line(theta)
+
+
+class ComplexBatch(ComplexModel):
+    def simulate_batch(self, thetas):
+        return np.array([self.simulate(theta) for theta in thetas]), [""] * len(thetas)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "model",
+    [ComplexModel(), ComplexBatch(), FunctionModel(complex_line, NAMES, CHANNELS, DT, N_STEPS)],
+    ids=["model", "batch", "function"],
+)
+def test_a_complex_response_is_refused(model):
+    for batch in (simulate_batch(model, THETAS), misfit_batch(model, THETAS, line(THETAS[0]))):
+        assert [bool(reason) for reason in batch.reasons] == [False, True, False]
+        assert batch.reasons[1].startswith("the response of channel 'a' is complex, expected real numbers")
+        assert not isinstance(batch.reasons[1], TransientReason)
