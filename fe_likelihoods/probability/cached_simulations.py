@@ -10,7 +10,7 @@ import hashlib
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ from ..simulation.model import (
     misfit_of_responses,
     simulate_batch,
 )
+from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .inputs import as_points, match_measurements
 
@@ -112,6 +113,7 @@ class CachedSimulations:
         self.memory_cache = MemoryCache(memory_rows)
         self.response_memory = ResponseMemory(memory_bytes)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
+        self._verified_cache = None if self.cache is None else VerifiedCache(self.cache)
         self._model_fingerprint = None if cache is None else model.fingerprint
         self._key = None if cache is None else self.simulation_key
         self.chunk_size = 1
@@ -123,6 +125,11 @@ class CachedSimulations:
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"pool": None}
+
+    @property
+    def verifications(self) -> int:
+        """Number of simulations that were run to verify rows of the cache on disk, in addition to `simulations`."""
+        return 0 if self._verified_cache is None else self._verified_cache.runs
 
     @property
     def failure_count(self) -> int:
@@ -348,13 +355,26 @@ class CachedSimulations:
         new = np.flatnonzero(~requested.known)
         if self.cache is None or not len(new):
             return
-        stored = self.cache.look_up(self._key, requested.thetas[new], self._width, self.measurements.n_steps)
+        stored = self._verified(self._verified_cache.look_up, self._key, requested.thetas[new])
         rows = new[stored.known]
         requested.misfit[rows] = stored.misfit[stored.known]
         requested.known[rows] = requested.on_disk[rows] = True
         for row, reason in zip(new, stored.reasons, strict=True):
             requested.reasons[row] = reason
         self._add_outcomes(requested, rows)
+
+    def _verified(self, look_up: Callable, *arguments: Any) -> Any:
+        """Rows from the disk, of which some are simulated again; if these differ, the caches in memory are emptied."""
+        run = VerifyingRun(self.model, self.pool, self.measurements.values, self._statistic, self._width)
+        earlier = self._verified_cache.seconds
+        try:
+            return look_up(*arguments, run)
+        except StaleCache:
+            self.memory_cache.clear()
+            self.response_memory.clear()
+            raise
+        finally:
+            self.seconds += self._verified_cache.seconds - earlier
 
     def _read_responses(self, requested: _Requested, rows: np.ndarray) -> None:
         """Fill in rows whose responses are cached, and their statistics where these are not known."""
@@ -364,7 +384,7 @@ class CachedSimulations:
             outcomes = self.response_memory.look_up(self.model.fingerprint, keys)
         left = [place for place, outcome in enumerate(outcomes) if outcome is None]
         if self.cache is not None and left:
-            stored = self.cache.look_up_responses(self.model, requested.thetas[rows[left]])
+            stored = self._verified(self._verified_cache.look_up_responses, requested.thetas[rows[left]])
             found = [(place, response) for place, response in zip(left, stored, strict=True) if response is not None]
             for place, response in found:
                 outcomes[place] = response

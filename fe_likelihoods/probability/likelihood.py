@@ -64,12 +64,15 @@ class FELikelihood(CachedSimulations):
         Indices of the parameters whose change needs no simulation: those of the noise.
     simulations : int
         Simulations run by this object in this process.
+    verifications : int
+        Simulations run in addition, to verify rows of the cache on disk (see
+        `fe_likelihoods.simulation.verification`).
     cache_hits : int
         Rows whose statistics were cached, in memory or on disk.
     disk_hits : int
         Rows among them that came from the cache on disk.
     seconds : float
-        Wall time of the simulations [s].
+        Wall time of the simulations [s], those for verification included.
     memory_cache : MemoryCache
         The statistics that are cached in memory.
     response_memory : ResponseMemory

@@ -301,7 +301,8 @@ class Posterior:
         Returns
         -------
         dict
-            ``simulations``, ``cache_hits`` (rows whose statistics were cached), ``disk_hits`` (rows among them that
+            ``simulations``, ``verifications`` (further simulations, which verified rows of the cache on disk),
+            ``cache_hits`` (rows whose statistics were cached), ``disk_hits`` (rows among them that
             came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where
             known and ``"transient"`` where the cause is not the model; the first 1000), ``failure_count``,
             ``transient_failures`` (those of them that a later run simulates again, see `FailureLog`),
@@ -309,6 +310,7 @@ class Posterior:
         """
         return {
             "simulations": self.likelihood.simulations,
+            "verifications": self.likelihood.verifications,
             "cache_hits": self.likelihood.cache_hits,
             "disk_hits": self.likelihood.disk_hits,
             "failures": list(self.likelihood.failures),

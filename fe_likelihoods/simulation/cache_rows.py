@@ -111,8 +111,9 @@ class CacheInfo(NamedTuple):
         Wall time of the stored simulations [s].
     file_bytes : int
         Size of the file without its write-ahead log [bytes].
-    hits, misses, evictions, damaged : int
-        Rows found, not found, evicted and found damaged by this object in this process.
+    hits, misses, evictions, damaged, verified : int
+        Rows found, not found, evicted, found damaged, and simulated again without a difference, by this object in this
+        process.
     """
 
     path: Path
@@ -126,6 +127,7 @@ class CacheInfo(NamedTuple):
     misses: int
     evictions: int
     damaged: int
+    verified: int
 
 
 def simulation_keys(fingerprint: str, thetas: np.ndarray) -> list[bytes]:

@@ -85,6 +85,12 @@ class SimulationCache(FailureTable):
         message at level INFO at the first one.
     timeout : float
         How long to wait for another writer [s].
+    verify : bool
+        Whether likelihoods simulate some of the stored rows again before they use the others (see
+        `fe_likelihoods.simulation.verification`): two rows per process, and one of every 1000.
+    tolerance : float, optional
+        Accepted difference of a response that is simulated again, relative to the norm of the response. By default 0
+        for the compiled models of this library and 1e-9 for other models, or their attribute ``response_tolerance``.
 
     Attributes
     ----------
@@ -94,6 +100,8 @@ class SimulationCache(FailureTable):
         Rows evicted by this object.
     damaged : int
         Rows that were damaged and deleted.
+    verified : int
+        Rows that were simulated again by likelihoods in this process and did not differ.
     file : CacheFile
         The SQLite file and its connection.
     retry_times : dict of str to float
@@ -102,9 +110,9 @@ class SimulationCache(FailureTable):
     Raises
     ------
     ValueError
-        If a bound is not positive, or if the path is a folder or in no existing folder, or if the file cannot be read
-        or created, is not a cache, belongs to another program, or has the layout of another release. Such a file is
-        not changed.
+        If a bound is not positive, if the tolerance is negative, if the path is a folder or in no existing folder, or
+        if the file cannot be read or created, is not a cache, belongs to another program, or has the layout of another
+        release. Such a file is not changed.
 
     Examples
     --------
@@ -121,25 +129,33 @@ class SimulationCache(FailureTable):
         responses: bool = False,
         max_response_bytes: int = 2**30,
         timeout: float = 30.0,
+        verify: bool = True,
+        tolerance: float | None = None,
     ) -> None:
         if not isinstance(path, str | os.PathLike):
             raise ValueError(f"SimulationCache: expected the path of a file; got {path!r}")
         for name, value in (("max_rows", max_rows), ("max_response_bytes", max_response_bytes)):
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"SimulationCache: {name} must be a whole number of 1 or more; got {value!r}")
-        self._set_up(path, int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes), timeout)
+        if tolerance is not None and not 0.0 <= tolerance < np.inf:
+            raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more, or None; got {tolerance!r}")
+        bounds = int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes)
+        self._set_up(path, *bounds, timeout, bool(verify), tolerance)
         self.file.check()
         if not self.file.writable:
             self._warn_read_only()
 
-    def _set_up(self, path, max_rows, retry_failures, responses, max_response_bytes, timeout) -> None:
+    def _set_up(
+        self, path, max_rows, retry_failures, responses, max_response_bytes, timeout, verify, tolerance
+    ) -> None:
         """Set all attributes without opening the file."""
         super().__init__(CacheFile(path, timeout))
         self.max_rows = max_rows
         self.retry_failures = retry_failures
         self.responses = responses
         self.max_response_bytes = max_response_bytes
-        self.hits = self.misses = self.evictions = self.damaged = 0
+        self.verify, self.tolerance = verify, tolerance
+        self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
         self._waiting: list[tuple] = []
         self._warned_read_only = self._said_evicted = False
 
@@ -151,6 +167,8 @@ class SimulationCache(FailureTable):
             self.responses,
             self.max_response_bytes,
             self.file.timeout,
+            self.verify,
+            self.tolerance,
         )
 
     def __setstate__(self, state: tuple) -> None:
@@ -349,7 +367,8 @@ class SimulationCache(FailureTable):
         with self.file.lock:
             counted = self._try("read", ask, (0, 0, 0, 0, 0.0))
             size = self.path.stat().st_size if self.path.exists() else 0
-            return CacheInfo(self.path, *counted, size, self.hits, self.misses, self.evictions, self.damaged)
+            counts = self.hits, self.misses, self.evictions, self.damaged, self.verified
+            return CacheInfo(self.path, *counted, size, *counts)
 
     def clear(self) -> None:
         """Delete all rows, for all users of the file; the caches in memory of likelihoods are not affected.

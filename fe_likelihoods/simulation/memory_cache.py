@@ -91,6 +91,11 @@ class MemoryCache:
         misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), width)
         return misfits, [misfit is not None for misfit in found]
 
+    def clear(self) -> None:
+        """Drop all rows."""
+        with self._lock:
+            self._misfits.clear()
+
     def store(self, keys: Sequence[bytes], misfits: np.ndarray) -> None:
         """Cache the statistics (n, width) of n distinct keys."""
         with self._lock:
@@ -171,6 +176,12 @@ class ResponseMemory:
                             self.max_bytes,
                         )
                     self.dropped += 1
+
+    def clear(self) -> None:
+        """Drop all responses."""
+        with self._lock:
+            self._outcomes.clear()
+            self._bytes = 0
 
     def _remove(self, key: tuple[str, bytes]) -> None:
         outcome = self._outcomes.pop(key, None)

@@ -194,10 +194,11 @@ def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
 
     sampler, posterior = cached_run.make(path)
     sampler.run_mcmc(None, cached_run.STEPS)
-    assert posterior.likelihood.model.runs == posterior.report()["simulations"] == distinct - stored
+    report = posterior.report()
+    assert report["simulations"] == posterior.likelihood.model.runs - report["verifications"] == distinct - stored
     again, replayed = cached_run.make(path)
     again.run_mcmc(None, cached_run.STEPS)
-    assert replayed.likelihood.model.runs == 0
+    assert replayed.likelihood.model.runs == replayed.likelihood.verifications < 5
     for other in (sampler, again):
         np.testing.assert_array_equal(other.get_chain(), whole.get_chain())
         np.testing.assert_array_equal(other.get_log_prob(), whole.get_log_prob())

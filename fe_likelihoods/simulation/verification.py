@@ -1,0 +1,366 @@
+"""Verification of a cache: stored simulations are run again and compared before they are trusted.
+
+The key of a stored simulation contains a digest of the model, but no digest contains everything that a model depends
+on. Therefore rows of a file are compared with new simulations: two before the first row is used in a process (the one
+that was stored last, and one at random of those that are requested), and one more for every 1000 rows used. The first
+comparison is repeated after a change of the model object, of its pool, or of a source file.
+
+A difference is an error, because either the stored rows or the new simulations belong to another model.
+"""
+
+import logging
+import os
+import random
+import sys
+import threading
+import time
+import uuid
+from collections import Counter, OrderedDict
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .cache_rows import CachedRows, StoredSimulation
+from .disk_cache import SimulationCache
+from .model import Model, SimulationBatch, Statistic, misfit_batch, misfit_of_responses
+from .source_digest import inherits_fingerprint
+
+__all__ = ["StaleCache", "VerifiedCache", "VerifyingRun", "largest_difference", "response_tolerance"]
+
+logger = logging.getLogger(__name__)
+
+FIRST_ROWS = 2  # verified before the first row is used
+ROWS_PER_VERIFICATION = 1000
+DEFAULT_TOLERANCE = 1e-9
+MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
+STAMP_SECONDS = 1.0  # between two looks at the source files
+MAX_SCHEDULES = 32
+MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used without verification
+
+_schedules: "OrderedDict[str, _Schedule]" = OrderedDict()  # of pickled objects: copies in a process share one
+
+
+class StaleCache(ValueError):
+    """A stored simulation differs from a new one with the same parameters. The message says what to do."""
+
+
+class VerifyingRun(NamedTuple):
+    """What a simulation for verification needs.
+
+    Attributes
+    ----------
+    model : Model
+    pool : executor or None
+        Where the simulations of the likelihood run.
+    measured : (n_channels, n_steps) float
+        Measured response [SI].
+    statistic : Statistic or None
+        Statistic of the residuals that is stored; None for the sums of squares.
+    n_numbers : int
+        Length of the statistic.
+    """
+
+    model: Model
+    pool: Any
+    measured: np.ndarray
+    statistic: Statistic | None
+    n_numbers: int
+
+
+def response_tolerance(model: Model) -> float:
+    """Relative difference of responses with the same parameters that a model may have.
+
+    It is the attribute ``response_tolerance`` of the model: zero for the compiled models of this library, whose
+    responses are the same to the last bit. For models without the attribute, and for subclasses of the user, it is
+    1e-9, because sums of several threads may differ in their last digits.
+    """
+    if inherits_fingerprint(type(model)):
+        return DEFAULT_TOLERANCE
+    return float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
+
+
+def largest_difference(
+    stored: np.ndarray, new: np.ndarray, measured: np.ndarray, tolerance: float
+) -> tuple[int, float] | None:
+    """The statistic that differs most between two simulations with the same parameters, if one differs too much.
+
+    Parameters
+    ----------
+    stored, new : (n_numbers,) float
+        Statistics of the residuals, the sums of squares (n_channels,) first; further numbers have the order and the
+        scale of the sums.
+    measured : (n_channels, n_steps) float
+        Measured response [SI].
+    tolerance : float
+        Accepted change of the response in a channel, relative to the norm of the response.
+
+    Returns
+    -------
+    int, float
+        Index of the number, and the change of the response that explains its difference, relative as for `tolerance`;
+        None if all numbers agree.
+
+    Notes
+    -----
+    The norm of a response is at most r, the sum of the norms of its residual and of the measured response. If the
+    response changes by t r, the sum of squares s^2 changes by at most 2 s t r + (t r)^2, and so does a sum of products
+    of two residuals of the channel.
+    """
+    if np.array_equal(stored, new):
+        return None
+    channels = np.arange(len(stored)) % len(measured)
+    sums = np.sort([stored[: len(measured)], new[: len(measured)]], axis=0)
+    s = np.sqrt(sums[0])[channels]
+    r = (np.sqrt(sums[1]) + np.linalg.norm(measured, axis=1))[channels]
+    difference = np.abs(stored - new)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the positive root of (t r)^2 + 2 s (t r) = difference, in the form that does not cancel
+        change = np.where(difference > 0.0, difference / (s + np.sqrt(s**2 + difference)) / r, 0.0)
+    worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
+    return (worst, float(change[worst])) if not change[worst] <= tolerance else None
+
+
+class _Schedule:
+    """How many rows have been used since the last full verification, per table; shared by the copies in a process.
+
+    Parameters
+    ----------
+    token : str
+        Identifies the schedule in other processes, where it starts anew.
+    """
+
+    def __init__(self, token: str) -> None:
+        self.token = token
+        self.served: Counter[str] = Counter()
+        self.failed_attempts = 0
+        self._lock, self._owner = threading.RLock(), os.getpid()
+
+    def __reduce__(self) -> tuple:
+        return _schedule, (_schedule(self.token, self).token,)
+
+    @property
+    def lock(self) -> threading.RLock:
+        """A lock that no thread of a parent process held at the time of the fork."""
+        if self._owner != os.getpid():
+            self._lock, self._owner = threading.RLock(), os.getpid()
+        return self._lock
+
+
+def _schedule(token: str, new: _Schedule | None = None) -> _Schedule:
+    """The schedule of this process with a token."""
+    if token not in _schedules:
+        _schedules[token] = new or _Schedule(token)
+        while len(_schedules) > MAX_SCHEDULES:
+            _schedules.popitem(last=False)
+    return _schedules[token]
+
+
+class VerifiedCache:
+    """A `SimulationCache` whose rows are verified before they are used.
+
+    Copies in another process verify rows of their own, once for all copies of that process.
+
+    Parameters
+    ----------
+    cache : SimulationCache
+        Its settings `verify` and `tolerance` apply.
+
+    Attributes
+    ----------
+    runs : int
+        Simulations that were run for verification.
+    seconds : float
+        Their wall time [s].
+    """
+
+    def __init__(self, cache: SimulationCache) -> None:
+        self._set_up(cache, _Schedule(uuid.uuid4().hex))
+
+    def _set_up(self, cache: SimulationCache, schedule: _Schedule) -> None:
+        self.cache, self._schedule = cache, schedule
+        self.runs, self.seconds = 0, 0.0
+        self._objects: tuple | None = None  # of the last look-up; None if there was none, or in another process
+        self._stamps: tuple = ()
+        self._stamp_time = -np.inf
+        self._random = random.Random()  # its own, so that the user's streams of random numbers do not change
+
+    def __getstate__(self) -> tuple:
+        return self.cache, self._schedule
+
+    def __setstate__(self, state: tuple) -> None:
+        self._set_up(*state)
+
+    def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
+        """Rows of `SimulationCache.look_up`, of which some are verified.
+
+        Parameters
+        ----------
+        fingerprint : str
+            As for `SimulationCache.look_up`.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        run : VerifyingRun
+
+        Raises
+        ------
+        StaleCache
+            If a stored row and a new simulation differ.
+        """
+        n_steps = run.measured.shape[1]
+        rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps)
+        known = np.flatnonzero(rows.known)
+        if self.cache.verify and len(known):
+
+            def candidates(first: bool) -> Iterator[StoredSimulation]:
+                latest = self.cache.latest(fingerprint, run.n_numbers, n_steps) if first else None
+                if latest is not None and not (latest.reason and self.cache.retry_failures):
+                    yield latest
+                for row in self._random.sample(known.tolist(), len(known)):
+                    if latest is None or not np.array_equal(latest.theta, thetas[row]):
+                        yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row])
+
+            self._verify_due("simulations", len(known), candidates, run)
+        return rows
+
+    def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | None]:
+        """Responses of `SimulationCache.look_up_responses`, of which some are verified by their statistics.
+
+        Raises
+        ------
+        StaleCache
+            If the statistics of a stored response and of a new simulation differ.
+        """
+        responses = self.cache.look_up_responses(run.model, thetas)
+        known = [place for place, response in enumerate(responses) if response is not None]
+        if self.cache.verify and known:
+
+            def candidates(first: bool) -> Iterator[StoredSimulation]:
+                for row in self._random.sample(known, len(known)):
+                    batch = SimulationBatch(responses[row][None], [""])
+                    misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
+                    yield StoredSimulation(thetas[row], misfit[0], reason)
+
+            self._verify_due("responses", len(known), candidates, run)
+        return responses
+
+    def _verify_due(self, table: str, n: int, candidates: Any, run: VerifyingRun) -> None:
+        """Verify as many rows as are due now that `n` more are used."""
+        schedule = self._schedule
+        with schedule.lock:
+            self._notice_changes(run)
+            before = schedule.served[table]
+            first = before == 0
+            due = FIRST_ROWS if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
+            if due and not self._verify(candidates(first), due, run):
+                schedule.failed_attempts += 1
+                if schedule.failed_attempts < MAX_FAILED_ATTEMPTS:
+                    return  # verified with the next rows
+            schedule.served[table] = before + n
+
+    def _verify(self, rows: Iterable[StoredSimulation], due: int, run: VerifyingRun) -> bool:
+        """Simulate the first `due` rows again, and further ones in place of those whose simulation is stopped.
+
+        Returns whether a row was compared.
+        """
+        rows, done, reasons = iter(rows), 0, []
+        attempts = max(due, MAX_ATTEMPTS)
+        while done < due and attempts > 0:
+            chosen = [row for row, _ in zip(rows, range(min(due - done, attempts)), strict=False)]
+            if not chosen:
+                break
+            attempts -= len(chosen)
+            thetas = np.array([row.theta for row in chosen])
+            start = time.perf_counter()
+            misfit, new_reasons = misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic)
+            self.seconds += time.perf_counter() - start
+            self.runs += len(chosen)
+            for row, values, reason in zip(chosen, misfit, new_reasons, strict=True):
+                if _is_transient(reason):
+                    reasons.append(reason)
+                else:
+                    self._compare(row, values, reason, run)
+                    done += 1
+        self.cache.verified += done
+        if reasons:
+            logger.warning(
+                "%s: %d of %d stored simulations could not be verified, because the new simulation was stopped (%s)%s",
+                self.cache.path,
+                len(reasons),
+                len(reasons) + done,
+                reasons[0],
+                "" if done else ". Rows are used without verification; the next ones are verified instead",
+            )
+        return bool(done)
+
+    def _compare(self, row: StoredSimulation, new: np.ndarray, reason: str, run: VerifyingRun) -> None:
+        """Raise `StaleCache` if a stored simulation differs from a new one."""
+        if row.reason and reason:
+            return
+        names = [channel.name for channel in run.model.channels]
+        if row.reason or reason:
+            was, now = (f"failed ({text})" if text else "succeeded" for text in (row.reason, reason))
+            difference, advice = f"the stored simulation {was}; simulated again, it {now}", ""
+            if row.reason:
+                advice = ". If failures depend on anything but the parameters, set retry_failures=True"
+        else:
+            tolerance = response_tolerance(run.model) if self.cache.tolerance is None else self.cache.tolerance
+            found = largest_difference(row.misfit, new, run.measured, tolerance)
+            if found is None:
+                return
+            index, change = found
+            what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
+            difference = (
+                f"channel {names[index % len(names)]!r}, {what}: stored {row.misfit[index]:.17g}, simulated again "
+                f"{new[index]:.17g}"
+            )
+            advice = (
+                f". If the model is not exactly repeatable, for example on another machine, accept differences of this "
+                f"size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
+            )
+        served = self._schedule.served.total()
+        self._schedule.served.clear()
+        point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
+        rest = f", and discard this run, which has used {served} rows" if served else ""
+        raise StaleCache(
+            f"{self.cache.path}: a stored simulation is not that of the present {type(run.model).__name__}. At {point}: "
+            f"{difference}. The model has changed in a way that its fingerprint does not contain. Delete its rows with "
+            "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
+            f"{rest}{advice}"
+        )
+
+    def _notice_changes(self, run: VerifyingRun) -> None:
+        """Start again with the first verification if the model object, its pool or a source file has changed."""
+        objects = run.model, run.pool
+        if self._objects is not None and any(a is not b for a, b in zip(objects, self._objects, strict=True)):
+            self._schedule.served.clear()
+        now = time.monotonic()
+        if objects != self._objects or now > self._stamp_time + STAMP_SECONDS:
+            stamps = tuple(_stamp(file) for file in watched_files(run.model))
+            if self._stamps and stamps != self._stamps:
+                self._schedule.served.clear()
+            self._stamps, self._stamp_time = stamps, now
+        self._objects = objects
+
+
+def watched_files(model: Model) -> list[str]:
+    """Files of the source code of a model and of its attributes, and those that it names as ``watched_files``."""
+    things = [model, *getattr(model, "__dict__", {}).values()]
+    modules = {getattr(thing, "__module__", None) or "" for thing in things} | {type(model).__module__}
+    files = {getattr(sys.modules.get(module), "__file__", None) for module in modules if isinstance(module, str)}
+    files |= {str(file) for file in getattr(model, "watched_files", ())}
+    return sorted(file for file in files if file)
+
+
+def _stamp(file: str) -> tuple[int, int] | None:
+    """Size and time of modification of a file; None if it does not exist."""
+    try:
+        status = os.stat(file)
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
+def _is_transient(reason: str) -> bool:
+    """Whether a simulation failed for a reason that says nothing about the model."""
+    return type(reason).__name__ == "TransientReason"
