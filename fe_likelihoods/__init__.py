@@ -184,6 +184,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         Model,
         SimulationFailed,
     )
+    from .simulation.verification import (
+        StaleCache,
+    )
     from .units import (
         from_si,
         to_si,
@@ -238,6 +241,7 @@ __all__ = [
     "ShearFrame",
     "SimulationCache",
     "SimulationFailed",
+    "StaleCache",
     "Steel",
     "SteelCoupon",
     "TooManyFailures",
@@ -408,6 +412,7 @@ _EXPORTS = {
         "Model",
         "SimulationFailed",
     ),
+    "simulation.verification": ("StaleCache",),
     "units": (
         "from_si",
         "to_si",

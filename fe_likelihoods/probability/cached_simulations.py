@@ -11,7 +11,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,51 +32,13 @@ from ..simulation.model import (
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .inputs import as_points, match_measurements
+from .requested_simulations import Requested, Simulated
 
 __all__ = ["CachedSimulations"]
 
 _SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
 _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
 _RESPONSE_VALUES = 2**23  # responses held at once where they are cached: 64 MiB
-
-
-class _Simulated(NamedTuple):
-    """Statistics and reasons of new simulations, and their responses if these were requested."""
-
-    misfit: np.ndarray
-    reasons: list[str]
-    response: np.ndarray | None
-
-
-class _Requested(NamedTuple):
-    """Distinct simulations that were requested, with arrays that are filled in.
-
-    Attributes
-    ----------
-    keys : list of n bytes
-        See `distinct_keys`.
-    thetas : (n, n_structural) float
-        Structural parameters.
-    misfit : (n, n_numbers) float
-        Statistics of the residuals; NaN where they are not known.
-    known : (n,) bool
-        Whether the statistics are known, those of failures included.
-    reasons : list of n str
-        Reasons of failures.
-    response : (n, n_channels, n_steps) float, optional
-        Responses, if they were requested.
-    cached, on_disk : (n,) bool
-        Whether no simulation was needed, and whether the result came from the disk.
-    """
-
-    keys: list[bytes]
-    thetas: np.ndarray
-    misfit: np.ndarray
-    known: np.ndarray
-    reasons: list[str]
-    response: np.ndarray | None
-    cached: np.ndarray
-    on_disk: np.ndarray
 
 
 class CachedSimulations:
@@ -323,15 +285,15 @@ class CachedSimulations:
         misfit: np.ndarray | None = None,
         known: np.ndarray | None = None,
         response: np.ndarray | None = None,
-    ) -> _Requested:
+    ) -> Requested:
         """Arrays to be filled in by `_obtain`."""
         n = len(keys)
         thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(n, self._n_structural).copy()
         if misfit is None:
             misfit, known = np.full((n, self._width), np.nan), np.zeros(n, dtype=bool)
-        return _Requested(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, bool), np.zeros(n, bool))
+        return Requested(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, bool), np.zeros(n, bool))
 
-    def _obtain(self, requested: _Requested) -> None:
+    def _obtain(self, requested: Requested) -> None:
         """Fill in what was requested, from the caches or by simulation."""
         self._read_statistics(requested)
         failed = requested.known & ~np.isfinite(requested.misfit).all(axis=1)
@@ -350,7 +312,7 @@ class CachedSimulations:
             if requested.response is not None:
                 requested.response[rows] = batch.response
 
-    def _read_statistics(self, requested: _Requested) -> None:
+    def _read_statistics(self, requested: Requested) -> None:
         """Fill in statistics from the cache on disk; they are then cached in memory, and failures recorded."""
         new = np.flatnonzero(~requested.known)
         if self.cache is None or not len(new):
@@ -376,7 +338,7 @@ class CachedSimulations:
         finally:
             self.seconds += self._verified_cache.seconds - earlier
 
-    def _read_responses(self, requested: _Requested, rows: np.ndarray) -> None:
+    def _read_responses(self, requested: Requested, rows: np.ndarray) -> None:
         """Fill in rows whose responses are cached, and their statistics where these are not known."""
         outcomes: list[np.ndarray | str | None] = [None] * len(rows)
         keys = [requested.keys[row] for row in rows]
@@ -416,18 +378,18 @@ class CachedSimulations:
                 self.cache.store(self._key, requested.thetas[rows[new]], n_steps, misfit, reasons_of_new, 0.0)
         requested.cached[rows] = True
 
-    def _read_failures(self, requested: _Requested, rows: np.ndarray) -> None:
+    def _read_failures(self, requested: Requested, rows: np.ndarray) -> None:
         """Fill in rows whose simulation is known to fail for any measurements."""
         if self.cache is None or not len(rows):
             return
-        reasons = self.cache.look_up_failures(self.model, requested.thetas[rows])
+        reasons = self._verified(self._verified_cache.look_up_failures, requested.thetas[rows])
         for row, reason in zip(rows, reasons, strict=True):
             requested.reasons[row] = reason
         rows = rows[[bool(reason) for reason in reasons]]
         requested.known[rows] = requested.cached[rows] = requested.on_disk[rows] = True
         self._add_outcomes(requested, rows)
 
-    def _add_outcomes(self, requested: _Requested, rows: np.ndarray) -> None:
+    def _add_outcomes(self, requested: Requested, rows: np.ndarray) -> None:
         """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
         self._outcomes += len(rows)
         for row in rows:
@@ -435,7 +397,7 @@ class CachedSimulations:
                 self._failures.add(requested.thetas[row], requested.reasons[row])
         self.memory_cache.store([requested.keys[row] for row in rows], requested.misfit[rows])
 
-    def _name_failures(self, requested: _Requested, rows: np.ndarray) -> None:
+    def _name_failures(self, requested: Requested, rows: np.ndarray) -> None:
         """Fill in reasons of failures of which only the statistics were cached."""
         rows = [row for row in rows if not requested.reasons[row]]
         if not rows or requested.response is None:
@@ -444,7 +406,7 @@ class CachedSimulations:
         for row, outcome in zip(rows, outcomes, strict=True):
             requested.reasons[row] = outcome if isinstance(outcome, str) else "the simulation failed before"
 
-    def _chunks(self, requested: _Requested, left: np.ndarray) -> Iterator[tuple[np.ndarray, _Simulated]]:
+    def _chunks(self, requested: Requested, left: np.ndarray) -> Iterator[tuple[np.ndarray, Simulated]]:
         """Simulate the rows `left` in chunks that are stored one by one; yields their indices and results."""
         responses = requested.response is not None
         smallest, largest = self._chunk_limits(len(left), responses) if len(left) else (0, 0)
@@ -475,7 +437,7 @@ class CachedSimulations:
             return 1, largest
         return min(_ROUNDS_PER_CHUNK * workers, largest), largest
 
-    def _simulate(self, keys: list[bytes], thetas: np.ndarray, responses: bool) -> _Simulated:
+    def _simulate(self, keys: list[bytes], thetas: np.ndarray, responses: bool) -> Simulated:
         """Results of new simulations, which are counted, recorded if they fail, and cached in memory and on disk."""
         # checked before a batch and not after it, so that finished simulations are stored
         self._failures.check(self._outcomes)
@@ -511,4 +473,4 @@ class CachedSimulations:
             self.cache.store_failures(self.model, thetas, reasons)
         if responses:
             batch.response[[bool(reason) for reason in reasons]] = np.nan
-        return _Simulated(misfit, reasons, batch.response if responses else None)
+        return Simulated(misfit, reasons, batch.response if responses else None)

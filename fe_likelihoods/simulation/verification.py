@@ -23,6 +23,7 @@ import numpy as np
 
 from .cache_rows import CachedRows, StoredSimulation
 from .disk_cache import SimulationCache
+from .faults import TransientReason
 from .model import Model, SimulationBatch, Statistic, misfit_batch, misfit_of_responses
 from .source_digest import inherits_fingerprint
 
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 FIRST_ROWS = 2  # verified before the first row is used
 ROWS_PER_VERIFICATION = 1000
 DEFAULT_TOLERANCE = 1e-9
+LARGEST_ROUNDING = 1e-4  # relative difference of responses that may come from rounding and iterations
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 STAMP_SECONDS = 1.0  # between two looks at the source files
 MAX_SCHEDULES = 32
@@ -116,7 +118,7 @@ def largest_difference(
     difference = np.abs(stored - new)
     with np.errstate(divide="ignore", invalid="ignore"):
         # the positive root of (t r)^2 + 2 s (t r) = difference, in the form that does not cancel
-        change = np.where(difference > 0.0, difference / (s + np.sqrt(s**2 + difference)) / r, 0.0)
+        change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
     worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
     return (worst, float(change[worst])) if not change[worst] <= tolerance else None
 
@@ -244,6 +246,27 @@ class VerifiedCache:
             self._verify_due("responses", len(known), candidates, run)
         return responses
 
+    def look_up_failures(self, thetas: np.ndarray, run: VerifyingRun) -> list[str]:
+        """Reasons of `SimulationCache.look_up_failures`, of which some are verified.
+
+        Those that name a time limit are not, because each would take as long as the limit.
+
+        Raises
+        ------
+        StaleCache
+            If the new simulation succeeds.
+        """
+        reasons = self.cache.look_up_failures(run.model, thetas)
+        known = [row for row, reason in enumerate(reasons) if reason and not _is_transient(reason)]
+        if self.cache.verify and known:
+
+            def candidates(first: bool) -> Iterator[StoredSimulation]:
+                for row in self._random.sample(known, len(known)):
+                    yield StoredSimulation(thetas[row], np.full(run.n_numbers, np.nan), reasons[row])
+
+            self._verify_due("failures", len(known), candidates, run)
+        return reasons
+
     def _verify_due(self, table: str, n: int, candidates: Any, run: VerifyingRun) -> None:
         """Verify as many rows as are due now that `n` more are used."""
         schedule = self._schedule
@@ -314,16 +337,18 @@ class VerifiedCache:
                 f"channel {names[index % len(names)]!r}, {what}: stored {row.misfit[index]:.17g}, simulated again "
                 f"{new[index]:.17g}"
             )
-            advice = (
-                f". If the model is not exactly repeatable, for example on another machine, accept differences of this "
-                f"size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
-            )
+            advice = ""
+            if change < LARGEST_ROUNDING:
+                advice = (
+                    ". If the model is not exactly repeatable, for example on another machine, accept differences of "
+                    f"this size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
+                )
         served = self._schedule.served.total()
         self._schedule.served.clear()
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
         rest = f", and discard this run, which has used {served} rows" if served else ""
         raise StaleCache(
-            f"{self.cache.path}: a stored simulation is not that of the present {type(run.model).__name__}. At {point}: "
+            f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
             f"{difference}. The model has changed in a way that its fingerprint does not contain. Delete its rows with "
             "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
             f"{rest}{advice}"
@@ -363,4 +388,4 @@ def _stamp(file: str) -> tuple[int, int] | None:
 
 def _is_transient(reason: str) -> bool:
     """Whether a simulation failed for a reason that says nothing about the model."""
-    return type(reason).__name__ == "TransientReason"
+    return isinstance(reason, TransientReason)

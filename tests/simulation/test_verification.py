@@ -1,0 +1,288 @@
+"""Rows of a cache are simulated again before they are used: what is compared, when, and what a difference says."""
+
+import logging
+import os
+import pickle
+import time
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import AutoregressiveNoise, FELikelihood, LinearOscillator, Measurements, Record, SimulationCache
+from fe_likelihoods.simulation import verification
+from fe_likelihoods.simulation.faults import TransientReason
+from fe_likelihoods.simulation.model import SimulationFailed
+from fe_likelihoods.simulation.verification import StaleCache, largest_difference, response_tolerance
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
+
+
+class Scaled(Treacherous):
+    """Response times a factor that its fingerprint does not contain; fails above `limit`; counts its runs."""
+
+    fingerprint = "scaled"
+
+    def __init__(self, factor=1.0, limit=np.inf, fault=None):
+        self.factor, self.limit, self.fault, self.runs = factor, limit, fault, 0
+
+    def simulate(self, theta):
+        self.runs += 1
+        if self.fault is not None and theta[0] in self.fault:
+            raise SimulationFailed(TransientReason("no licence was free"))
+        if theta[0] > self.limit:
+            raise SimulationFailed("above the limit")
+        return self.factor * line(theta)
+
+
+def likelihood_of(model, cache, **options):
+    values = np.sin(np.arange(1.0 * N_STEPS))[None]
+    return FELikelihood(model, Measurements(CHANNELS, DT, values), cache=cache, **options)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cache.sqlite"
+
+
+@pytest.fixture
+def thetas(rng):
+    return rng.uniform(0.1, 0.9, size=(50, 2))
+
+
+@pytest.fixture
+def filled(path, thetas):
+    likelihood_of(Scaled(), path).misfit(thetas)
+    return path
+
+
+# what is compared -----------------------------------------------------------------------------------------------------
+
+
+def test_a_change_that_no_fingerprint_contains_is_an_error_that_says_what_to_do(filled, thetas):
+    likelihood = likelihood_of(Scaled(1.01), filled)
+    for _ in range(2):  # it stays an error
+        with pytest.raises(StaleCache) as caught:
+            likelihood.misfit(thetas[:10])
+    row = next(theta for theta in thetas if f"offset = {theta[0]:.17g}, slope = {theta[1]:.17g}" in str(caught.value))
+    old, new = (likelihood_of(Scaled(factor), None).misfit(row)[0, 0] for factor in (1.0, 1.01))
+    assert f"channel 'a', sum of squared residuals: stored {old:.17g}, simulated again {new:.17g}" in str(caught.value)
+    assert "forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)" in str(caught.value)
+    assert likelihood.verifications == likelihood.model.runs == 4
+    assert (likelihood.simulations, likelihood.cache_hits, len(likelihood.memory_cache)) == (0, 0, 0)
+    likelihood.cache.forget(*likelihood.cache_keys)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(Scaled(1.01), None).misfit(thetas))
+
+
+def test_the_same_model_is_verified_once(filled, thetas):
+    likelihood = likelihood_of(Scaled(), filled)
+    expected = likelihood_of(Scaled(), None).misfit(thetas)
+    np.testing.assert_array_equal(likelihood.misfit(thetas[:1]), expected[:1])
+    assert likelihood.verifications == 2  # the requested row, and the one that was stored last
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    assert likelihood.verifications == likelihood.cache.verified == likelihood.cache.info().verified == 2
+    assert (likelihood.simulations, likelihood.model.runs, likelihood.disk_hits) == (0, 2, 50)
+    assert likelihood.seconds > 0.0
+
+
+def test_the_row_that_was_stored_last_is_verified_even_if_it_is_not_requested(filled, thetas):
+    """Rows that another model stored under the key, after those of this model."""
+    other = likelihood_of(Scaled(2.0), SimulationCache(filled, verify=False))
+    other.misfit(thetas[:5] + 1.0)
+    with pytest.raises(StaleCache, match="stored .*, simulated again"):
+        likelihood_of(Scaled(), filled).misfit(thetas)
+
+
+def test_verification_can_be_turned_off(filled, thetas):
+    likelihood = likelihood_of(Scaled(1.01), SimulationCache(filled, verify=False))
+    likelihood.misfit(thetas)
+    assert (likelihood.verifications, likelihood.disk_hits, likelihood.model.runs) == (0, 50, 0)
+
+
+def test_a_stored_failure_that_succeeds_now_is_a_difference(path, thetas):
+    likelihood_of(Scaled(limit=0.0), path).misfit(thetas)
+    with pytest.raises(StaleCache, match=r"failed \(above the limit\); simulated again, it succeeded.*retry_failures"):
+        likelihood_of(Scaled(), path).misfit(thetas)
+    retried = likelihood_of(Scaled(), SimulationCache(path, retry_failures=True))
+    assert np.isfinite(retried.misfit(thetas)).all()
+    assert (retried.verifications, retried.simulations) == (0, 50)
+
+
+def test_a_stored_success_that_fails_now_is_a_difference(filled, thetas):
+    with pytest.raises(StaleCache, match="succeeded; simulated again, it failed .above the limit"):
+        likelihood_of(Scaled(limit=0.0), filled).misfit(thetas)
+
+
+def test_failures_for_other_measurements_are_verified(path, thetas):
+    likelihood_of(Scaled(limit=0.0), path).misfit(thetas)
+    with pytest.raises(StaleCache, match="simulated again, it succeeded"):
+        likelihood_of(Scaled(), path, noise=AutoregressiveNoise(CHANNELS)).misfit(thetas)
+
+
+def test_stored_responses_are_verified(path, thetas):
+    likelihood_of(Scaled(), path).simulate(thetas)
+    same = likelihood_of(Scaled(), path, noise=AutoregressiveNoise(CHANNELS))
+    same.misfit(thetas)
+    assert (same.simulations, same.verifications) == (0, 2)
+    with pytest.raises(StaleCache, match="sum of squared residuals"):
+        likelihood_of(Scaled(1.01), path, noise=AutoregressiveNoise(CHANNELS)).simulate(thetas)
+
+
+def test_pooled_models_are_verified_in_the_workers(filled, thetas):
+    class Pool:
+        n_workers, items = 2, 0
+
+        def map(self, function, items):
+            self.items += len(items)
+            return [function(item) for item in items]
+
+    pool = Pool()
+    likelihood_of(Scaled(), filled, pool=pool).misfit(thetas)
+    assert pool.items == 2
+
+
+# tolerance ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "tolerance", "stale"), [(1e-11, None, False), (1e-7, None, True), (1e-7, 1e-6, False)]
+)
+def test_small_differences_are_accepted_for_models_of_the_user(filled, thetas, change, tolerance, stale):
+    likelihood = likelihood_of(Scaled(1.0 + change), SimulationCache(filled, tolerance=tolerance))
+    if not stale:
+        likelihood.misfit(thetas)
+        return
+    with pytest.raises(StaleCache, match=r"accept differences of this size, .* with SimulationCache\(path, tolerance="):
+        likelihood.misfit(thetas)
+
+
+def test_the_tolerance_that_the_message_states_is_enough(filled, thetas):
+    with pytest.raises(StaleCache) as caught:
+        likelihood_of(Scaled(1.0 + 1e-7), filled).misfit(thetas)
+    stated = float(str(caught.value).rpartition("tolerance=")[2].rstrip(")"))
+    assert 1e-9 < stated < 1e-6
+    likelihood_of(Scaled(1.0 + 1e-7), SimulationCache(filled, tolerance=stated)).misfit(thetas)
+
+
+def test_compiled_models_are_compared_to_the_last_bit(path):
+    model = LinearOscillator(Record("sine", 0.02, np.sin(np.arange(50.0))))
+    assert response_tolerance(model) == 0.0
+    assert response_tolerance(Scaled()) == 1e-9
+    assert response_tolerance(type("Own", (LinearOscillator,), {})(model.record)) == 1e-9
+    likelihood = FELikelihood(model, Measurements(model.channels, 0.02, np.ones((2, 50))), cache=path)
+    misfit = np.nextafter(likelihood.misfit([[1.1, 0.9]]), np.inf)
+    likelihood.cache.clear()
+    likelihood.cache.store(likelihood.simulation_key, np.array([[1.1, 0.9]]), 50, misfit, [""], 1.0)
+    with pytest.raises(StaleCache, match="channel 'acceleration'"):
+        FELikelihood(model, likelihood.measurements, cache=path).misfit([[1.1, 0.9]])
+
+
+@pytest.mark.parametrize("tolerance", [-1e-9, np.nan, np.inf])
+def test_invalid_tolerances(path, tolerance):
+    with pytest.raises(ValueError, match="tolerance must be a number of 0 or more"):
+        SimulationCache(path, tolerance=tolerance)
+
+
+def test_differences_of_statistics_are_changes_of_the_response(rng):
+    """A change of the response of relative norm t is found for a tolerance below it, and accepted well above it."""
+    for scale in (1e-3, 1.0):  # of the residual: a good fit and a bad one
+        response = rng.normal(size=(2, 1000))
+        measured = response + scale * rng.normal(size=response.shape)
+        direction = (response - measured) / np.linalg.norm(response - measured, axis=1, keepdims=True)
+        other = response + 1e-6 * np.linalg.norm(response, axis=1, keepdims=True) * direction
+
+        def statistics(values, measured=measured):
+            residuals = values - measured
+            return np.concatenate([(residuals**2).sum(axis=1), (residuals[:, 1:] * residuals[:, :-1]).sum(axis=1)])
+
+        old, new = statistics(response), statistics(other)
+        assert largest_difference(old, old, measured, 0.0) is None
+        index, change = largest_difference(old, new, measured, 2e-7)
+        assert index < 2 and 2e-7 < change <= 1.01e-6
+        assert largest_difference(old, new, measured, 1.01e-6) is None
+    perfect = np.zeros(2)
+    assert largest_difference(perfect, perfect + 1e-30, measured, 1e-9) is None
+    assert largest_difference(perfect, np.array([0.0, np.nan]), measured, 1e-9)[0] == 1
+
+
+# when -----------------------------------------------------------------------------------------------------------------
+
+
+def test_one_of_every_thousand_rows_is_verified(path, rng):
+    thetas = rng.uniform(0.1, 0.9, size=(3500, 2))
+    likelihood_of(Scaled(), path).misfit(thetas)
+    likelihood = likelihood_of(Scaled(), path, memory_rows=0)
+    for start in range(0, 3500, 100):
+        likelihood.misfit(thetas[start : start + 100])
+    assert likelihood.verifications == 2 + 3
+    likelihood.model.factor = 2.0
+    with pytest.raises(StaleCache, match="discard this run, which has used 3[0-9]00 rows"):
+        for start in range(0, 1000, 100):
+            likelihood.misfit(thetas[start : start + 100])
+
+
+@pytest.mark.parametrize("what", ["model", "pool", "file"])
+def test_verified_again_after_a_change(filled, thetas, what, tmp_path, monkeypatch):
+    monkeypatch.setattr(verification, "STAMP_SECONDS", 0.0)
+    data = tmp_path / "data.txt"
+    data.write_text("1")
+    likelihood = likelihood_of(Scaled(), filled, memory_rows=0)
+    likelihood.model.watched_files = [data]
+    for _ in range(2):
+        likelihood.misfit(thetas)
+    assert likelihood.verifications == 2
+    if what == "model":
+        likelihood.model = Scaled(2.0)
+    elif what == "pool":
+        likelihood.pool = type("Pool", (), {"n_workers": 1, "map": lambda s, f, items: [f(i * 1.1) for i in items]})()
+    else:
+        data.write_text("two")
+        likelihood.model.factor = 2.0
+    with pytest.raises(StaleCache):
+        likelihood.misfit(thetas)
+
+
+def test_a_simulation_that_is_stopped_is_not_a_difference(filled, thetas, caplog):
+    """Another row is verified in its place; the first of them is the one that was stored last."""
+    likelihood = likelihood_of(Scaled(fault=thetas[-1:, 0]), filled)
+    likelihood.misfit(thetas)
+    assert (likelihood.verifications, likelihood.cache.verified) == (3, 2)
+    assert "1 of 3 stored simulations could not be verified" in caplog.text
+    assert likelihood.failure_count == 0
+
+
+def test_rows_are_used_if_no_simulation_ends(filled, thetas, caplog):
+    likelihood = likelihood_of(Scaled(fault=thetas[:, 0]), filled, memory_rows=0)
+    for _ in range(5):
+        likelihood.misfit(thetas)
+    assert likelihood.verifications == 3 * verification.MAX_ATTEMPTS  # three times four, and then no more
+    assert likelihood.cache.verified == 0
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert sum("used without verification" in text for text in warnings) == 3
+
+
+# copies ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_process_verifies_once_for_all_copies_of_a_likelihood(filled, thetas, monkeypatch):
+    data = pickle.dumps(likelihood_of(Scaled(), filled))
+    monkeypatch.setattr(verification, "_schedules", type(verification._schedules)())  # as in a new process
+    copies = [pickle.loads(data) for _ in range(3)]  # as for the tasks of a pool
+    for copy in copies:
+        copy.misfit(thetas)
+        copy.misfit(thetas)
+    assert [copy.verifications for copy in copies] == [2, 0, 0]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
+def test_a_fork_while_another_thread_verifies_does_not_block(filled, thetas):
+    likelihood = likelihood_of(Scaled(), filled)
+    with likelihood._verified_cache._schedule.lock:
+        child = os.fork()
+        if not child:
+            likelihood.misfit(thetas)
+            os._exit(likelihood.verifications)
+        for _ in range(200):
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                break
+            time.sleep(0.05)
+    assert os.waitstatus_to_exitcode(status) == 2
