@@ -42,11 +42,14 @@ class FunctionModel(ExternalModel):
         default the fingerprint contains a digest of the code and of everything it uses
         (`fe_likelihoods.simulation.code_digest`).
     isolated : bool
-        Run the function in a separate process. A limit below implies it.
+        Run the function in a separate process. A setting below implies it.
     time_limit : float, optional
         Longest duration of a run [s]. A longer run is stopped and counts as failed.
     memory_limit : int, optional
         Largest address space of the process [bytes]. Allocations beyond it fail.
+    runs_per_process : int, optional
+        Number of runs after which the process is replaced by a new one, which limits the memory that compiled code
+        leaks; never by default.
 
     Raises
     ------
@@ -72,6 +75,7 @@ class FunctionModel(ExternalModel):
         isolated: bool = False,
         time_limit: float | None = None,
         memory_limit: int | None = None,
+        runs_per_process: int | None = None,
     ) -> None:
         super().__init__(parameter_names, channels, dt, n_steps)
         kind = type(self).__name__
@@ -83,9 +87,19 @@ class FunctionModel(ExternalModel):
         self.memory_limit = (
             None if memory_limit is None else int(positive_float(memory_limit, f"{kind}: memory_limit", "bytes"))
         )
-        self.isolated = bool(isolated) or time_limit is not None or memory_limit is not None
+        if runs_per_process is not None and (
+            isinstance(runs_per_process, bool) or not isinstance(runs_per_process, int) or runs_per_process < 1
+        ):
+            raise ValueError(f"{kind}: runs_per_process must be None or a positive integer; got {runs_per_process!r}")
+        self.runs_per_process = runs_per_process
+        settings = (time_limit, memory_limit, runs_per_process)
+        self.isolated = bool(isolated) or any(setting is not None for setting in settings)
         self.fingerprint = self._digest(self._version_of(function))
-        self._run = Sandbox(function, self.time_limit, self.memory_limit or 0) if self.isolated else function
+        self._run = function
+        if self.isolated:
+            self._run = Sandbox(
+                function, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process
+            )
 
     def _version_of(self, function: Callable) -> list[str]:
         """Texts that identify what the function computes."""

@@ -54,6 +54,9 @@ class OpenSeesModel(FunctionModel):
         Longest duration of a run [s]. A longer run is stopped and counts as failed.
     memory_limit : int, optional
         Largest address space of the process [bytes]. Allocations beyond it fail.
+    runs_per_process : int or None
+        Number of runs after which the process is replaced by a new one; None for never. OpenSees leaks memory: in
+        version 3.7.1, ``ops.eigen`` leaks about 14 kB per run of a model of 90 degrees of freedom.
     version : str, optional
         Text that replaces the code in the fingerprint; see `FunctionModel`.
 
@@ -80,6 +83,7 @@ class OpenSeesModel(FunctionModel):
         *,
         time_limit: float | None = None,
         memory_limit: int | None = None,
+        runs_per_process: int | None = 1000,
         version: str | None = None,
     ) -> None:
         if importlib.util.find_spec("openseespy") is None:
@@ -100,6 +104,7 @@ class OpenSeesModel(FunctionModel):
             isolated=True,
             time_limit=time_limit,
             memory_limit=memory_limit,
+            runs_per_process=runs_per_process,
         )
 
     def _version_of(self, function: Callable) -> list[str]:

@@ -5,6 +5,7 @@ has a pipe of its own, so it is known which item every process was running. Only
 up after the third time.
 """
 
+import math
 import os
 import threading
 from collections import Counter, deque
@@ -23,6 +24,13 @@ Outcome = tuple[Any, str]
 """Result and an empty reason, or None and the reason of a failure; mapped functions return this."""
 
 
+def _is_positive_whole(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and int(value) == value and value >= 1
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
 class LocalPool:
     """Pool of processes of this machine.
 
@@ -37,26 +45,30 @@ class LocalPool:
     ----------
     workers : int
         Number of processes.
+    runs_per_process : int, optional
+        Number of items after which a process is replaced by a new one, which limits the memory that leaks in compiled
+        code of a model; never by default.
 
     Raises
     ------
     ValueError
-        If `workers` is not a positive whole number.
+        If `workers` or `runs_per_process` is not a positive whole number.
     """
 
     other_processes = True
 
-    def __init__(self, workers: int) -> None:
-        try:
-            whole = not isinstance(workers, bool) and int(workers) == workers and workers >= 1
-        except (TypeError, ValueError):
-            whole = False
-        if not whole:
+    def __init__(self, workers: int, runs_per_process: int | None = None) -> None:
+        if not _is_positive_whole(workers):
             raise ValueError(
                 "pool must be None, a positive number of processes, or an object with map(function, items); "
                 f"got {workers!r}"
             )
+        if runs_per_process is not None and not _is_positive_whole(runs_per_process):
+            raise ValueError(
+                f"LocalPool: runs_per_process must be None or a positive whole number; got {runs_per_process!r}"
+            )
         self.workers = int(workers)
+        self.runs_per_process = None if runs_per_process is None else int(runs_per_process)
         self._environment = {
             f"{library}_NUM_THREADS": "1" for library in _THREADS if f"{library}_NUM_THREADS" not in os.environ
         }
@@ -70,7 +82,7 @@ class LocalPool:
         self.close()
 
     def __reduce__(self) -> tuple:
-        return type(self), (self.workers,)
+        return type(self), (self.workers, self.runs_per_process)
 
     @property
     def n_workers(self) -> int:
@@ -129,7 +141,11 @@ class LocalPool:
                             raise reply.value
                         if index is not None:
                             results[index] = reply.value
-                        self._next(worker, running, waiting, items)
+                        if worker.runs >= (self.runs_per_process or math.inf):
+                            del running[worker]
+                            worker.kill()  # another one is started if items are waiting
+                        else:
+                            self._next(worker, running, waiting, items)
             except BaseException:
                 for worker in running:
                     worker.kill()

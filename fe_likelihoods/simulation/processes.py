@@ -47,8 +47,8 @@ __all__ = [
 ]
 
 _BOOT = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from fe_likelihoods.simulation.processes import serve; serve(int(sys.argv[2]), int(sys.argv[3]))"
+    "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
+    "from fe_likelihoods.simulation.processes import serve; serve(*settings)"
 )
 _MARK = "FE_LIKELIHOODS_RUN_"
 _SCRIPTS = ("__main__", "__mp_main__")  # names of the user's script as it runs, and as a worker imports it
@@ -284,20 +284,22 @@ class Worker:
         Limit of the address space of the process [bytes], beyond which its allocations fail; 0 for no limit.
     output : open file, optional
         Receives standard output and standard error, which are otherwise those of this process.
+
+    Attributes
+    ----------
+    key : bytes
+        Digest of the function that was sent last.
+    runs : int
+        Number of items that were sent.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
         _refuse_while_importing_script()
         self.connection, theirs = Pipe()
         with theirs:
-            command = [
-                sys.executable,
-                "-c",
-                _BOOT,
-                json.dumps([str(path) for path in sys.path]),
-                str(theirs.fileno()),
-                str(memory_limit),
-            ]
+            # the arguments as well, because a script that is imported may read them
+            texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
+            command = [sys.executable, "-c", _BOOT, json.dumps([*texts, theirs.fileno(), memory_limit])]
             self._process = ManagedProcess(
                 command,
                 environment,
@@ -307,6 +309,7 @@ class Worker:
                 stderr=output,
             )
         self.key = b""
+        self.runs = 0
         self._owner = os.getpid()
 
     @property
@@ -326,6 +329,7 @@ class Worker:
 
     def submit(self, item: Any) -> None:
         """Send an item."""
+        self.runs += 1
         self._send(("call", item))
 
     def _send(self, message: tuple) -> None:

@@ -20,8 +20,9 @@ _POLL_INTERVAL = 0.1  # [s] between checks of the amount of output
 class Sandbox:
     """Callable that runs a function in another process.
 
-    The process is kept for later calls, and replaced after a call that did not end by itself. Concurrent calls of
-    several threads use one process each. What the function prints is not shown.
+    The process is kept for later calls. It is replaced after a call that did not end by itself, and after a number of
+    calls, which limits the memory that the function leaks. Concurrent calls of several threads use one process each.
+    What the function prints is not shown.
 
     Parameters
     ----------
@@ -33,6 +34,8 @@ class Sandbox:
         Limit of the address space of the process [bytes]; 0 for no limit.
     max_output : int
         Largest amount of output of one call [bytes].
+    runs_per_process : int, optional
+        Number of calls after which a process is replaced; never by default.
 
     Raises
     ------
@@ -41,12 +44,18 @@ class Sandbox:
     """
 
     def __init__(
-        self, function: Callable, time_limit: float | None = None, memory_limit: int = 0, max_output: int = 2**24
+        self,
+        function: Callable,
+        time_limit: float | None = None,
+        memory_limit: int = 0,
+        max_output: int = 2**24,
+        runs_per_process: int | None = None,
     ) -> None:
-        self._settings = function, time_limit, memory_limit, max_output
+        self._settings = function, time_limit, memory_limit, max_output, runs_per_process
         self._function = function
         self._time_limit = math.inf if time_limit is None else time_limit
         self._memory_limit, self._max_output = memory_limit, max_output
+        self._most_runs = runs_per_process or math.inf
         self._pickled = PickledFunction.of(function)
         self._pickled.script()  # raises here what would be raised in the first call
         self._free: list[tuple[Worker, Any]] = []
@@ -78,9 +87,12 @@ class Sandbox:
         except BaseException:
             worker.kill()
             raise
-        os.ftruncate(output.fileno(), 0)
-        os.lseek(output.fileno(), 0, os.SEEK_SET)
-        self._free.append((worker, output))
+        if worker.runs >= self._most_runs:
+            worker.kill()
+        else:
+            os.ftruncate(output.fileno(), 0)
+            os.lseek(output.fileno(), 0, os.SEEK_SET)
+            self._free.append((worker, output))
         if reply.kind == "raised":
             raise reply.value
         return reply.value

@@ -17,6 +17,7 @@ from . import (
     few_hundred_peers,
     growth,
     job,
+    opensees_memory,
     overhead,
     peers,
     samplers,
@@ -45,6 +46,7 @@ BENCHMARKS = {
     "overhead": overhead.overhead,
     "few_hundred_peers": few_hundred_peers.rows,
     "memory": job.memory,
+    "opensees_memory": opensees_memory.memory,
     "job": job.job,
 }
 

@@ -97,6 +97,13 @@ def test_threads_and_forks_have_separate_processes(kind, guarded):
     np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
 
 
+def test_a_process_is_replaced_after_a_number_of_runs():
+    model = pickle.loads(pickle.dumps(model_of(bad.process_id, runs_per_process=2)))
+    pids = [model.simulate(THETA)[0, 0] for _ in range(4)]
+    assert model.isolated
+    assert pids[0] == pids[1] != pids[2] == pids[3]
+
+
 def test_a_pickled_copy_keeps_its_settings(guarded):
     copy = pickle.loads(pickle.dumps(guarded))
     assert (copy.fingerprint, copy.time_limit, copy.isolated) == (guarded.fingerprint, 1.0, True)
@@ -174,6 +181,8 @@ def test_failures_are_in_the_report_with_their_duration():
         ({"time_limit": math.inf}, "time_limit"),
         ({"time_limit": "long"}, "time_limit"),
         ({"memory_limit": 0}, "memory_limit must be a positive number of bytes"),
+        ({"runs_per_process": 0}, "runs_per_process must be None or a positive integer"),
+        ({"runs_per_process": 2.5}, "runs_per_process"),
         ({"function": 3}, "expected a function"),
         ({"function": lambda theta: line(theta), "isolated": True}, "cannot be sent to another process"),
         ({"parameter_names": ()}, "parameter_names must be a tuple of one or more str"),

@@ -1,5 +1,6 @@
 """Executors of ``pool=``: same bits, one transfer of the model per process, early errors for invalid pools."""
 
+import math
 import multiprocessing
 import os
 import pickle
@@ -249,6 +250,16 @@ def test_local_pool_maps_any_function_and_raises_its_exceptions():
             pool.map(lambda x: x, [1])
 
 
+def test_a_worker_is_replaced_after_a_number_of_runs():
+    with LocalPool(1, runs_per_process=3) as pool:
+        pids = pool.map(os.getsid, [0] * 7) + pool.map(os.getsid, [0] * 2)  # a worker leads a session
+        assert pickle.loads(pickle.dumps(pool)).runs_per_process == 3
+    assert [pids.index(pid) for pid in pids] == [0, 0, 0, 3, 3, 3, 6, 6, 6]
+    for wrong in (0, 2.5, True, "3", math.inf):
+        with pytest.raises(ValueError, match="runs_per_process must be None or a positive whole number"):
+            LocalPool(1, wrong)
+
+
 def test_threads_in_workers_are_limited(monkeypatch):
     names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"]
     for name in names:
@@ -312,9 +323,9 @@ def main():
 )
 def test_models_defined_in_a_script(end, expected, tmp_path):
     script = tmp_path / "script.py"
-    script.write_text(SCRIPT + end)
+    script.write_text("import sys\nCOUNT = int(sys.argv[1])  # workers have the arguments as well\n" + SCRIPT + end)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    run = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
+    run = subprocess.run([sys.executable, script, "8"], env=environment, capture_output=True, text=True, timeout=120)
     assert expected in (" ".join(run.stdout.split()) or run.stderr)
 
 
