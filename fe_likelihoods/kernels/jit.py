@@ -10,14 +10,20 @@ ones.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
+import shutil
+import stat
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numba
 
 __all__ = ["kernel", "CACHE_FOLDER", "KERNEL_HASH", "SUM_REORDERING"]
+
+logger = logging.getLogger(__name__)
 
 SUM_REORDERING = {"reassoc", "contract", "nsz"}
 """LLVM flags that allow sums to be reordered, which SIMD reductions need. NaN and infinity keep their meaning, which
@@ -36,30 +42,72 @@ KERNEL_HASH: str = _hash_sources()
 """Hash of the sources of all kernels."""
 
 
-def _find_cache_folder() -> str:
-    """Return the first writable folder below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME, ~/.cache, the temporary folder."""
+def _is_ours(path: str) -> bool:
+    """Whether a path is a folder of this user, and not a link."""
+    status = os.lstat(path)
+    return stat.S_ISDIR(status.st_mode) and (not hasattr(os, "getuid") or status.st_uid == os.getuid())
+
+
+def _private_folder(path: str) -> str:
+    """Create a folder that only this user can read and write; OSError if that is impossible.
+
+    numba's index is a pickle, and loading it runs what it contains: nobody else may have written it. An existing folder
+    that others could write to is emptied.
+    """
+    with suppress(FileExistsError):
+        os.mkdir(path, 0o700)
+    if not _is_ours(path):
+        raise PermissionError(f"{path} does not belong to this user")
+    if hasattr(os, "getuid"):
+        writable_by_others = os.lstat(path).st_mode & 0o022
+        os.chmod(path, 0o700)
+        if os.lstat(path).st_mode & 0o077:
+            raise PermissionError(f"{path} cannot be made private")
+        if writable_by_others:
+            for entry in os.scandir(path):
+                if entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path)
+                else:
+                    os.unlink(entry.path)
+    return path
+
+
+def _find_cache_folder() -> str | None:
+    """Create a private folder for compiled kernels.
+
+    Returns
+    -------
+    str or None
+        A folder below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME or ~/.cache, or the temporary folder: the first of them
+        where it can be created. None, with a warning, if there is none: kernels are then compiled in every process.
+    """
     user = f"fe_likelihoods-{os.getuid()}" if hasattr(os, "getuid") else "fe_likelihoods"
+    shared = os.path.join(tempfile.gettempdir(), user)
     roots = [
         os.environ.get("FE_LIKELIHOODS_CACHE"),
         os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "fe_likelihoods"),
-        os.path.join(tempfile.gettempdir(), user),
+        shared,
     ]
     for root in filter(None, roots):
-        folder = os.path.join(root, f"kernels-{KERNEL_HASH}")
         try:
-            os.makedirs(folder, exist_ok=True)
+            if root == shared:  # its name is known to others, who can create it first
+                _private_folder(root)
+            os.makedirs(root, exist_ok=True)
+            folder = _private_folder(os.path.join(root, f"kernels-{KERNEL_HASH}"))
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
             continue
-    raise OSError(
-        f"expected a writable folder for compiled kernels; none of {[r for r in roots if r]} can be written: set the "
-        "environment variable FE_LIKELIHOODS_CACHE to a writable folder"
+    logger.warning(
+        "Kernels are compiled in every process, which takes about a minute: none of %s can hold a private folder for "
+        "them. Set the environment variable FE_LIKELIHOODS_CACHE to a folder of your own",
+        ", ".join(root for root in roots if root),
     )
+    return None
 
 
-CACHE_FOLDER: str = _find_cache_folder()
-"""Folder of the machine code."""
+CACHE_FOLDER: str | None = _find_cache_folder()
+"""Folder of the machine code; None if there is none."""
 
 
 def kernel(
@@ -90,12 +138,13 @@ def kernel(
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = CACHE_FOLDER  # numba reads it at decoration; it is restored below
+    if CACHE_FOLDER is not None:
+        numba.config.CACHE_DIR = CACHE_FOLDER  # numba reads it at decoration; it is restored below
     try:
         return numba.njit(
             nogil=True,
             error_model="numpy",
-            cache=cache and not inline,
+            cache=cache and not inline and CACHE_FOLDER is not None,
             forceinline=inline,
             fastmath=fastmath,
             _nrt=False,

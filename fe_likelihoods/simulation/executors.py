@@ -9,14 +9,15 @@ The rule for ``pool=``:
   loky and mpi4py.futures and the pools of multiprocessing and schwimmbad.
 
 The mapped function contains the model and the measurements and may be large; an item is a few parameters. The function
-is sent to each worker process once: through the worker's own pipe in a `LocalPool`, through a temporary file in other
-pools on the same machine, and together with the items where a worker reports that it has neither the function nor the
-file. Later tasks consist of a digest of the function and the parameters.
+is sent to each worker process once: through the worker's own pipe in a `LocalPool`, through a private temporary file,
+whose digest is checked, in other pools on the same machine, and together with the items where a worker reports that it
+has neither the function nor the file. Later tasks consist of a digest of the function and the parameters.
 
 Results do not depend on the pool, to the last bit.
 """
 
 import logging
+import os
 import pickle
 import threading
 import time
@@ -149,7 +150,8 @@ class _FunctionReference:
                 path = self._folder / pickled.key.hex()
                 if not self._carried and not path.exists():
                     part = path.with_suffix(f".{threading.get_ident()}")
-                    part.write_bytes(pickled.payload)
+                    with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                        file.write(pickled.payload)
                     part.replace(path)
                 self._parts = pickled.key, str(path), pickled.payload if self._carried else b""
         return _LoadedFunction, self._parts
@@ -174,11 +176,11 @@ class _LoadedFunction:
             function = loaded_functions.get(key)
             if function is None:
                 try:
-                    payload = payload or Path(path).read_bytes()
+                    pickled = PickledFunction(payload or Path(path).read_bytes(), key)
                 except OSError:
                     return _Missing()
                 try:
-                    function = pickle.loads(payload)
+                    function = pickled.load()
                 except Exception as error:
                     return _Unusable(f"{type(error).__name__}: {error}")
                 loaded_functions[key] = function

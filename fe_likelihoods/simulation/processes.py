@@ -211,6 +211,10 @@ def _without_addresses(message: str) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", message)
 
 
+def _digest(payload: bytes) -> bytes:
+    return blake2b(payload, digest_size=16).digest()
+
+
 class PickledFunction(NamedTuple):
     """A function as it is sent to workers.
 
@@ -238,7 +242,13 @@ class PickledFunction(NamedTuple):
                 f"{name} cannot be sent to another process ({why}). Define functions and classes at the top level of a "
                 "module, without open files, locks and connections"
             ) from error
-        return cls(payload, blake2b(payload, digest_size=16).digest())
+        return cls(payload, _digest(payload))
+
+    def load(self) -> Any:
+        """Unpickle the function; ValueError, before anything is unpickled, if the payload does not match its digest."""
+        if _digest(self.payload) != self.key:
+            raise ValueError("the pickled function has been changed after it was sent: its digest differs")
+        return pickle.loads(self.payload)
 
     def script(self) -> str | None:
         """Path of the user's script if the function uses definitions in it, else None; ValueError for a notebook."""

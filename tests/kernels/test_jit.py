@@ -112,6 +112,59 @@ def test_a_cache_folder_that_cannot_be_written_is_skipped(tmp_path):
     assert Path(folder).is_relative_to(home)
 
 
+def folder_of(**environment):
+    code = "from fe_likelihoods.kernels import jit; print(jit.CACHE_FOLDER)"
+    return python(code, **{name: str(value) for name, value in environment.items()}).strip()
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="NO getuid: files have no modes")
+def test_the_folder_is_private(tmp_path):
+    """Others could put a pickle into another one, which numba would load."""
+    folder = tmp_path / f"kernels-{jit.KERNEL_HASH}"
+    assert folder_of(FE_LIKELIHOODS_CACHE=tmp_path) == str(folder)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    (folder / "kept").touch()
+    folder.chmod(0o755)  # as an earlier version made it: nobody else could write
+    assert folder_of(FE_LIKELIHOODS_CACHE=tmp_path) == str(folder)
+    assert (folder.stat().st_mode & 0o777, [path.name for path in folder.iterdir()]) == (0o700, ["kept"])
+    folder.chmod(0o777)
+    (folder / "deep").mkdir()
+    assert folder_of(FE_LIKELIHOODS_CACHE=tmp_path) == str(folder)
+    assert (folder.stat().st_mode & 0o777, list(folder.iterdir())) == (0o700, [])
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="NO getuid: files have no modes")
+def test_a_folder_of_somebody_else_is_not_used(tmp_path, monkeypatch, caplog):
+    """A link counts as one; so does the folder that another user created under the known name."""
+    monkeypatch.setattr(jit.tempfile, "gettempdir", lambda: str(tmp_path))
+    for name in ("XDG_CACHE_HOME", "FE_LIKELIHOODS_CACHE"):
+        monkeypatch.setenv(name, str(tmp_path / "file" / "below"))
+    (tmp_path / "file").touch()
+    shared = tmp_path / f"fe_likelihoods-{os.getuid()}"
+    assert jit._find_cache_folder() == str(shared / f"kernels-{jit.KERNEL_HASH}")
+    assert shared.stat().st_mode & 0o777 == 0o700
+    shutil.rmtree(shared)
+    (tmp_path / "elsewhere").mkdir()
+    shared.symlink_to(tmp_path / "elsewhere")
+    assert jit._find_cache_folder() is None
+    assert "Set the environment variable FE_LIKELIHOODS_CACHE to a folder of your own" in caplog.text
+    shared.unlink()
+    shared.mkdir()
+    monkeypatch.setattr(os, "getuid", lambda uid=os.getuid(): uid)
+    owner = os.lstat
+    monkeypatch.setattr(os, "lstat", lambda path: os.stat_result([*owner(path)[:4], os.getuid() + 1, *owner(path)[5:]]))
+    assert jit._find_cache_folder() is None
+
+
+def test_kernels_work_without_a_folder(monkeypatch):
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+    assert jit.kernel(_double)(2.0) == 4.0
+
+
+def _double(x):
+    return 2.0 * x
+
+
 def test_decorating_restores_the_setting_of_numba():
     import numba
 

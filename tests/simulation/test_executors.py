@@ -162,6 +162,23 @@ def _absent_file(path):
     raise FileNotFoundError(path)
 
 
+def test_a_sent_function_is_private_and_its_digest_is_checked(tmp_path):
+    """Anybody who could change the file would run code in the workers."""
+    executor = as_executor(Recorder())
+    model, thetas = Treacherous(), np.array([[0.1, 0.2]])
+    simulate_batch(model, thetas, executor)
+    (path,) = executor.folder.path.iterdir()
+    assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+    evil = tmp_path / "evil"
+    path.write_bytes(b"cos\nmkdir\n(V" + str(evil).encode() + b"\ntR.")  # a pickle that makes a folder
+    executors.loaded_functions.clear()
+    with pytest.raises(RuntimeError, match="the pickled function has been changed after it was sent"):
+        simulate_batch(model, thetas, executor)
+    assert not evil.exists()
+    pickle.loads(path.read_bytes())
+    assert evil.exists()
+
+
 @pytest.mark.parametrize("forget", [False, True], ids=["file", "no file"])
 def test_bytes_sent_with_each_item(forget, monkeypatch):
     model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
