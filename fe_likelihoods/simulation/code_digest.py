@@ -1,12 +1,17 @@
 """Digest of what a Python function computes, the same in every process.
 
-A stored result belongs to the code that made it. The digest covers everything a function uses: its bytecode and
-constants, its defaults, the values it closes over, the global names it uses, the modules it imports when it runs, and
-recursively the functions and classes that it calls, in its own package and in any file that is not installed (such as a
-file in the same folder). The standard library and installed packages are represented by name and version, modules of
-this library by their source files (see `fe_likelihoods.simulation.source_digest`). For objects that cannot be
-identified by their value (an open file, a handle of compiled code) a ValueError is raised, and the user is asked for a
-version.
+A stored result belongs to the code that made it. The digest covers the bytecode and constants of a function, its
+defaults and attributes, the values it closes over, the global names it uses, the modules it imports when it runs, and
+recursively the functions, classes and objects that it uses, in its own package and in any file that is not installed
+(such as a file in the same folder). Of a module of the user, however it is reached, the members count whose names
+appear in any of these functions. The standard library and installed packages are represented by name and version,
+modules of this library by their source files (see `fe_likelihoods.simulation.source_digest`). For objects that cannot
+be identified by their value (an open file, a handle of compiled code) a ValueError is raised, and the user is asked for
+a version.
+
+The digest cannot contain what the code finds only while it runs: files and environment variables that it reads, names
+that it composes, modules that it imports by a computed name. They can be named in ``depends_on=`` of a model; besides,
+stored results are compared with new ones (see `fe_likelihoods.simulation.verification`).
 """
 
 import dis
@@ -18,26 +23,44 @@ import importlib.util
 import logging
 import sys
 import types
-from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import is_dataclass
 from hashlib import blake2b
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .source_digest import LIBRARY, inherits_fingerprint, object_digest, source_digest
+from .source_digest import LIBRARY, inherits_fingerprint, is_standard, object_digest, source_digest
 
-__all__ = ["code_digest"]
+__all__ = ["CodeDescription", "code_digest", "describe_code"]
+
+_BUILTIN_VALUES = (int, float, complex, str, bytes, bytearray, tuple, list, frozenset, set, dict)
 
 
-def code_digest(function: Callable) -> str:
-    """Digest of a function, or a class, and of everything it uses.
+class CodeDescription(NamedTuple):
+    """Digest of a function, and where its code is.
+
+    Attributes
+    ----------
+    digest : str
+        Hexadecimal, 128 bits.
+    files : tuple of str
+        Files of the user that contain the code, sorted.
+    """
+
+    digest: str
+    files: tuple[str, ...]
+
+
+def code_digest(thing: Any) -> str:
+    """Digest of a function, a class or a value, and of everything it uses.
 
     Parameters
     ----------
-    function : callable
+    thing : object
 
     Returns
     -------
@@ -49,7 +72,13 @@ def code_digest(function: Callable) -> str:
     ValueError
         If it uses an object that has no stable digest; the message names it.
     """
-    return _Digest(_package(function)).of(function).hex()
+    return describe_code(thing).digest
+
+
+def describe_code(thing: Any) -> CodeDescription:
+    """As `code_digest`, with the files of the code."""
+    digest = _Digest(_package(thing))
+    return CodeDescription(digest.whole(thing).hex(), tuple(sorted(digest.files)))
 
 
 def _package(thing: Any) -> str:
@@ -73,6 +102,23 @@ class _Digest:
         self.package = package
         self.open: dict[int, int] = {}  # ids of the objects in progress and their depths, to detect cycles
         self.done: dict[int, tuple[bytes, Any]] = {}  # with the object, so that its id is not reused
+        self.names: set[str] = set()  # of globals and attributes in the functions of the user
+        self.modules: dict[str, types.ModuleType] = {}  # of the user, reached as globals, values or imports
+        self.files: set[str] = set()
+
+    def whole(self, thing: Any) -> bytes:
+        """Digest of an object and of the members that its functions use of the user's modules."""
+        parts, seen = [self.of(thing)], set()
+        while True:
+            members = [(m, n) for m in self.modules for n in self.names & vars(self.modules[m]).keys()]
+            new = sorted(set(members) - seen)
+            if not new:
+                return self._joined(parts)
+            seen.update(new)
+            for module, name in new:
+                value = vars(self.modules[module])[name]
+                if value is not self.modules[module]:
+                    parts += [module, *self._named(name, value, module)]
 
     def of(self, thing: Any) -> bytes:
         """Digest of an object."""
@@ -102,19 +148,24 @@ class _Digest:
         kind = type(thing)
         if thing is None or kind in (bool, int, float, complex, str, bytes, type(Ellipsis)):
             return [kind.__name__, repr(thing)]
-        if isinstance(thing, np.ndarray | np.generic) and not np.asarray(thing).dtype.hasobject:
+        if kind is bytearray:
+            return ["bytearray", bytes(thing)]
+        if (kind is np.ndarray or isinstance(thing, np.generic)) and not np.asarray(thing).dtype.hasobject:
             values = np.ascontiguousarray(thing)
             return ["array", values.dtype.str, repr(np.shape(thing)), values.tobytes()]
         if kind in (tuple, list):
             return [kind.__name__, *map(self.of, thing)]
         if kind in (set, frozenset):
             # a separate digest for each item, so that the order does not matter
-            return [kind.__name__, *sorted(_Digest(self.package).of(item) for item in thing)]
-        if isinstance(thing, dict | types.MappingProxyType):
+            return [kind.__name__, *sorted(self._separate().of(item) for item in thing)]
+        if kind in (dict, types.MappingProxyType):
             return ["dict", *(self.of(part) for item in thing.items() for part in item)]
         if isinstance(thing, PurePath):
             return ["path", str(thing)]
         if isinstance(thing, types.ModuleType):
+            if not self._known_by_version(thing.__name__):
+                self.modules[thing.__name__] = thing
+                self.files.update(filter(None, [getattr(thing, "__file__", None)]))
             return ["module", thing.__name__, _version(thing.__name__)]
         if isinstance(thing, logging.Logger):
             return ["logger", thing.name]
@@ -128,6 +179,10 @@ class _Digest:
             return [kind.__name__, self.of(thing.__func__)]
         if isinstance(thing, property):
             return ["property", *map(self.of, (thing.fget, thing.fset))]
+        if isinstance(thing, functools.cached_property):
+            return ["cached property", self.of(thing.func)]
+        if isinstance(thing, functools._lru_cache_wrapper):
+            return ["cached", self.of(thing.__wrapped__)]
         if isinstance(thing, types.FunctionType):
             return self._function(thing)
         if isinstance(getattr(thing, "py_func", None), types.FunctionType):  # compiled by numba
@@ -147,30 +202,28 @@ class _Digest:
             return [*parts, function.__module__, _version(function.__module__)]
         closed_over = [_contents(cell) for cell in function.__closure__ or ()]
         parts += [self._joined(self._code(function.__code__))]
-        parts += map(self.of, (function.__defaults__, function.__kwdefaults__, closed_over))
-        names = sorted(set(_names(function.__code__)))
+        parts += map(self.of, (function.__defaults__, function.__kwdefaults__, closed_over, vars(function)))
+        self.names.update(_names(function.__code__))
+        self.files.add(function.__code__.co_filename)
         for name in sorted(set(_global_names(function.__code__))):
             if name in function.__globals__:
-                parts += self._named(name, function.__globals__[name], names, function)
+                parts += self._named(name, function.__globals__[name], function.__qualname__)
         for name in sorted(set(_imports(function))):
-            if self._known_by_version(name):
-                parts += [name, _version(name)]
-            else:
-                parts += self._named(name, importlib.import_module(name), names, function)
+            parts += [name, self.of(_imported(name)) if not self._known_by_version(name) else _version(name)]
         return parts
 
-    def _named(self, name: str, value: Any, names: list[str], function: types.FunctionType) -> list[str | bytes]:
-        """Digest of the value of a name in a function, and of the attributes that it uses if the value is a module."""
+    def _named(self, name: str, value: Any, user: str) -> list[str | bytes]:
+        """Digest of the value of a name in a function or module."""
         try:
-            parts = [name, self.of(value)]
+            return [name, self.of(value)]
         except ValueError as error:
-            raise ValueError(f"{function.__qualname__} uses {name}, and {error}") from None
-        if isinstance(value, types.ModuleType) and not self._known_by_version(value.__name__):
-            members = [member for member in names if member in vars(value) and vars(value)[member] is not value]
-            for member in members:
-                inner = [other for other in names if other != member]
-                parts += self._named(member, vars(value)[member], inner, function)
-        return parts
+            raise ValueError(f"{user} uses {name}, and {error}") from None
+
+    def _separate(self) -> "_Digest":
+        """A digest that does not depend on what this one has seen."""
+        other = _Digest(self.package)
+        other.names, other.modules, other.files = self.names, self.modules, self.files
+        return other
 
     def _code(self, code: types.CodeType) -> list[str | bytes]:
         parts = map(self.of, (code.co_consts, code.co_names, code.co_varnames))
@@ -197,24 +250,16 @@ class _Digest:
             code = [self.of(type(thing))] if inherits_fingerprint(type(thing)) else []
             return ["fingerprint", fingerprint, object_digest(thing), *code]
         if isinstance(thing, enum.Enum):
-            state = {thing.name: thing.value}
-        elif is_dataclass(thing):
-            state = {field.name: getattr(thing, field.name) for field in fields(thing)}
-        elif isinstance(thing, tuple):  # named
-            state = dict(enumerate(thing))
-        elif type(thing).__module__ != "builtins" and isinstance(getattr(thing, "__dict__", None), dict):
-            state = vars(thing)
-            plain = type(thing).__reduce_ex__ is object.__reduce_ex__ and type(thing).__reduce__ is object.__reduce__
-            if not plain or hasattr(type(thing), "__slots__"):
-                state = None
-        else:
-            state = None
+            return ["enum", self.of(type(thing)), thing.name, self.of(thing.value)]
+        value = _builtin_value(thing)
+        state = _attributes(thing, always=value is not None)
         if state is None:
             raise ValueError(
                 f"no digest can be made of {repr(thing)[:80]} ({type(thing).__name__}) that would be the same in "
                 "another process"
             )
-        return ["object", self.of(type(thing)), *(self.of(part) for item in state.items() for part in item)]
+        parts = [self.of(part) for item in state.items() for part in item]
+        return ["object", self.of(type(thing)), self.of(value), *parts]
 
     def _known_by_version(self, module: str) -> bool:
         """Whether a module is represented by a version: neither in the function's package nor a file of the user."""
@@ -222,13 +267,67 @@ class _Digest:
         return top != self.package and (top == LIBRARY or not _is_own(top))
 
 
+def _builtin_value(thing: Any) -> Any:
+    """Value of an instance of a subclass of a built-in type or of an array, None for other objects."""
+    if isinstance(thing, np.ndarray) and not thing.dtype.hasobject:
+        return np.array(thing, subok=False)
+    return next((kind(thing) for kind in _BUILTIN_VALUES if isinstance(thing, kind)), None)
+
+
+def _attributes(thing: Any, always: bool) -> dict[str, Any] | None:
+    """All attributes of an object, without those that a cached property has computed from others.
+
+    None if they need not be the whole state of the object: if it has no attributes, unless `always`, or if its class
+    defines how it is pickled and is not a dataclass.
+    """
+    cls = type(thing)
+    if cls.__module__ == "builtins":
+        return None
+    slots = [slot for base in cls.__mro__ for slot in _slots(base)]
+    if not (always or slots or is_dataclass(thing) or isinstance(getattr(thing, "__dict__", None), dict)):
+        return None
+    if not (always or is_dataclass(thing) or _is_plain(thing)):
+        return None
+    state = {slot: getattr(thing, slot) for slot in slots if hasattr(thing, slot)} | getattr(thing, "__dict__", {})
+    if isinstance(thing, defaultdict):
+        state["default_factory"] = thing.default_factory
+    return {name: value for name, value in state.items() if not _is_computed(cls, name)}
+
+
+def _is_plain(thing: Any) -> bool:
+    """Whether an object has no state besides its attributes, such as that of compiled code or of an open file."""
+    cls = type(thing)
+    if cls.__reduce_ex__ is not object.__reduce_ex__ or cls.__reduce__ is not object.__reduce__:
+        return False
+    try:
+        thing.__reduce_ex__(2)
+    except TypeError:
+        return False
+    return True
+
+
+def _slots(cls: type) -> list[str]:
+    """Names of the slots that a class defines, as they are looked up on its instances."""
+    slots = vars(cls).get("__slots__", ())
+    names = [slots] if isinstance(slots, str) else list(slots)
+    private = "_" + cls.__name__.lstrip("_")
+    names = [private + name if name.startswith("__") and not name.endswith("__") else name for name in names]
+    return [name for name in names if name not in ("__dict__", "__weakref__")]
+
+
+def _is_computed(cls: type, name: str) -> bool:
+    """Whether an attribute is the stored value of a cached property."""
+    found = next((vars(base)[name] for base in cls.__mro__ if name in vars(base)), None)
+    return isinstance(found, functools.cached_property)
+
+
 @functools.cache
 def _is_own(top: str) -> bool:
     """Whether a module is neither installed nor in the standard library, so that it changes without a version."""
-    if top in sys.stdlib_module_names:
-        return False
-    if top == "__main__":  # a notebook has no file
+    if top in ("__main__", "__mp_main__"):  # a notebook has no file; the script has the second name in a worker
         return True
+    if is_standard(top):
+        return False
     module = sys.modules.get(top)
     try:
         spec = module.__spec__ if module else importlib.util.find_spec(top)
@@ -237,6 +336,14 @@ def _is_own(top: str) -> bool:
     found = getattr(module, "__file__", None) or getattr(spec, "origin", None)
     places = [found] if found else list(getattr(spec, "submodule_search_locations", None) or [])
     return any(not {"site-packages", "dist-packages"} & set(PurePath(place).parts) for place in places)
+
+
+def _imported(name: str) -> Any:
+    """A module that a function imports, or the reason why it cannot be imported."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:  # it may be optional
+        return f"{type(error).__name__} of {name}"
 
 
 def _version(module: str) -> str:
@@ -270,10 +377,22 @@ def _imports(function: types.FunctionType) -> Iterator[str]:
                 level = next((value for value in before[-2:] if isinstance(value, int)), 0)
                 name, package = "." * level + step.argval, function.__globals__.get("__package__") or ""
                 try:
-                    yield importlib.util.resolve_name(name, package)
+                    name = importlib.util.resolve_name(name, package)
                 except ImportError:
                     raise ValueError(f"{function.__qualname__} imports {name}, but is not in a package") from None
+                yield name
+                yield from (f"{name}.{item}" for item in before[-1] or () if _is_submodule(name, item))
             before.append(step.argval)
+
+
+def _is_submodule(package: str, name: str) -> bool:
+    """Whether ``from package import name`` imports a module of the user."""
+    if not _is_own(package.split(".")[0]) or package.split(".")[0] == LIBRARY:
+        return False
+    try:
+        return importlib.util.find_spec(f"{package}.{name}") is not None
+    except (ImportError, ValueError):
+        return False
 
 
 def _contents(cell: types.CellType) -> Any:

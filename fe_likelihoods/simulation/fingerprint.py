@@ -18,7 +18,8 @@ def simulation_fingerprint(model: Any, statistic: Any = None) -> str:
     model : Model
         Its class may be defined outside the library.
     statistic : function, optional
-        The statistic of the residuals that is stored, where it is not the sum of squares.
+        The statistic of the residuals that is stored, where it is not the sum of squares. One of the user is
+        represented by its code.
 
     Returns
     -------
@@ -27,19 +28,24 @@ def simulation_fingerprint(model: Any, statistic: Any = None) -> str:
     Raises
     ------
     ValueError
-        If no digest of the code of the user's class can be computed.
+        If no digest of the code of the user's class or statistic can be computed.
     """
-    modules = [f"{LIBRARY}.simulation.model"]
-    if statistic is not None and statistic.__module__.split(".")[0] == LIBRARY:
-        modules.append(statistic.__module__)
-    parts = [model.fingerprint, object_digest(model, *modules)]
+    modules, code = [f"{LIBRARY}.simulation.model"], []
+    if statistic is not None:
+        if statistic.__module__.split(".")[0] == LIBRARY:
+            modules.append(statistic.__module__)
+        else:
+            code = [_code_of(statistic, "the statistic of the noise", "define it without such an object")]
+    parts = [model.fingerprint, object_digest(model, *modules), *code]
     cls = type(model)
     if inherits_fingerprint(cls):
-        try:
-            parts.append(code_digest(cls))
-        except ValueError as error:
-            raise ValueError(
-                f"{cls.__name__}: no digest of the code of the class can be computed; define a property `fingerprint` "
-                f"in it, a text to be changed whenever the code changes: {error}"
-            ) from error
+        advice = "define a property `fingerprint` in it, a text to be changed whenever the code changes"
+        parts.append(_code_of(cls, "the code of the class", advice))
     return " ".join(parts)
+
+
+def _code_of(thing: Any, what: str, advice: str) -> str:
+    try:
+        return code_digest(thing)
+    except ValueError as error:
+        raise ValueError(f"{thing.__qualname__}: no digest of {what} can be computed; {advice}: {error}") from error

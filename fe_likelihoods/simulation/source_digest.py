@@ -14,12 +14,13 @@ import ast
 import functools
 import importlib.util
 import sys
+import sysconfig
 from collections.abc import Iterator
 from hashlib import blake2b
 from pathlib import Path, PurePath
 from typing import Any
 
-__all__ = ["LIBRARY", "imported_files", "inherits_fingerprint", "object_digest", "source_digest"]
+__all__ = ["LIBRARY", "imported_files", "inherits_fingerprint", "is_standard", "object_digest", "source_digest"]
 
 LIBRARY = __name__.split(".")[0]
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,13 +56,31 @@ def inherits_fingerprint(cls: type) -> bool:
     return False
 
 
+@functools.cache
+def is_standard(top: str) -> bool:
+    """Whether a module belongs to the standard library; not a file of the user with the name of such a module."""
+    if top not in sys.stdlib_module_names:
+        return False
+    module = sys.modules.get(top)
+    try:
+        spec = getattr(module, "__spec__", None) or importlib.util.find_spec(top)
+    except (ValueError, ImportError):
+        return True
+    file = getattr(module, "__file__", None) or getattr(spec, "origin", None)
+    if file in (None, "built-in", "frozen"):
+        return True
+    folders = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib")}
+    parents = set(Path(file).resolve().parents)
+    return bool(folders & parents) and not {"site-packages", "dist-packages"} & set(Path(file).parts)
+
+
 def _modules_of(thing: Any) -> set[str]:
     """Modules of the library in which the class of an object, its bases and the classes of its attributes are defined.
 
     A class of the user may use any model of the library, so all models stand in for its own modules.
     """
     modules = _library_modules(thing) | _modules_of_attributes(thing)
-    if any(_top(base) not in {LIBRARY, *sys.stdlib_module_names} for base in type(thing).__mro__):
+    if any(_top(base) != LIBRARY and not is_standard(_top(base)) for base in type(thing).__mro__):
         modules.add(MODELS)
     return modules
 
