@@ -22,7 +22,7 @@ PLOTTING = {"arviz", "corner", "matplotlib"}
 CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy"}
 ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}, "pints": {"pints"}, "nautilus": {"nautilus"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
-WORKERS = {"faults", "orphan_reaper", "processes", "local_pool", "sandbox"}
+WORKERS = {"faults", "orphan_reaper", "processes", "local_pool", "sandbox", "supervisor", "programs"}
 LONGEST_MODULE = 500
 MOST_METHODS = 30
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import shutil
 import string
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -24,12 +23,14 @@ from ..signals.channels import Channel
 from ..simulation.code_digest import code_digest
 from ..simulation.faults import TransientReason, reason_of
 from ..simulation.model import SimulationFailed
-from ..simulation.processes import ManagedProcess, RunFailed, TemporaryFolder, describe_exit, last_lines
+from ..simulation.processes import RunFailed, TemporaryFolder, describe_exit, last_lines
+from ..simulation.programs import run_program
 from .external import ExternalModel
 from .validation import positive_float
 
 __all__ = ["ExecutableModel"]
 
+_WATCH_INTERVAL = 0.1  # [s] between checks of the amount of output
 _FREE_BYTES = 2**16  # less free space than this may be the reason of a failure
 _EXIT_CODES_OF_SHELLS = {126, 127, *range(129, 160)}  # no program, or a program killed by signal 1 to 31
 
@@ -39,9 +40,11 @@ class ExecutableModel(ExternalModel):
 
     ``$name`` or ``${name}`` in the templates and in the arguments of the command is replaced by the value of a
     parameter, with all its digits; ``$$`` is a dollar sign (`string.Template`). The program is started in the folder of
-    the run, without a shell and without standard input. After it has ended or was stopped, its process group is killed.
-    If it was stopped, all other processes with its environment are killed too (on Linux), such as programs that it
-    started in the background.
+    the run, without a shell and without standard input.
+
+    After the program has ended or was stopped, everything that it has started is killed: on Linux also processes in a
+    session of their own with another environment, on other systems its process group. Not found are processes that a
+    service starts for it, such as a container or a job of a queue, and those of a program that kills its supervisor.
 
     Parameters
     ----------
@@ -74,6 +77,10 @@ class ExecutableModel(ExternalModel):
         Largest number of folders that are kept there.
     max_output : int
         Largest amount that a run may write into its folder and to standard output and error [bytes].
+    env : mapping of str to str, optional
+        All environment variables of the program; they are part of the fingerprint. By default the program has the
+        variables of this process at each run, which are not part of the fingerprint, so that a change in them is not
+        noticed by a cache.
     hash_executable : bool
         Whether the fingerprint contains the content of the program, and of files that an argument names by an absolute
         path. For large installations use `version` instead.
@@ -110,6 +117,7 @@ class ExecutableModel(ExternalModel):
         keep_failures: str | Path | None = None,
         max_kept: int = 20,
         max_output: int = 2**28,
+        env: Mapping[str, str] | None = None,
         hash_executable: bool = True,
         version: str | None = None,
     ) -> None:
@@ -139,6 +147,7 @@ class ExecutableModel(ExternalModel):
                 f"ExecutableModel: expected one column, 0 or more, for each of the {len(self.channels)} channels; "
                 f"got {columns}"
             )
+        self.env = None if env is None else _environment(env)
         self.keep_failures = None if keep_failures is None else Path(keep_failures).resolve()
         self.fingerprint = self._fingerprint(hash_executable, version)
 
@@ -156,7 +165,8 @@ class ExecutableModel(ExternalModel):
                     "ExecutableModel: no digest of the function output can be computed; give version=, a text to be "
                     f"changed whenever the function changes: {error}"
                 ) from error
-        return self._digest(self.command, contents, sorted(self.templates.items()), copied, parse, version)
+        stated = [] if self.env is None else [sorted(self.env.items())]
+        return self._digest(self.command, contents, sorted(self.templates.items()), copied, parse, version, *stated)
 
     def _check_placeholders(self) -> None:
         """Raise ValueError unless every placeholder is a parameter and every parameter has a placeholder."""
@@ -214,38 +224,26 @@ class ExecutableModel(ExternalModel):
     def _execute(self, place: Path, arguments: list[str]) -> None:
         """Run the program in the folder ``run`` of `place`; raise RunFailed unless it succeeds."""
         start = time.monotonic()
-        with open(place / "stdout.txt", "wb") as stdout, open(place / "stderr.txt", "w+b") as stderr:
-            program = ManagedProcess(
-                [self.command[0], *arguments],
-                cwd=place / "run",
-                stdin=subprocess.DEVNULL,
-                stdout=stdout,
-                stderr=stderr,
-            )
-            try:
-                checked = start
-                while not program.ended():
-                    now = time.monotonic()
-                    if now - start > self.time_limit:
-                        text = f"stopped at the time limit of {self.time_limit:g} s"
-                        raise RunFailed(TransientReason(text, time_limit=self.time_limit), now - start)
-                    if now - checked > 0.1:
-                        checked = now
-                        if _size(place) > self.max_output:
-                            text = f"stopped because it wrote more than {self.max_output} bytes"
-                            raise RunFailed(TransientReason(text), now - start)
-                    time.sleep(min(0.02, 0.001 + 0.05 * (now - start)))
-            except BaseException:
-                program.kill()
-                raise
-            exit_code = program.kill(everywhere=False)
-            if exit_code:
-                reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)]))
-                killed = exit_code < 0 or exit_code in _EXIT_CODES_OF_SHELLS
-                raise RunFailed(TransientReason(reason) if killed else reason, time.monotonic() - start)
+
+        def watch(seconds: float) -> float:
+            if seconds > self.time_limit:
+                text = f"stopped at the time limit of {self.time_limit:g} s"
+                raise RunFailed(TransientReason(text, time_limit=self.time_limit), seconds)
             if _size(place) > self.max_output:
-                reason = TransientReason(f"the program wrote more than {self.max_output} bytes")
-                raise RunFailed(reason, time.monotonic() - start)
+                raise RunFailed(TransientReason(f"stopped because it wrote more than {self.max_output} bytes"), seconds)
+            return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
+
+        environment = os.environ if self.env is None else self.env
+        outputs = place / "stdout.txt", place / "stderr.txt"
+        exit_code = run_program([self.command[0], *arguments], environment, place / "run", *outputs, watch)
+        seconds = time.monotonic() - start
+        if exit_code:
+            with open(outputs[1], "rb") as stderr:
+                reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)]))
+            killed = exit_code < 0 or exit_code in _EXIT_CODES_OF_SHELLS
+            raise RunFailed(TransientReason(reason) if killed else reason, seconds)
+        if _size(place) > self.max_output:
+            raise RunFailed(TransientReason(f"the program wrote more than {self.max_output} bytes"), seconds)
 
     def _read(self, folder: Path) -> Any:
         """Read the response from the folder of the run."""
@@ -295,6 +293,19 @@ def _executable(name: str) -> str:
             f"ExecutableModel: expected an executable program, as a path or in the folders of PATH; got {name!r}"
         )
     return os.path.abspath(found)
+
+
+def _environment(env: Mapping[str, str]) -> dict[str, str]:
+    """Copy of environment variables; ValueError for names and values that no process can have."""
+    if not isinstance(env, Mapping):
+        raise ValueError(f"ExecutableModel: env must be a mapping of names to values, both str; got {env!r}")
+    for name, value in env.items():
+        text = isinstance(name, str) and isinstance(value, str)
+        if not text or not name or "=" in name or "\0" in name + value:
+            raise ValueError(
+                f"ExecutableModel: env must map names without '=' to values, both str; got {name!r}: {value!r}"
+            )
+    return dict(env)
 
 
 def _inside(name: str) -> str:

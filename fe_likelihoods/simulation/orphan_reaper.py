@@ -19,9 +19,41 @@ import shutil
 import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
-__all__ = ["kill_tree", "main"]
+__all__ = ["kill_tree", "main", "terminate"]
+
+
+def terminate(pid: int, grace: float, runs: Callable[[int], bool] | None = None) -> None:
+    """Send SIGTERM to a process, and wait until it has ended.
+
+    Parameters
+    ----------
+    pid : int
+        Process.
+    grace : float
+        Longest time to wait [s].
+    runs : callable, optional
+        Returns whether a process runs; needed for a child of this process on systems without ``/proc``.
+    """
+    with suppress(ProcessLookupError, PermissionError):
+        os.kill(pid, signal.SIGTERM)
+        give_up = time.monotonic() + grace
+        while (runs or _runs)(pid) and time.monotonic() < give_up:
+            time.sleep(0.002)
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process exists and is no zombie; a zombie counts as running on systems without /proc."""
+    try:
+        os.kill(pid, 0)
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            return file.read().rpartition(b")")[2].split()[0] != b"Z"
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return not os.path.isdir("/proc/self")
 
 
 def kill_tree(group: int, mark: str) -> None:
@@ -59,21 +91,23 @@ def kill_tree(group: int, mark: str) -> None:
 def main() -> None:
     """Read messages until the pipe closes, then kill the groups and remove the folders that are left.
 
-    A message is a line of JSON: ``["group", id, mark]`` or ``["folder", path]`` for a new one, ``["gone", id or path]``
-    for one that has ended.
+    A message is a line of JSON: ``["group", id, mark, grace]`` or ``["folder", path]`` for a new one, ``["gone", id or
+    path]`` for one that has ended. The grace is the time that a group has to end after SIGTERM [s].
     """
-    groups: dict[int, str] = {}
+    groups: dict[int, list] = {}
     folders: set[str] = set()
     for line in sys.stdin:
-        kind, what, *mark = json.loads(line)
+        kind, what, *rest = json.loads(line)
         if kind == "group":
-            groups[what] = mark[0]
+            groups[what] = rest
         elif kind == "folder":
             folders.add(what)
         else:
             groups.pop(what, None)
             folders.discard(what)
-    for group, mark in groups.items():
+    for group, (mark, grace) in groups.items():
+        if grace:
+            terminate(group, grace)
         kill_tree(group, mark)
     for folder in folders:
         shutil.rmtree(folder, ignore_errors=True)

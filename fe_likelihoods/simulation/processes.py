@@ -85,11 +85,9 @@ class _Reaper:
         with self._lock:
             if self._owner != os.getpid() or self._process is None or self._process.poll() is not None:
                 command = [sys.executable, "-I", "-S", orphan_reaper.__file__]
-                # without the marks: killing this process by its mark must not kill its reaper, which then cleans up
-                variables = {name: value for name, value in os.environ.items() if not name.startswith(_MARK)}
                 self._process = subprocess.Popen(
                     command,
-                    env=variables,
+                    env=_without_marks(os.environ),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,
@@ -98,6 +96,11 @@ class _Reaper:
                 self._owner = os.getpid()
             with suppress(BrokenPipeError):
                 self._process.stdin.write(json.dumps(message).encode() + b"\n")
+
+
+def _without_marks(variables: Mapping[str, str]) -> dict[str, str]:
+    """Environment of a process that cleans up: killing its parent by a mark must not kill it."""
+    return {name: value for name, value in variables.items() if not name.startswith(_MARK)}
 
 
 _REAPER = _Reaper()
@@ -114,16 +117,23 @@ class ManagedProcess:
         Program and arguments; no shell is used.
     environment : mapping, optional
         Environment variables in addition to those of this process.
+    grace : float
+        Time that the process has to clean up and end after SIGTERM [s], as a process does that starts others; 0 to kill
+        it at once.
     **options
         Passed to `subprocess.Popen`.
     """
 
-    def __init__(self, command: list[str], environment: Mapping[str, str] | None = None, **options: Any) -> None:
+    def __init__(
+        self, command: list[str], environment: Mapping[str, str] | None = None, grace: float = 0.0, **options: Any
+    ) -> None:
         self.mark = f"{_MARK}{uuid.uuid4().hex}"
         variables = os.environ | dict(environment or {}) | {self.mark: "1"}
+        if grace:
+            variables = _without_marks(variables)
         self.process = subprocess.Popen(command, env=variables, start_new_session=True, **options)
-        _REAPER.send("group", self.process.pid, self.mark)
-        self._kill = weakref.finalize(self, _kill, self.process, self.mark, os.getpid())
+        _REAPER.send("group", self.process.pid, self.mark, grace)
+        self._kill = weakref.finalize(self, _kill, self.process, self.mark, os.getpid(), grace)
 
     def ended(self) -> bool:
         """Whether the process has exited; it is not waited for, so that its process id is not reused."""
@@ -135,30 +145,21 @@ class ManagedProcess:
             return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
         return True
 
-    def kill(self, everywhere: bool = True) -> int:
-        """Kill the process and its descendants.
-
-        Parameters
-        ----------
-        everywhere : bool
-            Whether descendants outside its process group are killed as well.
-
-        Returns
-        -------
-        int
-            Exit code, as in `subprocess`.
-        """
-        if not everywhere and self._kill.detach():
-            _kill(self.process, "", os.getpid())
+    def kill(self) -> int:
+        """Kill the process and its descendants; returns its exit code, as in `subprocess`."""
         self._kill()
         return self.process.returncode
 
 
-def _kill(process: subprocess.Popen, mark: str, owner: int) -> None:
+def _kill(process: subprocess.Popen, mark: str, owner: int, grace: float) -> None:
     """Kill a process with its descendants, unless the calling process has only a forked copy of its object."""
     if owner != os.getpid():
         return
     if process.returncode is None or not hasattr(os, "waitid"):
+        if grace and process.returncode is None:
+            orphan_reaper.terminate(
+                process.pid, grace, None if hasattr(os, "waitid") else lambda _: process.poll() is None
+            )
         orphan_reaper.kill_tree(process.pid, mark)
         process.wait()
     _REAPER.send("gone", process.pid)

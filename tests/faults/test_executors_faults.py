@@ -185,8 +185,8 @@ PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask"
 @needs_proc
 @pytest.mark.parametrize("pool", PARENTS)
 def test_nothing_outlives_a_parent_that_is_killed(pool, tmp_path, tmp_path_factory):
-    # one orphan reaper per process that starts others; two more for the program and its child
-    expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 4, "dask": WORKERS}.get(pool, 1 + WORKERS)
+    # one orphan reaper per process that starts others; three more for the program, its supervisor and its child
+    expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 5, "dask": WORKERS}.get(pool, 1 + WORKERS)
     at_once = 1 if pool == "isolated" else WORKERS
     command = [sys.executable, "-m", "tests.faults.pooled_run", pool, str(tmp_path)]
     place = tmp_path_factory.mktemp("place")

@@ -4,6 +4,7 @@ INPUT contains offset, slope, n, dt and the behaviour, one per line. The respons
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -12,16 +13,21 @@ offset, slope, n, dt, what = open(sys.argv[1]).read().split()
 rows = [(k * float(dt), float(offset) + float(slope) * (k * float(dt))) for k in range(int(n))]
 if what == "hang":
     time.sleep(3600)
-if what == "family":
-    sleep = [sys.executable, "-c", "import time; time.sleep(3600)"]
+if what in ("family", "leftovers"):  # a child, one in its own session, and a daemon without environment
+    sleep = ["sleep", "3600"]
     children = [subprocess.Popen(sleep), subprocess.Popen(sleep, start_new_session=True)]
+    read, write = os.pipe()
+    if os.fork() == 0:
+        os.setsid()
+        if pid := os.fork():
+            os.write(write, str(pid).encode())
+            os._exit(0)
+        os.execve(shutil.which("sleep"), sleep, {})
+    pids = [os.getpid(), *(child.pid for child in children), int(os.read(read, 20))]
     with open(os.environ["FAMILY"], "w") as file:
-        file.write(" ".join(str(pid) for pid in (os.getpid(), *(child.pid for child in children))))
-    time.sleep(3600)
-if what == "leftover":  # succeeds and leaves a child process in its group
-    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(3600)"])
-    with open(os.environ["FAMILY"], "w") as file:
-        file.write(str(child.pid))
+        file.write(" ".join(map(str, pids)))
+    if what == "family":
+        time.sleep(3600)
 if what == "fail":
     sys.exit("matrix is singular\n  at step 12\n")
 if what == "crash":

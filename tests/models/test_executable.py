@@ -1,5 +1,6 @@
 """Models defined by a program: parameters and responses are exact, and failing programs are reported."""
 
+import functools
 import os
 import pickle
 import sys
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ExecutableModel, LocalPool, SimulationFailed
+from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
 
@@ -120,17 +122,59 @@ def test_reason_and_duration_of_a_failure(what):
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: background processes cannot be found")
 def test_hanging_program_is_killed_with_its_children(tmp_path, monkeypatch):
     monkeypatch.setenv("FAMILY", str(tmp_path / "pids"))
-    reason, _ = failure(model_of("family", time_limit=2.0))
-    assert reason == "stopped at the time limit of 2 s"
+    reason, _ = failure(model_of("family", time_limit=1.0))
+    assert reason == "stopped at the time limit of 1 s"
     pids = family(tmp_path / "pids")
-    assert len(pids) == 3
+    assert len(pids) == 4
     assert gone(pids)
 
 
-def test_children_left_by_a_program_are_killed(tmp_path, monkeypatch):
-    monkeypatch.setenv("FAMILY", str(tmp_path / "pids"))
-    np.testing.assert_array_equal(model_of("leftover").simulate(THETA), line(THETA))
-    assert gone(family(tmp_path / "pids"))
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: background processes cannot be found")
+def test_processes_left_by_a_program_are_killed(tmp_path):
+    """Also a daemon in its own session, without an environment, whose parent has ended."""
+    model = model_of("leftovers", env={"FAMILY": str(tmp_path / "pids"), "PATH": os.environ["PATH"]})
+    np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
+    pids = family(tmp_path / "pids")
+    assert len(pids) == 4
+    assert gone(pids, 0.0)  # before the run is over
+
+
+def test_a_supervisor_that_is_killed_is_a_transient_fault():
+    model = model_of()
+    model.simulate(THETA)  # its supervisor is kept
+    kill = "import os, signal; os.kill(os.getppid(), signal.SIGKILL)"
+    killer = model_of(command=[sys.executable, "-S", "-c", kill, "in.txt"])
+    (reason,) = simulate_batch(killer, THETA[None]).reasons
+    assert isinstance(reason, TransientReason)
+    assert reason.startswith("the supervisor of the program died")
+    np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
+
+
+# environment --------------------------------------------------------------------------------------------------------
+
+
+def test_a_program_has_the_stated_environment(monkeypatch):
+    monkeypatch.setenv("SEEN", "1")
+    show = [sys.executable, "-S", "-c", "import os; print(*sorted(os.environ))", "in.txt"]
+
+    def names(**options):
+        seen = []
+        model_of(command=show, output=functools.partial(_names, seen), version="1", **options).simulate(THETA)
+        return {name for name in seen if not name.startswith(("FE_LIKELIHOODS_RUN_", "LC_CTYPE"))}
+
+    assert names() >= {"SEEN", "PATH"}
+    assert names(env={"LICENCE": "1"}) == {"LICENCE"}
+    assert names(env={}) == set()
+    prints = [model_of(env=env).fingerprint for env in (None, {}, {"A": "1", "B": "2"}, {"A": "2", "B": "2"})]
+    assert len(set(prints)) == 4
+    assert model_of(env={"B": "2", "A": "1"}).fingerprint == prints[2]
+    monkeypatch.setenv("SEEN", "2")
+    assert model_of().fingerprint == prints[0]
+
+
+def _names(seen, folder):
+    seen += (folder.parent / "stdout.txt").read_text().split()
+    return line(THETA)
 
 
 def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path):
@@ -184,6 +228,9 @@ def test_failures_are_counted_by_the_posterior():
         ({"output": 3}, "output must be a file name or a function"),
         ({"columns": [0, 1]}, "one column, 0 or more, for each of the 1 channels"),
         ({"columns": [-1]}, "one column, 0 or more"),
+        ({"env": ["PATH"]}, "env must be a mapping of names to values"),
+        ({"env": {"A": 1}}, "env must map names without '=' to values, both str; got 'A': 1"),
+        ({"env": {"A=B": "1"}}, "env must map"),
     ],
     ids=str,
 )

@@ -1,0 +1,171 @@
+"""Programs that run under a supervisor, which kills everything that they leave.
+
+See `fe_likelihoods.simulation.supervisor`. A supervisor runs one program at a time and is kept for the next one, since
+its start takes about 50 ms.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from multiprocessing.connection import wait
+from pathlib import Path
+
+from . import supervisor
+from .faults import TransientReason
+from .processes import ManagedProcess, RunFailed
+
+__all__ = ["run_program"]
+
+_MOST_IDLE = 16  # supervisors that are kept
+_STOP_SECONDS = 15.0  # longer than a supervisor tries to kill a program
+_idle: "list[_Supervisor]" = []
+_lock = threading.Lock()
+
+
+class _Supervisor:
+    """A supervisor process, seen from the process that uses it."""
+
+    def __init__(self) -> None:
+        self._managed = ManagedProcess(
+            [sys.executable, "-I", "-S", supervisor.__file__],
+            grace=_STOP_SECONDS,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            bufsize=0,
+            cwd="/",
+        )
+        self._process = self._managed.process
+        self._owner = os.getpid()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs and is a child of this process (not of the one this was forked from)."""
+        return self._owner == os.getpid() and not self._managed.ended()
+
+    def start(
+        self, command: Sequence[str], environment: Mapping[str, str], folder: Path, stdout: Path, stderr: Path
+    ) -> None:
+        """Start a program; `wait` reports its end."""
+        request = {
+            "command": list(command),
+            "environment": {**environment, self._managed.mark: "1"},
+            "folder": str(folder),
+            "stdout": str(stdout),
+            "stderr": str(stderr),
+        }
+        self._send(request)
+
+    def wait(self, seconds: float) -> int | None:
+        """Exit code of the program, None if it has not ended within a time [s].
+
+        Raises
+        ------
+        OSError
+            If the program could not be started.
+        RunFailed
+            If the supervisor has died.
+        """
+        answer = self._receive(seconds)
+        if "error" in answer:
+            raise OSError(answer["errno"], answer["error"])
+        return answer.get("exit_code")
+
+    def stop(self) -> None:
+        """Kill the program and everything that it has started."""
+        self._send(None)
+        with suppress(RunFailed):
+            # the program may have ended by itself at the same time, which is answered first
+            while answer := self._receive(_STOP_SECONDS):
+                if "stopped" in answer:
+                    return
+            self.kill()
+
+    def kill(self) -> None:
+        """Kill the supervisor as well."""
+        self._managed.kill()
+        self._process.stdin.close()
+        self._process.stdout.close()
+
+    def _receive(self, seconds: float) -> dict:
+        """Next answer, empty if there is none within a time [s]; RunFailed if the supervisor has died."""
+        if not wait([self._process.stdout], seconds):
+            return {}
+        line = self._process.stdout.readline()
+        if not line.endswith(b"\n"):
+            self.kill()
+            raise RunFailed(TransientReason("the supervisor of the program died"))
+        return json.loads(line)
+
+    def _send(self, request: dict | None) -> None:
+        with suppress(OSError):  # `wait` reports that the supervisor has died
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+
+
+def run_program(
+    command: Sequence[str],
+    environment: Mapping[str, str],
+    folder: Path,
+    stdout: Path,
+    stderr: Path,
+    watch: Callable[[float], float],
+) -> int:
+    """Run a program to its end and kill everything that it leaves.
+
+    Parameters
+    ----------
+    command : sequence of str
+        Absolute path of the program, and arguments; no shell is used. Standard input is empty.
+    environment : mapping
+        All environment variables of the program. One more is added, with a random name, by which processes are found.
+    folder : Path
+        Working folder.
+    stdout, stderr : Path
+        Files for its output.
+    watch : callable
+        Called repeatedly with the time since the start of the program [s]. It returns the time until the next call [s],
+        or raises an exception, which stops the program and is passed on.
+
+    Returns
+    -------
+    int
+        Exit code, as in `subprocess`: negative for a signal.
+
+    Raises
+    ------
+    OSError
+        If the program cannot be started.
+    RunFailed
+        If its supervisor dies.
+    """
+    keeper = _take()
+    running = True
+    try:
+        keeper.start(command, environment, folder, stdout, stderr)
+        start = time.monotonic()
+        while (exit_code := keeper.wait(watch(time.monotonic() - start))) is None:
+            pass
+        running = False
+        return exit_code
+    finally:
+        if running and keeper.alive:
+            keeper.stop()
+        with _lock:
+            if keeper.alive and len(_idle) < _MOST_IDLE:
+                _idle.append(keeper)
+            else:
+                keeper.kill()
+
+
+def _take() -> _Supervisor:
+    with _lock:
+        while _idle:
+            keeper = _idle.pop()
+            if keeper.alive:
+                return keeper
+    return _Supervisor()
