@@ -1,7 +1,7 @@
 """Record of the simulations that failed."""
 
 import logging
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +16,7 @@ logger = logging.getLogger(__name__)
 _MAX_RECORDS = 1000
 _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
+_OTHER_FAULTS = "other faults of the infrastructure"
 _MIN_SIMULATIONS = 20  # before the share of failures is checked
 
 
@@ -38,13 +39,14 @@ class FailureLog:
     count : int
         Number of failures.
     records : list of dict
-        ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures, with ``"seconds"`` where the
-        duration is known, and ``"transient": True`` where the cause is not the model, so that a later run simulates
-        the point again (`fe_likelihoods.simulation.faults`).
+        ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of the model and of the first 1000
+        others, with ``"seconds"`` where the duration is known, and ``"transient": True`` where the cause is not the
+        model, so that a later run simulates the point again (`fe_likelihoods.simulation.faults`).
     transient : int
         Number of failures whose cause is not the model.
     reasons : collections.Counter
-        Number of failures per reason; reasons beyond the first 100 are counted together.
+        Number of failures per reason; reasons beyond the first 100 are counted together, those of the model and the
+        others apart.
 
     Raises
     ------
@@ -59,7 +61,14 @@ class FailureLog:
         self.count = self.transient = 0
         self.records: list[dict] = []
         self.reasons: Counter[str] = Counter()
+        self._reasons_of_model: set[str] = set()
+        self._transient_reasons: set[str] = set()
         self._names = tuple(parameter_names)
+        self._faults: OrderedDict[bytes, str] = OrderedDict()  # the last ones, by structural parameters
+
+    def fault(self, theta: np.ndarray) -> str:
+        """Reason of the failure at the structural parameters `theta` if its cause is not the model, else empty."""
+        return self._faults.get((theta + 0.0).tobytes(), "") if self._faults else ""
 
     def add(self, theta: np.ndarray, reason: str) -> None:
         """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
@@ -76,14 +85,20 @@ class FailureLog:
             )
         self.count += 1
         self.transient += transient
-        if len(self.records) < _MAX_RECORDS:
+        if transient:
+            self._faults[(theta + 0.0).tobytes()] = reason
+            while len(self._faults) > _MAX_RECORDS:
+                self._faults.popitem(last=False)
+        if (self.transient if transient else self.count - self.transient) <= _MAX_RECORDS:
             self.records.append({"parameters": parameters, "reason": reason})
             if seconds is not None:
                 self.records[-1]["seconds"] = seconds
             if transient:
                 self.records[-1]["transient"] = True
-        known = reason in self.reasons or len(self.reasons) < _MAX_REASONS
-        self.reasons[reason if known else _OTHER_REASONS] += 1
+        known = self._transient_reasons if transient else self._reasons_of_model
+        if len(known) < _MAX_REASONS:
+            known.add(reason)
+        self.reasons[reason if reason in known else _OTHER_FAULTS if transient else _OTHER_REASONS] += 1
 
     def check(self, n_simulations: int) -> None:
         """Raise `TooManyFailures` if too large a share of `n_simulations` simulations (20 or more) failed."""

@@ -209,6 +209,21 @@ class FELikelihood(CachedSimulations):
             result[possible] = np.where(simulated & usable, values, -np.inf)
         return result if points.ndim == 2 else float(result[0])
 
+    def fault(self, x: Any) -> str:
+        """Reason of a failed simulation whose cause is not the model, such as a worker that was killed.
+
+        Parameters
+        ----------
+        x : array_like (ndim,), or mapping
+            A point whose log-likelihood was computed in this process.
+
+        Returns
+        -------
+        str
+            Empty where the simulation succeeded, or its failure is an answer of the model.
+        """
+        return self._failures.fault(as_points(x, self.parameter_names)[: self._n_structural])
+
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.
 

@@ -295,6 +295,21 @@ class Posterior:
 
         return ResponseGuide(self, starts)
 
+    def fault(self, x: Any) -> str:
+        """As `FELikelihood.fault`: samplers record the reason where they evaluate points in other processes.
+
+        Parameters
+        ----------
+        x : array_like (ndim,), or mapping
+            A point whose log-probability was computed in this process.
+
+        Returns
+        -------
+        str
+            Empty where there was no fault of the infrastructure.
+        """
+        return self.likelihood.fault(x)
+
     def report(self) -> dict:
         """Summary of the simulations that this object has requested in this process.
 

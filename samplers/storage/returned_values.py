@@ -125,25 +125,35 @@ def log_densities(results: Any, n: int, name: str) -> np.ndarray:
 
 
 class Failed:
-    """Takes the place of a result where a function raised an exception.
+    """Takes the place of a result where a function raised an exception, or reports a fault.
 
     Parameters
     ----------
-    error : Exception
-        What was raised.
+    error : Exception or str
+        What was raised, or the reason.
 
     Attributes
     ----------
     reason : str
-        Type and message of the exception.
+        Type and message of the exception, or the reason.
     """
 
-    def __init__(self, error: Exception):
-        self.reason = f"{type(error).__name__}: {error}"
+    def __init__(self, error: Exception | str):
+        self.reason = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
+
+
+def _lost_in_pool(result: Any) -> bool:
+    """Whether a pool returned (None, reason) for a point, because every process that evaluated it died."""
+    return isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
 
 
 class ErrorCapturing:
     """A function that returns `Failed` instead of raising; it can be sent to a worker if the function can.
+
+    A function of one point, or the object of a method, may have a method ``fault(point)``, which returns the reason why
+    the point could not be evaluated by a fault of the infrastructure (a process that was killed, a full disk), or an
+    empty string. Such a point has `Failed` as well, because the records of a function in a worker are not seen in this
+    process.
 
     Parameters
     ----------
@@ -164,7 +174,10 @@ class ErrorCapturing:
 
     def __call__(self, points: Any) -> Any:
         try:
-            return self.function(points, *self.args, **self.kwargs)
+            result = self.function(points, *self.args, **self.kwargs)
+            owner = getattr(self.function, "__self__", self.function)  # of a method such as log_likelihood
+            fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
+            return Failed(fault) if fault else result
         except Exception as error:
             if not self.vectorize:
                 return Failed(error)
@@ -185,10 +198,12 @@ def outcomes(
 ) -> tuple[np.ndarray, np.ndarray | None, dict[int, str]]:
     """Log-probabilities and blobs as in `log_probabilities`, and the reasons of failures by row.
 
-    A point fails by an exception (`ErrorCapturing`) or by NaN. Its log-probability is NaN; its blobs are zero or empty.
+    A point fails by an exception or a fault (`ErrorCapturing`), by NaN, or where a pool lost every process that
+    evaluated it. Its log-probability is NaN; its blobs are zero or empty.
     """
     reasons = {}
     if isinstance(results, list):
+        results = [Failed(result[1]) if _lost_in_pool(result) else result for result in results]
         reasons = {row: result.reason for row, result in enumerate(results) if isinstance(result, Failed)}
     if not reasons:
         log_prob, blobs = log_probabilities(results, n, name, blobs_dtype)

@@ -14,9 +14,19 @@ from concurrent.futures.process import BrokenProcessPool
 import numpy as np
 import pytest
 
-from fe_likelihoods import ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache, SimulationFailed
+from fe_likelihoods import (
+    ExecutableModel,
+    FELikelihood,
+    FunctionModel,
+    LocalPool,
+    Measurements,
+    SimulationCache,
+    SimulationFailed,
+)
+from fe_likelihoods.probability.failures import FailureLog
 from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
+from samplers import SMCSampler
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
@@ -271,6 +281,61 @@ def test_the_first_fault_is_logged(caplog):
     with caplog.at_level(logging.WARNING):
         likelihood.misfit(THETAS)
     assert "is -inf in this run, and a later run simulates the point again" in caplog.text
+
+
+# records ------------------------------------------------------------------------------------------------------------
+
+
+def test_faults_are_recorded_after_many_other_failures():
+    log = FailureLog(NAMES, 1.0)
+    for k in range(1500):
+        log.add(np.array([k, 0.0]), f"no convergence at step {k}")
+    fault = np.array([0.5, -0.0])
+    log.add(fault, TransientReason("No space left on device after 3 s"))
+    assert log.records[-1] == {
+        "parameters": {"offset": 0.5, "slope": 0.0},
+        "reason": "No space left on device",
+        "seconds": 3.0,
+        "transient": True,
+    }
+    assert (log.count, log.transient, len(log.records), len(log.reasons)) == (1501, 1, 1001, 102)
+    assert log.reasons["No space left on device"] == 1
+    assert log.fault(fault) == log.fault(-fault * [-1, 1]) == "No space left on device"
+    assert log.fault(np.array([3.0, 0.0])) == ""
+
+
+class FullDisk(Treacherous):
+    """Fails at offsets below 0.1."""
+
+    def simulate(self, theta):
+        if theta[0] < 0.1:
+            raise FAULTS["no space"]
+        return line(theta)
+
+
+class Copies:
+    """A pool that calls a copy of the function, as other processes do."""
+
+    def map(self, function, items):
+        return map(pickle.loads(pickle.dumps(function)), items)
+
+
+@pytest.mark.parametrize("what", ["disk", "death"])
+def test_faults_in_the_pool_of_a_sampler_are_in_its_records(what, seed):
+    """The records of the posterior are those of its copy in a worker, and a worker that dies has none."""
+    points = np.random.default_rng(seed).uniform(0.2, 0.8, size=(20, 3))
+    points[7, 0] = 0.05
+    posterior = bad.posterior_of(FullDisk())
+    function, pool = (posterior, Copies()) if what == "disk" else (bad.deadly_density, LocalPool(1))
+    sampler = SMCSampler(20, 3, function, pool=pool, log_prior_fn=posterior.log_prior, seed=seed)
+    log_prob, _ = sampler.compute_log_prob(points)
+    assert np.isneginf(log_prob).tolist() == (np.arange(20) == 7).tolist()
+    reason = {"disk": "OSError: [Errno 28] No space left on device", "death": "the worker process died (signal 11)"}
+    (failure,) = sampler.failures
+    np.testing.assert_array_equal(failure["parameters"], points[7])
+    assert failure["reason"] == reason[what]
+    if what == "death":
+        pool.close()
 
 
 # complex responses ---------------------------------------------------------------------------------------------------

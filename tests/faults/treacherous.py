@@ -145,6 +145,13 @@ def third(theta: np.ndarray) -> np.ndarray:
     return line(theta) * (np.nan if theta[0] < 1.0 / 3.0 else 1.0)
 
 
+def deadly_density(x: np.ndarray) -> float:
+    """A log-density that kills its process below 0.1."""
+    if x[0] < 0.1:
+        treacherous(np.array([CRASHES, 0.0]))
+    return -0.5 * float(x @ x)
+
+
 def deadly(theta: np.ndarray) -> np.ndarray:
     """Crashes below 0.02, hangs up to 0.04."""
     if theta[0] < 0.02:
