@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .smc import (
         SMCSampler,
     )
-    from .storage.backends import (
+    from .storage.ladder_file import (
         read_ladder,
     )
     from .tempered import (
@@ -143,7 +143,7 @@ _EXPORTS = {
         "to_arviz",
     ),
     "smc": ("SMCSampler",),
-    "storage.backends": ("read_ladder",),
+    "storage.ladder_file": ("read_ladder",),
     "tempered": ("TemperedSampler",),
     "tempering.diagnostics": ("SamplingWarning",),
     "tempering.evidence_check": ("EvidenceCheck",),

@@ -36,6 +36,7 @@ from .storage.evaluation import CallingConvention, FailureLimit
 from .storage.evaluators import make_evaluators
 from .storage.journal import RunStart
 from .storage.recording import record, show_progress
+from .storage.resumption import Resumption
 from .storage.user_functions import UserFunctions
 from .tempering.anneal import anneal
 from .tempering.budget import Budget, BudgetExhausted, as_limit
@@ -55,7 +56,7 @@ __all__ = ["TemperedSampler"]
 logger = logging.getLogger(__name__)
 
 
-class TemperedSampler(RunResults, EnsembleSampler):
+class TemperedSampler(Resumption, RunResults, EnsembleSampler):
     """emcee's ensemble sampler, preceded by annealing from the prior to the posterior.
 
     Parameters
@@ -165,7 +166,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._budget = Budget(limit=as_limit(max_simulations))
         self._checkpoint = Checkpoint(backend, limited=max_simulations is not None)
         self._result, self._verdict = AnnealingResult(), None
-        self._annealed_state: State | None = None
+        self._start_is_open = False
         self.seconds = 0.0
         set_previous_state(self, None)
         super().__init__(
@@ -243,6 +244,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         emcee.State
             The last state.
         """
+        self._start_is_open = initial_state is None
         if initial_state is None and get_previous_state(self) is None:
             initial_state = self._last_or_prior()
         result = super().run_mcmc(initial_state, nsteps, **kwargs)
@@ -275,6 +277,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if int(thin_by if thin is None else thin) <= 0:
             raise ValueError("Invalid thinning argument")
         state = State(self._last_or_prior() if initial_state is None else initial_state, copy=True)
+        start_is_open, self._start_is_open = self._start_is_open or initial_state is None, False
         for name, value in (("log_prob", log_prob0), ("random_state", rstate0), ("blobs", blobs0)):
             if value is not None:
                 setattr(state, name, value)
@@ -286,17 +289,20 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.pool = self.pool
         failure_count, complete, made, start = self.failure_count, False, 0, time.perf_counter()
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
+        given = state.coords
+        start_is_open = start_is_open or np.array_equal(given, self._returned)
+        call = self._checkpoint.find_call(iterations, None if start_is_open else given) if store else None
+        if call is not None and call.complete:
+            yield from self._repeat(call, bar)
+            return
         try:
-            if self._checkpoint.interrupted is not None:
-                state, made = self._resume(state, iterations, bar)
-                iterations = None if iterations is None else iterations - made
-                skip_initial_state_check = True
-            elif self._needs_annealing(state):
-                state = self._anneal(state, skip_initial_state_check, bar)
-                skip_initial_state_check = True
+            if call is not None:  # it was interrupted
+                made, iterations = call.made, max(iterations - call.made, 0)
+            state, is_known = self._first_state(state, call, start_is_open, skip_initial_state_check, bar)
+            skip_initial_state_check = skip_initial_state_check or is_known
             self._annealed_state = state
-            if store and not made:
-                self._checkpoint.begin_call(iterations)
+            if store and call is None:
+                self._checkpoint.begin_call(iterations, given)
             self.seconds += time.perf_counter() - start
             start = time.perf_counter()
             self._evaluator.evaluates_parts = False
@@ -334,7 +340,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                     for name in State.__slots__:
                         setattr(advanced, name, getattr(stored, name))
                 self.random_state = stored.random_state
-                self._checkpoint.halt(stored, store and missing > 0 and made + new == 0)
+                self._checkpoint.halt(stored, store and missing > 0 and not self._checkpoint.has_steps)
                 warn(describe_halt(self.verdict, self._budget.limit, self._result, made + new, missing))
                 if new == 0 and missing > 0:
                     yield stored
@@ -344,13 +350,17 @@ class TemperedSampler(RunResults, EnsembleSampler):
         except GeneratorExit:  # the user wants no more states
             complete = True
             raise
+        except KeyboardInterrupt:
+            if not self._checkpoint.place:
+                raise
+            self._checkpoint.prepare_to_continue()
+            raise KeyboardInterrupt(
+                f"{self.evaluations} evaluations and {self.iteration} steps are kept in {self._checkpoint.place}: run "
+                "the same script again, or make the same call, to go on"
+            ) from None
         finally:
             self._checkpoint.end_call(complete and store)
-            if self.failure_count > failure_count:
-                warn(
-                    f"{self.failure_count - failure_count} evaluations failed and count as impossible "
-                    f"({self._evaluator.failures.most_common()}); see failures"
-                )
+            self._warn_of_failures(failure_count)
 
     def _judge(self, missing: int) -> None:
         """Store the verdict on an annealing of this object, or keep that of the backend."""
@@ -397,44 +407,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         functions, moves = (self._functions.function, self.coarse_log_prob_fn), self._usual_moves or get_moves(self)
         described = header(self.nwalkers, self.ndim, *functions, self.settings, *moves, self._given_guide)
         return described | self._functions.described()
-
-    def _resume(self, state: State, iterations: int | None, bar: dict) -> tuple[State, int]:
-        """Continue the interrupted run: repeat the annealing without evaluations, and go to the last stored step.
-
-        The run was killed, or ended by its limit of simulations, perhaps in this process.
-
-        Returns
-        -------
-        state : State
-            Where the run was interrupted.
-        made : int
-            How many of the iterations wanted now it has made already.
-        """
-        start, last = self._checkpoint.interrupted.start, self._checkpoint.interrupted.last
-        known_states = start, last, self._checkpoint.interrupted.provisional, get_previous_state(self)
-        if not any(np.array_equal(state.coords, known.coords) for known in known_states if known is not None):
-            raise ValueError(
-                f"{self.backend.filename} contains a run from other draws of the prior: pass None as initial_state to "
-                "continue it, or use another file; backend.reset(nwalkers, ndim) discards it"
-            )
-        contents = self._checkpoint.resume(self._header(), self._evaluator.log_base, self._evaluator.compute)
-        self.random_state = start.random_state
-        if self.evaluations > 0:  # a run of this object: its moves have adapted
-            _, probabilities = self._usual_moves or get_moves(self)
-            self._usual_moves = MoveSchedule(copy.deepcopy(self._first_moves), probabilities)
-        self._evaluator.reset()
-        known = (batch.coords for batch in contents.evaluated)
-        self._budget.restore(known, contents.of_earlier_guides, contents.of_guides)
-        self._drawn = start.coords  # tested when the run began
-        state = self._anneal(State(start.coords, copy=True), True, bar)
-        if last is not None and self._result.halt is None:
-            state = State(last.coords, log_prob=last.log_prob, blobs=last.blobs, random_state=last.random_state)
-            self.random_state = last.random_state
-            self._evaluator.reset()
-            for batch in contents.evaluated[: contents.before_last]:
-                self._evaluator.count(batch)
-        same_call = iterations is not None and iterations == contents.wanted
-        return state, contents.made if same_call else 0
 
     def _start(self, state: State, skip_check: bool) -> Population:
         """Draws of the prior, or of the start density, as a population, checked and entered in the journal."""

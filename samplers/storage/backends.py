@@ -1,55 +1,58 @@
-"""Storage of a run: the chain in emcee's backend, the ladder with it, and a journal beside an HDF5 file.
+"""emcee's HDF5 backend with a journal beside the file, so that a killed run can be continued.
 
-In an HDF5 file the ladder is the dataset ``ladder`` in the group of the chain, one row per stage, appended when the
-stage is finished. The independent check of the evidence is its attribute ``evidence_check``. In memory both are
-attributes of the backend.
-
-A process that dies while it writes can damage an HDF5 file. Therefore the journal (`samplers.storage.journal`) is
-written first, and a chain that does not agree with it is rebuilt from it. The journal is ``<file>.<group>.journal``,
-beside the file. The group names its run, so that the journal of another run has no effect.
+The journal is ``<file>.<group>.journal``, beside the file. Everything is written to the journal first
+(`samplers.storage.journal`), and the file follows from it (`samplers.storage.chain_file`). So whatever kills a process,
+the file is brought up to the journal when a sampler is made with it. A file that has more steps than its journal is
+never cut: they are entered in the journal when the run goes on. A file that differs from its journal in another way is
+kept beside, with a warning, and rebuilt.
 """
 
-import itertools
-import json
 import logging
 import os
 import secrets
 import time
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+import h5py
 import numpy as np
-from emcee.backends import Backend, HDFBackend
+from emcee.backends import HDFBackend
 
 from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.population import Stage
 from ..tempering.verdict import Verdict
-from .emcee_internals import append_steps, drop_last_step, holds_steps
-from .journal import Contents, EvaluatedBatch, Journal, RunStart, Step, describe_damage, read_journal
+from .chain_file import (
+    DAMAGE,
+    StoredRun,
+    adopt,
+    compare,
+    create_group,
+    is_unfinished,
+    ladder_differs,
+    read_run,
+    rebuild,
+    set_aside,
+    write_marks,
+)
+from .emcee_internals import append_steps, drop_last_step
+from .file_lock import FileLock
+from .journal import EvaluatedBatch, Journal, RunStart, Step, lock_path
+from .journal_contents import Contents, read_journal
+from .ladder_file import write_check, write_stage, write_verdict
+from .script import Script, digest
 
-__all__ = [
-    "JournaledBackend",
-    "read_check",
-    "read_ladder",
-    "read_verdict",
-    "write_check",
-    "write_stage",
-    "write_verdict",
-]
+__all__ = ["JournaledBackend"]
 
 logger = logging.getLogger(__name__)
 
-DATASET = "ladder"
-CHECK = "evidence_check"
-VERDICT = "verdict"
 RUN = "run"
 SECONDS_BETWEEN_WRITES = 0.25
-# Superblock of HDF5, version 0 (file format specification, section II.A): signature, version, and the end of the file
-SIGNATURE, END_OF_FILE, EMPTY_SIZE = b"\x89HDF\r\n\x1a\n\0", slice(40, 48), 2048
-STAGE_DTYPE = np.dtype(
-    [(name, np.int64 if kind is int else np.float64) for name, kind in Stage.__annotations__.items()]
-)
+# How long to wait for a process that reads the file, which locks it
+PATIENCE = 30.0
+
+# the objects of this process that write to a journal
+_writers: "weakref.WeakValueDictionary[Path, JournaledBackend]" = weakref.WeakValueDictionary()
 
 
 class JournaledBackend(HDFBackend):
@@ -61,7 +64,15 @@ class JournaledBackend(HDFBackend):
     Attributes
     ----------
     contents : Contents, or None
-        Journal of an interrupted run that can be continued; None after `continue_run`.
+        Journal of a run that can be continued; None after `continue_run`.
+    script : Script
+        The calls of the run, and how far this object has repeated them.
+    annealings : int
+        Number of annealings that have begun.
+    known_verdict : Verdict, or None
+        The verdict that the journal contains.
+    has_steps : bool
+        Whether the last annealing was followed by stored steps.
     """
 
     @classmethod
@@ -79,7 +90,19 @@ class JournaledBackend(HDFBackend):
         self._pending: list[Step] = []
         self._written = 0.0
         self._journal: Journal | None = None
-        self.contents = self._recover()
+        self._run, self._fresh, self._shows = "", False, False
+        self.contents: Contents | None = None
+        self.script, self.annealings = Script(), 0
+        self._accepted: np.ndarray | None = None
+        self.known_verdict: Verdict | None = None
+        self.has_steps = False
+        path = self.journal_path
+        if (writer := _writers.get(path.resolve())) is not None:
+            writer.flush()
+        if os.path.exists(self.filename) or path.exists():
+            with FileLock(lock_path(path)):
+                self._recover()
+        self._seen = _signature(path)
         return self
 
     def __getstate__(self):
@@ -96,22 +119,40 @@ class JournaledBackend(HDFBackend):
     def open(self, mode="r"):
         """emcee's: the open HDF5 file, after pending steps have been written."""
         self.flush()
-        return super().open(mode)
+        return self._open(mode)
+
+    def _open(self, mode: str, patience: float = PATIENCE) -> h5py.File:
+        """The open file; waits while another process has locked it by reading."""
+        end = time.monotonic() + patience
+        while True:
+            try:
+                return super().open(mode)
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.02)
 
     def reset(self, nwalkers, ndim):
         """emcee's: clear the chain."""
-        super().reset(nwalkers, ndim)
+        if self.script.skips_reset():
+            return
+        self._pending = []
+        if self.contents is not None and self._journal is None:
+            self._write_to(Journal(self.journal_path, self.contents.size, self.contents.whole))
+        # the file first: a process that dies between the two has reset nothing
+        self._accepted = None
+        with FileLock(lock_path(self.journal_path)):
+            self._run = secrets.token_hex(8) if self._journal is None else self._run
+            create_group(self, nwalkers, ndim, self._run)
+        self._fresh = self._journal is None
         if self._journal is not None:
-            self._journal.wipe()
-            self._write_run()
+            self._journal.wipe(self.script.begin(None))
+            self._mark()
             if self.contents is not None:
-                self.contents = self.contents._replace(steps=[], provisional=None)
+                self.contents = self.contents._replace(steps=[], provisional=None, adopted=(), wiped=False)
 
     def save_step(self, state, accepted):
         """emcee's: store a step."""
-        if self._journal is None:
-            super().save_step(state, accepted)
-            return
         step = Step(
             state.coords.copy(),
             state.log_prob.copy(),
@@ -119,22 +160,43 @@ class JournaledBackend(HDFBackend):
             None if state.blobs is None else state.blobs.copy(),
             state.random_state,
         )
-        self._journal.step(step)
+        if self._journal is not None:
+            self._journal.step(step)
+        if not self._shows:
+            self.script.stepped(step)
+            self.has_steps = True
+        self._shows = False
         self._pending.append(step)
-        if time.perf_counter() - self._written > SECONDS_BETWEEN_WRITES:
+        if self._journal is None:
             self.flush()
+        elif time.perf_counter() - self._written > SECONDS_BETWEEN_WRITES:
+            try:
+                self.flush(patience=0.0)
+            except BlockingIOError:  # another process reads the file: the journal has the step
+                self._written = time.perf_counter()
 
-    def flush(self) -> None:
-        """Write pending steps to the HDF5 file."""
+    def flush(self, patience: float = PATIENCE) -> None:
+        """Write pending steps to the HDF5 file.
+
+        Parameters
+        ----------
+        patience : float
+            How long to wait for a process that reads the file [s]. BlockingIOError after it.
+        """
         if not self._pending:
             return
         steps, self._pending = self._pending, []
         try:
-            with super().open("a") as file:
-                append_steps(file[self.name], steps)
+            with self._open("a", patience) as file:
+                group = file[self.name]
+                if self._accepted is None:
+                    self._accepted = group["accepted"][...]
+                append_steps(group, steps, self._accepted)
+                self._write_marks(file)
         except BaseException:
             self._pending = steps + self._pending
             raise
+        self._accepted = self._accepted + sum(step.accepted for step in steps)
         self._written = time.perf_counter()
 
     def close(self) -> None:
@@ -147,22 +209,38 @@ class JournaledBackend(HDFBackend):
 
     def begin(self, header: dict, start: RunStart) -> None:
         """Enter the start of the annealing in the journal; a new one if there is none and the chain is empty."""
-        if self._journal is None:
-            if self.iteration > 0:
-                logger.info("%s contains a chain without a journal: the new run cannot be resumed", self.filename)
-                return
-            header = {**header, RUN: secrets.token_hex(8)}
-            self._run = header[RUN]
-            self._journal = Journal.create(self.journal_path, header)
-            self._write_run()
-        self._journal.start(start)
+        self.annealings, self.known_verdict, self.has_steps = self.annealings + 1, None, False
+        if self._journal is not None:
+            self._journal.start(start)
+            return
+        if self.iteration > 0:
+            logger.info("%s contains a chain without a journal: the new run cannot be resumed", self.filename)
+            return
+        path = self.journal_path
+        with FileLock(lock_path(path)):
+            if _signature(path) != self._seen:
+                raise ValueError(f"another run has written to {path} since it was read: make a new sampler with it")
+            if path.exists() and path.stat().st_size > 0:
+                os.replace(path, f"{path}.old")
+                logger.info("%s belongs to a discarded run: kept as %s.old", path, path.name)
+            with self.open() as file:
+                fresh = self._fresh and file[self.name].attrs.get(RUN) == self._run
+            if not fresh:
+                self._run = secrets.token_hex(8)
+                create_group(self, *self.shape, self._run)
+            self._write_to(Journal.create(path, {**header, RUN: self._run}, start))
+        self._fresh, self.script = False, Script()
 
-    def continue_run(self, contents: Contents) -> None:
-        """Append to the journal that was read from now on."""
+    def continue_run(self, contents: Contents) -> Contents:
+        """Append to the journal that was read from now on; returns its contents."""
         self.contents = None
-        self._run = contents.header[RUN]
         if self._journal is None:
-            self._journal = Journal(self.journal_path, contents)
+            self._write_to(Journal(self.journal_path, contents.size, contents.whole))
+        if contents.adopted:
+            self._enter_adopted(contents)
+            contents = read_journal(self.journal_path)
+            self.script.calls = contents.script.calls
+        return contents
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter a batch of evaluated points in the journal."""
@@ -174,18 +252,42 @@ class JournaledBackend(HDFBackend):
         if self._journal is not None:
             self._journal.remembered(key, arrays, of_guides)
 
-    def call(self, nsteps: int) -> None:
-        """Enter the number of steps that a call asks for in the journal."""
+    def stage(self, index: int, stage: Stage, in_file: bool = True) -> None:
+        """Store a stage at its place in the ladder; with ``in_file=False``, in the journal only."""
         if self._journal is not None:
-            self._journal.call(nsteps)
+            self._journal.stage(index, stage)
+        if in_file:
+            write_stage(self, index, stage)
+
+    def check(self, check: EvidenceCheck) -> None:
+        """Store the check of the evidence."""
+        if self._journal is not None:
+            self._journal.check(check)
+        write_check(self, check)
+
+    def verdict(self, verdict: Verdict) -> None:
+        """Store the verdict."""
+        self.known_verdict = verdict
+        if self._journal is not None:
+            self._journal.verdict(verdict)
+        write_verdict(self, verdict)
+
+    def call(self, nsteps: int, coords: np.ndarray) -> None:
+        """Enter a call in the journal: the steps that it asks for, and where it starts."""
+        index = self.script.begin(int(nsteps), digest(coords), self.annealings)
+        if self._journal is not None:
+            self._journal.call(index, int(nsteps), digest(coords))
 
     def done(self) -> None:
-        """Enter that the call is complete, or was ended by the user, in the journal."""
+        """Enter that the call is complete, or was ended by the user."""
+        self.script.complete()
         if self._journal is not None:
             self._journal.done()
+        self._mark()
 
     def halt(self, shows: bool) -> None:
         """Enter in the journal that the limit of simulations ended the call, and whether the next step shows it."""
+        self._shows = shows
         if self._journal is not None:
             self._journal.halt(shows)
 
@@ -197,191 +299,165 @@ class JournaledBackend(HDFBackend):
 
     def back(self) -> None:
         """Remove the last step, which only showed the state, from the chain."""
+        # the file first: a process that dies between the two has removed nothing
+        drop_last_step(self)
         if self._journal is not None:
             self._journal.back()
-        drop_last_step(self)
+        self._mark()
 
-    def _write_run(self) -> None:
-        """Name the run in the group."""
-        with super().open("a") as file:
-            file[self.name].attrs[RUN] = self._run
+    def _write_to(self, journal: Journal) -> None:
+        self._journal = journal
+        _writers[self.journal_path.resolve()] = self
 
-    def _recover(self) -> Contents | None:
-        """The journal of the run in the file; where the chain differs from it, the chain is rebuilt."""
-        if not os.path.exists(self.filename):
-            return None
+    def _mark(self) -> None:
+        with self.open("a") as file:
+            self._write_marks(file)
+
+    def _write_marks(self, file: h5py.File) -> None:
+        write_marks(file[self.name], self._run, 0 if self._journal is None else self._journal.size, self.script)
+
+    def _enter_adopted(self, contents: Contents) -> None:
+        """Enter the steps that only the file of the chain has in the journal, with the calls that made them."""
+        known, calls, missing = read_journal(self.journal_path).script.calls, contents.script.calls, contents.adopted
+        if contents.provisional is not None:
+            missing = missing[:-1]
+        self._journal.halt(False)  # a step that the journal announced has not come
+        if contents.wiped and not any(call.steps is None for call in calls[len(known) :]):
+            self._journal.wipe(len(known))
+        for index, call in enumerate(calls):
+            new = index >= len(known) or known[index][:2] != call[:2]
+            if call.steps is None:
+                if new:
+                    self._journal.wipe(index)
+                continue
+            if new:
+                self._journal.call(index, call.steps, call.begin)
+            later = sum(other.made for other in calls[index + 1 :])
+            here = max(len(missing) - later, 0)
+            for step in missing[:here]:
+                self._journal.step(step)
+            missing = missing[here:]
+            if call.complete and (new or not known[index].complete):
+                self._journal.done()
+        for step in missing:
+            self._journal.step(step)
+        if contents.provisional is not None:
+            self._journal.halt(True)
+            self._journal.step(contents.provisional)
+        if contents.verdict is not None:
+            self._journal.verdict(contents.verdict)
+
+    # ------------------------------------------------------------------ recovery
+
+    def _recover(self) -> None:
+        """Read the journal and the file of the chain, and bring the file up to the journal."""
+        contents = read_journal(self.journal_path)
         try:
-            with HDFBackend.open(self) as file:
-                run = file[self.name].attrs.get(RUN) if self.name in file else None
-                if run is None:
-                    return None
-                contents = read_journal(self.journal_path)
-                if contents is None and self.journal_path.exists() and _holds_results(file[self.name]):
-                    raise ValueError(describe_damage(self.journal_path, "it ends before the start of the run"))
-                if contents is None or contents.header[RUN] != run:
-                    logger.info("%s: the journal of the run is missing or has no start", self.filename)
-                    return None
-                self._run = run
-                if holds_steps(file[self.name], contents.steps):
-                    return contents
+            stored = read_run(self)
         except BlockingIOError as error:  # locked, not damaged
             raise ValueError(
-                f"another run is writing to {self.filename}: wait for it or stop it, or give this run another file"
+                f"another run is writing to {self.filename}, or another program has opened it: wait for it or stop it, "
+                "or give this run another file"
             ) from error
-        except (OSError, KeyError, RuntimeError) as error:
-            contents = read_journal(self.journal_path)
-            if contents is None and not _is_unfinished(self.filename):
-                raise ValueError(
-                    f"{self.filename} is damaged or not an HDF5 file ({error}), and there is no journal at "
-                    f"{self.journal_path}, or too little of one, to rebuild it from: restore it from a copy, or give "
-                    "another file"
-                ) from error
-            aside = _set_aside(self.filename)
-            if contents is None:
-                logger.warning(
-                    "%s contains nothing, since a process died while it created the file: set aside as %s",
-                    self.filename,
-                    aside,
-                )
-                return None
-            logger.warning("%s is damaged: set aside as %s and rebuilt from its journal", self.filename, aside)
-        self._rebuild(contents)
-        return contents
+        except DAMAGE as error:
+            self._replace_damaged(contents, error)
+            return
+        if contents is not None and stored is None:
+            logger.warning(
+                "%s",
+                f"{self.filename} is missing or has no group {self.name}: rebuilt from {self.journal_path}. To start a "
+                "new run instead, remove both files",
+            )
+            self._take(contents, rewrite=True)
+            return
+        if stored is None or stored.run is None:
+            return
+        self._run = stored.run
+        if contents is None or contents.header[RUN] != stored.run:
+            self._continue_without_journal(stored, contents)
+            return
+        relation, (stale, foreign) = compare(stored, contents), ladder_differs(stored, contents)
+        if relation == "ahead":
+            logger.warning(
+                "%s",
+                f"{self.journal_path} has {len(contents.steps)} steps and {self.filename} has "
+                f"{len(stored.chain.coords)}, since the journal was truncated or the chain was continued without it: "
+                "the steps of the chain are kept, and evaluations that the journal has lost are made again",
+            )
+            self._take(adopt(stored, contents), rewrite=False)
+            return
+        if relation == "differs" or foreign:
+            aside = set_aside(self.filename, copy=True)
+            what = "the chain" if relation == "differs" else "the ladder"
+            logger.warning("%s in %s differs from its journal: kept as %s, and rebuilt", what, self.filename, aside)
+        self._take(contents, rewrite=relation != "equal" or stale)
 
-    def _rebuild(self, contents: Contents) -> None:
-        self._run = contents.header[RUN]
-        ladder = read_ladder(self) if self.initialized else ()
-        HDFBackend.reset(self, contents.header["nwalkers"], contents.header["ndim"])
-        self._write_run()
-        for index, stage in enumerate(ladder):
-            write_stage(self, index, stage)
-        if contents.steps:
-            self.grow(len(contents.steps), contents.steps[0].blobs)
-            self._pending = list(contents.steps)
-            self.flush()
+    def _take(self, contents: Contents, rewrite: bool) -> None:
+        """Prepare to continue the run of a journal."""
+        self._run, self.contents, self.script = contents.header[RUN], contents, Script(contents.script.calls)
+        self.annealings, self.known_verdict = contents.annealings, contents.verdict
+        self.has_steps = contents.last is not None
+        if rewrite:
+            rebuild(self, contents, self._run)
+
+    def _continue_without_journal(self, stored: StoredRun, contents: Contents | None) -> None:
+        """Use the chain alone, where its journal is lost."""
+        if not stored.intact:
+            raise ValueError(
+                f"{self.filename} is damaged (the chain does not agree with its checksum), and there is no journal of "
+                f"this run at {self.journal_path} to rebuild it from: restore both from a copy, or give another file"
+            )
+        if not stored.has_results:
+            logger.info("%s: the run was killed before its journal had a start", self.filename)
+            return
+        found = "is of another run" if contents is not None else "is missing or ends before the start of the run"
+        n = len(stored.chain.coords)
+        if n > 0:
+            last = adopt(stored._replace(script=[]), _EMPTY).steps[-1]
+            calls = stored.script
+            if calls and calls[-1].steps is not None:
+                calls = [*calls[:-1], calls[-1]._replace(last=last)]
+            self.script = Script(calls)
+            logger.warning(
+                "%s %s: the %d steps in %s are continued without it", self.journal_path, found, n, self.filename
+            )
+            return
+        aside = set_aside(self.filename, copy=True)
+        logger.warning(
+            "%s",
+            f"{self.journal_path} {found}, and {self.filename} has {len(stored.ladder)} stages and no steps: kept as "
+            f"{aside}, and the run starts again",
+        )
+        create_group(self, *self.shape, self._run)
+        self._fresh = True
+
+    def _replace_damaged(self, contents: Contents | None, error: Exception) -> None:
+        """Rebuild a file that cannot be read."""
+        if contents is None and not is_unfinished(self.filename):
+            raise ValueError(
+                f"{self.filename} is damaged or not an HDF5 file ({error}), and there is no journal at "
+                f"{self.journal_path}, or too little of one, to rebuild it from: restore it from a copy, or give "
+                "another file"
+            ) from error
+        aside = set_aside(self.filename)
+        if contents is None:
+            logger.warning(
+                "%s contains nothing, since a process died while it created the file: set aside as %s",
+                self.filename,
+                aside,
+            )
+            return
+        logger.warning("%s is damaged: set aside as %s and rebuilt from its journal", self.filename, aside)
+        self._take(contents, rewrite=True)
 
 
-def _holds_results(group: Any) -> bool:
-    """Whether the HDF5 group of a run has stages or steps, which a run enters after its start is in the journal."""
-    return int(group.attrs["iteration"]) > 0 or (DATASET in group and len(group[DATASET]) > 0)
+_EMPTY = Contents({}, None, [], [], 0, 0, [], None, Script())
 
 
-def _is_unfinished(filename: str) -> bool:
-    """Whether a process died while it created an HDF5 file: nothing is in it, or its header is still of an empty file.
-
-    HDF5 writes the header of an empty file first, then the content, and the header with the end of the file last.
-    """
+def _signature(path: Path) -> tuple | None:
+    """What changes when a file is written; None if there is none."""
     try:
-        with open(filename, "rb") as file:
-            header = file.read(END_OF_FILE.stop)
-    except OSError:  # a folder, or a file that may not be read
-        return False
-    return not header or (
-        header.startswith(SIGNATURE)
-        and len(header) == END_OF_FILE.stop
-        and int.from_bytes(header[END_OF_FILE], "little") <= EMPTY_SIZE
-    )
-
-
-def _set_aside(filename: str) -> str:
-    """Rename a damaged file to a name that is not in use, and return the name."""
-    names = itertools.chain([f"{filename}.damaged"], (f"{filename}.damaged-{i}" for i in itertools.count(2)))
-    aside = next(name for name in names if not os.path.exists(name))
-    os.replace(filename, aside)
-    return aside
-
-
-def write_stage(backend: Backend, index: int, stage: Stage) -> None:
-    """Store a stage at its place in the ladder; later stages and the check of the evidence are dropped.
-
-    Parameters
-    ----------
-    backend : emcee Backend or HDFBackend
-        Initialised.
-    index : int
-        Place in the ladder, 0 for the first stage.
-    stage : Stage
-        The stage.
-    """
-    row = np.array(tuple(stage), dtype=STAGE_DTYPE)
-    if isinstance(backend, HDFBackend):
-        with backend.open("a") as file:
-            group = file[backend.name]
-            if DATASET not in group:
-                group.create_dataset(DATASET, shape=(0,), maxshape=(None,), chunks=(64,), dtype=STAGE_DTYPE)
-            group[DATASET].resize(index + 1, axis=0)
-            group[DATASET].attrs.pop(CHECK, None)
-            group[DATASET][index] = row
-    else:
-        stored = getattr(backend, DATASET, np.empty(0, dtype=STAGE_DTYPE))
-        setattr(backend, DATASET, np.append(stored[:index], row))
-        setattr(backend, CHECK, None)
-
-
-def read_ladder(backend: Backend) -> tuple[Stage, ...]:
-    """The ladder stored in a backend.
-
-    Parameters
-    ----------
-    backend : emcee Backend or HDFBackend
-        HDF5 locks files: reading a file while a run writes to it can stop that run, as with emcee's chains. To watch a
-        run, set HDF5_USE_FILE_LOCKING=FALSE in both processes.
-
-    Returns
-    -------
-    tuple of Stage
-        The sequence of stages; empty if there are none.
-    """
-    if isinstance(backend, HDFBackend):
-        if not backend.initialized:
-            return ()
-        with backend.open() as file:
-            group = file[backend.name]
-            rows = group[DATASET][...] if DATASET in group else np.empty(0, dtype=STAGE_DTYPE)
-    else:
-        rows = getattr(backend, DATASET, np.empty(0, dtype=STAGE_DTYPE))
-    return tuple(Stage(*row.item()) for row in rows)
-
-
-def write_check(backend: Backend, check: EvidenceCheck) -> None:
-    """Store the check of the evidence with a stored ladder."""
-    if isinstance(backend, HDFBackend):
-        with backend.open("a") as file:
-            file[backend.name][DATASET].attrs[CHECK] = np.array(check, dtype=float)
-    else:
-        setattr(backend, CHECK, check)
-
-
-def read_check(backend: Backend) -> EvidenceCheck | None:
-    """The stored check of the evidence; None if there is none."""
-    if not isinstance(backend, HDFBackend):
-        return getattr(backend, CHECK, None)
-    if not backend.initialized:
+        status = path.stat()
+    except FileNotFoundError:
         return None
-    with backend.open() as file:
-        group = file[backend.name]
-        row = group[DATASET].attrs.get(CHECK) if DATASET in group else None
-    return None if row is None else EvidenceCheck(*row[:4].tolist(), int(row[4]))
-
-
-def write_verdict(backend: Backend, verdict: Verdict) -> None:
-    """Store the verdict on a run with its chain."""
-    if isinstance(backend, HDFBackend):
-        with backend.open("a") as file:
-            file[backend.name].attrs[VERDICT] = json.dumps(verdict)
-    else:
-        setattr(backend, VERDICT, verdict)
-
-
-def read_verdict(backend: Backend) -> Verdict | None:
-    """The stored verdict; None if there is none."""
-    if not isinstance(backend, HDFBackend):
-        return getattr(backend, VERDICT, None)
-    if not backend.initialized:
-        return None
-    with backend.open() as file:
-        text = file[backend.name].attrs.get(VERDICT)
-    if text is None:
-        return None
-    status, reasons, *numbers = json.loads(text)
-    return Verdict(status, tuple(reasons), *numbers)
+    return status.st_size, status.st_mtime_ns, status.st_ino

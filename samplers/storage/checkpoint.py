@@ -6,6 +6,7 @@ The chain then continues from the last stored step.
 """
 
 import itertools
+import json
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -13,22 +14,27 @@ import numpy as np
 from emcee import State
 from emcee.backends import Backend, HDFBackend
 
+from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.population import Stage
 from ..tempering.results import AnnealingResult
 from ..tempering.verdict import Verdict
-from .backends import JournaledBackend, read_check, read_ladder, read_verdict, write_check, write_stage, write_verdict
+from .backends import JournaledBackend
 from .compatibility import differences
 from .emcee_internals import trim_chain
-from .journal import Contents, EvaluatedBatch, RunStart
+from .journal import EvaluatedBatch, RunStart
+from .journal_contents import Contents
+from .ladder_file import read_check, read_ladder, read_verdict, write_check, write_stage, write_verdict
 from .memory_record import MemoryRecord
+from .script import Call
 
 __all__ = ["Checkpoint", "Replay"]
 
 
 class Replay:
-    """Evaluations and stored arrays of an interrupted run, found by their points and keys.
+    """Evaluations, stages and stored arrays of an interrupted annealing, found by their points, order and keys.
 
-    Points must be equal to the last bit.
+    Points must be equal to the last bit. Evaluations of earlier annealings in the file are not used, so that a run that
+    is continued makes the same evaluations, and counts the same, as one that was not interrupted.
 
     Parameters
     ----------
@@ -37,10 +43,10 @@ class Replay:
     """
 
     def __init__(self, contents: Contents):
-        self._batches = contents.evaluated
+        self._batches = contents.evaluated[contents.before_start :]
         self._place = {
             row.tobytes(): (number, index)
-            for number, batch in enumerate(contents.evaluated)
+            for number, batch in enumerate(self._batches)
             for index, row in enumerate(batch.coords)
         }
         self._remembered: dict[str, deque[list[np.ndarray]]] = {}
@@ -98,7 +104,13 @@ class Checkpoint:
         elif limited and not isinstance(self.backend, HDFBackend):
             self._journal = MemoryRecord(self.backend)
         self._replayed: Replay | None = None
-        self._earlier_stages: tuple[Stage, ...] = ()
+        self._forget_earlier()
+
+    def _forget_earlier(self) -> None:
+        """Look up no more stages of an interrupted run."""
+        self._earlier_stages: deque[tuple[int, Stage]] = deque()
+        self._stored_ladder: tuple[Stage, ...] = ()
+        self._earlier_check: EvidenceCheck | None = None
 
     # ------------------------------------------------------------------ the ladder
 
@@ -111,32 +123,55 @@ class Checkpoint:
         return read_verdict(self.backend)
 
     def store_verdict(self, verdict: Verdict) -> None:
-        """Store a verdict in the backend."""
-        write_verdict(self.backend, verdict)
+        """Store a verdict in the backend, unless it is stored."""
+        known = self._journal.known_verdict if isinstance(self._journal, JournaledBackend) else self.stored_verdict()
+        if json.dumps(verdict) == json.dumps(known):
+            return
+        if self._journal is None:
+            write_verdict(self.backend, verdict)
+        else:
+            self._journal.verdict(verdict)
 
     def store_result(self, result: AnnealingResult, verdict: Verdict | None) -> None:
         """Store ladder, check and verdict in the backend, after it was reset."""
         if isinstance(self._journal, MemoryRecord):
             self._journal.forget_steps()
+        if read_ladder(self.backend) == result.ladder:  # the reset repeats a stored one
+            return
         if verdict is not None:
             write_verdict(self.backend, verdict)
         for index, stage in enumerate(result.ladder):
             write_stage(self.backend, index, stage)
-        self.store_check(result)
+        if result.check is not None:
+            write_check(self.backend, result.check)
 
     def store_stage(self, index: int, stage: Stage) -> Stage:
         """Store a stage; returns it with its original wall time if it is a repeated stage of an interrupted run."""
-        if index < len(self._earlier_stages):
-            earlier = self._earlier_stages[index]
-            if earlier == stage._replace(seconds=earlier.seconds):
-                stage = earlier
-        write_stage(self.backend, index, stage)
+        if self._earlier_stages:
+            known, earlier = self._earlier_stages.popleft()
+            if known == index and earlier == stage._replace(seconds=earlier.seconds):
+                return earlier
+            self._earlier_stages.clear()
+        stored = self._stored_ladder[index : index + 1]
+        is_stored = bool(stored) and stored[0] == stage._replace(seconds=stored[0].seconds)
+        if is_stored:  # in the file only, whose journal has lost it
+            stage = stored[0]
+        else:
+            self._stored_ladder = (*self._stored_ladder[:index], stage)
+        if self._journal is not None:
+            self._journal.stage(index, stage, in_file=not is_stored)
+        elif not is_stored:
+            write_stage(self.backend, index, stage)
         return stage
 
     def store_check(self, result: AnnealingResult) -> None:
-        """Store the check of a finished annealing, if there is one."""
-        if result.check is not None:
+        """Store the check of a finished annealing, if there is one and it is not stored."""
+        if result.check is None or json.dumps(result.check) == json.dumps(self._earlier_check):
+            return
+        if self._journal is None:
             write_check(self.backend, result.check)
+        else:
+            self._journal.check(result.check)
 
     # ------------------------------------------------------------------ the journal
 
@@ -152,6 +187,7 @@ class Checkpoint:
 
     def begin(self, header: dict, start: RunStart) -> None:
         """Enter the start of the annealing."""
+        self._forget_earlier()
         self._journal.begin(header, start)
 
     def resume(
@@ -186,12 +222,39 @@ class Checkpoint:
                 f"{self.backend.filename} contains another run, which cannot be continued here: {'; '.join(differing)}."
                 " Use the settings and functions that it was started with, or another file"
             )
-        self._journal.continue_run(contents)
+        contents = self._journal.continue_run(contents)
         if contents.provisional is not None:
             self._journal.back()
         self._replayed = Replay(contents)
-        self._earlier_stages = read_ladder(self.backend)
+        self._stored_ladder = read_ladder(self.backend)
+        self._earlier_stages = deque(contents.stages)
+        self._earlier_check = contents.check
         return contents
+
+    # ------------------------------------------------------------------ the calls of the script
+
+    def find_call(self, nsteps: int, coords: np.ndarray | None) -> Call | None:
+        """The stored call that a new one repeats (`samplers.storage.script.Script.find`); None without a record."""
+        if self._journal is None:
+            return None
+        return self._journal.script.find(nsteps, coords, self.interrupted is not None)
+
+    def skip_call(self) -> None:
+        """Go to the next call of the script: the present one repeats a stored one that is complete."""
+        self._journal.script.skip()
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether the last annealing was followed by stored steps; without a record, whether the chain has any."""
+        return self.backend.iteration > 0 if self._journal is None else self._journal.has_steps
+
+    @property
+    def place(self) -> str:
+        """Where an interrupted run can be continued from; empty for a run in memory."""
+        journal = self._journal
+        if not isinstance(journal, JournaledBackend) or journal.annealings == 0:
+            return ""
+        return f"{journal.filename} and {journal.journal_path.name}"
 
     def find(self, coords: np.ndarray) -> list[tuple[slice, EvaluatedBatch | None]]:
         """Consecutive parts of the points (n, ndim), with their evaluations if the interrupted run has made them."""
@@ -216,10 +279,10 @@ class Checkpoint:
             self._journal.remembered(key, arrays, of_guides())
         return arrays
 
-    def begin_call(self, nsteps: int) -> None:
-        """Enter the number of steps that a call asks for."""
+    def begin_call(self, nsteps: int, coords: np.ndarray) -> None:
+        """Enter a call: the number of steps that it asks for, and where it starts."""
         if self._journal is not None:
-            self._journal.call(nsteps)
+            self._journal.call(nsteps, coords)
 
     def expect_limit(self, new: bool) -> None:
         """Prepare for a limit of simulations that is set after the sampler was made; `new`: nothing was evaluated."""
@@ -262,7 +325,8 @@ class Checkpoint:
 
     def end_call(self, complete: bool) -> None:
         """Write pending steps, and enter whether the call was completed; evaluations are no longer looked up."""
-        self._replayed, self._earlier_stages = None, ()
+        self._replayed = None
+        self._forget_earlier()
         if self._journal is not None:
             self._journal.flush()
             if complete:

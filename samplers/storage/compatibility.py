@@ -1,6 +1,7 @@
 """Whether an interrupted run may be continued: what it was started with, as plain data, and what differs now."""
 
 import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -11,9 +12,12 @@ from emcee.moves import Move
 from ..moves.kernels import describe
 from ..tempering.guide import Guide, guide_fingerprint
 from ..tempering.settings import Settings
-from .journal import Contents, EvaluatedBatch
+from .journal import EvaluatedBatch, merge_batches
+from .journal_contents import Contents
 
 __all__ = ["differences", "header"]
+
+logger = logging.getLogger(__name__)
 
 CLOSE = {"rtol": 1e-9, "atol": 1e-9}
 
@@ -74,7 +78,9 @@ def differences(
     """What prevents a run from being continued, as text; empty if nothing does.
 
     Settings are compared, then the log-prior of the starting points, then, for a posterior without a fingerprint, the
-    log-probability of one point, at the cost of one evaluation.
+    log-probabilities of the first points of the annealing, as many as there are walkers, and of the best point. Half of
+    the space may have changed, so one point is not enough. This costs an evaluation per point, which a fingerprint
+    saves.
 
     Parameters
     ----------
@@ -93,17 +99,25 @@ def differences(
         return found
     if not np.allclose(log_prior(start.coords), start.log_prior, **CLOSE):
         return ["the log-prior of the starting points differs"]
-    return [] if ours["log_prob_fn"] is not None else _compare_one_point(contents.evaluated, compute)
+    if ours["log_prob_fn"] is not None or not contents.evaluated[contents.before_start :]:
+        return []
+    before = merge_batches(contents.evaluated[contents.before_start :])
+    rows = np.arange(min(ours["nwalkers"], len(before.coords)))
+    best = int(np.argmax(np.where(np.isnan(before.log_prob), -np.inf, before.log_prob)))
+    rows = rows if best in rows else np.append(rows, best)
+    return _compare_points(before.coords[rows], before.log_prob[rows], compute)
 
 
-def _compare_one_point(
-    evaluated: Sequence[EvaluatedBatch], compute: Callable[[np.ndarray], EvaluatedBatch]
+def _compare_points(
+    coords: np.ndarray, log_prob: np.ndarray, compute: Callable[[np.ndarray], EvaluatedBatch]
 ) -> list[str]:
-    for batch in evaluated:
-        row = int(np.argmax(np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)))
-        if np.isfinite(batch.log_prob[row]):
-            before, now = batch.log_prob[row], compute(batch.coords[row : row + 1]).log_prob[0]
-            if np.isclose(before, now, **CLOSE):
-                return []
-            return [f"log_prob_fn was {before:.10g} at {batch.coords[row]}, is {now:.10g}"]
-    return []
+    logger.info("log_prob_fn has no fingerprint: it is compared with the stored run at %d points", len(coords))
+    now = compute(coords).log_prob
+    different = np.flatnonzero(~np.isclose(log_prob, now, **CLOSE, equal_nan=True))
+    if len(different) == 0:
+        return []
+    row = different[0]
+    return [
+        f"log_prob_fn was {log_prob[row]:.10g} at {coords[row]}, is {now[row]:.10g} ({len(different)} of {len(coords)} "
+        "points differ)"
+    ]

@@ -4,7 +4,9 @@ They are used in this module only, and pinned by `tests.contract.test_emcee_cont
 later version of emcee (``emcee>=3.1.4,<4``) differs.
 """
 
+import zlib
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -15,12 +17,16 @@ from emcee.moves import Move
 from .journal import Step
 
 __all__ = [
+    "Chain",
     "append_steps",
+    "begins_with",
+    "checksum",
     "drop_last_step",
+    "ends_with",
     "get_moves",
     "get_previous_state",
     "get_random",
-    "holds_steps",
+    "read_chain",
     "set_moves",
     "set_previous_state",
     "trim_chain",
@@ -54,8 +60,10 @@ def set_previous_state(sampler: EnsembleSampler, state: State | None) -> None:
     sampler._previous_state = state
 
 
-def append_steps(group: h5py.Group, steps: Sequence[Step]) -> None:
+def append_steps(group: h5py.Group, steps: Sequence[Step], accepted: np.ndarray) -> None:
     """Write steps to the group of a chain, as repeated calls of ``HDFBackend.save_step`` would.
+
+    The same call after one that was interrupted leaves the same group.
 
     Parameters
     ----------
@@ -63,13 +71,15 @@ def append_steps(group: h5py.Group, steps: Sequence[Step]) -> None:
         Group of the chain, in which ``HDFBackend.grow`` has made room.
     steps : sequence of Step
         At least one.
+    accepted : (n,) float
+        Number of accepted proposals per walker before them.
     """
     start, stop = group.attrs["iteration"], group.attrs["iteration"] + len(steps)
     group["chain"][start:stop] = np.stack([step.coords for step in steps])
     group["log_prob"][start:stop] = np.stack([step.log_prob for step in steps])
     if steps[0].blobs is not None:
         group["blobs"][start:stop] = np.stack([step.blobs for step in steps])
-    group["accepted"][:] += np.sum([step.accepted for step in steps], axis=0)
+    group["accepted"][:] = accepted + np.sum([step.accepted for step in steps], axis=0)
     for i, value in enumerate(steps[-1].random_state):
         group.attrs[f"random_state_{i}"] = value
     group.attrs["iteration"] = stop
@@ -94,25 +104,75 @@ def trim_chain(backend: Backend) -> None:
                 setattr(backend, name, values[: backend.iteration])
 
 
-def holds_steps(group: h5py.Group, steps: Sequence[Step]) -> bool:
-    """Whether the chain in a group consists of these steps, and has their blobs and the last random state."""
-    if group.attrs["iteration"] != len(steps):
-        return False
-    if not steps:
+class Chain(NamedTuple):
+    """The chain in a group.
+
+    Attributes
+    ----------
+    coords : (n_steps, n, ndim) float
+        Positions of the walkers.
+    log_prob : (n_steps, n) float
+        Their log-probabilities.
+    blobs : (n_steps, n, ...) array, or None
+        Their blobs.
+    accepted : (n,) float
+        Number of accepted proposals per walker.
+    random_state : tuple, or None
+        State of the random generator after the last step.
+    consistent : bool
+        Whether the parts of the group agree with each other.
+    """
+
+    coords: np.ndarray
+    log_prob: np.ndarray
+    blobs: np.ndarray | None
+    accepted: np.ndarray
+    random_state: tuple | None
+    consistent: bool
+
+
+def read_chain(group: h5py.Group) -> Chain:
+    """The chain in a group; KeyError, OSError, RuntimeError, TypeError or ValueError if it is damaged."""
+    n, nwalkers, ndim = (int(group.attrs[name]) for name in ("iteration", "nwalkers", "ndim"))
+    coords, log_prob, accepted = group["chain"][:n], group["log_prob"][:n], group["accepted"][...]
+    blobs = group["blobs"][:n] if "blobs" in group else None
+    consistent = coords.shape == (n, nwalkers, ndim) and log_prob.shape == (n, nwalkers)
+    consistent = consistent and accepted.shape == (nwalkers,) and bool(group.attrs["has_blobs"]) == (blobs is not None)
+    consistent = consistent and (blobs is None or len(blobs) == n)
+    random = tuple(group.attrs.get(f"random_state_{i}") for i in range(5))
+    return Chain(coords, log_prob, blobs, accepted, None if random[0] is None else random, consistent)
+
+
+def begins_with(chain: Chain, steps: Sequence[Step]) -> bool:
+    """Whether the first steps of a chain, at least `steps`, are these, with their blobs."""
+    m = len(steps)
+    if m == 0:
         return True
-    if ("blobs" in group) != (steps[0].blobs is not None):
+    if not chain.consistent or (chain.blobs is None) != (steps[0].blobs is None):
         return False
-    if steps[0].blobs is not None:
-        blobs = group["blobs"][: len(steps)]
-        if not _equal(blobs, np.stack([step.blobs for step in steps]).astype(blobs.dtype)):
-            return False
-    stored_random = (group.attrs.get(f"random_state_{i}") for i in range(len(steps[-1].random_state)))
-    if not all(np.array_equal(a, b) for a, b in zip(stored_random, steps[-1].random_state, strict=True)):
+    pairs = [(chain.coords, [s.coords for s in steps]), (chain.log_prob, [s.log_prob for s in steps])]
+    if chain.blobs is not None:
+        pairs.append((chain.blobs, [s.blobs for s in steps]))
+    return all(_equal(stored[:m], np.stack(expected).astype(stored.dtype)) for stored, expected in pairs)
+
+
+def ends_with(chain: Chain, steps: Sequence[Step]) -> bool:
+    """Whether acceptance and random state of a chain are those after these steps."""
+    if not chain.consistent or not np.array_equal(chain.accepted, sum((s.accepted for s in steps), 0 * chain.accepted)):
         return False
-    stored = group["chain"][: len(steps)], group["log_prob"][: len(steps)], group["accepted"][...]
-    coords, log_prob = np.stack([step.coords for step in steps]), np.stack([step.log_prob for step in steps])
-    expected = coords.astype(stored[0].dtype), log_prob.astype(stored[1].dtype), sum(step.accepted for step in steps)
-    return all(_equal(a, b) for a, b in zip(stored, expected, strict=True))
+    if not steps or chain.random_state is None:
+        return not steps
+    return all(np.array_equal(a, b) for a, b in zip(chain.random_state, steps[-1].random_state, strict=True))
+
+
+def checksum(group: h5py.Group, start: int, stop: int, value: int = 0) -> int:
+    """CRC-32 of steps of the chain in a group, continued from that of the steps before."""
+    names = [name for name in ("chain", "log_prob", "blobs") if name in group]
+    rows = [group[name][start:stop] for name in names]
+    for i in range(stop - start):
+        for values in rows:
+            value = zlib.crc32(np.ascontiguousarray(values[i]).tobytes(), value)
+    return value
 
 
 def _equal(a: np.ndarray, b: np.ndarray) -> bool:

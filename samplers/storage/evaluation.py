@@ -6,7 +6,7 @@ counts as -inf, and its reason is recorded.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -338,6 +338,12 @@ class Evaluator:
         if self._name == "log_likelihood_fn":
             log_prob = log_prob + self.log_prior(coords)
         return EvaluatedBatch(coords, log_prob, blobs if self._keep_blobs else None, reasons)
+
+    def count_again(self, batches: Sequence[EvaluatedBatch]) -> None:
+        """Count the batches of the interrupted run that is continued, and nothing else."""
+        self.reset()
+        for batch in batches:
+            self.count(batch)
 
     def count(self, batch: EvaluatedBatch) -> None:
         """Count the evaluations of a batch and its failures."""

@@ -6,8 +6,14 @@ import numpy as np
 from emcee import State
 from emcee.backends import Backend
 
+from ..tempering.evidence_check import EvidenceCheck
+from ..tempering.population import Stage
+from ..tempering.verdict import Verdict
 from .emcee_internals import drop_last_step
-from .journal import Contents, EvaluatedBatch, RunStart, Step
+from .journal import EvaluatedBatch, RunStart, Step
+from .journal_contents import Contents
+from .ladder_file import write_check, write_stage, write_verdict
+from .script import Script, digest
 
 __all__ = ["MemoryRecord"]
 
@@ -24,6 +30,10 @@ class MemoryRecord:
     ----------
     contents : Contents, or None
         What can be continued; None unless the limit of simulations has ended the run.
+    script : Script
+        The calls of the run.
+    annealings : int
+        Number of annealings that have begun.
     """
 
     def __init__(self, backend: Backend):
@@ -34,17 +44,26 @@ class MemoryRecord:
         self._last: Step | None = None
         self._header: dict = {}
         self._start: RunStart | None = None
-        self._before_last, self._wanted, self._made, self._shows = 0, None, 0, False
+        self._before_start, self._before_last, self._shows = 0, 0, False
+        self.script, self.annealings = Script(), 0
         self._of_earlier_guides, self._of_guides = 0.0, 0.0
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether the last annealing was followed by stored steps."""
+        return self._last is not None
 
     def begin(self, header: dict, start: RunStart) -> None:
         """Enter the start of the annealing."""
-        self._header, self._start, self._last, self._wanted = header, start, None, None
+        self._header, self._start, self._last = header, start, None
+        self._before_start = self._before_last = len(self._evaluated)
         self._of_earlier_guides = self._of_guides
+        self.annealings += 1
 
-    def continue_run(self, contents: Contents) -> None:
+    def continue_run(self, contents: Contents) -> Contents:
         """Add to what has been kept from now on."""
         self.contents = None
+        return contents
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter a batch of evaluated points."""
@@ -55,9 +74,22 @@ class MemoryRecord:
         self._remembered.append((key, list(arrays)))
         self._of_guides = max(self._of_guides, of_guides)
 
-    def call(self, nsteps: int) -> None:
-        """Enter the number of steps that a call asks for."""
-        self._wanted, self._made = nsteps, 0
+    def stage(self, index: int, stage: Stage, in_file: bool = True) -> None:
+        """Store a stage at its place in the ladder, unless it is stored."""
+        if in_file:
+            write_stage(self._backend, index, stage)
+
+    def check(self, check: EvidenceCheck) -> None:
+        """Store the check of the evidence."""
+        write_check(self._backend, check)
+
+    def verdict(self, verdict: Verdict) -> None:
+        """Store the verdict."""
+        write_verdict(self._backend, verdict)
+
+    def call(self, nsteps: int, coords: np.ndarray) -> None:
+        """Enter a call: the steps that it asks for, and where it starts."""
+        self.script.begin(nsteps, digest(coords), self.annealings)
 
     def stepped(self, state: State) -> None:
         """Enter a stored step of the chain."""
@@ -65,11 +97,11 @@ class MemoryRecord:
         accepted = np.zeros(len(state.coords), dtype=bool)
         self._last = Step(state.coords, state.log_prob, accepted, state.blobs, state.random_state)
         self._before_last = len(self._evaluated)
-        self._made += 1
+        self.script.stepped(self._last)
 
     def done(self) -> None:
         """Enter that the call is complete, or was ended by the user."""
-        self._wanted = None
+        self.script.complete()
 
     def flush(self) -> None:
         """Nothing is pending in memory."""
@@ -91,14 +123,15 @@ class MemoryRecord:
             self._start,
             list(self._evaluated),
             list(self._remembered),
+            self._before_start,
             self._before_last,
             [],
             self._last,
-            self._wanted,
-            self._made,
-            shown,
-            self._of_earlier_guides,
-            self._of_guides,
+            self.script,
+            self.annealings,
+            provisional=shown,
+            of_earlier_guides=self._of_earlier_guides,
+            of_guides=self._of_guides,
         )
 
     def forget_steps(self) -> None:

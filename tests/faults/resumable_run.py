@@ -1,9 +1,5 @@
-"""A run that a test can kill: ``python -m tests.faults.resumable_run PATH SAMPLER STEPS [SECONDS]``.
+"""A run that a test can kill: its posterior takes time in every call, and returns blobs."""
 
-The posterior takes SECONDS per batch, so that there is time to kill the run anywhere. It returns blobs.
-"""
-
-import sys
 import time
 
 import emcee
@@ -46,8 +42,3 @@ def make(path, name, seconds=0.0, sd=0.01, **changes):
     if "guide" in settings:
         settings["guide"] = settings["guide"](posterior)
     return Sampler(N, NDIM, posterior, vectorize=True, backend=backend, **settings)
-
-
-if __name__ == "__main__":
-    path, name, steps, seconds = (*sys.argv[1:], "0")[:4]
-    make(path, name, float(seconds)).run_mcmc(None, int(steps))

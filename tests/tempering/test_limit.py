@@ -216,6 +216,7 @@ def test_the_count_is_that_of_the_model(guide, where, tmp_path):
     if where == "file":
         whole.backend.close()
         (tmp_path / "run.h5").unlink()
+        (tmp_path / "run.h5.mcmc.journal").unlink()
     points = set()
     sampler, counted = make(points, 13), []
     for limit in (13, 22, 60, 150, None):
@@ -304,13 +305,14 @@ def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
         journal = file.with_name("run.h5.mcmc.journal")
         data = journal.read_bytes()
         journal.write_bytes(data[: data.rindex(b"HALT")])
+        file.unlink()
     sampler = make(path, 10, file, seed=77)
     halted(sampler, 3)
     assert sampler.simulations == sampler.verdict.simulations == made
-    assert sampler.log_prob_fn.f.calls <= 2  # to check that the posterior is the same
+    assert sampler.log_prob_fn.f.calls <= N + 1  # to check that the posterior is the same
     assert sampler.log_evidence == evidence
     assert np.array_equal(sampler.get_chain()[: len(chain)], chain)
-    assert np.array_equal(sampler.get_chain()[-1], chain[-1])  # shown again where the chain was finished
+    assert len(sampler.get_chain()) == len(chain)  # no copy is stored in place of a step that the limit does not allow
     assert sampler.max_simulations == 10
     sampler.backend.close()
     sampler = make(path, None, file, seed=78)
@@ -340,8 +342,8 @@ def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
     assert made == sampler.log_prob_fn.f.calls and made > first + searched
     sampler.backend.close()
     sampler = make("searching guide", None, file)
-    sampler.run_mcmc(None, 1)
-    assert sampler.simulations == made + N
+    sampler.run_mcmc(None, 2)
+    assert sampler.simulations == made + 2 * N
 
 
 def test_no_step_is_stored_where_none_was_wanted():
