@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..signals.channels import Channel
-from ..simulation.faults import TransientReason, reason_of
+from ..simulation.faults import ChangedModel, TransientReason, reason_of
 from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest
+from .dependencies import Dependencies
 from .validation import check_theta, positive_float
 
 __all__ = ["ExternalModel"]
@@ -37,16 +38,27 @@ class ExternalModel(StructuralModel):
         Time step of the response [s].
     n_steps : int
         Number of samples of the response.
+    depends_on : sequence, optional
+        What the response depends on besides the code, as part of the fingerprint: a Path stands for the content of a
+        file or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
 
     Raises
     ------
     ValueError
-        If names are missing, repeated or not text, or `dt` or `n_steps` is not positive.
+        If names are missing, repeated or not text, or `dt` or `n_steps` is not positive, or `depends_on` cannot be
+        used.
     """
 
     fingerprint = ""
 
-    def __init__(self, parameter_names: Sequence[str], channels: Sequence[Channel], dt: float, n_steps: int) -> None:
+    def __init__(
+        self,
+        parameter_names: Sequence[str],
+        channels: Sequence[Channel],
+        dt: float,
+        n_steps: int,
+        depends_on: Iterable[Any] = (),
+    ) -> None:
         kind = type(self).__name__
         for what, values, expected in (("parameter_names", parameter_names, str), ("channels", channels, Channel)):
             if isinstance(values, str) or not all(isinstance(value, expected) for value in values) or not len(values):
@@ -62,6 +74,7 @@ class ExternalModel(StructuralModel):
         if isinstance(n_steps, bool) or not isinstance(n_steps, int | np.integer) or n_steps < 1:
             raise ValueError(f"{kind}: n_steps must be a positive integer number of samples; got {n_steps!r}")
         self.n_steps = int(n_steps)
+        self._dependencies = Dependencies(depends_on, kind)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Simulate the structure for one set of parameters.
@@ -83,12 +96,14 @@ class ExternalModel(StructuralModel):
             The reason ends in the duration of the simulation. It is a `TransientReason` if the cause is not the model
             (see `fe_likelihoods.simulation.faults`).
         ValueError
-            If `theta` has another shape.
+            If `theta` has another shape, or a worker process has other code (`ChangedModel`).
         """
         theta = check_theta(theta, self.parameter_names).copy()
         start = time.perf_counter()
         try:
             return self._check_response(self._respond(theta))
+        except ChangedModel:
+            raise
         except Exception as error:  # external code may raise anything
             reason = reason_of(error)
             seconds = getattr(error, "seconds", None)  # excludes the start of a process, where that is known
@@ -99,8 +114,8 @@ class ExternalModel(StructuralModel):
     def _digest(self, *parts: Any) -> str:
         """Fingerprint of the names, the channels, the step, the length and `parts`, which JSON can represent."""
         channels = [(channel.name, channel.quantity) for channel in self.channels]
-        kind = type(self).__name__
-        return digest(json.dumps([kind, self.parameter_names, channels, self.dt, self.n_steps, *parts]))
+        named = [type(self).__name__, self.parameter_names, channels, self.dt, self.n_steps]
+        return digest(json.dumps([*named, *parts, *self._dependencies.texts()]))
 
     def _check_response(self, response: Any) -> np.ndarray:
         """Convert a response to floats (n_channels, n_steps); raise SimulationFailed if it cannot be used."""

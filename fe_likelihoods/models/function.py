@@ -6,18 +6,26 @@ simulation. The process is reused for the next run, which adds a fraction of a m
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..signals.channels import Channel
-from ..simulation.code_digest import code_digest
+from ..simulation.changed_model import SentFunction
+from ..simulation.code_digest import describe_code
 from ..simulation.sandbox import Sandbox
 from .external import ExternalModel
 from .validation import positive_float
 
 __all__ = ["FunctionModel"]
+
+logger = logging.getLogger(__name__)
+
+# fingerprints of functions that have run in this process, and of those that change what they use when they run
+_observed: set[str] = set()
+_changes_itself: set[str] = set()
 
 
 class FunctionModel(ExternalModel):
@@ -41,6 +49,9 @@ class FunctionModel(ExternalModel):
         Text that replaces the code in the fingerprint; change it whenever the function computes something else. By
         default the fingerprint contains a digest of the code and of everything it uses
         (`fe_likelihoods.simulation.code_digest`).
+    depends_on : sequence, optional
+        What the response depends on besides the code, as part of the fingerprint: a Path stands for the content of a
+        file or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
     isolated : bool
         Run the function in a separate process. A setting below implies it.
     time_limit : float, optional
@@ -72,12 +83,13 @@ class FunctionModel(ExternalModel):
         n_steps: int,
         *,
         version: str | None = None,
+        depends_on: Sequence[Any] = (),
         isolated: bool = False,
         time_limit: float | None = None,
         memory_limit: int | None = None,
         runs_per_process: int | None = None,
     ) -> None:
-        super().__init__(parameter_names, channels, dt, n_steps)
+        super().__init__(parameter_names, channels, dt, n_steps, depends_on)
         kind = type(self).__name__
         if not callable(function):
             raise ValueError(f"{kind}: expected a function of the parameters; got {function!r}")
@@ -94,24 +106,65 @@ class FunctionModel(ExternalModel):
         self.runs_per_process = runs_per_process
         settings = (time_limit, memory_limit, runs_per_process)
         self.isolated = bool(isolated) or any(setting is not None for setting in settings)
-        self.fingerprint = self._digest(self._version_of(function))
+        self.watched_files: tuple[str, ...] = ()
+        code = self._code()
+        self.fingerprint = self._digest(*self._identity(code))
         self._run = function
         if self.isolated:
-            self._run = Sandbox(
-                function, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process
-            )
+            sent = SentFunction(function, self._fingerprinted, code)
+            self._run = Sandbox(sent, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process)
 
-    def _version_of(self, function: Callable) -> list[str]:
-        """Texts that identify what the function computes."""
+    def current_fingerprint(self) -> str:
+        """The fingerprint of the function as it is now, computed again.
+
+        It is the attribute `fingerprint` if the function itself changes what it uses, such as a counter or a table of
+        earlier results: then no other change can be told from these.
+        """
+        if self.fingerprint in _changes_itself and self.version is None:
+            return self.fingerprint
+        return self._digest(*self._identity(self._code()))
+
+    @property
+    def _fingerprinted(self) -> Callable:
+        """The function whose code is part of the fingerprint."""
+        return self.function
+
+    def _code(self) -> str:
+        """Digest of the code, empty if there is a version; ValueError if it has none."""
         if self.version is not None:
-            return ["version", str(self.version)]
+            return ""
         try:
-            return ["code", code_digest(function)]
+            code = describe_code(self._fingerprinted)
         except ValueError as error:
             raise ValueError(
                 f"{type(self).__name__}: no digest of the function can be computed; give version=, a text to be "
                 f"changed whenever the function changes: {error}"
             ) from error
+        self.watched_files = tuple(code.files) + tuple(map(str, self._dependencies.paths))
+        return code.digest
+
+    def _identity(self, code: str) -> list[Any]:
+        """Texts that identify what the function computes."""
+        return [["code", code] if self.version is None else ["version", str(self.version)]]
 
     def _respond(self, theta: np.ndarray) -> Any:
-        return self._run(theta)
+        if self.isolated or self.version is not None or self.fingerprint in _observed:
+            return self._run(theta)
+        before = self._code_or_error()
+        try:
+            return self._run(theta)
+        finally:
+            _observed.add(self.fingerprint)
+            if self._code_or_error() != before:
+                _changes_itself.add(self.fingerprint)
+                logger.info(
+                    "%s changes what it uses when it runs, such as a counter or a table of earlier results; other "
+                    "changes of its values are not noticed during a run. version= replaces its digest",
+                    getattr(self.function, "__qualname__", self.function),
+                )
+
+    def _code_or_error(self) -> str:
+        try:
+            return self._code()
+        except ValueError as error:
+            return str(error)

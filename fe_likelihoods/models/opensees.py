@@ -59,6 +59,9 @@ class OpenSeesModel(FunctionModel):
         version 3.7.1, ``ops.eigen`` leaks about 14 kB per run of a model of 90 degrees of freedom.
     version : str, optional
         Text that replaces the code in the fingerprint; see `FunctionModel`.
+    depends_on : sequence, optional
+        Files and values that the response depends on besides the code, such as ``Path("record.txt")``; see
+        `FunctionModel`.
 
     Raises
     ------
@@ -85,6 +88,7 @@ class OpenSeesModel(FunctionModel):
         memory_limit: int | None = None,
         runs_per_process: int | None = 1000,
         version: str | None = None,
+        depends_on: Sequence[Any] = (),
     ) -> None:
         if importlib.util.find_spec("openseespy") is None:
             raise ValueError(
@@ -101,11 +105,16 @@ class OpenSeesModel(FunctionModel):
             dt,
             n_steps,
             version=version,
+            depends_on=depends_on,
             isolated=True,
             time_limit=time_limit,
             memory_limit=memory_limit,
             runs_per_process=runs_per_process,
         )
 
-    def _version_of(self, function: Callable) -> list[str]:
-        return [*super()._version_of(function.build_and_run), "openseespy", metadata.version("openseespy")]
+    @property
+    def _fingerprinted(self) -> Callable:
+        return self.function.build_and_run
+
+    def _identity(self, code: str) -> list[Any]:
+        return [*super()._identity(code), "openseespy", metadata.version("openseespy")]

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Measurements
+from ..simulation.changed_model import ModelGuard
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
+from ..simulation.faults import ChangedModel
 from ..simulation.fingerprint import simulation_fingerprint
 from ..simulation.memory_cache import MemoryCache, ResponseMemory, distinct_keys
 from ..simulation.model import (
@@ -76,7 +78,7 @@ class CachedSimulations:
         self.response_memory = ResponseMemory(memory_bytes)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._verified_cache = None if self.cache is None else VerifiedCache(self.cache)
-        self._model_fingerprint = None if cache is None else model.fingerprint
+        self._guard = ModelGuard(model)
         self._key = None if cache is None else self.simulation_key
         self.chunk_size = 1
         self.simulations = 0
@@ -133,12 +135,6 @@ class CachedSimulations:
     def cache_keys(self) -> tuple[str, str]:
         """Keys under which a `SimulationCache` stores the statistics and the responses, as `forget` takes them."""
         return self.simulation_key, simulation_fingerprint(self.model)
-
-    @property
-    def data_fingerprint(self) -> str:
-        """Hex digest of the measurements: equal for likelihoods of the same data, in any order of the channels."""
-        names = sorted(channel.name for channel in self.measurements.channels)
-        return self.measurements.select(names).fingerprint
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals: the first columns of `statistics`.
@@ -437,6 +433,18 @@ class CachedSimulations:
             return 1, largest
         return min(_ROUNDS_PER_CHUNK * workers, largest), largest
 
+    def _check_model(self, thetas: np.ndarray) -> None:
+        """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
+        try:
+            self._guard.check(self.model, thetas)
+        except ChangedModel:
+            self.memory_cache.clear()
+            self.response_memory.clear()
+            if self.cache is not None:
+                unchecked = np.concatenate(self._guard.unchecked)
+                self.cache.discard(unchecked, self._key, simulation_fingerprint(self.model))
+            raise
+
     def _simulate(self, keys: list[bytes], thetas: np.ndarray, responses: bool) -> Simulated:
         """Results of new simulations, which are counted, recorded if they fail, and cached in memory and on disk."""
         # checked before a batch and not after it, so that finished simulations are stored
@@ -456,16 +464,12 @@ class CachedSimulations:
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self._failures.add(theta, reason)
+        self._check_model(thetas)
         self.memory_cache.store(keys, misfit)
         if responses:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
             self.response_memory.store(self.model.fingerprint, keys, outcomes)
         if self.cache is not None:
-            if self.model.fingerprint != self._model_fingerprint:
-                raise ValueError(
-                    "the model has changed since the likelihood was made (its fingerprint differs), so its simulations "
-                    "cannot be stored with the earlier ones; make a new likelihood"
-                )
             if batch is not None:
                 # before the statistics, which are computed from them if the program is killed in between
                 self.cache.store_responses(self.model, thetas, batch.response)

@@ -120,6 +120,12 @@ class FELikelihood(CachedSimulations):
         """Number of parameters."""
         return len(self.parameter_names)
 
+    @property
+    def data_fingerprint(self) -> str:
+        """Hex digest of the measurements: equal for likelihoods of the same data, in any order of the channels."""
+        names = sorted(channel.name for channel in self.measurements.channels)
+        return self.measurements.select(names).fingerprint
+
     def first(self, seconds: float) -> "FELikelihood":
         """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).
 

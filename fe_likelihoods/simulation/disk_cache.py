@@ -32,7 +32,6 @@ import numpy as np
 from .cache_exchange import read_rows, write_rows
 from .cache_rows import (
     COLUMNS,
-    REMOVE,
     STORE,
     STORE_RESPONSE,
     CachedRows,
@@ -46,10 +45,10 @@ from .cache_rows import (
     simulation_keys,
     source_number,
 )
-from .failure_table import FailureTable
 from .faults import TransientReason
 from .fingerprint import simulation_fingerprint
 from .model import Model
+from .row_deletion import RowDeletion
 from .sqlite_file import CacheFile
 
 __all__ = ["SimulationCache"]
@@ -59,7 +58,7 @@ logger = logging.getLogger(__name__)
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 
 
-class SimulationCache(FailureTable):
+class SimulationCache(RowDeletion):
     """Cache of the sums of squared residuals of simulations, in one SQLite file.
 
     Any number of threads, processes and programs may use a file at the same time, each process through its own
@@ -322,38 +321,6 @@ class SimulationCache(FailureTable):
                 return StoredSimulation(theta, misfit, row[5].decode("utf-8", "replace"))
         return None
 
-    def forget(self, *fingerprints: str) -> int:
-        """Delete the simulations and responses of some models, for all users of the file.
-
-        The caches in memory of likelihoods are not affected: make a new likelihood.
-
-        Parameters
-        ----------
-        *fingerprints : str
-            As for `look_up`; ``cache.forget(*likelihood.cache_keys)`` deletes what a likelihood uses.
-
-        Returns
-        -------
-        int
-            Number of rows deleted.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
-        sources = [(source_number(fingerprint),) for fingerprint in fingerprints]
-
-        def delete(connection: sqlite3.Connection) -> int:
-            connection.execute("BEGIN IMMEDIATE")
-            deleted = sum(connection.executemany(statement, sources).rowcount for statement in REMOVE.values())
-            connection.execute("COMMIT")
-            return deleted
-
-        with self.file.lock:
-            self._waiting = [row for row in self._waiting if (row[1],) not in sources]
-            return self._insist(delete)
-
     def info(self) -> CacheInfo:
         """State of the cache, and counts of this object."""
 
@@ -369,27 +336,6 @@ class SimulationCache(FailureTable):
             size = self.path.stat().st_size if self.path.exists() else 0
             counts = self.hits, self.misses, self.evictions, self.damaged, self.verified
             return CacheInfo(self.path, *counted, size, *counts)
-
-    def clear(self) -> None:
-        """Delete all rows, for all users of the file; the caches in memory of likelihoods are not affected.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
-
-        def delete(connection: sqlite3.Connection) -> None:
-            connection.execute("BEGIN IMMEDIATE")
-            for table in ("simulations", "responses", "failures"):
-                connection.execute(f"DELETE FROM {table}")
-            connection.execute("COMMIT")
-
-        with self.file.lock:
-            self._insist(delete)
-            self._waiting.clear()
-            # returns the space to the disk; may fail while others read
-            self._try("vacuumed", lambda connection: connection.execute("VACUUM"), None)
 
     def export_hdf5(self, path: str | os.PathLike) -> int:
         """Write all simulations, without responses, to an HDF5 file; an existing file is replaced atomically.

@@ -12,7 +12,7 @@ point again. A `MisfitReason` depends on the measurements, so that it says nothi
 import subprocess
 from concurrent.futures import BrokenExecutor
 
-__all__ = ["FailedRun", "MisfitReason", "TransientReason", "is_transient", "reason_of"]
+__all__ = ["ChangedModel", "FailedRun", "MisfitReason", "TransientReason", "is_transient", "reason_of"]
 
 _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
 
@@ -27,6 +27,10 @@ class FailedRun(RuntimeError):
     """
 
     reason: str
+
+
+class ChangedModel(ValueError):
+    """A model is not the one whose fingerprint was computed. The message says what to do."""
 
 
 class TransientReason(str):

@@ -19,7 +19,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..signals.channels import Channel
-from .faults import FailedRun, MisfitReason, is_transient, reason_of
+from .changed_model import SentModel
+from .faults import ChangedModel, FailedRun, MisfitReason, is_transient, reason_of
 
 __all__ = [
     "MisfitBatch",
@@ -356,18 +357,28 @@ def _attempt(
     """Run one simulation; returns its result and an empty reason, or None and the reason. Called in the worker."""
     try:
         result = run(model, theta)
+    except ChangedModel:
+        raise
     except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
         return None, reason_of(error)
     reason = _not_finite(model, result)
     return (None, reason) if reason else (result, "")
 
 
+def _attempt_sent(
+    run: Callable[[Model, np.ndarray], np.ndarray], sent: SentModel, theta: np.ndarray
+) -> tuple[np.ndarray | None, str]:
+    return _attempt(run, sent.model, theta)
+
+
 def _run_each(
     run: Callable[[Model, np.ndarray], np.ndarray], model: Model, thetas: np.ndarray, shape: tuple[int, ...], pool: Any
 ) -> tuple[np.ndarray, list[str]]:
     """Run simulations one by one, in this process or in the pool's workers."""
-    attempt = partial(_attempt, run, model)
-    outcomes = list(map(attempt, thetas) if pool is None else pool.map(attempt, list(thetas)))
+    if pool is None:
+        outcomes = [_attempt(run, model, theta) for theta in thetas]
+    else:
+        outcomes = list(pool.map(partial(_attempt_sent, run, SentModel(model)), list(thetas)))
     values = np.full((len(thetas), *shape), np.nan)
     for row, (result, _) in zip(values, outcomes, strict=True):
         if result is not None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from .faults import TransientReason
+from .faults import ChangedModel, TransientReason
 from .processes import PickledFunction, RunFailed, Worker, WorkerReply, last_lines
 
 __all__ = ["Sandbox"]
@@ -121,6 +121,8 @@ class Sandbox:
             raise
         if reply.kind != "loaded":
             worker.kill()
+            if reply.value.startswith(ChangedModel.__name__):
+                raise ChangedModel(reply.value)
             raise ValueError(f"{self._function!r} cannot be loaded in another process: {reply.value}")
         return worker, output
 

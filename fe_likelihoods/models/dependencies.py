@@ -1,0 +1,100 @@
+"""Files and values that a model depends on and that no digest of its code can contain."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+from ..simulation.code_digest import code_digest
+
+__all__ = ["Dependencies", "file_digest"]
+
+_CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again without another time of modification
+_digests: dict[str, tuple[tuple, float, str]] = {}
+
+
+def file_digest(path: str | os.PathLike) -> str:
+    """Digest of the content of a file, read again only after a change of its size or time of modification."""
+    name = os.fspath(path)
+    status = os.stat(name)
+    stamp = status.st_size, status.st_mtime_ns, status.st_ino
+    known = _digests.get(name)
+    if known is not None and known[0] == stamp and known[1] - status.st_mtime > _CLOCK_TICK:
+        return known[2]
+    now = time.time()
+    digest = blake2b(digest_size=16)
+    with open(name, "rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    _digests[name] = stamp, now, digest.hexdigest()
+    return digest.hexdigest()
+
+
+class Dependencies:
+    """The argument ``depends_on`` of a model.
+
+    Parameters
+    ----------
+    things : iterable of Path or of values
+        A Path stands for the content of a file, or of all files in a folder; any other object for its value.
+    kind : str
+        Name of the model's class, for messages.
+
+    Attributes
+    ----------
+    paths : tuple of Path
+        The files and folders.
+
+    Raises
+    ------
+    ValueError
+        If a file does not exist, a text is the name of a file, or a value has no digest.
+    """
+
+    def __init__(self, things: Iterable[Any], kind: str) -> None:
+        if isinstance(things, str | os.PathLike | dict) or not isinstance(things, Iterable):
+            raise ValueError(f"{kind}: depends_on must be a list of Paths and values; got {things!r}")
+        self._things = tuple(things)
+        self._kind = kind
+        for thing in self._things:
+            if isinstance(thing, str) and os.path.exists(thing):
+                raise ValueError(
+                    f"{kind}: depends_on has the text {thing!r}, which is the name of a file; write Path({thing!r}) "
+                    "for its content"
+                )
+            if isinstance(thing, Path) and not thing.exists():
+                raise ValueError(f"{kind}: depends_on has {thing!r}, but there is no such file or folder")
+        self.paths = tuple(thing.resolve() for thing in self._things if isinstance(thing, Path))
+        self.texts()
+
+    def texts(self) -> list[str]:
+        """Digests of all contents and values, in order, as they are now."""
+        texts, paths = [], iter(self.paths)
+        for thing in self._things:
+            if isinstance(thing, Path):
+                texts.append(_content(next(paths)))
+                continue
+            try:
+                texts.append(code_digest(thing))
+            except ValueError as error:
+                raise ValueError(
+                    f"{self._kind}: no digest of {thing!r} in depends_on can be computed; give numbers, texts, arrays "
+                    f"or Paths: {error}"
+                ) from error
+        return texts
+
+
+def _content(path: Path) -> str:
+    """Digest of a file, of all files in a folder with their names, or a text that says that it is missing."""
+    try:
+        if not path.is_dir():
+            return file_digest(path)
+        files = sorted(file for file in path.rglob("*") if file.is_file())
+        parts = [f"{file.relative_to(path).as_posix()}\0{file_digest(file)}" for file in files]
+        return blake2b("\0".join(parts).encode(), digest_size=16).hexdigest()
+    except OSError as error:
+        return f"missing: {type(error).__name__}"
