@@ -11,7 +11,7 @@ from typing import Any
 
 from ..simulation.code_digest import code_digest
 
-__all__ = ["Dependencies", "file_digest"]
+__all__ = ["Dependencies", "content_digest", "file_digest"]
 
 _CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again without another time of modification
 _digests: dict[str, tuple[tuple, float, str]] = {}
@@ -76,7 +76,7 @@ class Dependencies:
         texts, paths = [], iter(self.paths)
         for thing in self._things:
             if isinstance(thing, Path):
-                texts.append(_content(next(paths)))
+                texts.append(content_digest(next(paths)))
                 continue
             try:
                 texts.append(code_digest(thing))
@@ -88,7 +88,7 @@ class Dependencies:
         return texts
 
 
-def _content(path: Path) -> str:
+def content_digest(path: Path) -> str:
     """Digest of a file, of all files in a folder with their names, or a text that says that it is missing."""
     try:
         if not path.is_dir():

@@ -7,13 +7,13 @@ a failed simulation, with a reason and the last lines of its standard error. The
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import string
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from ..simulation.faults import TransientReason, reason_of
 from ..simulation.model import SimulationFailed
 from ..simulation.processes import RunFailed, TemporaryFolder, describe_exit, last_lines
 from ..simulation.programs import run_program
+from .dependencies import content_digest
 from .external import ExternalModel
 from .validation import positive_float
 
@@ -79,13 +80,19 @@ class ExecutableModel(ExternalModel):
         Largest amount that a run may write into its folder and to standard output and error [bytes].
     env : mapping of str to str, optional
         All environment variables of the program; they are part of the fingerprint. By default the program has the
-        variables of this process at each run, which are not part of the fingerprint, so that a change in them is not
-        noticed by a cache.
+        variables of this process at each run, which are not part of the fingerprint: name those that matter in
+        `depends_on`, since a cache compares only some of its rows with new runs.
     hash_executable : bool
         Whether the fingerprint contains the content of the program, and of files that an argument names by an absolute
-        path. For large installations use `version` instead.
+        path, alone or as in ``--script=/path``. For large installations use `version` instead.
+    written : sequence of Path, optional
+        Files among these that the program itself writes, such as a log; the fingerprint does not contain them.
     version : str, optional
-        Text that enters the fingerprint. If `output` is a function, it replaces the code of the function.
+        Text that enters the fingerprint; change it whenever the program computes something else for a reason that the
+        files do not show. If `output` is a function, it replaces the code of the function.
+    depends_on : sequence, optional
+        Files and values that the response depends on besides, such as a library or a material table that the program
+        reads; see `FunctionModel`.
 
     Raises
     ------
@@ -100,6 +107,8 @@ class ExecutableModel(ExternalModel):
     ...     (Channel("top", "relative displacement", "mm"),), 0.01, 2000, time_limit=60.0,
     ... )
     """
+
+    change_advice = " A file that the program itself writes belongs in written=."
 
     def __init__(
         self,
@@ -119,9 +128,11 @@ class ExecutableModel(ExternalModel):
         max_output: int = 2**28,
         env: Mapping[str, str] | None = None,
         hash_executable: bool = True,
+        written: Sequence[str | Path] = (),
         version: str | None = None,
+        depends_on: Sequence[Any] = (),
     ) -> None:
-        super().__init__(parameter_names, channels, dt, n_steps)
+        super().__init__(parameter_names, channels, dt, n_steps, depends_on)
         self.time_limit = positive_float(time_limit, "ExecutableModel: time_limit", "seconds")
         self.max_output = int(positive_float(max_output, "ExecutableModel: max_output", "bytes"))
         self.max_kept = int(positive_float(max_kept, "ExecutableModel: max_kept", "folders"))
@@ -149,13 +160,18 @@ class ExecutableModel(ExternalModel):
             )
         self.env = None if env is None else _environment(env)
         self.keep_failures = None if keep_failures is None else Path(keep_failures).resolve()
-        self.fingerprint = self._fingerprint(hash_executable, version)
+        self.version = version
+        written = {Path(file).resolve() for file in written}
+        named = _named_files(self.command) if hash_executable else []
+        self._named = tuple(file for file in named if file.resolve() not in written)
+        self.watched_files = (*self._named, *self.files.values(), *self._dependencies.paths)
+        self.fingerprint = self.current_fingerprint()
 
-    def _fingerprint(self, hash_executable: bool, version: str | None) -> str:
-        """Digest of everything that a response depends on."""
-        named = [Path(part) for part in self.command if Path(part).is_absolute() and Path(part).is_file()]
-        contents = [_hash(path) for path in named] if hash_executable else []
-        copied = {name: _hash(path) for name, path in sorted(self.files.items())}
+    def current_fingerprint(self) -> str:
+        """Digest of everything that a response depends on, with the files as they are now."""
+        version = self.version
+        contents = [content_digest(path) for path in self._named]
+        copied = {name: content_digest(path) for name, path in sorted(self.files.items())}
         parse: Any = [self.output, self.columns]
         if callable(self.output):
             try:
@@ -331,12 +347,16 @@ def _text(name: str, source: str | Path) -> str:
         raise ValueError(f"ExecutableModel: the template of {name} is not a text file: {error}") from error
 
 
-def _hash(path: Path) -> str:
-    with open(path, "rb") as file:
-        digest = blake2b(digest_size=16)
-        while block := file.read(2**20):
-            digest.update(block)
-    return digest.hexdigest()
+def _named_files(command: Sequence[str]) -> list[Path]:
+    """Files that the parts of a command name by an absolute path, also after an option as in ``--script=/path``."""
+    found = []
+    for part in command:
+        for start in [match.start() for match in re.finditer("/", part)]:
+            # a path starts the part, or follows an option or a separator
+            if start == 0 or part[start - 1] in "=,:;@" or re.fullmatch("-[A-Za-z]", part[:start]):
+                places = [part[start:], *re.split("[,:;]", part[start:])[:1]]
+                found += [Path(place) for place in places if os.path.isfile(place)][:1]
+    return found
 
 
 def _size(folder: Path) -> int:

@@ -64,7 +64,7 @@ class ModelGuard:
                 f"the {type(model).__name__} has changed since the likelihood was made (its fingerprint differs): a "
                 "value or file that it uses was changed, or another model was set. Its simulations cannot be stored "
                 "with the earlier ones. Make a new model and a new likelihood; what varies during a run has to be a "
-                "parameter"
+                f"parameter.{getattr(model, 'change_advice', '')}"
             )
         self.unchecked.clear()
         self._not_before = time.monotonic() + (time.monotonic() - start) / _SHARE_OF_TIME

@@ -1,0 +1,168 @@
+"""No way of changing a model lets the cache use simulations of another model in silence."""
+
+import pickle
+import sys
+import time
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import ExecutableModel, FunctionModel, LocalPool, SimulationCache
+from fe_likelihoods.simulation import changed_model
+from fe_likelihoods.simulation.changed_model import SentModel, current_fingerprint
+from fe_likelihoods.simulation.code_digest import code_digest
+from fe_likelihoods.simulation.faults import ChangedModel
+
+from . import model_changes as changes
+from .model_changes import CHANNELS, N_STEPS, NAMES, NOTICED, THETAS
+
+
+@pytest.mark.parametrize("way", [*changes.CODE, *changes.OUTSIDE], ids=lambda way: way.name)
+def test_a_change_between_two_runs(way):
+    assert changes.between(way) == way.expected
+
+
+@pytest.mark.parametrize("way", changes.DURING, ids=lambda way: way.name)
+def test_a_change_during_a_run(way):
+    """Its simulations are not stored under the key of the earlier model."""
+    assert changes.during(way) == NOTICED
+
+
+@pytest.mark.parametrize("way", changes.WORKERS, ids=lambda way: way.name)
+def test_a_worker_with_other_code_refuses(way):
+    assert changes.in_worker(way) == NOTICED
+
+
+def test_only_what_is_documented_is_used_unseen():
+    expected = Counter(way.expected for way in [*changes.CODE, *changes.OUTSIDE])
+    assert len(changes.CODE) + len(changes.OUTSIDE) + len(changes.DURING) + len(changes.WORKERS) > 80
+    assert expected[changes.DOCUMENTED] == 3
+
+
+# functions that change what they use ----------------------------------------------------------------------------------
+
+COUNTS = "calls = 0\ndef f(t):\n    global calls\n    calls += 1\n    return line(t)"
+KEEPS = "known = {}\ndef f(t):\n    known[tuple(t)] = 1.0\n    return line(t)"
+
+
+@pytest.mark.parametrize("body", [COUNTS, KEEPS], ids=["a counter", "earlier results"])
+def test_a_function_that_changes_its_own_state_is_not_refused(body, tmp_path):
+    with changes.workshop(changes.user(body)) as folder:
+        first = changes.likelihood_of(folder, {}, SimulationCache(tmp_path / "cache.sqlite"))
+        for row in THETAS:
+            first.misfit(row)
+        assert first.cache.info().simulations == len(THETAS)
+        pickle.loads(pickle.dumps(SentModel(first.model)))
+        again = changes.likelihood_of(folder, {}, SimulationCache(tmp_path / "cache.sqlite"))
+        again.misfit(THETAS)
+        assert (again.simulations, again.verifications) == (0, 2)
+
+
+def test_rows_since_the_last_comparison_are_deleted_after_a_change(tmp_path, monkeypatch):
+    """The fingerprint is computed again in 1 % of the time, so a few rows are stored before a change is noticed."""
+    with changes.workshop(changes.user("E = 2.5\ndef f(t): return E * line(t)")) as folder:
+        likelihood = changes.likelihood_of(folder, {}, SimulationCache(tmp_path / "cache.sqlite", responses=True))
+        likelihood.misfit(THETAS[:2])
+        likelihood._guard._not_before = time.monotonic() + 1e6
+        sys.modules["user"].E = 2.6
+        likelihood.misfit(THETAS[2:4])
+        assert likelihood.cache.info().simulations == 4
+        likelihood._guard._not_before = 0.0
+        with pytest.raises(ChangedModel, match="FunctionModel has changed since the likelihood was made"):
+            likelihood.misfit(THETAS[4:5])
+        info = likelihood.cache.info()
+        assert (info.simulations, info.responses, len(likelihood.memory_cache)) == (2, 2, 0)
+    monkeypatch.setattr(changed_model, "_SHARE_OF_TIME", 0.01)
+    guard = changed_model.ModelGuard(likelihood.model)
+    computed = []
+    monkeypatch.setattr(
+        changed_model, "current_fingerprint", lambda model: computed.append(time.sleep(0.001)) or model.fingerprint
+    )
+    start = time.monotonic()
+    while time.monotonic() < start + 0.25:
+        guard.check(likelihood.model, THETAS)
+    assert 1 <= len(computed) <= 3
+
+
+def test_a_change_in_memory_is_noticed_without_a_file():
+    with changes.workshop(changes.user("E = [2.5]\ndef f(t): return E[0] * line(t)")) as folder:
+        likelihood = changes.likelihood_of(folder, {}, None)
+        likelihood.misfit(THETAS[:2])
+        sys.modules["user"].E[0] = 2.6
+        with pytest.raises(ChangedModel):
+            likelihood.misfit(THETAS[2:])
+
+
+# real processes -------------------------------------------------------------------------------------------------------
+
+EDITED = changes.user("import helper\ndef f(t): return helper.g(line(t)) * helper.E", helper=changes.HELPER)
+
+
+@pytest.mark.parametrize("isolated", [False, True], ids=["pool", "process of its own"])
+def test_processes_that_import_other_code_refuse(isolated):
+    with changes.workshop(EDITED) as folder, LocalPool(1) as pool:
+        expected = changes.likelihood_of(folder, {}, None).misfit(THETAS[:1])
+        likelihood = changes.likelihood_of(folder, {"isolated": isolated}, None)
+        if not isolated:
+            likelihood.pool = pool
+        if not isolated:
+            np.testing.assert_array_equal(likelihood.misfit(THETAS[:1]), expected)
+            pool.close()
+        (folder / "helper.py").write_text(changes.HELPER.replace("3.0", "4.0"))
+        with pytest.raises(ValueError, match="not the same in the worker process .* source file was edited"):
+            likelihood.misfit(THETAS[1:2])
+        assert likelihood.failure_count == 0
+
+
+# arguments ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("depends_on", "message"),
+    [
+        ("table.txt", "must be a list of Paths and values"),
+        ({"a": 1}, "must be a list"),
+        ([__file__], "is the name of a file; write Path"),
+        ([changes.Path("/no/such/file")], "no such file or folder"),
+        ([sys.stdout], "no digest of .* in depends_on can be computed"),
+    ],
+    ids=["a name", "a dict", "a text", "a missing file", "an open file"],
+)
+def test_wrong_dependencies_are_rejected(depends_on, message):
+    with pytest.raises(ValueError, match=message):
+        FunctionModel(np.sum, NAMES, CHANNELS, 0.1, N_STEPS, depends_on=depends_on)
+
+
+def test_a_file_that_the_program_writes_is_named(tmp_path):
+    log = tmp_path / "solver.log"
+    log.write_text("")
+    command = ["sh", "-c", "echo $0 >> $1; for k in 1 2 3; do cat in.txt; done > out.txt", "${offset}", str(log)]
+    command[2] = command[2].replace("$", "$$")
+    options = {"time_limit": 30.0, "columns": [0]}
+
+    def model(**more):
+        return ExecutableModel(
+            command, {"in.txt": "$offset $slope\n"}, "out.txt", NAMES, CHANNELS, 0.1, 3, **options | more
+        )
+
+    plain, named = model(), model(written=[log])
+    for one in (plain, named):
+        assert current_fingerprint(one) == one.fingerprint
+    np.testing.assert_array_equal(named.simulate([0.5, 0.1]), np.full((1, 3), 0.5))
+    assert log.read_text() == "0.5\n"
+    assert current_fingerprint(named) == named.fingerprint == model(written=[log]).fingerprint
+    assert current_fingerprint(plain) != plain.fingerprint != model().fingerprint
+    with pytest.raises(ChangedModel, match="the program itself writes belongs in written="):
+        changed_model.ModelGuard(plain).check(plain, THETAS)
+
+
+def test_the_digest_of_a_function_takes_milliseconds():
+    with changes.workshop(EDITED) as folder:
+        function = changes.likelihood_of(folder, {}, None).model.function
+        seconds = []
+        for _ in range(20):
+            start = time.perf_counter()
+            code_digest(function)
+            seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.01
