@@ -162,6 +162,16 @@ def run_program(
                 keeper.kill()
 
 
+def _forget() -> None:
+    """In a forked process: the supervisors belong to its parent, and one of its threads may have held the lock."""
+    global _lock
+    _lock = threading.Lock()
+    _idle.clear()
+
+
+os.register_at_fork(after_in_child=_forget)
+
+
 def _take() -> _Supervisor:
     with _lock:
         while _idle:

@@ -1,6 +1,7 @@
 """Models defined by a program: parameters and responses are exact, and failing programs are reported."""
 
 import functools
+import multiprocessing
 import os
 import pickle
 import sys
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ExecutableModel, LocalPool, SimulationFailed
+from fe_likelihoods.simulation import programs
 from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
@@ -147,6 +149,15 @@ def test_a_supervisor_that_is_killed_is_a_transient_fault():
     (reason,) = simulate_batch(killer, THETA[None]).reasons
     assert isinstance(reason, TransientReason)
     assert reason.startswith("the supervisor of the program died")
+    np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
+
+
+def test_a_forked_process_has_a_supervisor_of_its_own():
+    """As in a pool of multiprocessing that forks while threads of the parent run programs."""
+    model = model_of()
+    model.simulate(THETA)
+    with programs._lock, multiprocessing.get_context("fork").Pool(1) as pool:
+        np.testing.assert_array_equal(pool.apply_async(model.simulate, (THETA,)).get(20.0), line(THETA))
     np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
 
 
