@@ -101,6 +101,8 @@ class Measurements:
         names = [channel.name for channel in channels]
         if not channels or len(set(names)) != len(names):
             raise ValueError(f"measurements need channels with different names, got {names}")
+        if np.iscomplexobj(self.values):
+            raise ValueError("values must be real numbers, got complex ones; give the real part if it is the data")
         values = np.array(self.values, dtype=np.float64)
         if values.ndim != 2 or values.shape[0] != len(channels) or values.shape[1] < 1:
             raise ValueError(

@@ -36,6 +36,8 @@ def check_samples(values: ArrayLike, what: str, name: str) -> NDArray[np.float64
     ValueError
         If the array has another shape, fewer than two samples, or a sample that is not a finite number.
     """
+    if np.iscomplexobj(values):
+        raise ValueError(f"{what} of {name!r} must be real numbers, got complex ones")
     try:
         samples = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -40,7 +40,10 @@ def map_threads(
 
     def one(i: int) -> None:
         try:
-            out[i] = run(thetas[i])
+            values = run(thetas[i])
+            if np.iscomplexobj(values):  # the assignment would keep the real part
+                raise ValueError("expected real numbers, got complex ones")
+            out[i] = values
         except SimulationFailed as failure:
             reasons[i] = failure.reason
 

@@ -18,8 +18,10 @@ from fe_likelihoods import (
     ExecutableModel,
     FELikelihood,
     FunctionModel,
+    LinearOscillator,
     LocalPool,
     Measurements,
+    Record,
     SimulationCache,
     SimulationFailed,
 )
@@ -357,11 +359,25 @@ class ComplexBatch(ComplexModel):
         return np.array([self.simulate(theta) for theta in thetas]), [""] * len(thetas)
 
 
+class ComplexOscillator(LinearOscillator):
+    """A model on threads."""
+
+    channels = CHANNELS
+
+    def _respond(self, theta):
+        return complex_line(theta)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     "model",
-    [ComplexModel(), ComplexBatch(), FunctionModel(complex_line, NAMES, CHANNELS, DT, N_STEPS)],
-    ids=["model", "batch", "function"],
+    [
+        ComplexModel(),
+        ComplexBatch(),
+        FunctionModel(complex_line, NAMES, CHANNELS, DT, N_STEPS),
+        ComplexOscillator(Record("r", DT, np.ones(N_STEPS))),
+    ],
+    ids=["model", "batch", "function", "threads"],
 )
 def test_a_complex_response_is_refused(model):
     for batch in (simulate_batch(model, THETAS), misfit_batch(model, THETAS, line(THETAS[0]))):

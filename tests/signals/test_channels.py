@@ -53,6 +53,7 @@ class TestMeasurements:
             ((), 0.1, np.ones((0, 3)), "different names"),
             ((TOP, DRIFT), 0.1, np.ones((3, 2)), r"= \(2, n_steps\), got \(3, 2\)"),
             ((TOP,), 0.1, np.ones(3), r"got \(3,\)"),
+            ((TOP,), 0.1, np.ones((1, 3)) + 0j, "values must be real numbers, got complex ones"),
             ((TOP,), 0.1, np.ones((1, 0)), r"got \(1, 0\)"),
             ((TOP,), 0.0, np.ones((1, 3)), "positive number of seconds, got 0.0"),
             ((TOP, DRIFT), 0.1, [[0, 1], [2, np.nan]], "1 are not, the first is sample 1 of channel 'drift'"),

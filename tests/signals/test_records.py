@@ -37,6 +37,10 @@ class TestRecord:
         with pytest.raises(ValueError, match="2 of 5 samples are not, the first is sample 3"):
             Record("r", 0.01, [0, 1, 2, value, np.nan])
 
+    def test_complex_numbers_are_refused(self):
+        with pytest.raises(ValueError, match="acceleration of 'r' must be real numbers, got complex ones"):
+            Record("r", 0.01, [0.0, 1j])
+
     def test_text_is_refused(self):
         with pytest.raises(ValueError, match="'r' must be an array of numbers"):
             Record("r", 0.01, ["zero", "one"])
