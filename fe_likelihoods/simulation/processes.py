@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from . import orphan_reaper
-from .faults import FailedRun, TransientReason
+from .faults import FailedRun, TransientReason, is_transient
 
 __all__ = [
     "ManagedProcess",
@@ -44,6 +44,7 @@ __all__ = [
     "last_lines",
     "local_definition",
     "serve",
+    "without_addresses",
 ]
 
 _BOOT = (
@@ -208,7 +209,8 @@ def local_definition(thing: Any) -> str:
     return "a local function or class" if "<locals>" in thing.__qualname__ else ""
 
 
-def _without_addresses(message: str) -> str:
+def without_addresses(message: str) -> str:
+    """A message without the addresses of objects, which differ between runs."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", message)
 
 
@@ -238,7 +240,7 @@ class PickledFunction(NamedTuple):
         except Exception as error:
             name = getattr(function, "__qualname__", type(function).__qualname__)
             local = local_definition(function)
-            why = f"it is {local}" if local else f"{type(error).__name__}: {_without_addresses(str(error))}"
+            why = f"it is {local}" if local else f"{type(error).__name__}: {without_addresses(str(error))}"
             raise ValueError(
                 f"{name} cannot be sent to another process ({why}). Define functions and classes at the top level of a "
                 "module, without open files, locks and connections"
@@ -446,7 +448,7 @@ def _import_script(path: str) -> None:
 
 
 def _packed(kind: str, value: Any) -> bytes:
-    """Pickled reply; a value that cannot be pickled becomes a RuntimeError with its message."""
+    """Pickled reply; what cannot be pickled is replaced by an exception with its message, or that of the error."""
     try:
         data = pickle.dumps((kind, value), protocol=5)
         if kind == "raised":
@@ -454,7 +456,10 @@ def _packed(kind: str, value: Any) -> bytes:
         return data
     except Exception as error:
         shown = value if kind == "raised" else error
-        return pickle.dumps(("raised", RuntimeError(f"{type(shown).__name__}: {shown}")))
+        text = f"{type(shown).__name__}: {shown}"
+        return pickle.dumps(
+            ("raised", RunFailed(TransientReason(text)) if is_transient(shown) else RuntimeError(text)), protocol=5
+        )
 
 
 def last_lines(file: Any, most: int) -> str:

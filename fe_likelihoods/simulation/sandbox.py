@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from .faults import ChangedModel, TransientReason
-from .processes import PickledFunction, RunFailed, Worker, WorkerReply, last_lines
+from .processes import PickledFunction, RunFailed, Worker, WorkerReply, last_lines, without_addresses
 
 __all__ = ["Sandbox"]
 
@@ -123,7 +123,8 @@ class Sandbox:
             worker.kill()
             if reply.value.startswith(ChangedModel.__name__):
                 raise ChangedModel(reply.value)
-            raise ValueError(f"{self._function!r} cannot be loaded in another process: {reply.value}")
+            reason = f"{self._function!r} cannot be loaded in another process: {reply.value}"
+            raise RunFailed(TransientReason(without_addresses(reason)))
         return worker, output
 
     def _wait(self, worker: Worker, output: Any, limit: float) -> WorkerReply | None:

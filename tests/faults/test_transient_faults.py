@@ -216,6 +216,25 @@ def test_a_worker_that_dies_is_not_an_answer(what, pool, tmp_path):
         first.pool.close()
 
 
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (bad.unreachable, "Unreachable: licences:27000 is unreachable"),
+        (
+            bad.Absent().simulate,
+            "<bound method Treacherous.simulate of <tests.faults.treacherous.Absent object>> cannot ",
+        ),
+    ],
+    ids=["exception", "loading"],
+)
+def test_faults_in_an_isolated_process_keep_their_kind(function, reason):
+    """Also an exception that cannot be unpickled, and a function that cannot be loaded there."""
+    model = FunctionModel(function, NAMES, CHANNELS, DT, N_STEPS, isolated=True, version="1")
+    (found,) = simulate_batch(model, THETAS[:1]).reasons
+    assert isinstance(found, TransientReason)
+    assert found.startswith(reason)
+
+
 SOLVER = "import sys; offset, slope = map(float, open('in.txt').read().split()); {do}; " + (
     f"open('out.txt', 'w').write(''.join(f'{{{{offset + slope * {DT} * k!r}}}}\\n' for k in range({N_STEPS})))"
 )

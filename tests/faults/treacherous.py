@@ -122,6 +122,18 @@ def _absent(home):
     raise ModuleNotFoundError("No module named 'mine'")
 
 
+class Unreachable(OSError):
+    """Can be pickled, but not unpickled, because of its constructor."""
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(f"{host}:{port} is unreachable")
+
+
+def unreachable(theta: np.ndarray) -> np.ndarray:
+    """Needs a server that cannot be reached."""
+    raise Unreachable("licences", 27000)
+
+
 def process_id(theta: np.ndarray) -> np.ndarray:
     """The process in which it runs."""
     return np.full((1, N_STEPS), os.getpid())
