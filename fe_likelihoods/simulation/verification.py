@@ -136,6 +136,7 @@ class _Schedule:
         self.token = token
         self.served: Counter[str] = Counter()
         self.failed_attempts = 0
+        self.stamps: tuple = ()  # of the source files
         self._lock, self._owner = threading.RLock(), os.getpid()
 
     def __reduce__(self) -> tuple:
@@ -183,7 +184,6 @@ class VerifiedCache:
         self.cache, self._schedule = cache, schedule
         self.runs, self.seconds = 0, 0.0
         self._objects: tuple | None = None  # of the last look-up; None if there was none, or in another process
-        self._stamps: tuple = ()
         self._stamp_time = -np.inf
         self._random = random.Random()  # its own, so that the user's streams of random numbers do not change
 
@@ -357,14 +357,15 @@ class VerifiedCache:
     def _notice_changes(self, run: VerifyingRun) -> None:
         """Start again with the first verification if the model object, its pool or a source file has changed."""
         objects = run.model, run.pool
-        if self._objects is not None and any(a is not b for a, b in zip(objects, self._objects, strict=True)):
+        same = self._objects is not None and all(a is b for a, b in zip(objects, self._objects, strict=True))
+        if self._objects is not None and not same:
             self._schedule.served.clear()
         now = time.monotonic()
-        if objects != self._objects or now > self._stamp_time + STAMP_SECONDS:
+        if not same or now > self._stamp_time + STAMP_SECONDS:
             stamps = tuple(_stamp(file) for file in watched_files(run.model))
-            if self._stamps and stamps != self._stamps:
+            if self._schedule.stamps and stamps != self._schedule.stamps:
                 self._schedule.served.clear()
-            self._stamps, self._stamp_time = stamps, now
+            self._schedule.stamps, self._stamp_time = stamps, now
         self._objects = objects
 
 
