@@ -21,6 +21,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import logging
+import re
 import sys
 import types
 from collections import defaultdict
@@ -37,6 +38,7 @@ from .source_digest import LIBRARY, inherits_fingerprint, is_standard, object_di
 
 __all__ = ["CodeDescription", "code_digest", "describe_code"]
 
+_DESCRIPTORS = (types.WrapperDescriptorType, types.MethodDescriptorType, types.ClassMethodDescriptorType)
 _BUILTIN_VALUES = (int, float, complex, str, bytes, bytearray, tuple, list, frozenset, set, dict)
 
 
@@ -192,6 +194,11 @@ class _Digest:
             bound = getattr(thing, "__self__", None)  # the array of array.dot; the module of a function of a module
             values = [] if bound is None or isinstance(bound, types.ModuleType) else [self.of(bound)]
             return ["builtin", owner, thing.__name__, _version(owner), *values]
+        if isinstance(thing, _DESCRIPTORS):  # methods of compiled types
+            owner = thing.__objclass__
+            return ["descriptor", owner.__module__, owner.__qualname__, thing.__name__, _version(owner.__module__)]
+        if isinstance(thing, re.Pattern):
+            return ["pattern", self.of(thing.pattern), self.of(thing.flags)]
         if isinstance(thing, type):
             return self._class(thing)
         return self._object(thing)

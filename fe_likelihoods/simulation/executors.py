@@ -29,7 +29,7 @@ from multiprocessing.pool import Pool, ThreadPool
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .faults import ChangedModel, TransientReason
+from .faults import TransientReason, raise_if_refused
 from .local_pool import LocalPool, Outcome
 from .processes import PickledFunction, TemporaryFolder, local_definition
 
@@ -232,9 +232,8 @@ class PoolExecutor:
             for index, outcome in zip(missing, carried, strict=True):
                 outcomes[index] = outcome
         for outcome in outcomes:
-            if isinstance(outcome, _Unusable) and outcome.reason.startswith(ChangedModel.__name__):
-                raise ChangedModel(outcome.reason)
             if isinstance(outcome, _Unusable):
+                raise_if_refused(outcome.reason)
                 raise RuntimeError(
                     f"a worker cannot load the model: {outcome.reason}. Define its classes and functions in modules "
                     "that the workers can import"

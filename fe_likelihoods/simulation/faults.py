@@ -12,9 +12,20 @@ point again. A `MisfitReason` depends on the measurements, so that it says nothi
 import subprocess
 from concurrent.futures import BrokenExecutor
 
-__all__ = ["ChangedModel", "FailedRun", "MisfitReason", "TransientReason", "is_transient", "reason_of"]
+__all__ = [
+    "ChangedModel",
+    "FailedRun",
+    "MisfitReason",
+    "TransientReason",
+    "is_transient",
+    "raise_if_refused",
+    "reason_of",
+]
 
 _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
+
+
+_REFUSED = "ChangedModel: "
 
 
 class FailedRun(RuntimeError):
@@ -31,6 +42,12 @@ class FailedRun(RuntimeError):
 
 class ChangedModel(ValueError):
     """A model is not the one whose fingerprint was computed. The message says what to do."""
+
+
+def raise_if_refused(reason: str) -> None:
+    """Raise the `ChangedModel` with which a worker process has refused a function, if that is the reason."""
+    if reason.startswith(_REFUSED):
+        raise ChangedModel(reason.removeprefix(_REFUSED))
 
 
 class TransientReason(str):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from multiprocessing.connection import wait
 from typing import Any
 
+from .faults import raise_if_refused
 from .processes import PickledFunction, RunFailed, Worker
 
 __all__ = ["LocalPool", "Outcome"]
@@ -136,6 +137,7 @@ class LocalPool:
                         if reply is None:
                             continue
                         if reply.kind == "unusable":
+                            raise_if_refused(reply.value)
                             raise ValueError(f"{function!r} cannot be loaded in a worker process: {reply.value}")
                         if reply.kind == "raised":
                             raise reply.value

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from .faults import ChangedModel, TransientReason
+from .faults import TransientReason, raise_if_refused
 from .processes import PickledFunction, RunFailed, Worker, WorkerReply, last_lines, without_addresses
 
 __all__ = ["Sandbox"]
@@ -121,8 +121,7 @@ class Sandbox:
             raise
         if reply.kind != "loaded":
             worker.kill()
-            if reply.value.startswith(ChangedModel.__name__):
-                raise ChangedModel(reply.value)
+            raise_if_refused(reply.value)
             reason = f"{self._function!r} cannot be loaded in another process: {reply.value}"
             raise RunFailed(TransientReason(without_addresses(reason)))
         return worker, output
