@@ -321,6 +321,16 @@ class SimulationCache(RowDeletion):
                 return StoredSimulation(theta, misfit, row[5].decode("utf-8", "replace"))
         return None
 
+    def is_stored(self, fingerprint: str, theta: np.ndarray) -> bool:
+        """Whether a simulation, a response or a failure is stored for one set of structural parameters."""
+        keys = simulation_keys(fingerprint, theta[None])
+
+        def count(connection: sqlite3.Connection) -> int:
+            tables = ("simulations", "responses", "failures")
+            return sum(len(select_rows(connection, keys, f"key FROM {table}")) for table in tables)
+
+        return bool(self._try("read", count, 0))
+
     def info(self) -> CacheInfo:
         """State of the cache, and counts of this object."""
 

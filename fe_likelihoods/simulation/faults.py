@@ -41,7 +41,15 @@ class FailedRun(RuntimeError):
 
 
 class ChangedModel(ValueError):
-    """A model is not the one whose fingerprint was computed. The message says what to do."""
+    """A model is not the one whose fingerprint was computed. The message says what to do.
+
+    Attributes
+    ----------
+    ends_run : bool
+        True: samplers stop, since no other point can be evaluated either.
+    """
+
+    ends_run = True
 
 
 def raise_if_refused(reason: str) -> None:

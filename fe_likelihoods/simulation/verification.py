@@ -24,6 +24,7 @@ import numpy as np
 from .cache_rows import CachedRows, StoredSimulation
 from .disk_cache import SimulationCache
 from .faults import TransientReason
+from .fingerprint import simulation_fingerprint
 from .model import Model, SimulationBatch, Statistic, misfit_batch, misfit_of_responses
 from .source_digest import inherits_fingerprint
 
@@ -44,7 +45,26 @@ _schedules: "OrderedDict[str, _Schedule]" = OrderedDict()  # of pickled objects:
 
 
 class StaleCache(ValueError):
-    """A stored simulation differs from a new one with the same parameters. The message says what to do."""
+    """A stored simulation differs from a new one with the same parameters. The message says what to do.
+
+    It is raised again, for any row, as long as that simulation is stored and the model is the same object.
+
+    Attributes
+    ----------
+    theta : (n_structural,) float
+        Structural parameters of the simulation.
+    ends_run : bool
+        True: samplers stop, since no other point can be evaluated either.
+    """
+
+    ends_run = True
+
+    def __init__(self, message: str, theta: np.ndarray) -> None:
+        super().__init__(message)
+        self.theta = theta
+
+    def __reduce__(self) -> tuple:
+        return type(self), (str(self), self.theta)
 
 
 class VerifyingRun(NamedTuple):
@@ -136,6 +156,7 @@ class _Schedule:
         self.token = token
         self.served: Counter[str] = Counter()
         self.failed_attempts = 0
+        self.stale: tuple[str, StaleCache] | None = None  # fingerprint of the row that differed, and the error
         self.stamps: tuple = ()  # of the source files
         self._lock, self._owner = threading.RLock(), os.getpid()
 
@@ -222,7 +243,7 @@ class VerifiedCache:
                     if latest is None or not np.array_equal(latest.theta, thetas[row]):
                         yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row])
 
-            self._verify_due("simulations", len(known), candidates, run)
+            self._verify_due("simulations", fingerprint, len(known), candidates, run)
         return rows
 
     def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | None]:
@@ -243,7 +264,7 @@ class VerifiedCache:
                     misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
                     yield StoredSimulation(thetas[row], misfit[0], reason)
 
-            self._verify_due("responses", len(known), candidates, run)
+            self._verify_due("responses", simulation_fingerprint(run.model), len(known), candidates, run)
         return responses
 
     def look_up_failures(self, thetas: np.ndarray, run: VerifyingRun) -> list[str]:
@@ -264,18 +285,28 @@ class VerifiedCache:
                 for row in self._random.sample(known, len(known)):
                     yield StoredSimulation(thetas[row], np.full(run.n_numbers, np.nan), reasons[row])
 
-            self._verify_due("failures", len(known), candidates, run)
+            self._verify_due("failures", simulation_fingerprint(run.model), len(known), candidates, run)
         return reasons
 
-    def _verify_due(self, table: str, n: int, candidates: Any, run: VerifyingRun) -> None:
+    def _verify_due(self, table: str, fingerprint: str, n: int, candidates: Any, run: VerifyingRun) -> None:
         """Verify as many rows as are due now that `n` more are used."""
         schedule = self._schedule
         with schedule.lock:
             self._notice_changes(run)
+            if schedule.stale is not None:
+                differing, error = schedule.stale
+                if self.cache.is_stored(differing, error.theta):
+                    raise StaleCache(str(error), error.theta)
+                schedule.stale = None
             before = schedule.served[table]
             first = before == 0
             due = FIRST_ROWS if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
-            if due and not self._verify(candidates(first), due, run):
+            try:
+                compared = not due or self._verify(candidates(first), due, run)
+            except StaleCache as error:
+                schedule.stale = fingerprint, error
+                raise
+            if not compared:
                 schedule.failed_attempts += 1
                 if schedule.failed_attempts < MAX_FAILED_ATTEMPTS:
                     return  # verified with the next rows
@@ -351,7 +382,8 @@ class VerifiedCache:
             f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
             f"{difference}. The model has changed in a way that its fingerprint does not contain. Delete its rows with "
             "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
-            f"{rest}{advice}"
+            f"{rest}{advice}",
+            row.theta,
         )
 
     def _notice_changes(self, run: VerifyingRun) -> None:
@@ -360,6 +392,7 @@ class VerifiedCache:
         same = self._objects is not None and all(a is b for a, b in zip(objects, self._objects, strict=True))
         if self._objects is not None and not same:
             self._schedule.served.clear()
+            self._schedule.stale = None
         now = time.monotonic()
         if not same or now > self._stamp_time + STAMP_SECONDS:
             stamps = tuple(_stamp(file) for file in watched_files(run.model))

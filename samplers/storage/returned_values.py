@@ -155,6 +155,9 @@ class ErrorCapturing:
     empty string. Such a point has `Failed` as well, because the records of a function in a worker are not seen in this
     process.
 
+    An exception whose attribute ``ends_run`` is true is raised: the function cannot be used for any point, such as a
+    posterior whose model has changed.
+
     Parameters
     ----------
     function, args, kwargs
@@ -179,6 +182,8 @@ class ErrorCapturing:
             fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
             return Failed(fault) if fault else result
         except Exception as error:
+            if getattr(error, "ends_run", False):
+                raise
             if not self.vectorize:
                 return Failed(error)
             if len(points) == 1:

@@ -10,9 +10,10 @@ import pytest
 
 from fe_likelihoods import AutoregressiveNoise, FELikelihood, LinearOscillator, Measurements, Record, SimulationCache
 from fe_likelihoods.simulation import verification
-from fe_likelihoods.simulation.faults import TransientReason
+from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
 from fe_likelihoods.simulation.model import SimulationFailed
 from fe_likelihoods.simulation.verification import StaleCache, largest_difference, response_tolerance
+from samplers import SMCSampler
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
 
@@ -66,8 +67,8 @@ def test_a_change_that_no_fingerprint_contains_is_an_error_that_says_what_to_do(
     old, new = (likelihood_of(Scaled(factor), None).misfit(row)[0, 0] for factor in (1.0, 1.01))
     assert f"channel 'a', sum of squared residuals: stored {old:.17g}, simulated again {new:.17g}" in str(caught.value)
     assert "forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)" in str(caught.value)
-    assert likelihood.verifications == likelihood.model.runs == 4
     assert (likelihood.simulations, likelihood.cache_hits, len(likelihood.memory_cache)) == (0, 0, 0)
+    assert likelihood.verifications == likelihood.model.runs == 2
     likelihood.cache.forget(*likelihood.cache_keys)
     np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(Scaled(1.01), None).misfit(thetas))
 
@@ -89,6 +90,45 @@ def test_the_row_that_was_stored_last_is_verified_even_if_it_is_not_requested(fi
     other.misfit(thetas[:5] + 1.0)
     with pytest.raises(StaleCache, match="stored .*, simulated again"):
         likelihood_of(Scaled(), filled).misfit(thetas)
+
+
+def test_a_difference_remains_an_error_for_all_rows(filled, thetas):
+    """Also for those that are right: a client that tries each point alone must not go on with half of them."""
+    other = likelihood_of(Scaled(2.0), SimulationCache(filled, verify=False))
+    other.cache.discard(thetas[-1:], *other.cache_keys)
+    other.misfit(thetas[-1:])
+    likelihood = likelihood_of(Scaled(), filled)
+    runs = []
+    for theta in thetas:
+        with pytest.raises(StaleCache):
+            likelihood.misfit(theta)
+        runs.append(likelihood.verifications)
+    assert set(runs) == {2}
+    copy = pickle.loads(pickle.dumps(likelihood))
+    with pytest.raises(StaleCache):
+        copy.misfit(thetas[:1])
+    likelihood.misfit(thetas[:1] + 1.0)  # a new simulation
+
+
+@pytest.mark.parametrize("vectorize", [False, True])
+@pytest.mark.parametrize("error", [StaleCache("stale", np.zeros(2)), ChangedModel("changed")], ids=["stale", "changed"])
+def test_samplers_stop(error, vectorize):
+    """Instead of counting points as failures and going on with the others."""
+    calls = []
+
+    def log_prob(x):
+        calls.append(len(x))
+        if sum(calls) > 100:
+            raise error
+        return -0.5 * np.sum(np.square(x), axis=-1)
+
+    start = np.random.default_rng(0).uniform(-5.0, 5.0, size=(60, 2))
+    prior = dict(log_prior_fn=lambda x: np.where(np.all(np.abs(x) < 5.0, axis=-1), -2 * np.log(10.0), -np.inf))
+    sampler = SMCSampler(60, 2, log_prob, vectorize=vectorize, seed=1, **prior)
+    with pytest.raises(type(error), match=str(error)):
+        sampler.run_mcmc(start, 2)
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.ends_run) == (str(error), True)
 
 
 def test_verification_can_be_turned_off(filled, thetas):
