@@ -18,6 +18,7 @@ from .faults import ChangedModel
 __all__ = ["ModelGuard", "SentFunction", "SentModel", "current_fingerprint"]
 
 _SHARE_OF_TIME = 0.01  # for fingerprints that are computed again
+_NO_TIME = 5e-5  # [s]; a fingerprint that takes less is always computed again, since storing a row takes longer
 
 
 def current_fingerprint(model: Any) -> str:
@@ -27,7 +28,7 @@ def current_fingerprint(model: Any) -> str:
 
 
 class ModelGuard:
-    """Compares the fingerprint of a model with that at the start, in at most 1 % of the time.
+    """Compares the fingerprint of a model with that at the start, in about 1 % of the time.
 
     Parameters
     ----------
@@ -67,7 +68,8 @@ class ModelGuard:
                 f"parameter.{getattr(model, 'change_advice', '')}"
             )
         self.unchecked.clear()
-        self._not_before = time.monotonic() + (time.monotonic() - start) / _SHARE_OF_TIME
+        now = time.monotonic()
+        self._not_before = now + max(0.0, now - start - _NO_TIME) / _SHARE_OF_TIME
 
 
 class SentModel:
