@@ -106,23 +106,33 @@ class FunctionModel(ExternalModel):
         self.runs_per_process = runs_per_process
         settings = (time_limit, memory_limit, runs_per_process)
         self.isolated = bool(isolated) or any(setting is not None for setting in settings)
-        self.watched_files: tuple[str, ...] = ()
-        code = self._code()
-        self.fingerprint = self._digest(*self._identity(code))
+        self.watched_files = tuple(map(str, self._dependencies.paths))
+        self._code_at_start = self._code()
+        self.fingerprint = self._digest(*self._identity(self._code_at_start))
         self._run = function
         if self.isolated:
-            sent = SentFunction(function, self._fingerprinted, code)
+            sent = SentFunction(function, self._fingerprinted, self._code_at_start)
             self._run = Sandbox(sent, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process)
 
     def current_fingerprint(self) -> str:
         """The fingerprint of the function as it is now, computed again.
 
-        It is the attribute `fingerprint` if the function itself changes what it uses, such as a counter or a table of
-        earlier results: then no other change can be told from these.
+        If the function itself changes what it uses, such as a counter or a table of earlier results, its code counts as
+        unchanged: no other change of values can be told from these.
         """
-        if self.fingerprint in _changes_itself and self.version is None:
-            return self.fingerprint
-        return self._digest(*self._identity(self._code()))
+        code = self._code_at_start if self.fingerprint in _changes_itself else self._code()
+        return self._digest(*self._identity(code))
+
+    def accept_own_changes(self) -> None:
+        """State that the function may change what it uses; values of its code are then not compared any more."""
+        if self.isolated or self.version is not None or self.fingerprint in _changes_itself:
+            return
+        _changes_itself.add(self.fingerprint)
+        logger.info(
+            "%s changes what it uses when it runs, such as a counter or a table of earlier results; other changes of "
+            "its values are not noticed during a run. version= replaces its digest",
+            getattr(self.function, "__qualname__", self.function),
+        )
 
     @property
     def _fingerprinted(self) -> Callable:
@@ -156,12 +166,7 @@ class FunctionModel(ExternalModel):
         finally:
             _observed.add(self.fingerprint)
             if self._code_or_error() != before:
-                _changes_itself.add(self.fingerprint)
-                logger.info(
-                    "%s changes what it uses when it runs, such as a counter or a table of earlier results; other "
-                    "changes of its values are not noticed during a run. version= replaces its digest",
-                    getattr(self.function, "__qualname__", self.function),
-                )
+                self.accept_own_changes()
 
     def _code_or_error(self) -> str:
         try:

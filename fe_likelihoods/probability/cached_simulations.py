@@ -433,14 +433,14 @@ class CachedSimulations:
             return 1, largest
         return min(_ROUNDS_PER_CHUNK * workers, largest), largest
 
-    def _check_model(self, thetas: np.ndarray) -> None:
+    def _check_model(self, check: Callable, *arguments: Any) -> None:
         """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
         try:
-            self._guard.check(self.model, thetas)
+            check(self.model, *arguments)
         except ChangedModel:
             self.memory_cache.clear()
             self.response_memory.clear()
-            if self.cache is not None:
+            if self.cache is not None and self._guard.unchecked:
                 unchecked = np.concatenate(self._guard.unchecked)
                 self.cache.discard(unchecked, self._key, simulation_fingerprint(self.model))
             raise
@@ -449,6 +449,7 @@ class CachedSimulations:
         """Results of new simulations, which are counted, recorded if they fail, and cached in memory and on disk."""
         # checked before a batch and not after it, so that finished simulations are stored
         self._failures.check(self._outcomes)
+        self._check_model(self._guard.before)
         start = time.perf_counter()
         measured = self.measurements.values
         batch = None
@@ -464,7 +465,7 @@ class CachedSimulations:
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self._failures.add(theta, reason)
-        self._check_model(thetas)
+        self._check_model(self._guard.after, thetas, self.pool is None)
         self.memory_cache.store(keys, misfit)
         if responses:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]

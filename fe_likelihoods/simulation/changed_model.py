@@ -44,32 +44,63 @@ class ModelGuard:
         self._fingerprint = model.fingerprint
         self.unchecked: list[np.ndarray] = []
         self._not_before = -np.inf
+        self._is_due = False
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"unchecked": [], "_not_before": -np.inf}
 
-    def check(self, model: Any, thetas: np.ndarray) -> None:
-        """Compare after simulations at `thetas` (n, n_structural), unless the last comparison was too short ago.
+    def before(self, model: Any) -> None:
+        """Compare before simulations, unless the last comparison was too short ago.
 
         Raises
         ------
         ChangedModel
             If the model has changed; the simulations at `unchecked` may be those of either model.
         """
-        self.unchecked.append(thetas)
         start = time.monotonic()
-        if start < self._not_before:
+        self._is_due = start >= self._not_before
+        if self._is_due:
+            self._compare(model)
+            now = time.monotonic()
+            self._not_before = now + max(0.0, 2.0 * (now - start) - _NO_TIME) / _SHARE_OF_TIME
+
+    def after(self, model: Any, thetas: np.ndarray, in_process: bool) -> None:
+        """Compare after simulations at `thetas` (n, n_structural), if they were compared before them.
+
+        A model that ran in this process may have changed its own values. It then says so, with its method
+        ``accept_own_changes()``, and only its other inputs are compared.
+
+        Raises
+        ------
+        ChangedModel
+            As for `before`.
+        """
+        self.unchecked.append(thetas)
+        if not self._is_due:
             return
-        if current_fingerprint(model) != self._fingerprint:
-            raise ChangedModel(
-                f"the {type(model).__name__} has changed since the likelihood was made (its fingerprint differs): a "
-                "value or file that it uses was changed, or another model was set. Its simulations cannot be stored "
-                "with the earlier ones. Make a new model and a new likelihood; what varies during a run has to be a "
-                f"parameter.{getattr(model, 'change_advice', '')}"
-            )
+        try:
+            self._compare(model)
+        except ChangedModel:
+            if not in_process or not hasattr(model, "accept_own_changes"):
+                raise
+            model.accept_own_changes()
+            self._compare(model)
         self.unchecked.clear()
-        now = time.monotonic()
-        self._not_before = now + max(0.0, now - start - _NO_TIME) / _SHARE_OF_TIME
+
+    def _compare(self, model: Any) -> None:
+        try:
+            if current_fingerprint(model) == self._fingerprint:
+                return
+            why = "its fingerprint differs"
+        except ValueError as error:
+            why = str(error)
+        raise ChangedModel(
+            f"the {type(model).__name__} has changed since the likelihood was made ({why}): a value or file that it "
+            "uses was changed, or another model was set. Its simulations cannot be stored with the earlier ones. Make "
+            "a new model and a new likelihood; what varies during a run has to be a parameter. If the model itself "
+            "changes a value that does not matter, such as a counter, give it a version="
+            f".{getattr(model, 'change_advice', '')}"
+        )
 
 
 class SentModel:
