@@ -15,6 +15,7 @@ import numpy as np
 
 from ..units import DIMENSIONS
 from .channels import Channel, Measurements
+from .hdf5_files import DAMAGE, read_values
 from .records import Record
 
 __all__ = ["Dataset", "read_dataset", "write_dataset"]
@@ -120,22 +121,24 @@ def read_dataset(path: str | Path) -> Dataset:
                 )
             samples, values = file["record/acceleration"], file["measurements/values"]
             text, checksum = file.attrs["attributes"], file.attrs["checksum"]
-            record = Record(samples.attrs["name"], samples.attrs["dt"], samples[()], samples.attrs["source"])
+            acceleration, responses = read_values(samples, path), read_values(values, path)
+            record = Record(samples.attrs["name"], samples.attrs["dt"], acceleration, samples.attrs["source"])
             columns = [values.attrs[key] for key in ("channel_names", "quantities", "display_units")]
             channels = tuple(Channel(*map(str, each)) for each in zip(*columns, strict=True))
-            measurements = Measurements(channels, values.attrs["dt"], values[()], values.attrs["description"])
+            measurements = Measurements(channels, values.attrs["dt"], responses, values.attrs["description"])
             units = [samples.attrs["units"], *values.attrs["units"]]
-    except (OSError, KeyError, TypeError, RuntimeError) as error:
+        found, free = _checksum(record, measurements, text), json.loads(text)
+    except (*DAMAGE, RecursionError) as error:
         raise ValueError(f"{path}: not a complete data set ({error}); make it or download it again") from error
     if units != [DIMENSIONS["acceleration"], *(channel.si_unit for channel in channels)]:
         raise ValueError(
             f"{path}: expected SI units, got {units}; the file is damaged or was written by another program"
         )
-    if checksum != _checksum(record, measurements, text):
+    if checksum != found:
         raise ValueError(
             f"{path}: the contents do not match their checksum; the file is damaged, make it or download it again"
         )
-    return Dataset(record, measurements, json.loads(text))
+    return Dataset(record, measurements, free)
 
 
 def _channel_columns(channels: Sequence[Channel]) -> dict[str, list[str]]:

@@ -18,9 +18,12 @@ Both V2 formats are Fortran columns without separators. They are split by width,
 """
 
 import io
+import lzma
 import math
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -28,12 +31,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .text_files import NUMBER, Series, check_count, is_number, parse_number, read_bytes
+from .text_files import NUMBER, Series, check_count, is_number, parse_count, parse_number, read_bytes
 
 __all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
 
-_AT2_NEW = re.compile(rf"NPTS\s*=\s*(\d+)\b.*?DT\s*=\s*({NUMBER})", re.IGNORECASE)
-_AT2_OLD = re.compile(rf"^\s*(\d+)\s+({NUMBER})\s*,?\s*NPTS\s*,\s*DT", re.IGNORECASE)
+# Expressions are searched from one place of a line, and no two parts of one match the same text: their time is linear.
+_AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
+_AT2_STEP = re.compile(rf"DT\s*=\s*({NUMBER})", re.IGNORECASE)
+_AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
 _UNITS_OF = re.compile(r"UNITS\s+OF\s+([^\s,;]+?)[.]?(?=[\s,;]|$)", re.IGNORECASE)
 _CSMIP_DATA = re.compile(rf"^\s*(\d+)\s+points\s+of\s+accel\s+data\s+equally\s+spaced\s+at\s*({NUMBER})", re.IGNORECASE)
 _CSMIP_UNITS = re.compile(r"units:\s*([^\s)]+)|\bin\s+([^\s.,]+)", re.IGNORECASE)
@@ -41,14 +46,32 @@ _CSMIP_END = re.compile(r"^\s*/&")
 _COSMOS_DATA = re.compile(r"^\s*(\d+)\s+acceleration\s+pts\b.*?units\s*=\s*([^\s,(]+)", re.IGNORECASE)
 _COSMOS_REALS = re.compile(r"^\s*(\d+)\s+real-header\s+values\s+follow\s+on\s+(\d+)\s+lines", re.IGNORECASE)
 _COSMOS_END = re.compile(r"^\s*end-of-data", re.IGNORECASE)
-_FORMAT = re.compile(r"\(\s*(\d*)\s*[a-z](\d+)\.\d+[^)]*\)\s*$", re.IGNORECASE)
+_FORMAT = re.compile(r"\(\s*(\d*)\s*[a-z](\d+)\.\d+[^)]*\)$", re.IGNORECASE)
 _CSMIP_FORMAT = (8, 10)  # numbers per line, columns per number
 _CSMIP_REALS, _CSMIP_DT = (
     100,
     61,
 )  # length of the real header; position in it, from 1, of the step of the corrected data
 _COSMOS_DT = 34
-_LARGEST_MEMBER = 64 * 2**20  # largest size of a file in a zip archive [bytes]; stations have a few MiB
+_WIDEST = 1000
+# Limits of a zip archive with all that it contains: bytes, files, archives within archives. Stations have a few MiB.
+_LARGEST_CONTENT, _MOST_FILES, _DEEPEST = 64 * 2**20, 2000, 3
+_MOST_LINES = 4_000_000
+_ZIP_DAMAGE = (
+    zipfile.BadZipFile,
+    RuntimeError,
+    NotImplementedError,
+    OSError,
+    EOFError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+    zlib.error,
+    lzma.LZMAError,
+    UnicodeError,
+)
 
 
 class V2Channel(NamedTuple):
@@ -78,8 +101,7 @@ class V2Channel(NamedTuple):
 def parse_at2(text: str, file: str) -> Series:
     """Return the samples of a PEER AT2 file (see `fe_likelihoods.read_at2`)."""
     lines = text.splitlines()
-    matches = [_AT2_NEW.search(line) or _AT2_OLD.search(line) for line in lines]
-    index = next((i for i, match in enumerate(matches) if match), None)
+    index, stated = next(((i, found) for i, line in enumerate(lines) if (found := _at2_header(line))), (None, None))
     if index is None:
         raise ValueError(
             f"{file}: expected a header line 'NPTS=  4096, DT=  .0100 SEC' or '4096  .0100  NPTS, DT', found none in "
@@ -88,9 +110,18 @@ def parse_at2(text: str, file: str) -> Series:
     units = _UNITS_OF.search("\n".join(lines[:index]))
     fields = [(index + offset, field) for offset, row in enumerate(lines[index + 1 :], 2) for field in row.split()]
     values = np.array([parse_number(field, f"{file}, line {line}") for line, field in fields])
-    check_count(values.size, int(matches[index][1]), f"{file}: NPTS in line {index + 1}")
+    where = f"{file}: NPTS in line {index + 1}"
+    check_count(values.size, parse_count(stated[0], where), where)
     title = lines[index - 2].strip() if index >= 2 else ""
-    return Series(title, float(matches[index][2]), units[1] if units else None, values)
+    return Series(title, float(stated[1]), units[1] if units else None, values)
+
+
+def _at2_header(line: str) -> tuple[str, str] | None:
+    """Number of samples and step as the line of an AT2 header states them; None for another line."""
+    if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line, count.end())):
+        return count[1], step[1]
+    old = _AT2_OLD.match(line)
+    return (old[1], old[2]) if old else None
 
 
 def find_v2_channels(path: str | Path, member: str | None = None) -> list[V2Channel]:
@@ -117,8 +148,8 @@ def parse_v2(channel: V2Channel) -> Series:
     line = lines[index]
     if re.match(r"\s*(raw|uncorrected)", lines[0], re.IGNORECASE):
         raise ValueError(f"{where}: expected corrected acceleration (V2), got {lines[0].strip()!r}")
-    stated = _FORMAT.search(line)
-    per_line, width = (int(stated[1] or 1), int(stated[2])) if stated else _CSMIP_FORMAT
+    stated = _column_format(line, where)
+    per_line, width = stated or _CSMIP_FORMAT
     if match := _CSMIP_DATA.match(line):
         units = _CSMIP_UNITS.search(line, match.end())
         unit = units and (units[1] or units[2])
@@ -134,40 +165,64 @@ def parse_v2(channel: V2Channel) -> Series:
         match = _COSMOS_DATA.match(line)
         unit = match[2]
         header = next((i for i in range(index) if _COSMOS_REALS.match(lines[i])), None)
-        form = _FORMAT.search(lines[header]) if header is not None else None
+        form = _column_format(lines[header], where) if header is not None else None
         if form is None:
             raise ValueError(f"{where}: expected a line 'N Real-header values follow on N lines, Format= (5F15.6)'")
         if stated is None:
             raise ValueError(f"{where}, line {channel.first + index}: expected a Format such as (8F10.5) in {line!r}")
-        dt = _header_number(channel, header + 1, (int(form[1] or 1), int(form[2])), _COSMOS_DT)
+        dt = _header_number(channel, header + 1, form, _COSMOS_DT)
     if unit is None:
         raise ValueError(
             f"{where}, line {channel.first + index}: expected the unit of acceleration in {line.strip()!r}"
         )
-    count = int(match[1])
+    count = parse_count(match[1], f"{where}, line {channel.first + index}")
     values = _fixed_width(channel, index + 1, count, (per_line, width))
     return Series(channel.label, dt, unit, values)
 
 
-def _unzip(content: bytes, name: str) -> Iterator[tuple[str, bytes]]:
+class _Allowance:
+    """What may still be read of an archive; one object for all archives within it."""
+
+    def __init__(self, name: str):
+        self._name, self._bytes, self._files = name, _LARGEST_CONTENT, _MOST_FILES
+
+    def take(self, sizes: list[int]) -> None:
+        """Raise ValueError if an archive with files of these sizes [bytes] exceeds the limits."""
+        self._files -= len(sizes)
+        self._bytes -= sum(sizes)
+        if self._files < 0 or self._bytes < 0:
+            raise ValueError(
+                f"{self._name}: expected at most {_MOST_FILES} files with {_LARGEST_CONTENT} bytes in all, got more; "
+                "unpack the archive and read the files"
+            )
+
+
+def _unzip(content: bytes, name: str, allowance: _Allowance | None = None, depth: int = 1) -> Iterator:
     """Yield the names and contents of the files in a zip archive, and in the archives that it contains."""
+    allowance = allowance or _Allowance(name)
+    if depth > _DEEPEST:
+        raise ValueError(
+            f"{name}: expected at most {_DEEPEST} archives within each other; unpack it and read the files"
+        )
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            for info in archive.infolist():
+            infos = archive.infolist()
+            allowance.take([info.file_size for info in infos])
+            for info in infos:
                 inner = f"{name}/{info.filename}"
-                if info.file_size > _LARGEST_MEMBER:
-                    raise ValueError(f"{inner}: expected at most {_LARGEST_MEMBER} bytes, got {info.file_size}")
                 if info.filename.lower().endswith(".zip"):
-                    yield from _unzip(archive.read(info), inner)
+                    yield from _unzip(archive.read(info), inner, allowance, depth + 1)
                 elif not info.is_dir():
                     yield inner, archive.read(info)
-    except (zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
+    except _ZIP_DAMAGE as error:
         raise ValueError(f"{name}: the zip archive cannot be read ({error}); download it again") from error
 
 
 def _split_v2(text: str, file: str) -> list[V2Channel]:
     """Return the channels of a V2 file. Channels of velocity and displacement (in COSMOS files) are left out."""
     channels = []
+    if text.count("\n") > _MOST_LINES:
+        raise ValueError(f"{file}: expected at most {_MOST_LINES} lines, got {text.count(chr(10))}")
     lines = text.splitlines()
     first = 0
     for index, line in enumerate(lines):
@@ -182,9 +237,20 @@ def _split_v2(text: str, file: str) -> list[V2Channel]:
             if number is None and label is not None and label[1] != "?":
                 number = label
             text = re.sub(r"\s+", " ", label[0]).strip() if label else Path(file).name
-            channels.append(V2Channel(int(number[1]) if number else None, text, file, first + 1, block))
+            channels.append(V2Channel(parse_count(number[1], file) if number else None, text, file, first + 1, block))
         first = index + 1
     return channels
+
+
+def _column_format(line: str, where: str) -> tuple[int, int] | None:
+    """Numbers per line and columns per number of the Fortran format at the end of a line; None without one."""
+    stated = _FORMAT.search(line.rstrip()[-100:])
+    if stated is None:
+        return None
+    per_line, width = parse_count(stated[1] or "1", where), parse_count(stated[2], where)
+    if not (0 < per_line <= _WIDEST and 0 < width <= _WIDEST):
+        raise ValueError(f"{where}: expected a format of 1 to {_WIDEST} numbers and columns, got {stated[0]!r}")
+    return per_line, width
 
 
 def _header_number(channel: V2Channel, start: int, form: tuple[int, int], place: int) -> float:
@@ -202,7 +268,7 @@ def _fixed_width(channel: V2Channel, start: int, count: int, form: tuple[int, in
     """Return the `count` numbers of a block of Fortran columns."""
     per_line, width = form
     values: list[float] = []
-    for offset in range(start, start + math.ceil(count / per_line)):
+    for offset in range(start, start - (-count // per_line)):
         line = channel.lines[offset].rstrip() if offset < len(channel.lines) else ""
         where = f"{channel.file}, line {channel.first + offset}"
         wanted = min(per_line, count - len(values))
@@ -213,7 +279,7 @@ def _fixed_width(channel: V2Channel, start: int, count: int, form: tuple[int, in
                 f"{count} samples that the file announces; the file is truncated or damaged"
             )
         values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
-    following = channel.lines[start + math.ceil(count / per_line) :][:1]
+    following = channel.lines[start - (-count // per_line) :][:1]
     if following and is_number(following[0][:width].strip()):
         raise ValueError(
             f"{channel.file}, line {channel.first + start}: the file announces {count} samples but has more after them"

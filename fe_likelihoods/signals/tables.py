@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import find_unit, to_si
-from .text_files import NUMBER, Series, agree_on_unit, check_count, is_number, parse_number, read_text
+from .text_files import NUMBER, Series, agree_on_unit, check_count, is_number, parse_count, parse_number, read_text
 
 __all__ = ["Table", "column_unit", "csv_series", "read_table", "table_step", "value_column"]
+
+_LONGEST_UNIT = 100
 
 
 class Table(NamedTuple):
@@ -73,7 +75,10 @@ def read_table(path: str | Path) -> Table:
         if line.lstrip().startswith("#"):
             comments.append(line.lstrip("# \t"))
         elif line.strip():
-            cells = next(csv.reader([line], skipinitialspace=True)) if "," in line else line.split()
+            try:
+                cells = next(csv.reader([line], skipinitialspace=True)) if "," in line else line.split()
+            except csv.Error as error:
+                raise ValueError(f"{file}, line {number}: expected cells separated by commas ({error})") from None
             cells = [cell.strip() for cell in cells]
             if not rows and not names and not any(is_number(cell) for cell in cells):
                 names = tuple(cells)
@@ -117,6 +122,7 @@ def value_column(table: Table, column: str | None = None) -> int:
 
 def column_unit(name: str) -> str | None:
     """Return the unit at the end of a column name (``acc_cm_s2``, ``force [kip]``, ``disp (in)``), or None."""
+    name = name[-_LONGEST_UNIT:]
     bracket = re.search(r"[\[(]([^\])]+)[\])]\s*$", name)
     parts = name.split("_")
     for text in [bracket[1]] if bracket else ["_".join(parts[i:]) for i in range(1, len(parts))]:
@@ -176,7 +182,8 @@ def csv_series(table: Table, column: str | None = None, dt: float | None = None)
     place = value_column(table, column)
     stated = re.search(r"\bnpts\s*=\s*(\d+)", table.comments)
     if stated:
-        check_count(len(table.values), int(stated[1]), f"{table.file}: npts in the comments")
+        where = f"{table.file}: npts in the comments"
+        check_count(len(table.values), parse_count(stated[1], where), where)
     comment = re.search(r"\bunits:\s*([^\s;,]+)", table.comments)
     unit = column_unit(table.names[place]) if table.names else None
     if comment and unit is not None:
@@ -212,7 +219,7 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
             f"or print the times with more digits"
         )
     tolerance /= increments.size
-    rate = round(1 / step)
+    rate = round(1 / step) if 1 / step < 1e15 else 0
     if rate and abs(1 / rate - step) < min(tolerance, 1e-4 * step):
         step = 1 / rate
     return step, tolerance
@@ -220,4 +227,5 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
 
 def _decimals(field: str) -> int:
     mantissa, _, exponent = field.lower().partition("e")
-    return len(mantissa.partition(".")[2]) - int(exponent or 0)
+    power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger one is that of zero
+    return min(max(len(mantissa.partition(".")[2]) - power, -300), 300)

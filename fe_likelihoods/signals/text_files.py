@@ -10,18 +10,23 @@ from numpy.typing import NDArray
 from ..units import find_unit
 
 __all__ = [
+    "LARGEST_FILE",
     "NUMBER",
     "Series",
     "agree_on_unit",
     "check_count",
     "is_number",
+    "parse_count",
     "parse_number",
     "read_bytes",
     "read_text",
 ]
 
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-"""Regular expression of a decimal number."""
+NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+"""Regular expression of a decimal number, without alternatives for the same digits: its time is linear."""
+
+LARGEST_FILE = 256 * 2**20
+"""Largest size of a text file or an archive [bytes]; long records have some MiB."""
 
 
 class Series(NamedTuple):
@@ -46,8 +51,11 @@ class Series(NamedTuple):
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return the content of a file; raise ValueError if it cannot be read."""
+    """Return the content of a file; raise ValueError if it cannot be read or is too large."""
     try:
+        size = Path(path).stat().st_size
+        if size > LARGEST_FILE:
+            raise ValueError(f"{path}: expected at most {LARGEST_FILE} bytes, got {size}; cut the file")
         return Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}; check the path") from error
@@ -103,18 +111,32 @@ def check_count(found: int, stated: int, where: str) -> None:
 def parse_number(field: str, where: str) -> float:
     """Return the finite number in a field of a file; raise ValueError for anything else."""
     try:
-        value = float(field)
+        value = _as_float(field)
     except ValueError:
-        raise ValueError(f"{where}: expected a number, got {field!r}") from None
+        raise ValueError(f"{where}: expected a number, got {field[:100]!r}") from None
     if not math.isfinite(value):
-        raise ValueError(f"{where}: expected a finite number, got {field!r}")
+        raise ValueError(f"{where}: expected a finite number, got {field[:100]!r}")
     return value
 
 
 def is_number(field: str) -> bool:
     """Return whether a field of a file is a number."""
     try:
-        float(field)
+        _as_float(field)
     except ValueError:
         return False
     return True
+
+
+def parse_count(digits: str, where: str) -> int:
+    """Return a number of samples, channels or columns; raise ValueError for more than 12 digits."""
+    if len(digits) > 12:
+        raise ValueError(f"{where}: expected a count, got a number with {len(digits)} digits")
+    return int(digits)
+
+
+def _as_float(field: str) -> float:
+    """A number; ValueError also for digits grouped by underscores, which Python accepts."""
+    if "_" in field:
+        raise ValueError
+    return float(field)

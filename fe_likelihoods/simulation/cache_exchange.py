@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..signals.hdf5_files import DAMAGE, read_values
+
 __all__ = ["read_rows", "write_rows"]
 
 SCHEMA = "fe_likelihoods.cache"  # a name of the format: it stays when modules are moved
@@ -113,12 +115,13 @@ def read_rows(path: str | os.PathLike) -> list[Row]:
                     f"{path}: expected schema {SCHEMA!r} version {SCHEMA_VERSION}, got {schema!r} version {version}; "
                     "expected a file that SimulationCache.export_hdf5 wrote"
                 )
-            columns = {name: np.asarray(file[name][()], dtype=kind) for name, kind in COLUMNS.items()}
+            columns = {name: read_values(file[name], path, kind) for name, kind in COLUMNS.items()}
             whole = all(zlib.crc32(values.tobytes()) == file[name].attrs["crc32"] for name, values in columns.items())
-    except (OSError, KeyError, TypeError, RuntimeError) as error:
+    except DAMAGE as error:
         raise ValueError(f"{path}: not a complete export of a cache ({error}); export or copy it again") from error
     if not whole:
         raise ValueError(f"{path}: the contents do not match their checksums; export or copy it again")
+    _check_lengths(columns, path)
     keys = columns["key"].tobytes()
     thetas = _split(columns["theta"], 8 * columns["n_parameters"])
     misfits = _split(columns["misfit"], 8 * columns["n_channels"])
@@ -135,6 +138,21 @@ def read_rows(path: str | os.PathLike) -> list[Row]:
         )
         for i in range(len(columns["n_steps"]))
     ]
+
+
+def _check_lengths(columns: dict[str, np.ndarray], path: str | os.PathLike) -> None:
+    """Raise ValueError unless all columns belong to the same number of simulations."""
+    n = len(columns["n_steps"])
+    wanted = dict.fromkeys(COLUMNS, n) | {"key": KEY_BYTES * n}
+    for name, sizes in (("theta", "n_parameters"), ("misfit", "n_channels"), ("reason", "reason_bytes")):
+        lengths = columns[sizes]
+        wanted[name] = int(lengths.sum()) if lengths.size and lengths.min() >= 0 else 0
+    bad = [name for name, values in columns.items() if values.shape != (wanted[name],)]
+    if bad:
+        raise ValueError(
+            f"{path}: {bad[0]} has shape {columns[bad[0]].shape}, where {n} simulations need ({wanted[bad[0]]},); "
+            "export or copy it again"
+        )
 
 
 def _split(values: np.ndarray, sizes: np.ndarray) -> list[bytes]:

@@ -100,8 +100,8 @@ class JournaledBackend(HDFBackend):
         if (writer := _writers.get(path.resolve())) is not None:
             writer.flush()
         if os.path.exists(self.filename) or path.exists():
-            with FileLock(lock_path(path)):
-                self._recover()
+            with FileLock(lock_path(path)) as lock:
+                self._recover(lock.abandoned)
         self._seen = _signature(path)
         return self
 
@@ -240,6 +240,8 @@ class JournaledBackend(HDFBackend):
             self._enter_adopted(contents)
             contents = read_journal(self.journal_path)
             self.script.calls = contents.script.calls
+            rebuild(self, contents, self._run)
+            self._accepted = None
         return contents
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
@@ -349,8 +351,15 @@ class JournaledBackend(HDFBackend):
 
     # ------------------------------------------------------------------ recovery
 
-    def _recover(self) -> None:
-        """Read the journal and the file of the chain, and bring the file up to the journal."""
+    def _recover(self, torn: bool) -> None:
+        """Read the journal and the file of the chain, and bring the file up to the journal.
+
+        Parameters
+        ----------
+        torn : bool
+            Whether a process died while it could write to the file. A part of it that cannot be seen may be damaged,
+            so it is rebuilt in any case.
+        """
         contents = read_journal(self.journal_path)
         try:
             stored = read_run(self)
@@ -390,7 +399,7 @@ class JournaledBackend(HDFBackend):
             aside = set_aside(self.filename, copy=True)
             what = "the chain" if relation == "differs" else "the ladder"
             logger.warning("%s in %s differs from its journal: kept as %s, and rebuilt", what, self.filename, aside)
-        self._take(contents, rewrite=relation != "equal" or stale)
+        self._take(contents, rewrite=torn or relation != "equal" or stale)
 
     def _take(self, contents: Contents, rewrite: bool) -> None:
         """Prepare to continue the run of a journal."""

@@ -13,6 +13,7 @@ Attributes of the group of the chain, besides those of emcee:
 
 import itertools
 import json
+import logging
 import os
 import shutil
 from typing import NamedTuple
@@ -29,6 +30,8 @@ from .journal import Step
 from .journal_contents import Contents, ladders
 from .ladder_file import read_check, read_ladder, read_verdict, write_check, write_stage, write_verdict
 from .script import Call, Script
+
+logger = logging.getLogger(__name__)
 
 __all__ = [
     "DAMAGE",
@@ -208,8 +211,7 @@ def _replace(
     path = f"{backend.filename}.new"
     if os.path.exists(path):
         os.remove(path)
-    if _has_other_groups(backend):
-        shutil.copy(backend.filename, path)
+    _copy_other_groups(backend, path)
     dtype = backend.dtype if backend.dtype_set else None
     new = HDFBackend(path, backend.name, False, dtype, backend.compression, backend.compression_opts)
     new.reset(nwalkers, ndim)
@@ -230,15 +232,28 @@ def _replace(
     os.replace(path, backend.filename)
 
 
-def _has_other_groups(backend: HDFBackend) -> bool:
-    """Whether the file exists and contains anything besides the group of a backend."""
+def _copy_other_groups(backend: HDFBackend, path: str) -> None:
+    """Copy what the file contains besides the group of a backend to a new file, object by object."""
+    if not os.path.exists(backend.filename):
+        return
+    top = backend.name.strip("/").split("/")[0]
     try:
         with h5py.File(backend.filename, "r") as file:
-            return any(name != backend.name for name in file)
+            others = [name for name in file if name != top or name != backend.name.strip("/")]
+            if not others:
+                return
+            with h5py.File(path, "w") as new:
+                for name in others:
+                    file.copy(name, new)
+                if backend.name in new:
+                    del new[backend.name]
     except BlockingIOError:
         raise
-    except OSError:  # no file, or a damaged one
-        return False
+    except DAMAGE as error:
+        if os.path.exists(path):
+            os.remove(path)
+        aside = set_aside(backend.filename, copy=True)
+        logger.warning("the other groups of %s cannot be read (%s): kept as %s", backend.filename, error, aside)
 
 
 def is_unfinished(filename: str) -> bool:

@@ -2,10 +2,12 @@
 
 The lock is advisory, and belongs to the process: the operating system releases it when the process dies, also by a
 signal 9, and a forked child does not inherit it. The locked file is ``*.lock`` beside the file that is written. It
-contains the process, the host and the time, and is removed when the lock is released. Nothing else opens it, since any
-close of a file releases the locks of a process on it.
+contains the process, the host and the time, and is removed when the lock is released. So a lock file that is found and
+not locked was left by a process that died. Nothing else opens it, since any close of a file releases the locks of a
+process on it.
 """
 
+import atexit
 import contextlib
 import errno
 import json
@@ -36,6 +38,11 @@ class FileLock:
     path : Path
         The lock file. Without permission to write it, or on a file system without locks, nothing is locked.
 
+    Attributes
+    ----------
+    abandoned : bool
+        Whether the process that held the lock before died while it held it.
+
     Raises
     ------
     ValueError
@@ -44,11 +51,11 @@ class FileLock:
 
     def __init__(self, path: Path):
         self._path, self._key = path, (os.getpid(), path.resolve())
-        self._released = False
+        self._released, self.abandoned = False, False
         if self._key in _held:
             _held[self._key][1] += 1
             return
-        descriptor = _acquire(path)
+        descriptor, self.abandoned = _acquire(path)
         if descriptor is None:
             self._released = True
         else:
@@ -59,7 +66,9 @@ class FileLock:
         if self._released or self._key[0] != os.getpid():
             return
         self._released = True
-        held = _held[self._key]
+        held = _held.get(self._key)
+        if held is None:  # the process ends
+            return
         held[1] -= 1
         if held[1] == 0:
             del _held[self._key]
@@ -78,16 +87,16 @@ class FileLock:
             self.release()
 
 
-def _acquire(path: Path) -> int | None:
-    """The descriptor of the locked file; None where locks are not possible."""
+def _acquire(path: Path) -> tuple[int | None, bool]:
+    """The descriptor of the locked file, None without locks; and whether a dead process left the file."""
     if lockf is None:
-        return None
+        return None, False
     while True:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
             logger.info("%s cannot be opened (%s): other runs on the file are not detected", path, error.strerror)
-            return None
+            return None, False
         try:
             lockf(descriptor, LOCK_EX | LOCK_NB)
         except OSError as error:
@@ -99,14 +108,25 @@ def _acquire(path: Path) -> int | None:
                     "give this run another file"
                 ) from None
             logger.info("%s cannot be locked (%s): other runs on the file are not detected", path, error.strerror)
-            return None
+            return None, False
         if _is_current(descriptor, path):
             break
         os.close(descriptor)  # its holder has removed it in the meantime
     text = {"pid": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, json.dumps(text).encode(), 0)
-    return descriptor
+    abandoned = os.fstat(descriptor).st_size > 0
+    os.pwrite(descriptor, json.dumps(text).encode().ljust(200), 0)
+    return descriptor, abandoned
+
+
+@atexit.register
+def _release_all() -> None:
+    """Remove the lock files of a process that ends."""
+    for (process, path), (descriptor, _) in list(_held.items()):
+        if process == os.getpid():
+            with contextlib.suppress(OSError):
+                os.unlink(path)
+                os.close(descriptor)
+    _held.clear()
 
 
 def _is_current(descriptor: int, path: Path) -> bool:

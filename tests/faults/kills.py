@@ -2,11 +2,11 @@
 
 ``python -m tests.faults.kills --kills 1000`` prints a table of the kills by window.
 
-A script runs in a forked process, in which every write, truncation and renaming is counted: those of the journal, of the
-lock, and those that HDF5 makes, which go through a Python file. At a chosen one the process kills itself, before it, in
-the middle of the written bytes, or after it. The same script is then started again, perhaps killed again, and at last
-left to end. Its chain, ladder, evidence, counts and failures must be those of a run that was not killed, and a further
-start must add nothing.
+A script runs in a forked process, in which every write, truncation and renaming is counted: those of the journal, of
+the lock, and those that HDF5 makes, which go through a Python file. At a chosen one the process kills itself, before
+it, in the middle of the written bytes, or after it. The same script is then started again, perhaps killed again, and at
+last left to end. Its chain, ladder, evidence, counts and failures must be those of a run that was not killed, and a
+further start must add nothing.
 """
 
 import argparse
@@ -323,9 +323,13 @@ def kill(number_of_kills, seed=1, show=None):
                 script = choose.choice(SCRIPTS)
                 places = [choose.randint(1, writes[script]) for _ in range(choose.choice((2, 3)))]
                 plan = script, [(place, choose.choice(MODES)) for place in places]
+            known = len(messages)
             trial(plan, folder / "trial", whole, kills, bad, messages)
-            if show is not None and sum(kills.values()) % 200 == 0:
-                show(f"{sum(kills.values())} kills, wrong: {dict(bad)}")
+            if show is not None:
+                for message in messages[known:]:
+                    show(message)
+                if sum(kills.values()) % 200 == 0:
+                    show(f"{sum(kills.values())} kills, wrong: {dict(bad)}")
     finally:
         shutil.rmtree(folder)
     return kills, bad, messages
@@ -372,13 +376,12 @@ def main():
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     start = time.perf_counter()
-    kills, bad, messages = kill(args.kills, args.seed, print)
+    kills, bad, _ = kill(args.kills, args.seed, print)
     for window, count in sorted(kills.items()):
         print(f"{window:32s}{count:6d}")
     print(f"{'kills':32s}{sum(kills.values()):6d}   in {time.perf_counter() - start:.0f} s")
     for name in ("could not go on", "failures lost", "chains wrong", "counts wrong", "added when repeated"):
         print(f"{name:32s}{bad[name]:6d}")
-    print("\n".join(messages[:10]))
     return 1 if bad else 0
 
 

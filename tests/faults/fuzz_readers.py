@@ -1,0 +1,218 @@
+"""Damaged input files: every reader returns, or raises ValueError, within a few seconds.
+
+``python -m tests.faults.fuzz_readers --files 20000`` prints what came of them, by reader. Files are made from small
+valid ones by flipping, deleting, repeating and inserting bytes. Each hundred is read in a forked process, so that a
+crash of a library is counted as well.
+"""
+
+import argparse
+import faulthandler
+import io
+import json
+import logging
+import os
+import random
+import tempfile
+import time
+import warnings
+import zipfile
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fe_likelihoods import (
+    Channel,
+    Measurements,
+    Record,
+    read_at2,
+    read_columns,
+    read_csv,
+    read_dataset,
+    read_v2,
+    write_dataset,
+)
+from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
+from tests.signals.test_readers import cosmos, csmip
+
+SLOW = 5.0
+TOKENS = (
+    b"1" * 5000,
+    b"9" * 100_000,
+    b"1e99999",
+    b"0e400",
+    b"1_000",
+    b"nan",
+    b"(0F0.5)",
+    b"NPTS=1 " * 3000,
+    b" " * 20_000,
+    b"\n" * 5000,
+    b'",\r"',
+    b"units" * 3000,
+    b"((1f1.1" * 2000,
+    b"_" * 5000,
+    b"\0",
+    b"\xff",
+    b"dt = ",
+    b"-",
+    b",",
+)
+TOP = Channel("top", "absolute acceleration", "g")
+
+
+class Case(NamedTuple):
+    """A reader and valid files for it.
+
+    Attributes
+    ----------
+    name : str
+        Suffix of the files, with which the table names the reader.
+    read : callable
+        Function of the path.
+    files : list of bytes
+        Valid files.
+    """
+
+    name: str
+    read: Callable
+    files: list[bytes]
+
+
+def zipped(files):
+    """A zip archive of names and contents."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files:
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def cases(folder):
+    """All readers with valid files."""
+    values = np.sin(np.arange(23.0))
+    rows = "\n".join("".join(f"{value:15.7E}" for value in values[i : i + 5]) for i in range(0, 23, 5))
+    at2 = [
+        f"PEER\nSomewhere\nACCELERATION TIME SERIES IN UNITS OF G\n{header}\n{rows}".encode()
+        for header in ("NPTS=  23, DT= .005 SEC", "  23  0.005  NPTS, DT")
+    ]
+    csv = [
+        b"# units: g; dt = 0.5 s\n# npts = 3\nacc\n1\n2\n3\n",
+        b"time_s,acc_g\n0,1\n0.5,2\n1,3\n",
+        b"Time(s)  a(g)\n0 1\n0.5 2\n1 3\n",
+    ]
+    record, measured = Record("a", 0.01, values), Measurements((TOP,), 0.01, values[None])
+    write_dataset(folder / "valid.h5", record, measured, {"truth": [1.0, 2.0]})
+    row = (bytes(range(16)), 1, values[:2].tobytes(), values[:1].tobytes(), 23, b"", 0.1)
+    write_rows(folder / "cache.h5", [[row, row]])
+    forms = [csmip(1, values, 0.0125, " .013 sec, in cm/sec2. (8f10.6)"), cosmos(1, values, 0.005)]
+    v2 = ["\n".join(lines).encode() for lines in forms]
+    archives = [zipped([("a.v2", v2[0]), ("inner.zip", zipped([("b.V2", v2[-1])]))])]
+    return [
+        Case("at2", read_at2, at2),
+        Case("v2", lambda path: read_v2(path, channel=1), v2),
+        Case("zip", lambda path: read_v2(path, channel=1), archives),
+        Case("csv", read_csv, csv),
+        Case("columns.csv", lambda path: read_columns(path, [TOP], ["acc_g"]), csv[1:2]),
+        Case("h5", read_dataset, [(folder / "valid.h5").read_bytes()]),
+        Case("cache.h5", read_rows, [(folder / "cache.h5").read_bytes()]),
+    ]
+
+
+def damage(data, choose):
+    """A damaged copy of a file."""
+    data = bytearray(data)
+    for _ in range(choose.choice((1, 1, 2, 5))):
+        place = choose.randrange(len(data) + 1)
+        end = min(len(data), place + choose.choice((1, 4, 40, 400)))
+        kind = choose.randrange(6)
+        if kind == 0 and place < len(data):
+            data[place] ^= 1 << choose.randrange(8)
+        elif kind == 1:
+            del data[place:end]
+        elif kind == 2:
+            data[place:place] = data[place:end] * choose.choice((1, 10, 300))
+        elif kind == 3:
+            data[place:place] = choose.choice(TOKENS)
+        elif kind == 4:
+            data[place:end] = bytes(choose.randrange(256) for _ in range(end - place))
+        else:
+            del data[place:]
+    return bytes(data)
+
+
+def read_damaged(case, data, path):
+    """What came of one file: "read", "ValueError", the name of another exception, or "slow"."""
+    path.write_bytes(data)
+    start = time.perf_counter()
+    try:
+        case.read(path)
+        found = "read"
+    except ValueError:
+        found = "ValueError"
+    except Exception as error:
+        found = type(error).__name__
+    return "slow" if time.perf_counter() - start > SLOW else found
+
+
+def fuzz(number, seed, folder, forked=True, show=None):
+    """Read damaged files; a Counter of (reader, what came of it), and the bad ones as (reader, what, bytes)."""
+    folder.mkdir(exist_ok=True)
+    all_cases, counts, bad = cases(folder), Counter(), []
+    for batch in range(0, number, 100):
+
+        def read_batch(batch=batch):
+            results = []
+            for index in range(batch, min(batch + 100, number)):
+                choose = random.Random(1_000_003 * seed + index)
+                case = all_cases[index % len(all_cases)]
+                data = damage(choose.choice(case.files), choose)
+                found = read_damaged(case, data, folder / f"damaged.{case.name}")
+                results.append((case.name, found, index))
+            return results
+
+        for name, found, index in _forked(read_batch) if forked else read_batch():
+            counts[name, found] += 1
+            if found not in ("read", "ValueError"):
+                bad.append((name, found, index))
+                if show is not None:
+                    show(f"{name}: {found}, file {index}")
+    return counts, bad
+
+
+def _forked(function):
+    """The result of a function in a process of its own; a crash is a result."""
+    read, write = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        os.close(read)
+        faulthandler.dump_traceback_later(60, exit=True)
+        warnings.simplefilter("ignore")
+        logging.disable(logging.CRITICAL)
+        with os.fdopen(write, "w") as stream:
+            json.dump(function(), stream)
+        os._exit(0)
+    os.close(write)
+    with os.fdopen(read) as stream:
+        text = stream.read()
+    status = os.waitpid(pid, 0)[1]
+    return json.loads(text) if status == 0 else [("all", f"process died ({status})", -1)]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--files", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        counts, bad = fuzz(args.files, args.seed, Path(folder), show=print)
+    for (name, found), count in sorted(counts.items()):
+        print(f"{name:14s}{found:24s}{count:7d}")
+    print(f"{sum(counts.values())} files in {time.perf_counter() - start:.0f} s, {len(bad)} bad")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

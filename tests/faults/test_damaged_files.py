@@ -1,0 +1,122 @@
+"""Damaged and hostile input files: ValueError, in a short time. `tests.faults.fuzz_readers` makes many more of them."""
+
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, Measurements, Record, read_at2, read_csv, read_dataset, read_v2, write_dataset
+from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
+from tests.faults.fuzz_readers import fuzz, zipped
+from tests.signals.test_readers import cosmos
+
+SECONDS = 3.0
+
+
+def refused(read, path, content, match):
+    """The reader raises ValueError with this message, soon."""
+    path.write_bytes(content)
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match=match):
+        read(path)
+    assert time.perf_counter() - start < SECONDS
+
+
+def test_fuzz(tmp_path):
+    counts, bad = fuzz(420, 1, tmp_path, forked=False)
+    assert not bad and sum(counts.values()) == 420
+
+
+def nested(depth):
+    content = zipped([("a.v2", b"x")])
+    for _ in range(depth):
+        content = zipped([("inner.zip", content)])
+    return content
+
+
+LARGE = zipped([(f"{i}.v2", b"\0" * 2**22) for i in range(9)])
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (nested(6), "at most 3 archives within each other"),
+        (zipped([(f"{i}.v2", b"") for i in range(5000)]), "at most 2000 files with"),
+        (zipped([(f"{i}.v2", b"\0" * 2**23) for i in range(20)]), "at most 2000 files with"),
+        (
+            zipped([(f"{k}.zip", zipped([(f"{i}.v2", b"\0" * 2**22) for i in range(9)])) for k in "abc"]),
+            "at most 2000 files with",
+        ),
+        (zipped([("a.v2", b"\n" * 2**23)]), "at most 4000000 lines"),
+    ],
+    ids=["nested", "many", "large", "nested and large", "lines"],
+)
+def test_archives_have_total_limits(content, match, tmp_path):
+    assert len(content) < 2**20
+    refused(read_v2, tmp_path / "a.zip", content, match)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("# dt=" + "9" * 100_000 + "\nacc_g\n1\n2\n", "give dt="),
+        ("# dt=" + "9" * 100_000 + " s\nacc_g\n1\n2\n", "positive|finite"),
+        ("# npts = " + "9" * 5000 + "\n# dt = 1 s\nacc_g\n1\n2\n", "a number with 5000 digits"),
+        ('time_s,acc_g\n0,"' + "1" * 200_000 + '"\n', "cells separated by commas"),
+        ("time_s,acc_g\n0,1_000\n1,2\n", "expected a number, got '1_000'"),
+        ("time_s,acc_g\n0e400,1\n1,2\n2,x\n", "expected a number, got 'x'"),
+        ("time_s,acc" + "_g" * 50_000 + "(" * 50_000 + "\n0,1\n1,2\n", "unit"),
+    ],
+)
+def test_tables(text, match, tmp_path):
+    refused(read_csv, tmp_path / "a.csv", text.encode(), match)
+
+
+@pytest.mark.parametrize(
+    ("header", "match"),
+    [
+        ("NPTS=1 " * 30_000, "expected a header line"),
+        ("1 1" + " " * 100_000 + "x", "expected a header line"),
+        ("NPTS= " + "9" * 5000 + ", DT= .01", "a number with 5000 digits"),
+        ("NPTS= 2, DT= 0" + "1" * 100_000 + "e999999", "positive|finite"),
+    ],
+)
+def test_at2_headers(header, match, tmp_path):
+    refused(read_at2, tmp_path / "a.at2", f"P\nS\nUNITS OF G\n{header}\n1 2".encode(), match)
+
+
+@pytest.mark.parametrize("form", ["(1F0.5)", "(0F10.5)", "(1F99999999999999.5)", "(9999F1.1)"])
+def test_fortran_formats(form, tmp_path):
+    text = "\n".join(cosmos(1, np.ones(3), 0.01, form=form))
+    refused(read_v2, tmp_path / "a.v2", text.encode(), "expected a (format of 1 to 1000|count)")
+
+
+def test_counts_of_v2_files(tmp_path):
+    text = "\n".join(cosmos(1, np.ones(3), 0.01)).replace("       3 acceleration", "9" * 400 + " acceleration")
+    refused(read_v2, tmp_path / "a.v2", text.encode(), "a number with 400 digits")
+
+
+def test_hdf5_that_declares_more_than_it_contains(tmp_path):
+    top = Channel("top", "absolute acceleration", "g")
+    path, values = tmp_path / "a.h5", np.ones(5)
+    write_dataset(path, Record("a", 0.01, values), Measurements((top,), 0.01, values[None]))
+    with h5py.File(path, "a") as file:
+        attributes = dict(file["record/acceleration"].attrs)
+        del file["record/acceleration"]
+        file.create_dataset("record/acceleration", (10**11,), dtype="<f8", chunks=(1024,)).attrs.update(attributes)
+    refused(read_dataset, path, path.read_bytes(), "declares 100000000000 numbers, more than the file can contain")
+
+
+@pytest.mark.parametrize("name", ["key", "source", "theta", "n_channels", "seconds"])
+def test_an_export_of_a_cache_with_columns_of_different_length(name, tmp_path):
+    import zlib
+
+    path = tmp_path / "cache.h5"
+    row = (bytes(range(16)), 1, np.ones(2).tobytes(), np.ones(1).tobytes(), 23, b"failed", 0.1)
+    write_rows(path, [[row, row]])
+    assert len(read_rows(path)) == 2
+    with h5py.File(path, "a") as file:
+        file[name].resize((len(file[name]) - 1,))
+        file[name].attrs["crc32"] = zlib.crc32(file[name][()].tobytes())
+    refused(read_rows, path, path.read_bytes(), "simulations need")
