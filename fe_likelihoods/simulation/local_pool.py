@@ -106,7 +106,7 @@ class LocalPool:
         ValueError
             If the function or an item cannot be sent to the processes, or the function cannot be loaded there.
         RuntimeError
-            If three processes die before they are given an item.
+            If three processes in succession die before they are given an item.
         Exception
             The first exception that `function` raises; no further items are started.
         """
@@ -141,7 +141,9 @@ class LocalPool:
                             raise ValueError(f"{function!r} cannot be loaded in a worker process: {reply.value}")
                         if reply.kind == "raised":
                             raise reply.value
-                        if index is not None:
+                        if index is None:
+                            deaths[None] = 0  # the function can be loaded
+                        else:
                             results[index] = reply.value
                         if worker.runs >= (self.runs_per_process or math.inf):
                             del running[worker]

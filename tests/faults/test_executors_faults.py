@@ -19,7 +19,18 @@ from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
 from tests.faults import treacherous as bad
 from tests.faults.pooled_run import NAMES, WORKERS, at_work
-from tests.faults.treacherous import CHANNELS, DT, N_STEPS, DiesOnce, Treacherous, descendants, gone, line, posterior_of
+from tests.faults.treacherous import (
+    CHANNELS,
+    DT,
+    N_STEPS,
+    DiesLoading,
+    DiesOnce,
+    Treacherous,
+    descendants,
+    gone,
+    line,
+    posterior_of,
+)
 
 ROOT = Path(__file__).parents[2]
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: cannot list processes")
@@ -84,6 +95,14 @@ def test_items_of_killed_workers_are_run_again(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
     assert batch.reasons == [""] * 8
     np.testing.assert_array_equal(batch.response, [line(row) for row in thetas])
+
+
+def test_processes_may_die_while_they_load_the_function(tmp_path):
+    """Three deaths in succession end a map, and not three in a long run."""
+    function = DiesLoading(tmp_path)
+    with LocalPool(1) as pool:
+        assert pool.map(function, [5, 6]) == [5, 6]
+    assert len(list(tmp_path.iterdir())) == 4
 
 
 @needs_proc

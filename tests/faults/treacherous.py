@@ -87,6 +87,27 @@ class DiesOnce(Treacherous):
         return line(theta)
 
 
+class DiesLoading:
+    """A function whose first, second and fourth process dies while it loads it, and the third at its first item."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        self._dies(0, 1, 3)
+
+    def __call__(self, item: int) -> int:
+        self._dies(2)
+        return item
+
+    def _dies(self, *numbers: int) -> None:
+        number = len(list(self.folder.iterdir()))
+        if number in numbers:
+            (self.folder / str(number)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
 class Large(Treacherous):
     """A model of 1 MB that counts how often it was unpickled in this process."""
 
