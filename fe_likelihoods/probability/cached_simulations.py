@@ -476,6 +476,7 @@ class CachedSimulations:
                 self.cache.store_responses(self.model, thetas, batch.response)
             self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
             self.cache.store_failures(self.model, thetas, reasons)
+            self._verified_cache.add_own(thetas, self._key, simulation_fingerprint(self.model))
         if responses:
             batch.response[[bool(reason) for reason in reasons]] = np.nan
         return Simulated(misfit, reasons, batch.response if responses else None)

@@ -248,4 +248,6 @@ class FELikelihood(CachedSimulations):
             max_failure_share=self.max_failure_share,
         )
         other.pool, other.response_memory = self.pool, self.response_memory
+        if self._verified_cache is not None:
+            other._verified_cache.share_schedule(self._verified_cache)
         return other

@@ -2,8 +2,10 @@
 
 The key of a stored simulation contains a digest of the model, but no digest contains everything that a model depends
 on. Therefore rows of a file are compared with new simulations: two before the first row is used in a process (the one
-that was stored last, and one at random of those that are requested), and one more for every 1000 rows used. The first
-comparison is repeated after a change of the model object, of its pool, or of a source file.
+that was stored last, and one at random of those that are requested), and one more for every 1000 rows used. For the
+likelihoods of other noises or of a part of the record that are made from a verified one, one row is compared before the
+first is used. Rows that the same likelihood has stored itself need no verification. The first comparison is repeated
+after a change of the model object, of its pool, or of a source file.
 
 A difference is an error, because either the stored rows or the new simulations belong to another model.
 """
@@ -21,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .cache_rows import CachedRows, StoredSimulation
+from .cache_rows import CachedRows, StoredSimulation, simulation_keys
 from .disk_cache import SimulationCache
 from .faults import TransientReason
 from .fingerprint import simulation_fingerprint
@@ -39,6 +41,7 @@ LARGEST_ROUNDING = 1e-4  # relative difference of responses that may come from r
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 STAMP_SECONDS = 1.0  # between two looks at the source files
 MAX_SCHEDULES = 32
+MAX_OWN = 200_000  # keys of 16 bytes, about 100 bytes each in memory
 MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used without verification
 
 _schedules: "OrderedDict[str, _Schedule]" = OrderedDict()  # of pickled objects: copies in a process share one
@@ -144,7 +147,9 @@ def largest_difference(
 
 
 class _Schedule:
-    """How many rows have been used since the last full verification, per table; shared by the copies in a process.
+    """How many rows have been used since the last full verification, per table and fingerprint.
+
+    It is shared by the likelihoods that were derived from one, and by its copies in a process.
 
     Parameters
     ----------
@@ -154,10 +159,11 @@ class _Schedule:
 
     def __init__(self, token: str) -> None:
         self.token = token
-        self.served: Counter[str] = Counter()
+        self.served: Counter[tuple[str, str]] = Counter()
+        self.own: set[bytes] = set()  # keys of rows that were stored here, which need no verification
         self.failed_attempts = 0
         self.stale: tuple[str, StaleCache] | None = None  # fingerprint of the row that differed, and the error
-        self.stamps: tuple = ()  # of the source files
+        self.stamps: dict[str, tuple] = {}  # of the source files, per fingerprint
         self._lock, self._owner = threading.RLock(), os.getpid()
 
     def __reduce__(self) -> tuple:
@@ -232,14 +238,19 @@ class VerifiedCache:
         """
         n_steps = run.measured.shape[1]
         rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps)
-        known = np.flatnonzero(rows.known)
-        if self.cache.verify and len(known):
+        known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist())
+        if known:
 
             def candidates(first: bool) -> Iterator[StoredSimulation]:
                 latest = self.cache.latest(fingerprint, run.n_numbers, n_steps) if first else None
-                if latest is not None and not (latest.reason and self.cache.retry_failures):
+                if latest is not None and (
+                    (latest.reason and self.cache.retry_failures)
+                    or not self._of_others(fingerprint, latest.theta[None], [0])
+                ):
+                    latest = None
+                if latest is not None:
                     yield latest
-                for row in self._random.sample(known.tolist(), len(known)):
+                for row in self._random.sample(known, len(known)):
                     if latest is None or not np.array_equal(latest.theta, thetas[row]):
                         yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row])
 
@@ -256,7 +267,9 @@ class VerifiedCache:
         """
         responses = self.cache.look_up_responses(run.model, thetas)
         known = [place for place, response in enumerate(responses) if response is not None]
-        if self.cache.verify and known:
+        fingerprint = simulation_fingerprint(run.model) if known else ""
+        known = self._of_others(fingerprint, thetas, known)
+        if known:
 
             def candidates(first: bool) -> Iterator[StoredSimulation]:
                 for row in self._random.sample(known, len(known)):
@@ -264,7 +277,7 @@ class VerifiedCache:
                     misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
                     yield StoredSimulation(thetas[row], misfit[0], reason)
 
-            self._verify_due("responses", simulation_fingerprint(run.model), len(known), candidates, run)
+            self._verify_due("responses", fingerprint, len(known), candidates, run)
         return responses
 
     def look_up_failures(self, thetas: np.ndarray, run: VerifyingRun) -> list[str]:
@@ -279,28 +292,58 @@ class VerifiedCache:
         """
         reasons = self.cache.look_up_failures(run.model, thetas)
         known = [row for row, reason in enumerate(reasons) if reason and not _is_transient(reason)]
-        if self.cache.verify and known:
+        fingerprint = simulation_fingerprint(run.model) if known else ""
+        known = self._of_others(fingerprint, thetas, known)
+        if known:
 
             def candidates(first: bool) -> Iterator[StoredSimulation]:
                 for row in self._random.sample(known, len(known)):
                     yield StoredSimulation(thetas[row], np.full(run.n_numbers, np.nan), reasons[row])
 
-            self._verify_due("failures", simulation_fingerprint(run.model), len(known), candidates, run)
+            self._verify_due("failures", fingerprint, len(known), candidates, run)
         return reasons
+
+    def add_own(self, thetas: np.ndarray, *fingerprints: str) -> None:
+        """State that simulations were run and stored here, so that they need no verification.
+
+        Parameters
+        ----------
+        thetas : (n, n_structural) float
+            Structural parameters.
+        *fingerprints : str
+            As for `SimulationCache.look_up`.
+        """
+        if len(self._schedule.own) < MAX_OWN:
+            for fingerprint in fingerprints:
+                self._schedule.own.update(simulation_keys(fingerprint, thetas))
+
+    def share_schedule(self, other: "VerifiedCache") -> None:
+        """Verify no row that another object has verified or stored."""
+        self._schedule = other._schedule
+
+    def _of_others(self, fingerprint: str, thetas: np.ndarray, rows: list[int]) -> list[int]:
+        """Those of some rows that were not stored here; none if the cache is not to be verified."""
+        own = self._schedule.own
+        if not self.cache.verify or not own:
+            return rows if self.cache.verify else []
+        keys = simulation_keys(fingerprint, thetas[rows])
+        return [row for row, key in zip(rows, keys, strict=True) if key not in own]
 
     def _verify_due(self, table: str, fingerprint: str, n: int, candidates: Any, run: VerifyingRun) -> None:
         """Verify as many rows as are due now that `n` more are used."""
         schedule = self._schedule
         with schedule.lock:
-            self._notice_changes(run)
+            self._notice_changes(fingerprint, run)
             if schedule.stale is not None:
                 differing, error = schedule.stale
                 if self.cache.is_stored(differing, error.theta):
                     raise StaleCache(str(error), error.theta)
                 schedule.stale = None
-            before = schedule.served[table]
+            before = schedule.served[table, fingerprint]
             first = before == 0
-            due = FIRST_ROWS if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
+            # one row suffices for responses and for shorter records, if others of the same code were verified
+            first_rows = 1 if schedule.served else FIRST_ROWS
+            due = first_rows if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
             try:
                 compared = not due or self._verify(candidates(first), due, run)
             except StaleCache as error:
@@ -310,7 +353,7 @@ class VerifiedCache:
                 schedule.failed_attempts += 1
                 if schedule.failed_attempts < MAX_FAILED_ATTEMPTS:
                     return  # verified with the next rows
-            schedule.served[table] = before + n
+            schedule.served[table, fingerprint] = before + n
 
     def _verify(self, rows: Iterable[StoredSimulation], due: int, run: VerifyingRun) -> bool:
         """Simulate the first `due` rows again, and further ones in place of those whose simulation is stopped.
@@ -375,7 +418,7 @@ class VerifiedCache:
                     f"this size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
                 )
         served = self._schedule.served.total()
-        self._schedule.served.clear()
+        self._start_again()
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
         rest = f", and discard this run, which has used {served} rows" if served else ""
         raise StaleCache(
@@ -386,20 +429,24 @@ class VerifiedCache:
             row.theta,
         )
 
-    def _notice_changes(self, run: VerifyingRun) -> None:
+    def _notice_changes(self, fingerprint: str, run: VerifyingRun) -> None:
         """Start again with the first verification if the model object, its pool or a source file has changed."""
         objects = run.model, run.pool
         same = self._objects is not None and all(a is b for a, b in zip(objects, self._objects, strict=True))
         if self._objects is not None and not same:
-            self._schedule.served.clear()
+            self._start_again()
             self._schedule.stale = None
         now = time.monotonic()
         if not same or now > self._stamp_time + STAMP_SECONDS:
             stamps = tuple(_stamp(file) for file in watched_files(run.model))
-            if self._schedule.stamps and stamps != self._schedule.stamps:
-                self._schedule.served.clear()
-            self._schedule.stamps, self._stamp_time = stamps, now
+            if self._schedule.stamps.get(fingerprint, stamps) != stamps:
+                self._start_again()
+            self._schedule.stamps[fingerprint], self._stamp_time = stamps, now
         self._objects = objects
+
+    def _start_again(self) -> None:
+        self._schedule.served.clear()
+        self._schedule.own.clear()
 
 
 def watched_files(model: Model) -> list[str]:

@@ -299,6 +299,21 @@ def test_rows_are_used_if_no_simulation_ends(filled, thetas, caplog):
     assert sum("used without verification" in text for text in warnings) == 3
 
 
+def test_rows_that_the_same_likelihood_has_stored_are_not_verified(path, thetas):
+    likelihood = likelihood_of(Scaled(), path, memory_rows=0)
+    likelihood.simulate(thetas[:20])
+    likelihood.misfit(thetas[20:])
+    likelihood.misfit(thetas)
+    derived = likelihood.with_noise(AutoregressiveNoise(CHANNELS))
+    derived.misfit(thetas[:20])
+    assert (likelihood.verifications, derived.verifications) == (0, 0)
+    assert likelihood.disk_hits == 50
+    other = likelihood_of(Scaled(), path, memory_rows=0)
+    other.misfit(thetas)
+    other.with_noise(likelihood.noise).misfit(thetas)
+    assert (other.verifications, other.simulations) == (2, 0)
+
+
 # copies ---------------------------------------------------------------------------------------------------------------
 
 
