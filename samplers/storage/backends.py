@@ -379,6 +379,9 @@ class JournaledBackend(HDFBackend):
             )
             self._take(contents, rewrite=True)
             return
+        if stored is not None and stored.run is None and torn and contents is not None and not stored.fresh:
+            self._replace_damaged(contents, ValueError("the name of the run is lost"))
+            return
         if stored is None or stored.run is None:
             return
         self._run = stored.run

@@ -47,6 +47,8 @@ __all__ = [
     "write_marks",
 ]
 
+# A group as ``HDFBackend.reset`` of emcee creates it
+EMCEE_ATTRIBUTES, EMCEE_DATASETS = {"version", "nwalkers", "ndim", "has_blobs", "iteration"}, 3
 RUN, JOURNAL, SCRIPT, CHECKSUM = "run", "journal", "script", "checksum"
 # What reading a damaged HDF5 file raises
 DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, IndexError)
@@ -77,6 +79,8 @@ class StoredRun(NamedTuple):
         Whether the chain agrees with its checksum.
     marked : int
         Number of steps that the checksum covers.
+    fresh : bool
+        Whether the group is as emcee creates it.
     """
 
     run: str | None
@@ -88,6 +92,7 @@ class StoredRun(NamedTuple):
     verdict: Verdict | None
     intact: bool
     marked: int
+    fresh: bool
 
     @property
     def has_results(self) -> bool:
@@ -109,8 +114,9 @@ def read_run(backend: HDFBackend) -> StoredRun | None:
         intact = chain.consistent and (count > len(chain.coords) or checksum(group, 0, count) == crc)
         calls = [Call(*values) for values in json.loads(attrs.get(SCRIPT, "[]"))]
         run, journal_size = attrs.get(RUN), int(attrs.get(JOURNAL, 0))
+        fresh = set(attrs) == EMCEE_ATTRIBUTES and len(chain.coords) == 0 and len(group) == EMCEE_DATASETS
     extras = read_ladder(plain), read_check(plain), read_verdict(plain)
-    return StoredRun(run, journal_size, calls, chain, *extras, intact, count)
+    return StoredRun(run, journal_size, calls, chain, *extras, intact, count, fresh)
 
 
 def write_marks(group: h5py.Group, run: str, journal_size: int, script: Script) -> None:
