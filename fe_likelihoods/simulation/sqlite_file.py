@@ -25,6 +25,8 @@ try:
 except ImportError:  # without such locks two programs must not find the same damage at the same time
     lock_file = None
 
+from .salvage import salvage
+
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
 
 logger = logging.getLogger(__name__)
@@ -125,6 +127,7 @@ class CacheFile:
         self.writable = True
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
+        self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new one
         self._inode_of_cache: tuple[int, int] | None = None  # of the last file that was identified as a cache
         with _files_lock:
             _files.add(self)
@@ -197,6 +200,9 @@ class CacheFile:
                 )
                 self._connection = self._open() if self.writable else self._open_to_read()
                 self._inode = self._inode_of_cache = self._inode_now()
+            if self._aside is not None and self.writable:
+                aside, self._aside = self._aside, None
+                salvage(aside, self._connection)
         return self._connection
 
     def close(self) -> None:
@@ -230,6 +236,7 @@ class CacheFile:
                 part = self.path.with_name(self.path.name + suffix)
                 if part.exists():
                     os.rename(part, aside.with_name(aside.name + suffix))
+            self._aside = aside
             logger.warning("%s is damaged (%s): set aside as %s, and a new cache created", self.path, why, aside.name)
 
     def _inode_now(self) -> tuple[int, int] | None:

@@ -308,11 +308,29 @@ def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, b
     aside = filled.with_name(f"{filled.name}.damaged-{before + 1}")
     assert aside.read_bytes() == data
     assert warnings_of(caplog, f"set aside as {aside.name}") == 1
+    assert warnings_of(caplog, "simulations were salvaged") == 1
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert likelihood.simulations == len(thetas)
+    assert likelihood.simulations + likelihood.disk_hits == len(thetas)
     again = likelihood_of(filled)
     again.misfit(thetas)
     assert (again.simulations, again.disk_hits) == (0, len(thetas))
+
+
+@pytest.mark.parametrize("page", ["leaf", "index"])
+def test_a_bad_page_loses_its_own_rows_only(filled, thetas, expected, caplog, page):
+    """The others are copied to the new cache; what was lost is counted."""
+    data = bytearray(filled.read_bytes())
+    kind = {"leaf": 0x0D, "index": 0x0A}[page]
+    pages = [start for start in range(4096, len(data), 4096) if data[start] == kind]
+    place = pages[len(pages) // 2]
+    data[place : place + 4096] = b"\xa5" * 4096
+    filled.write_bytes(data)
+    likelihood = likelihood_of(filled)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    (message,) = (r.getMessage() for r in caplog.records if "simulations were salvaged" in r.getMessage())
+    kept, lost = (int(word) for word in message.split() if word.isdigit())
+    assert kept == likelihood.disk_hits and kept + lost == len(thetas)
+    assert lost == 0 if page == "index" else 0 < lost < len(thetas)
 
 
 @pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
