@@ -40,6 +40,23 @@ class RunResults:
         """
         return self._evaluator.evaluations
 
+    def report(self) -> dict[str, float]:
+        """Counts of this object, and of the run in all, which may have been continued from a file.
+
+        Returns
+        -------
+        dict
+            ``new_evaluations``, made by this object; ``evaluations``, ``simulations``, ``failures`` and ``steps`` of
+            the run in all.
+        """
+        return {
+            "new_evaluations": self._evaluator.new_evaluations,
+            "evaluations": self.evaluations,
+            "simulations": self.simulations,
+            "failures": self.failure_count,
+            "steps": int(self.iteration),
+        }
+
     @property
     def coarse_evaluations(self) -> int:
         """Points for which `coarse_log_prob_fn` was called by this object."""

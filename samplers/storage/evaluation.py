@@ -184,6 +184,8 @@ class Evaluator:
         Number of points evaluated so far, including those of the interrupted run that is continued.
     failures : Failures
         Those of them that failed.
+    new_evaluations : int
+        Number of points that this object has evaluated itself.
     pool : object with a method map, optional
         Where functions of one point are called; set by the sampler.
     """
@@ -208,6 +210,7 @@ class Evaluator:
         self.budget = Budget() if budget is None else budget
         self.evaluates_parts = True
         self.pool: Any = None
+        self.new_evaluations = 0
         self.reset()
 
     def __getstate__(self):
@@ -318,6 +321,7 @@ class Evaluator:
             self._check = None
         if self._checkpoint is not None:
             self._checkpoint.evaluated(batch)
+        self.new_evaluations += len(batch.coords)
         return batch
 
     def _first_records(self, log_base: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:

@@ -464,3 +464,41 @@ def test_failures_are_restored(tmp_path):
     assert again.get_chain()[..., 0].min() >= 0
     assert again.failure_count == whole.failure_count > 0
     assert [f["reason"] for f in again.failures] == [f["reason"] for f in whole.failures]
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_an_interrupt_says_what_is_kept_and_how_to_go_on(share, tmp_path, caplog):
+    """In a new process, or by the same call."""
+    whole = make(tmp_path / "whole.h5", "smc")
+    whole.run_mcmc(None, STEPS)
+    calls = whole.log_prob_fn.f.calls
+    assert whole.report()["new_evaluations"] == whole.report()["evaluations"] == calls
+    for where in ("the same object", "a new one"):
+        path = tmp_path / f"{where}.h5"
+        sampler = make(path, "smc")
+        posterior = sampler.log_prob_fn.f
+        evaluate = type(posterior).__call__
+
+        def interrupted(x, posterior=posterior, evaluate=evaluate):
+            if posterior.calls > share * calls:
+                posterior.calls = -100_000
+                raise KeyboardInterrupt
+            return evaluate(posterior, x)
+
+        sampler._evaluator._function.function = interrupted
+        with pytest.raises(
+            KeyboardInterrupt, match=rf"evaluations and \d+ steps are kept in .*{where}.h5 and .*journal"
+        ):
+            sampler.run_mcmc(None, STEPS)
+        made = sampler.report()["new_evaluations"]
+        if where == "a new one":
+            sampler.backend.close()
+            sampler = make(path, "smc", seed=99)
+        with caplog.at_level("INFO", logger="samplers"):
+            sampler.run_mcmc(None, STEPS)
+        assert f"{made} evaluations and" in caplog.text and "Resuming" in caplog.text
+        assert same(sampler, whole)
+        report = sampler.report()
+        assert report["evaluations"] == calls and report["steps"] == STEPS
+        if where == "a new one":
+            assert 0 < report["new_evaluations"] <= calls - made
