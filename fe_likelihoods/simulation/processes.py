@@ -77,7 +77,8 @@ class _Reaper:
     """The orphan reaper of this process, started when it is first needed."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        # reentrant, because the garbage collector may run the finalizer of another process while a message is sent
+        self._lock = threading.RLock()
         self._process: subprocess.Popen | None = None
         self._owner = 0
 
@@ -105,6 +106,14 @@ def _without_marks(variables: Mapping[str, str]) -> dict[str, str]:
 
 
 _REAPER = _Reaper()
+
+
+def _release_in_child() -> None:
+    """In a forked process: a thread of its parent may have held the lock."""
+    _REAPER._lock = threading.RLock()
+
+
+os.register_at_fork(after_in_child=_release_in_child)
 
 
 class ManagedProcess:

@@ -5,6 +5,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.probability.failures import TooManyFailures
+from fe_likelihoods.simulation import processes
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -103,6 +105,26 @@ def test_processes_may_die_while_they_load_the_function(tmp_path):
     with LocalPool(1) as pool:
         assert pool.map(function, [5, 6]) == [5, 6]
     assert len(list(tmp_path.iterdir())) == 4
+
+
+def _send_while_sending(ended):
+    with processes._REAPER._lock:  # the garbage collector runs a finalizer while a message is sent
+        processes._REAPER.send("gone", "nothing")
+    ended.set()
+
+
+def test_messages_to_the_orphan_reaper_do_not_block():
+    ended = threading.Event()
+    threading.Thread(target=_send_while_sending, args=(ended,), daemon=True).start()
+    assert ended.wait(10.0)
+    with processes._REAPER._lock:  # another thread sends while this one forks
+        child = os.fork()
+        if child == 0:
+            blocked = threading.Thread(target=processes._REAPER.send, args=("gone", "nothing"), daemon=True)
+            blocked.start()
+            blocked.join(10.0)
+            os._exit(blocked.is_alive())
+    assert os.waitpid(child, 0)[1] == 0
 
 
 @needs_proc
