@@ -187,7 +187,7 @@ def _forked(function):
     pid = os.fork()
     if pid == 0:
         os.close(read)
-        faulthandler.dump_traceback_later(60, exit=True)
+        faulthandler.dump_traceback_later(15, exit=True)  # HDF5 itself loops on some damaged files
         warnings.simplefilter("ignore")
         logging.disable(logging.CRITICAL)
         with os.fdopen(write, "w") as stream:
