@@ -73,7 +73,7 @@ class SMCSampler(TemperedSampler):
     resampling : str or callable, default "systematic"
         Name of a scheme in `samplers.tempering.resampling`, or a function of (weights, random) that returns indices.
     min_moves : int, default 2
-        Smallest number of sweeps of the ensemble per stage; with recycling, at beta = 1 only.
+        Smallest number of sweeps of the ensemble per stage; with recycling, see `RecyclingSettings.closing_sweeps`.
     max_moves : int, default 7
         Largest number of these sweeps; equal to `min_moves` for a fixed number.
     max_correlation : float, default 0.15

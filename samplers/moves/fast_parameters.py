@@ -21,7 +21,7 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import Move
 
-from .kernels import Inside, RandomWalkMove, calibrate_move
+from .kernels import Inside, MixtureMove, RandomWalkMove, calibrate_move
 
 __all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
 
@@ -111,6 +111,11 @@ class WithFastSweeps(Move):
         """Fit the walk, and the wrapped move if it can be fitted, to points (n, ndim) with weights (n,)."""
         calibrate_move(self.move, coords, weights, inside)
         self._walk.calibrate(coords, weights, inside)
+
+    def expect_independence(self) -> None:
+        """See `samplers.moves.kernels.MixtureMove.expect_independence`; without effect on other moves."""
+        if isinstance(self.move, MixtureMove):
+            self.move.expect_independence()
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Make the move, then the fast sweeps.

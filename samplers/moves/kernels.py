@@ -268,6 +268,14 @@ class MixtureMove(MHMove):
         self._cumulated = np.cumsum(weights)
         self._current, self._independence_accepted = None, False
 
+    def expect_independence(self) -> None:
+        """Prefer the independence kernel, without a first sweep that shows its acceptance.
+
+        For points that are independent draws of the target already, from the same mixture. A resumed run then needs no
+        state of the move.
+        """
+        self._current, self._independence_accepted = 0, True
+
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Make one sweep of one kernel.
 

@@ -13,12 +13,13 @@ For every component of the mixture, a quadratic
 is fitted to the points that belong to it, in the coordinates in which the component is the standard one, by least
 trimmed squares, which ignores a minority of the points.
 
-1. Points clearly above this quadratic belong to another basin. A second quadratic is fitted to them, about the highest
-   one. Its mode, at a limited distance, is the mean of a new component, and A^-1 its covariance. So points on the flank
-   of a mode suffice to find it, long before a draw hits its top. With fewer points than coefficients, A is drawn
-   towards a multiple of the identity by ridge regression, with the strength that has the smallest leave-one-out error.
-   With fewer than 1.5 points per dimension, the new component is centred at these points and somewhat narrower than the
-   component they were taken from.
+1. Points clearly above this quadratic, and above those of the other components, belong to another basin. A second
+   quadratic is fitted to the highest of them, its neighbours, and all that agree with these. Its mode, at a limited
+   distance, is the mean of a new component, and A^-1 its covariance. So points on the flank of a mode suffice to find
+   it, long before a draw hits its top. With fewer points than coefficients, A is drawn towards a multiple of the
+   identity by ridge regression, with the strength that has the smallest leave-one-out error. With fewer than 1.5 points
+   per dimension, the new component is centred at these points and somewhat narrower than the component they were taken
+   from. The points that it explains are set aside, and the next basin is found among the others.
 2. If most points agree with the first quadratic, but its mode and A^-1 are far from mean and covariance of the
    component, which were estimated from few effective points, a component is made from the quadratic too.
 
@@ -41,17 +42,18 @@ from typing import NamedTuple
 import numpy as np
 
 from .covariance import invert_roots
-from .mixture import Mixture, log_responsibilities, to_component_space
+from .mixture import Mixture, log_components, to_component_space
 from .support_bounds import log_abs_det_jacobian
 
 __all__ = ["cover_basins"]
 
-# Points whose log-density is this far below the highest, per dimension, are left out.
-DEPTH = 8.0
+# Points whose log-density is this far below the highest, per dimension, are left out. The only points of a narrow mode
+# may be low on its flank.
+DEPTH = 50.0
 # Squared distance, and depth below the highest point per dimension, at which a point has a quarter of the weight.
 CORE, TOP = 10.0, 3.0
-# A point belongs to another basin if it is above the quadratic by this, plus this many times the spread of the others.
-SIGNIFICANT, SPREADS = 2.0, 5.0
+# A point belongs to another basin if it is above the quadratic by this, plus this many times its error there.
+SIGNIFICANT, SPREADS = 0.5, 5.0
 # Least trimmed squares: share of the points that are fitted, and number of concentration steps.
 KEPT, CONCENTRATIONS = 0.7, 4
 # Points needed per coefficient, and largest number of coefficients of a quadratic with all products.
@@ -117,20 +119,12 @@ def cover_basins(
     Mixture
         The mixture itself if it covers all points.
     """
-    ndim = coords.shape[1]
+    ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)
     target = np.round(log_target[kept] * GRID) / GRID
     if mixture.bounds is not None:
         target = target - log_abs_det_jacobian(mixture.bounds, coords[kept])
-    points = to_component_space(mixture, coords[kept])
-    owner = log_responsibilities(mixture, coords[kept]).argmax(axis=1)
-    variance = mixture.dof / (mixture.dof - 2.0)
-    found: list[tuple[int, _Basin]] = []
-    for k, (mean, root, inverse) in enumerate(zip(mixture.means, mixture.roots, mixture.inverses, strict=True)):
-        rows = owner == k
-        log_volume = float(np.sum(np.log(root.diagonal())))
-        basins = _find_basins((points[rows] - mean) @ inverse.T, target[rows] + log_volume, variance, most)
-        found += [(k, basin) for basin in basins]
+    found = _find_basins(mixture, to_component_space(mixture, coords[kept]), target, most)
     if not found:
         return mixture
     found = sorted(found, key=lambda item: -item[1].log_mass)[:most]
@@ -146,24 +140,49 @@ def cover_basins(
     )
 
 
-def _find_basins(points: np.ndarray, target: np.ndarray, variance: float, most: int) -> list[_Basin]:
-    """Basins among points (n, d) in standard coordinates, by the logarithm (n,) of the target there."""
-    n, ndim = points.shape
-    if n < PER_COEFFICIENT * (ndim + 2):
-        return []
-    coefficients = 1 + ndim + ndim * (ndim + 1) // 2
-    full = n >= PER_COEFFICIENT * coefficients and coefficients <= MOST_COEFFICIENTS
-    quadratic, spread = _fit_most(points, target, full)
-    own = _own_basin(quadratic, variance) if full and spread < AGREEING else None
-    found = [] if own is None else [own]
-    left = target - quadratic.at(points) > SIGNIFICANT + SPREADS * spread
+def _find_basins(mixture: Mixture, points: np.ndarray, target: np.ndarray, most: int) -> list[tuple[int, _Basin]]:
+    """Basins among points (n, d) of the component space, each with the component in whose coordinates it is given."""
+    ndim, variance = points.shape[1], mixture.dof / (mixture.dof - 2.0)
+    owner = log_components(mixture, points).argmax(axis=1)
+    log_volumes = np.sum(np.log(np.diagonal(mixture.roots, axis1=1, axis2=2)), axis=1)
+    found, fulls = [], []
+    explained = np.full(len(points), -np.inf)
+    for k, log_volume in enumerate(log_volumes):
+        own, standard = owner == k, _standard(mixture, k, points)
+        fulls.append(_suffice_for_all(np.count_nonzero(own), ndim))
+        if np.count_nonzero(own) < PER_COEFFICIENT * (ndim + 2):
+            explained[own] = np.inf
+            continue
+        quadratic, spread, uncertainty = _fit_most(standard[own], target[own] + log_volume, fulls[k])
+        basin = _own_basin(quadratic, variance) if fulls[k] and spread < AGREEING else None
+        found += [] if basin is None else [(k, basin)]
+        # a quadratic with a mode explains points of its neighbours too
+        rows = own | (fulls[k] and np.linalg.eigvalsh(quadratic.curvature)[0] > CURVATURES[0])
+        terms = _terms(standard[rows], fulls[k])
+        # a quadratic fitted to rough values is less certain far from the points that it was fitted to
+        error = spread * np.sqrt(1.0 + np.sum((terms @ uncertainty.T) ** 2, axis=1))
+        level = quadratic.at(standard[rows]) - log_volume + SIGNIFICANT + SPREADS * error
+        explained[rows] = np.maximum(explained[rows], level)
+    left = target > explained
     for _ in range(most):
         if not left.any():
             break
-        basin, explained = _highest_basin(points[left], target[left], full)
-        left[left] = ~explained
-        found.append(basin)
+        k = owner[left][np.argmax(target[left])]
+        basin, in_it = _highest_basin(_standard(mixture, k, points[left]), target[left] + log_volumes[k], fulls[k])
+        left[left] = ~in_it
+        found.append((int(k), basin))
     return found
+
+
+def _standard(mixture: Mixture, k: int, points: np.ndarray) -> np.ndarray:
+    """Points (n, d) of the component space in the coordinates in which component k is the standard one."""
+    return (points - mixture.means[k]) @ mixture.inverses[k].T
+
+
+def _suffice_for_all(n: int, ndim: int) -> bool:
+    """Whether n points suffice for a quadratic with all products."""
+    coefficients = 1 + ndim + ndim * (ndim + 1) // 2
+    return n >= PER_COEFFICIENT * coefficients and coefficients <= MOST_COEFFICIENTS
 
 
 def _terms(points: np.ndarray, full: bool) -> np.ndarray:
@@ -185,8 +204,11 @@ def _quadratic(coefficients: np.ndarray, ndim: int) -> _Quadratic:
     return _Quadratic(float(coefficients[0]), coefficients[1 : 1 + ndim], curvature)
 
 
-def _fit_most(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Quadratic, float]:
-    """The quadratic that fits most of the points, and the spread of the residuals."""
+def _fit_most(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Quadratic, float, np.ndarray]:
+    """The quadratic that fits most of the points, the spread of the residuals, and a root F of the uncertainty.
+
+    For independent residuals with a standard deviation of 1, a prediction from terms t has the standard error |F t|.
+    """
     terms = _terms(points, full)
     core = 1.0 / (1.0 + np.sum(points**2, axis=1) / CORE) ** 2
     regular = np.diag(np.full(terms.shape[1], RIDGE * len(points)))
@@ -197,7 +219,12 @@ def _fit_most(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Quad
         coefficients = np.linalg.solve(scaled.T @ terms + regular, scaled.T @ target)
         size = np.abs(target - terms @ coefficients)
         weights = core * (size <= np.partition(size, kept - 1)[kept - 1])
-    return _quadratic(coefficients, points.shape[1]), 1.5 * float(np.median(size))
+    spread = 1.5 * float(np.median(size))
+    # the terms with all products are linearly dependent: only directions that the points determine count
+    values, vectors = np.linalg.eigh(scaled.T @ terms)
+    vectors, values = vectors[:, values > RIDGE * values[-1]], values[values > RIDGE * values[-1]]
+    uncertainty = np.linalg.qr(scaled @ (vectors / values), mode="r") @ vectors.T
+    return _quadratic(coefficients, points.shape[1]), spread, uncertainty
 
 
 def _log_mass(height: float, curvatures: np.ndarray) -> float:
@@ -231,7 +258,10 @@ def _highest_basin(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[
         mean = points[top] + weights @ apart[near] / weights.sum()
         return _Basin(-math.inf, mean, FEW_POINTS_SCALE * np.eye(ndim)), near
     weights = 1.0 / ((1.0 - below / (TOP * ndim)) * (1.0 + squared / (2.0 * ndim))) ** 2
-    quadratic, spread = _fit_few(apart, below, weights, full)
+    if _suffice_for_all(len(points), ndim):
+        quadratic, spread = _fit_near(apart, below, weights)
+    if not _suffice_for_all(len(points), ndim) or spread > AGREEING:
+        quadratic, spread = _fit_few(apart, below, weights, full)
     curvatures, vectors = np.linalg.eigh(quadratic.curvature)
     curvatures = np.clip(curvatures, *CURVATURES)
     step = vectors @ ((vectors.T @ quadratic.slope) / curvatures)
@@ -241,6 +271,22 @@ def _highest_basin(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[
     explained = np.abs(below - quadratic.at(apart)) < SIGNIFICANT + 3.0 * spread
     explained[top] = True
     return _Basin(_log_mass(height, curvatures), points[top] + step, root), explained
+
+
+def _fit_near(points: np.ndarray, target: np.ndarray, weights: np.ndarray) -> tuple[_Quadratic, float]:
+    """The quadratic of the points near the origin and of all that agree with it, and the spread of their residuals."""
+    terms = _terms(points, True)
+    regular = np.diag(np.full(terms.shape[1], RIDGE * len(points)))
+    fewest = min(int(PER_COEFFICIENT * terms.shape[1]), len(points))
+    squared = np.sum(points**2, axis=1)
+    kept = squared <= np.partition(squared, fewest - 1)[fewest - 1]
+    for _ in range(CONCENTRATIONS):
+        scaled = terms * (weights * kept)[:, None]
+        coefficients = np.linalg.solve(scaled.T @ terms + regular, scaled.T @ target)
+        size = np.abs(target - terms @ coefficients)
+        spread = 1.5 * float(np.median(size[kept]))
+        kept = size <= max(np.partition(size, fewest - 1)[fewest - 1], 3.0 * spread)
+    return _quadratic(coefficients, points.shape[1]), spread
 
 
 def _fit_few(points: np.ndarray, target: np.ndarray, weights: np.ndarray, full: bool) -> tuple[_Quadratic, float]:

@@ -33,6 +33,7 @@ __all__ = [
     "draw",
     "fit_mixture",
     "from_component_space",
+    "log_components",
     "log_density",
     "log_responsibilities",
     "to_component_space",
@@ -105,8 +106,13 @@ def _component_log_densities(mixture: Mixture, distances: np.ndarray) -> np.ndar
 
 def log_responsibilities(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Log of the responsibilities (n, K): probabilities that each point (n, ndim) came from each component."""
-    parts = _component_log_densities(mixture, _distances(mixture, to_component_space(mixture, coords)))
+    parts = log_components(mixture, to_component_space(mixture, coords))
     return parts - _log_sum(parts)[:, None]
+
+
+def log_components(mixture: Mixture, points: np.ndarray) -> np.ndarray:
+    """Log of weight times density (n, K) of each component at points (n, ndim) of the component space."""
+    return _component_log_densities(mixture, _distances(mixture, points))
 
 
 def to_component_space(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
@@ -128,7 +134,7 @@ def _log_sum(parts: np.ndarray) -> np.ndarray:
 
 def log_density(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Log density (n,) of the mixture at points (n, ndim), in the parameters; -inf beyond a bound."""
-    log_sum = _log_sum(_component_log_densities(mixture, _distances(mixture, to_component_space(mixture, coords))))
+    log_sum = _log_sum(log_components(mixture, to_component_space(mixture, coords)))
     return log_sum if mixture.bounds is None else log_sum + log_abs_det_jacobian(mixture.bounds, coords)
 
 

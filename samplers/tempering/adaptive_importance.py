@@ -225,7 +225,9 @@ def recycle(
         if settings.max_basins > 0 and not finished:
             log_target = archive.log_target(beta) - log_evidence
             mixture = cover_basins(mixture, archive.coords, log_target, settings.max_basins, settings.basin_share)
-        new, made = draw_inside(mixture, size if finished else int(round(2.0 * target)), random, density.inside)
+        new, made = draw_inside(
+            mixture, size if finished else int(round(settings.draws_per_target * target)), random, density.inside
+        )
         try:
             new_records = density.evaluate(new)
         except BudgetExhausted as stop:

@@ -52,6 +52,8 @@ logger = logging.getLogger(__name__)
 # half the walkers suffice, but not fewer points than these.
 FEWEST_TO_START = 250
 START_PER_DIMENSION = 10
+# Share of distinct points after recycling from which on the population is as good as independent draws.
+ENOUGH_DISTINCT = 0.9
 
 Steps = Iterator[tuple[Population, Report]]
 
@@ -376,7 +378,13 @@ def _by_recycling(
         yield population, doubt
     if earlier is not None:
         yield from _disagreement(population, earlier, found.log_evidence, found.log_evidence_error)
-    mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
+    distinct = len(np.unique(ancestors))
+    if settings.recycling.closing_sweeps or distinct < ENOUGH_DISTINCT * size:
+        mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
+    else:
+        # the draws are independent already: sweeps would cost evaluations and improve nothing
+        schedule.expect_independence()
+        mutated = Mutated(population, effective / len(found.coords), 0, 0.0)
     yield (
         mutated.population,
         Stage(
@@ -384,7 +392,7 @@ def _by_recycling(
             effective_sample_size=effective,
             acceptance=mutated.acceptance,
             moves=mutated.moves,
-            distinct_ancestors=len(np.unique(ancestors)),
+            distinct_ancestors=distinct,
             log_evidence_increment=found.log_evidence - found.log_evidence_below_one,
             log_evidence_error=found.log_evidence_error,
         ),

@@ -13,7 +13,8 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import Move, RedBlueMove
 
-from ..moves.kernels import calibrate_move
+from ..moves.fast_parameters import WithFastSweeps
+from ..moves.kernels import MixtureMove, calibrate_move
 from .budget import BudgetExhausted
 from .population import Density, Population, Sweep
 from .settings import Settings
@@ -65,6 +66,12 @@ class MoveSchedule(NamedTuple):
         """Fit the moves that can be fitted to points (n, ndim) with normalised weights (n,)."""
         for move in self.moves:
             calibrate_move(move, coords, weights, inside)
+
+    def expect_independence(self) -> None:
+        """Tell the moves that can use it that the points are independent draws of the target already."""
+        for move in self.moves:
+            if isinstance(move, MixtureMove | WithFastSweeps):
+                move.expect_independence()
 
 
 class Mutated(NamedTuple):

@@ -56,10 +56,14 @@ class RecyclingSettings:
     ----------
     target_share : float
         Target as a share of the number of starting points. A small target allows large steps of beta; the fresh draws
-        of a round, twice the target in number, then restore the effective sample size.
+        of a round then restore the effective sample size.
     points_per_dimension : float
         Smallest target per dimension (and one more). With fewer than five effective points per dimension, the
         covariances of the fitted mixture cannot be estimated.
+    draws_per_target : float
+        Draws of a round, as a multiple of the target. A narrow mode that holds one point in a thousand while beta is
+        small is found only if a draw meets it: of ten-dimensional modes with a ratio of volumes of 100, two draws per
+        target miss 40 %, three draws 10 %.
     fresh_share : float
         A beta is left once the draws made at it have an effective sample size of this share of the target. Among many
         old points some have large weights by chance; where the likelihood is rough, annealing that follows these points
@@ -92,10 +96,14 @@ class RecyclingSettings:
     max_evidence_difference : float
         Largest difference between the log-evidence of the check and that of the earlier points for which the result
         is used.
+    closing_sweeps : bool
+        Move the resampled draws of beta = 1 by `min_moves` to `max_moves` sweeps in any case. By default they are moved
+        only where less than 90 % of the resampled points are distinct: else they are independent draws already.
     """
 
     target_share: float = 0.2
     points_per_dimension: float = 5.0
+    draws_per_target: float = 3.0
     fresh_share: float = 0.75
     max_components: int = 8
     even_share: float = 0.25
@@ -108,6 +116,7 @@ class RecyclingSettings:
     trusted_yield: float = 0.25
     high_yield: float = 0.5
     max_evidence_difference: float = 0.25
+    closing_sweeps: bool = False
 
     def __post_init__(self):
         for name in ("target_share", "fresh_share"):
@@ -126,6 +135,11 @@ class RecyclingSettings:
         object.__setattr__(self, "max_basins", as_whole_number("max_basins", self.max_basins))
         if self.max_basins < 0:
             raise ValueError(f"max_basins must be a whole number, 0 for none; got {self.max_basins}")
+        if not isinstance(self.closing_sweeps, bool | np.bool_):
+            raise ValueError(f"closing_sweeps must be True or False; got {self.closing_sweeps!r}")
+        object.__setattr__(self, "closing_sweeps", bool(self.closing_sweeps))
+        if not self.draws_per_target > 0.0:
+            raise ValueError(f"draws_per_target must be positive; got {self.draws_per_target}")
         if not self.points_per_dimension > 0.0:
             raise ValueError(f"points_per_dimension must be positive; got {self.points_per_dimension}")
         if not self.max_evidence_difference >= 0.0:
@@ -215,7 +229,8 @@ class Settings:
     resampling : str or callable
         Name of a scheme in `samplers.tempering.resampling`, or a function of (weights, random) that returns indices.
     min_moves, max_moves : int
-        Smallest and largest number of sweeps of the ensemble per stage; equal for a fixed number.
+        Smallest and largest number of sweeps of the ensemble per stage; equal for a fixed number. With recycling, of
+        the closing sweeps (`RecyclingSettings.closing_sweeps`).
     max_correlation : float
         Between these two numbers, moving stops once the correlation of every parameter and of the log-likelihood with
         their values after the resampling is below this value, or decreases no further.
@@ -391,6 +406,13 @@ def refuse_unused(
         reasons.pop("recycling", None)
     else:
         reasons.setdefault("guided", "it belongs to a guide: pass guide= too")
+    if recycles and not settings.recycling.closing_sweeps:
+        for name in ("min_moves", "max_moves", "max_correlation", "burn_in"):
+            reasons.setdefault(
+                name,
+                "the draws of recycling are moved only where too many of them are copies: pass "
+                "recycling=RecyclingSettings(closing_sweeps=True), or recycle=False",
+            )
     if recycles:
         for name in ("ess_ratio", "ess_rule", "ess_floor", "coefficient_of_variation", "resampling"):
             reasons.setdefault(

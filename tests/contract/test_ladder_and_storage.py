@@ -13,6 +13,7 @@ from samplers import (
     CHING_CHEN_2007,
     RAMANCHA_2022_CONSTANT,
     RAMANCHA_2022_LITERAL,
+    RecyclingSettings,
     SamplingWarning,
     Settings,
     SMCSampler,
@@ -64,15 +65,16 @@ def test_recycling_accounts_for_everything():
     sampler = annealed(posterior, nsteps=0, recycle=True)
     betas = [s.beta for s in sampler.ladder]
     assert betas == sorted(set(betas)) and betas[-1] == 1.0
-    assert [s.moves for s in sampler.ladder[:-1]] == [0] * (len(betas) - 1)
-    assert sampler.ladder[-1].moves >= 2
+    assert [s.moves for s in sampler.ladder] == [0] * len(betas)
     check = sampler.log_evidence_check
     assert sum(s.evaluations for s in sampler.ladder) + check.evaluations == sampler.evaluations == posterior.calls
     assert abs(check.log_evidence - posterior.log_evidence) < 4 * check.error
     assert abs(sampler.log_evidence_ladder - posterior.log_evidence) < 4 * sampler.ladder[-1].log_evidence_error
     assert sampler.log_evidence in (check.log_evidence, sampler.log_evidence_ladder)
     moved = annealed(Gaussian(sd=0.02), nsteps=0, recycle=False)
-    assert sampler.evaluations < moved.evaluations
+    closed = annealed(Gaussian(sd=0.02), nsteps=0, recycle=True, recycling=RecyclingSettings(closing_sweeps=True))
+    assert sampler.evaluations < closed.evaluations < moved.evaluations
+    assert closed.ladder[-1].moves >= 2 and closed.ladder[-1].evaluations > sampler.ladder[-1].evaluations
 
 
 @pytest.mark.parametrize("recycle", [False, True])

@@ -22,10 +22,14 @@ from tests.contract.targets import Box, Gaussian
 
 PATHS = {
     "recycling": (SMCSampler, {"recycle": True}),
+    "closing sweeps": (SMCSampler, {"recycle": True, "recycling": RecyclingSettings(closing_sweeps=True)}),
     "moves": (SMCSampler, {"recycle": False}),
     "equal chains": (TMCMCSampler, {}),
     "chains from leaders": (TMCMCSampler, {"chains": "leaders"}),
-    "leaders, recycling": (TemperedSampler, {"chains": "leaders", "recycle": True}),
+    "leaders, recycling": (
+        TemperedSampler,
+        {"chains": "leaders", "recycle": True, "recycling": RecyclingSettings(closing_sweeps=True)},
+    ),
 }
 # per setting: another value, and what else is given so that it can act at all
 CHANGES = {
@@ -47,13 +51,14 @@ CHANGES = {
     "max_failure_share": (0.0, {}),
 }
 ACTS = {
-    "recycling": {"min_moves", "max_moves", "max_correlation", "fast_sweeps", "recycle", "recycling", "check_draws"},
+    "recycling": {"fast_sweeps", "recycle", "recycling", "check_draws"},
+    "closing sweeps": {"min_moves", "max_moves", "max_correlation", "fast_sweeps"} | {"recycling", "check_draws"},
     "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
     | {"fast_sweeps", "recycle", "check_draws"},
     "equal chains": {"coefficient_of_variation", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
     | {"burn_in", "fast_sweeps", "check_draws"},
     "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "fast_sweeps", "check_draws"},
-    "leaders, recycling": {"burn_in", "fast_sweeps", "recycle", "recycling", "check_draws"},
+    "leaders, recycling": {"burn_in", "fast_sweeps", "recycling", "check_draws"},
 }
 
 
@@ -109,18 +114,20 @@ class TwoModes(Box):
 RECYCLING_CHANGES = {
     "target_share": (0.6, {}),
     "points_per_dimension": (10.0, {}),
-    "fresh_share": (0.05, {}),
+    "draws_per_target": (2.0, {}),
+    "fresh_share": (1.0, {}),
     "max_components": (1, {}),
     "even_share": (0.0, {}),
     "max_basins": (0, {}),
     "basin_share": (0.3, {}),
-    "min_yield": (0.9, {}),
-    "patience": (2, {"min_yield": 0.9}),
+    "min_yield": (0.99, {"patience": 2}),
+    "patience": (2, {"min_yield": 0.99}),
     "max_rounds": (2, {}),
     "max_checks": (1, {"max_evidence_difference": 0.0}),
     "trusted_yield": (0.95, {}),
     "high_yield": (1.0, {}),
     "max_evidence_difference": (0.0, {}),
+    "closing_sweeps": (True, {}),
 }
 
 
@@ -149,6 +156,8 @@ def test_every_constant_of_the_recycling_changes_the_run(name):
         {"max_basins": -1},
         {"basin_share": 1.1},
         {"points_per_dimension": 0.0},
+        {"draws_per_target": 0.0},
+        {"closing_sweeps": 1},
         {"max_evidence_difference": -1.0},
     ],
     ids=str,
