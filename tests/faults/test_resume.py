@@ -174,7 +174,7 @@ def test_the_same_draws_continue_and_others_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"max_moves": 9}, "max_moves was 7, is 9"),
+        ({"check_draws": 0}, "check_draws was None, is 0"),
         ({"recycle": False}, "recycle was True, is False"),
         ({"moves": emcee.moves.DEMove(), "recycle": True}, "moves was"),
         ({"sd": 0.02}, "log_prob_fn was"),
