@@ -102,7 +102,7 @@ PROBLEMS = {
     "bridge": bridge("twin"),
     "means": bridge("means"),
 }
-few = {"max_moves": 3} if FAST else {}
+few = {"max_moves": 3} if FAST and args.walkers < 250 else {}
 SAMPLERS = {
     "SMC": (SMCSampler, few),
     "TMCMC": (TMCMCSampler, few),

@@ -237,7 +237,8 @@ def main() -> None:
     for name, model in models(args.out).items():
         posterior = make_posterior(model, data, pool, cache)
         start = time.perf_counter()
-        sampler = SMCSampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=args.seed, max_moves=3)
+        few = {"max_moves": 3} if args.walkers < 250 else {}  # with more walkers recycling replaces the moves
+        sampler = SMCSampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=args.seed, **few)
         sampler.run_mcmc(None, 4, progress=not os.environ.get("FAST"))
         draws[name] = sampler.get_chain(flat=True)
         report = posterior.report()
