@@ -12,6 +12,7 @@ Three collaborators do the rest: `samplers.storage.evaluation.Evaluator` evaluat
 ladder and the evidence.
 """
 
+import contextlib
 import copy
 import logging
 import time
@@ -48,7 +49,6 @@ from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import GuideTick, Population, Sweep, check_size, check_start
 from .tempering.results import AnnealingResult
 from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
-from .tempering.stopping import NothingToReport
 from .tempering.verdict import describe_halt, independent_points, judge
 
 __all__ = ["TemperedSampler"]
@@ -291,6 +291,8 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
         given = state.coords
         start_is_open = start_is_open or np.array_equal(given, self._returned)
+        if self._checkpoint.lost_journal:
+            self._compare_last_state()
         call = self._checkpoint.find_call(iterations, None if start_is_open else given) if store else None
         if call is not None and call.complete:
             yield from self._repeat(call, bar)
@@ -324,6 +326,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
             try:
                 for advanced in steps:
                     new += 1
+                    set_previous_state(self, State(advanced, copy=True))  # the next call without a state goes on here
                     if self._budget.limit is not None:
                         stored = State(advanced, copy=True)
                         self._checkpoint.stepped(stored, store)
@@ -344,8 +347,9 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
                 warn(describe_halt(self.verdict, self._budget.limit, self._result, made + new, missing))
                 if new == 0 and missing > 0:
                     yield stored
-        except NothingToReport:
-            self._checkpoint.prepare_to_continue()
+        except Exception:  # of the user's function, or of a disk that is full: the same call goes on
+            with contextlib.suppress(OSError, RuntimeError):
+                self._checkpoint.prepare_to_continue()
             raise
         except GeneratorExit:  # the user wants no more states
             complete = True

@@ -71,6 +71,8 @@ class JournaledBackend(HDFBackend):
         Number of annealings that have begun.
     known_verdict : Verdict, or None
         The verdict that the journal contains.
+    lost_journal : bool
+        Whether the chain is continued without its journal, and has not been compared with the posterior yet.
     has_steps : bool
         Whether the last annealing was followed by stored steps.
     """
@@ -96,6 +98,7 @@ class JournaledBackend(HDFBackend):
         self._accepted: np.ndarray | None = None
         self.known_verdict: Verdict | None = None
         self.has_steps = False
+        self.lost_journal = False
         path = self.journal_path
         if (writer := _writers.get(path.resolve())) is not None:
             writer.flush()
@@ -429,7 +432,7 @@ class JournaledBackend(HDFBackend):
             calls = stored.script
             if calls and calls[-1].steps is not None:
                 calls = [*calls[:-1], calls[-1]._replace(last=last)]
-            self.script = Script(calls)
+            self.script, self.lost_journal = Script(calls), True
             logger.warning(
                 "%s %s: the %d steps in %s are continued without it", self.journal_path, found, n, self.filename
             )

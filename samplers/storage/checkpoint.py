@@ -244,6 +244,15 @@ class Checkpoint:
         self._journal.script.skip()
 
     @property
+    def lost_journal(self) -> bool:
+        """Whether a chain is continued without its journal, and has not been compared with the posterior yet."""
+        return isinstance(self._journal, JournaledBackend) and self._journal.lost_journal
+
+    def has_compared(self) -> None:
+        """Enter that such a chain has been compared with the posterior."""
+        self._journal.lost_journal = False
+
+    @property
     def has_steps(self) -> bool:
         """Whether the last annealing was followed by stored steps; without a record, whether the chain has any."""
         return self.backend.iteration > 0 if self._journal is None else self._journal.has_steps

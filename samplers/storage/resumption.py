@@ -138,14 +138,28 @@ class Resumption:
             state = self.get_last_sample()
         self.random_state, self._annealed_state, self._returned = state.random_state, state, state.coords
         self._checkpoint.skip_call()
-        logger.info(
-            "%s contains this call of %d steps: nothing is added. To add steps, call run_mcmc once more in the script",
+        logger.warning(
+            "%s contains this call of %d steps already: nothing is added. To add steps, make another call"
+            " after all that the file contains, or ask for another number of steps",
             self.backend.filename,
             call.steps,
         )
         self._warn_of_failures(failure_count)
         if call.made > 0:
             yield State(state, copy=True)
+
+    def _compare_last_state(self) -> None:
+        """Raise ValueError if a chain without a journal has other log-probabilities than those of the posterior."""
+        last = self.get_last_sample()
+        few = np.argsort(last.log_prob)[[0, len(last.log_prob) // 2, -1]]
+        computed, stored = self.compute_log_prob(last.coords[few])[0], last.log_prob[few]
+        if not np.allclose(computed, stored, rtol=1e-9, atol=1e-9):
+            raise ValueError(
+                f"{self.backend.filename} contains a run of another posterior: at three points of its last step the "
+                f"log-probability is {stored}, and log_prob_fn gives {computed}. Its journal is lost. "
+                "Use another file, or restore the journal from a copy"
+            )
+        self._checkpoint.has_compared()
 
     def _warn_of_failures(self, before: int) -> None:
         """Warn if there are more failures than before a call."""

@@ -502,3 +502,56 @@ def test_an_interrupt_says_what_is_kept_and_how_to_go_on(share, tmp_path, caplog
         assert report["evaluations"] == calls and report["steps"] == STEPS
         if where == "a new one":
             assert 0 < report["new_evaluations"] <= calls - made
+
+
+def test_a_loop_over_sample_continues_from_its_last_state(tmp_path):
+    """Also in a later session that extends the chain, and after a loop that the user ends early."""
+    make(tmp_path / "run.h5", "smc").run_mcmc(None, 3)
+    sampler = make(tmp_path / "run.h5", "smc")
+    for _ in range(3):
+        for _ in sampler.sample(None, iterations=2):
+            pass
+    for state in sampler.sample(None, iterations=9):
+        last = state.coords.copy()
+        if sampler.iteration == 10:
+            break
+    assert np.array_equal(last, sampler.get_last_sample().coords)
+    sampler.run_mcmc(None, 1)
+    chain = sampler.get_chain()
+    assert len(chain) == 11 and len({step.tobytes() for step in chain}) == 11
+
+
+def test_after_an_error_the_same_call_goes_on(tmp_path):
+    """The log-probability raises an error in the annealing: nothing is evaluated twice, and the chain is the same."""
+    whole = make(tmp_path / "whole.h5", "smc")
+    whole.run_mcmc(None, 2)
+    sampler = make(tmp_path / "run.h5", "smc", max_failure_share=0.0)
+    posterior = sampler.log_prob_fn.f
+    works, calls = type(posterior).__call__, []
+
+    class Fails(type(posterior)):
+        def __call__(self, x):
+            calls.append(np.atleast_2d(x).shape[0])
+            if sum(calls) > 0.4 * whole.evaluations:
+                raise OSError("no licence")
+            return works(self, x)
+
+    posterior.__class__, usual = Fails, type(posterior)
+    with pytest.raises(RuntimeError, match="no licence"):
+        sampler.run_mcmc(None, 2)
+    kept = sampler.evaluations
+    posterior.__class__ = usual
+    sampler.run_mcmc(None, 2)
+    assert kept >= 0.2 * whole.evaluations
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+
+
+def test_a_chain_without_its_journal_is_compared_with_the_posterior(tmp_path):
+    path = tmp_path / "run.h5"
+    make(path, "smc").run_mcmc(None, 3)
+    journal_of(path).unlink()
+    with pytest.raises(ValueError, match="run of another posterior"):
+        make(path, "smc", sd=0.02).run_mcmc(None, 3)
+    sampler = make(path, "smc")
+    sampler.run_mcmc(None, 3)
+    assert sampler.iteration == 3
