@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
-from ..simulation.changed_model import SentFunction
+from ..simulation.changed_model import SentCode, SentFunction, different_in_worker, sent_code
 from ..simulation.code_digest import describe_code
 from ..simulation.sandbox import Sandbox
 from .external import ExternalModel
@@ -107,11 +107,12 @@ class FunctionModel(ExternalModel):
         settings = (time_limit, memory_limit, runs_per_process)
         self.isolated = bool(isolated) or any(setting is not None for setting in settings)
         self.watched_files = tuple(map(str, self._dependencies.paths))
+        self._sent_code: SentCode | None = None
         self._code_at_start = self._code()
         self.fingerprint = self._digest(*self._identity(self._code_at_start))
         self._run = function
         if self.isolated:
-            sent = SentFunction(function, self._fingerprinted, self._code_at_start)
+            sent = SentFunction(function, self._fingerprinted, self._sent_code, self.version is None)
             self._run = Sandbox(sent, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process)
 
     def current_fingerprint(self) -> str:
@@ -142,6 +143,7 @@ class FunctionModel(ExternalModel):
     def _code(self) -> str:
         """Digest of the code, empty if there is a version; ValueError if it has none."""
         if self.version is not None:
+            self._sent_code = self._sent_code or sent_code(self._fingerprinted)
             return ""
         try:
             code = describe_code(self._fingerprinted)
@@ -151,7 +153,20 @@ class FunctionModel(ExternalModel):
                 f"changed whenever the function changes: {error}"
             ) from error
         self.watched_files = tuple(code.files) + tuple(map(str, self._dependencies.paths))
+        self._sent_code = self._sent_code or sent_code(self._fingerprinted, code)
         return code.digest
+
+    def compare_with_sender(self) -> None:
+        """Compare code and files in a worker process with those of the process that has made the model.
+
+        Raises
+        ------
+        ChangedModel
+            If the code differs, or a file or value of `depends_on`. Other values may differ.
+        """
+        self._sent_code.compare(self._fingerprinted, self.version is None)
+        if self._digest(*self._identity(self._code_at_start)) != self.fingerprint:
+            raise different_in_worker(type(self).__name__, "what depends_on= names differs")
 
     def _identity(self, code: str) -> list[Any]:
         """Texts that identify what the function computes."""

@@ -51,10 +51,16 @@ class CodeDescription(NamedTuple):
         Hexadecimal, 128 bits.
     files : tuple of str
         Files of the user that contain the code, sorted.
+    code : dict of str to frozenset of bytes
+        Digests of the bytecode alone, per name of a function.
+    values : dict of str to bytes
+        Digests of the values that belong to names of modules, classes and functions.
     """
 
     digest: str
     files: tuple[str, ...]
+    code: dict[str, frozenset[bytes]]
+    values: dict[str, bytes]
 
 
 def code_digest(thing: Any) -> str:
@@ -77,10 +83,19 @@ def code_digest(thing: Any) -> str:
     return describe_code(thing).digest
 
 
-def describe_code(thing: Any) -> CodeDescription:
-    """As `code_digest`, with the files of the code."""
-    digest = _Digest(_package(thing))
-    return CodeDescription(digest.whole(thing).hex(), tuple(sorted(digest.files)))
+def describe_code(thing: Any, strict: bool = True) -> CodeDescription:
+    """As `code_digest`, with the files of the code, and with separate digests of bytecode and of values.
+
+    Parameters
+    ----------
+    thing : object
+    strict : bool
+        False: objects without a stable digest are represented by their class, and no ValueError is raised.
+    """
+    digest = _Digest(_package(thing), strict)
+    text = digest.whole(thing).hex()
+    code = {name: frozenset(digests) for name, digests in digest.bytecode.items()}
+    return CodeDescription(text, tuple(sorted(digest.files)), code, digest.values)
 
 
 def _package(thing: Any) -> str:
@@ -98,15 +113,19 @@ class _Digest:
     ----------
     package : str
         Package whose functions and classes are covered by their code instead of a version.
+    strict : bool
+        As for `describe_code`.
     """
 
-    def __init__(self, package: str) -> None:
-        self.package = package
+    def __init__(self, package: str, strict: bool = True) -> None:
+        self.package, self.strict = package, strict
         self.open: dict[int, int] = {}  # ids of the objects in progress and their depths, to detect cycles
         self.done: dict[int, tuple[bytes, Any]] = {}  # with the object, so that its id is not reused
         self.names: set[str] = set()  # of globals and attributes in the functions of the user
         self.modules: dict[str, types.ModuleType] = {}  # of the user, reached as globals, values or imports
         self.files: set[str] = set()
+        self.bytecode: dict[str, set[bytes]] = defaultdict(set)
+        self.values: dict[str, bytes] = {}
 
     def whole(self, thing: Any) -> bytes:
         """Digest of an object and of the members that its functions use of the user's modules."""
@@ -121,6 +140,7 @@ class _Digest:
                 value = vars(self.modules[module])[name]
                 if value is not self.modules[module]:
                     parts += [module, *self._named(name, value, module)]
+                    self.values[f"{module}.{name}"] = parts[-1]
 
     def of(self, thing: Any) -> bytes:
         """Digest of an object."""
@@ -208,13 +228,19 @@ class _Digest:
         if self._known_by_version(function.__module__):
             return [*parts, function.__module__, _version(function.__module__)]
         closed_over = [_contents(cell) for cell in function.__closure__ or ()]
-        parts += [self._joined(self._code(function.__code__))]
-        parts += map(self.of, (function.__defaults__, function.__kwdefaults__, closed_over, vars(function)))
+        bytecode = self._joined(self._code(function.__code__))
+        self.bytecode[_full_name(function)].add(bytecode)
+        values = [self.of((function.__defaults__, function.__kwdefaults__)), self.of(closed_over)]
+        values += [self.of(vars(function))]
+        for what, value in zip(("defaults", "closure", "attributes"), values, strict=True):
+            self.values[f"{what} of {_full_name(function)}"] = value
+        parts += [bytecode, *values]
         self.names.update(_names(function.__code__))
         self.files.add(function.__code__.co_filename)
         for name in sorted(set(_global_names(function.__code__))):
             if name in function.__globals__:
                 parts += self._named(name, function.__globals__[name], function.__qualname__)
+                self.values[f"{_module_name(function)}.{name}"] = parts[-1]
         for name in sorted(set(_imports(function))):
             parts += [name, self.of(_imported(name)) if not self._known_by_version(name) else _version(name)]
         return parts
@@ -228,8 +254,9 @@ class _Digest:
 
     def _separate(self) -> "_Digest":
         """A digest that does not depend on what this one has seen."""
-        other = _Digest(self.package)
+        other = _Digest(self.package, self.strict)
         other.names, other.modules, other.files = self.names, self.modules, self.files
+        other.bytecode, other.values = self.bytecode, self.values
         return other
 
     def _code(self, code: types.CodeType) -> list[str | bytes]:
@@ -248,6 +275,7 @@ class _Digest:
         for name, member in vars(thing).items():
             if name not in skipped and not isinstance(member, types.MemberDescriptorType | types.GetSetDescriptorType):
                 parts += [name, self.of(member)]
+                self.values[f"{_full_name(thing)}.{name}"] = parts[-1]
         return parts + [self.of(base) for base in thing.__bases__ if base is not object]
 
     def _object(self, thing: Any) -> list[str | bytes]:
@@ -260,6 +288,8 @@ class _Digest:
             return ["enum", self.of(type(thing)), thing.name, self.of(thing.value)]
         value = _builtin_value(thing)
         state = _attributes(thing, always=value is not None)
+        if state is None and not self.strict:
+            return ["object", self.of(type(thing))]
         if state is None:
             raise ValueError(
                 f"no digest can be made of {repr(thing)[:80]} ({type(thing).__name__}) that would be the same in "
@@ -272,6 +302,15 @@ class _Digest:
         """Whether a module is represented by a version: neither in the function's package nor a file of the user."""
         top = module.split(".")[0]
         return top != self.package and (top == LIBRARY or not _is_own(top))
+
+
+def _module_name(thing: Any) -> str:
+    """Module of a function or class; that of the script has another name in a worker process."""
+    return "__main__" if thing.__module__ == "__mp_main__" else str(thing.__module__)
+
+
+def _full_name(thing: Any) -> str:
+    return f"{_module_name(thing)}.{thing.__qualname__}"
 
 
 def _builtin_value(thing: Any) -> Any:

@@ -526,11 +526,6 @@ WORKERS = [
     InWorker(
         "a file that was edited after the import", CALLS_HELPER, rewrite("helper.py", HELPER.replace("3.0", "4.0"))
     ),
-    InWorker(
-        "a variable that the main process has changed",
-        CALLS_HELPER,
-        lambda folder, module: setattr(module.helper, "E", 3.0),
-    ),
     InWorker("a module that the main process has reloaded", CALLS_HELPER, None),
 ]
 
@@ -639,13 +634,8 @@ def in_worker(way: InWorker) -> str:
             data = pickle.dumps(SentModel(likelihood_of(folder, {}, None).model))
             sys.modules.update(old)  # the worker has imported the earlier version
         else:
-            if way.name.startswith("a variable"):
-                way.change(folder, sys.modules["user"])
-                model = FunctionModel(sys.modules["user"].f, NAMES, CHANNELS, 0.1, N_STEPS)
-                data = pickle.dumps(SentModel(model))
-            else:
-                data = pickle.dumps(SentModel(model))
-                way.change(folder, sys.modules["user"])
+            data = pickle.dumps(SentModel(model))
+            way.change(folder, sys.modules["user"])
             forget_modules(folder)  # the worker imports the files as they are now
         try:
             pickle.loads(data)

@@ -1,5 +1,6 @@
 """No way of changing a model lets the cache use simulations of another model in silence."""
 
+import importlib
 import pickle
 import sys
 import time
@@ -96,9 +97,63 @@ def test_a_change_in_memory_is_noticed_without_a_file():
             likelihood.misfit(THETAS[2:])
 
 
-# real processes -------------------------------------------------------------------------------------------------------
-
 EDITED = changes.user("import helper\ndef f(t): return helper.g(line(t)) * helper.E", helper=changes.HELPER)
+STARTED = "import time\nstarted = time.time()\ndef f(t):\n    return line(t) if started else None"
+OBJECT = (
+    "class Counting:\n    calls = 0\n    def __call__(self, t):\n"
+    "        self.calls += 1\n        return line(t)\nf = Counting()"
+)
+LAZY = "def f(t):\n    global steps\n    steps = 1.0\n    return steps * line(t)"
+ATTRIBUTE = "def f(t):\n    f.calls = getattr(f, 'calls', 0) + 1\n    return line(t)"
+HONEST = {
+    "a counter": COUNTS,
+    "earlier results": KEEPS,
+    "the time of the start": STARTED,
+    "an object": OBJECT,
+    "a lazy global": LAZY,
+    "an attribute": ATTRIBUTE,
+}
+
+
+@pytest.mark.parametrize("body", HONEST.values(), ids=HONEST)
+def test_a_worker_with_other_values_computes(body, caplog):
+    """The main process may have called the function before it makes the model."""
+    with changes.workshop(changes.user(body)) as folder:
+        function = importlib.import_module("user").f
+        function(THETAS[0])
+        model = FunctionModel(function, NAMES, CHANNELS, 0.1, N_STEPS)
+        expected = model.simulate(THETAS[0])
+        data = pickle.dumps(SentModel(model))
+        changes.forget_modules(folder)  # a worker imports the module
+        changed_model._compared.clear()
+        for _ in range(2):
+            received = pickle.loads(data).model
+            np.testing.assert_array_equal(received.simulate(THETAS[0]), expected)
+    messages = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    if body in (COUNTS, STARTED):
+        (message,) = messages
+        assert f"those of the main process: user.{'calls' if body == COUNTS else 'started'}. The worker" in message
+    assert len(messages) <= 1
+
+
+@pytest.mark.parametrize("options", [{}, {"version": "2"}], ids=["digest", "version"])
+@pytest.mark.parametrize(("old", "new"), [("3.0", "4.0"), ("2.0", "5.0")], ids=["code", "value"])
+def test_a_worker_with_an_earlier_version_of_a_file_refuses(options, old, new):
+    """Also with a version, which the main process has changed together with the file."""
+    with changes.workshop(EDITED) as folder:
+        changes.likelihood_of(folder, options, None)  # this process has seen the earlier files
+        modules = {name: sys.modules[name] for name in ("user", "helper")}
+        (folder / "helper.py").write_text(changes.HELPER.replace(old, new))
+        earlier = dict(changed_model._sources)
+        data = pickle.dumps(SentModel(changes.likelihood_of(folder, options, None).model))
+        sys.modules.update(modules)
+        changed_model._sources.update(earlier)
+        changed_model._compared.clear()
+        with pytest.raises(ChangedModel, match="not the same in the worker process"):
+            pickle.loads(data)
+
+
+# real processes -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("isolated", [False, True], ids=["pool", "process of its own"])
