@@ -90,6 +90,7 @@ class JournaledBackend(HDFBackend):
         self = cls.__new__(cls)
         self.__dict__.update(backend.__dict__)
         self._pending: list[Step] = []
+        self._pending_start: int | None = None  # where a flush that was interrupted has begun to write them
         self._written = 0.0
         self._journal: Journal | None = None
         self._run, self._fresh, self._shows = "", False, False
@@ -139,7 +140,7 @@ class JournaledBackend(HDFBackend):
         """emcee's: clear the chain."""
         if self.script.skips_reset():
             return
-        self._pending = []
+        self._pending, self._pending_start = [], None
         if self.contents is not None and self._journal is None:
             self._write_to(Journal(self.journal_path, self.contents.size, self.contents.whole))
         # the file first: a process that dies between the two has reset nothing
@@ -194,12 +195,14 @@ class JournaledBackend(HDFBackend):
                 group = file[self.name]
                 if self._accepted is None:
                     self._accepted = group["accepted"][...]
-                append_steps(group, steps, self._accepted)
+                if self._pending_start is None:
+                    self._pending_start = int(group.attrs["iteration"])
+                append_steps(group, steps, self._accepted, self._pending_start)
                 self._write_marks(file)
         except BaseException:
             self._pending = steps + self._pending
             raise
-        self._accepted = self._accepted + sum(step.accepted for step in steps)
+        self._accepted, self._pending_start = self._accepted + sum(step.accepted for step in steps), None
         self._written = time.perf_counter()
 
     def close(self) -> None:

@@ -60,7 +60,7 @@ def set_previous_state(sampler: EnsembleSampler, state: State | None) -> None:
     sampler._previous_state = state
 
 
-def append_steps(group: h5py.Group, steps: Sequence[Step], accepted: np.ndarray) -> None:
+def append_steps(group: h5py.Group, steps: Sequence[Step], accepted: np.ndarray, start: int | None = None) -> None:
     """Write steps to the group of a chain, as repeated calls of ``HDFBackend.save_step`` would.
 
     The same call after one that was interrupted leaves the same group.
@@ -73,8 +73,11 @@ def append_steps(group: h5py.Group, steps: Sequence[Step], accepted: np.ndarray)
         At least one.
     accepted : (n,) float
         Number of accepted proposals per walker before them.
+    start : int, optional
+        Number of steps before them; those in the group by default. An interrupted call is repeated with its number.
     """
-    start, stop = group.attrs["iteration"], group.attrs["iteration"] + len(steps)
+    start = group.attrs["iteration"] if start is None else start
+    stop = start + len(steps)
     group["chain"][start:stop] = np.stack([step.coords for step in steps])
     group["log_prob"][start:stop] = np.stack([step.log_prob for step in steps])
     if steps[0].blobs is not None:

@@ -555,3 +555,25 @@ def test_a_chain_without_its_journal_is_compared_with_the_posterior(tmp_path):
     sampler = make(path, "smc")
     sampler.run_mcmc(None, 3)
     assert sampler.iteration == 3
+
+
+def test_interrupted_between_the_steps_and_the_marks_of_a_flush(tmp_path, monkeypatch):
+    """The steps are in the file and are written again at the same place."""
+    sampler = make(tmp_path / "run.h5", "smc")
+    sampler.run_mcmc(None, 2)
+    marks, left = sampler.backend._write_marks, [1]
+
+    def interrupted(file):
+        if left:
+            left.pop()
+            raise KeyboardInterrupt
+        marks(file)
+
+    monkeypatch.setattr(sampler.backend, "_write_marks", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        for _ in sampler.sample(None, iterations=3):
+            sampler.backend.flush()
+    assert not left
+    sampler.backend.flush()
+    chain = sampler.get_chain()
+    assert len(chain) == 3 and len({step.tobytes() for step in chain}) == 3
