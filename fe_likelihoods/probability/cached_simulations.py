@@ -92,8 +92,13 @@ class CachedSimulations:
 
     @property
     def verifications(self) -> int:
-        """Number of simulations that were run to verify rows of the cache on disk, in addition to `simulations`."""
-        return 0 if self._verified_cache is None else self._verified_cache.runs
+        """Number of rows of the cache on disk that were compared with a new simulation, besides `simulations`."""
+        return 0 if self._verified_cache is None else self._verified_cache.compared
+
+    @property
+    def unverified(self) -> int:
+        """Number of rows that could not be compared, because the new simulation was stopped (`TransientReason`)."""
+        return 0 if self._verified_cache is None else self._verified_cache.unverified
 
     @property
     def failure_count(self) -> int:

@@ -65,8 +65,10 @@ class FELikelihood(CachedSimulations):
     simulations : int
         Simulations run by this object in this process.
     verifications : int
-        Simulations run in addition, to verify rows of the cache on disk (see
+        Rows of the cache on disk that were compared with a further simulation (see
         `fe_likelihoods.simulation.verification`).
+    unverified : int
+        Rows that could not be compared, because the further simulation was stopped.
     cache_hits : int
         Rows whose statistics were cached, in memory or on disk.
     disk_hits : int

@@ -316,7 +316,8 @@ class Posterior:
         Returns
         -------
         dict
-            ``simulations``, ``verifications`` (further simulations, which verified rows of the cache on disk),
+            ``simulations``, ``verifications`` (rows of the cache on disk that were compared with a further simulation),
+            ``unverified`` (rows that could not be compared, because the further simulation was stopped),
             ``cache_hits`` (rows whose statistics were cached), ``disk_hits`` (rows among them that
             came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where
             known and ``"transient"`` where the cause is not the model; the first 1000), ``failure_count``,
@@ -326,6 +327,7 @@ class Posterior:
         return {
             "simulations": self.likelihood.simulations,
             "verifications": self.likelihood.verifications,
+            "unverified": self.likelihood.unverified,
             "cache_hits": self.likelihood.cache_hits,
             "disk_hits": self.likelihood.disk_hits,
             "failures": list(self.likelihood.failures),

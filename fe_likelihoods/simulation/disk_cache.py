@@ -298,8 +298,8 @@ class SimulationCache(RowDeletion):
             self._drop("responses", bad)
         return [found.get(key) for key in keys]
 
-    def latest(self, fingerprint: str, n_channels: int, n_steps: int) -> StoredSimulation | None:
-        """The undamaged simulation that was stored last.
+    def latest_success(self, fingerprint: str, n_channels: int, n_steps: int) -> StoredSimulation | None:
+        """The undamaged successful simulation that was stored last.
 
         Parameters
         ----------
@@ -311,9 +311,9 @@ class SimulationCache(RowDeletion):
         Returns
         -------
         StoredSimulation or None
-            None if no simulation of this fingerprint is stored.
+            None if no successful simulation of this fingerprint is stored.
         """
-        query = f"SELECT {COLUMNS} FROM simulations WHERE source = ? ORDER BY id DESC LIMIT 1"
+        query = f"SELECT {COLUMNS} FROM simulations WHERE source = ? AND length(reason) = 0 ORDER BY id DESC LIMIT 1"
         source = source_number(fingerprint)
         for row in self._try("read", lambda connection: connection.execute(query, (source,)).fetchall(), []):
             if is_undamaged(*row) and len(row[3]) == 8 * n_channels and row[4] == n_steps:

@@ -2,7 +2,8 @@
 
 The key of a stored simulation contains a digest of the model, but no digest contains everything that a model depends
 on. Therefore rows of a file are compared with new simulations: two before the first row is used in a process (the one
-that was stored last, and one at random of those that are requested), and one more for every 1000 rows used. For the
+that was stored last, and one at random of those that are requested), and one more for every 1000 rows used. Failures
+count only where there is no successful simulation, since a changed model often fails at the same points. For the
 likelihoods of other noises or of a part of the record that are made from a verified one, one row is compared before the
 first is used. Rows that the same likelihood has stored itself need no verification. The first comparison is repeated
 after a change of the model object, of its pool, or of a source file.
@@ -28,21 +29,26 @@ from .disk_cache import SimulationCache
 from .faults import TransientReason
 from .fingerprint import simulation_fingerprint
 from .model import Model, SimulationBatch, Statistic, misfit_batch, misfit_of_responses
-from .source_digest import inherits_fingerprint
+from .tolerance import largest_difference, response_tolerance
 
-__all__ = ["StaleCache", "VerifiedCache", "VerifyingRun", "largest_difference", "response_tolerance"]
+__all__ = ["StaleCache", "VerifiedCache", "VerifyingRun"]
 
 logger = logging.getLogger(__name__)
 
 FIRST_ROWS = 2  # verified before the first row is used
 ROWS_PER_VERIFICATION = 1000
-DEFAULT_TOLERANCE = 1e-9
 LARGEST_ROUNDING = 1e-4  # relative difference of responses that may come from rounding and iterations
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 STAMP_SECONDS = 1.0  # between two looks at the source files
+CHANGED = (
+    "The model has changed in a way that its fingerprint does not contain. Delete its rows with "
+    "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
+)
 MAX_SCHEDULES = 32
 MAX_OWN = 200_000  # keys of 16 bytes, about 100 bytes each in memory
-MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used without verification
+MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used for a while without verification
+PAUSE_SECONDS = 60.0  # after failed attempts; at least
+PAUSE_RATIO = 20.0  # of the duration of the last attempt
 
 _schedules: "OrderedDict[str, _Schedule]" = OrderedDict()  # of pickled objects: copies in a process share one
 
@@ -93,59 +99,6 @@ class VerifyingRun(NamedTuple):
     n_numbers: int
 
 
-def response_tolerance(model: Model) -> float:
-    """Relative difference of responses with the same parameters that a model may have.
-
-    It is the attribute ``response_tolerance`` of the model: zero for the compiled models of this library, whose
-    responses are the same to the last bit. For models without the attribute, and for subclasses of the user, it is
-    1e-9, because sums of several threads may differ in their last digits.
-    """
-    if inherits_fingerprint(type(model)):
-        return DEFAULT_TOLERANCE
-    return float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
-
-
-def largest_difference(
-    stored: np.ndarray, new: np.ndarray, measured: np.ndarray, tolerance: float
-) -> tuple[int, float] | None:
-    """The statistic that differs most between two simulations with the same parameters, if one differs too much.
-
-    Parameters
-    ----------
-    stored, new : (n_numbers,) float
-        Statistics of the residuals, the sums of squares (n_channels,) first; further numbers have the order and the
-        scale of the sums.
-    measured : (n_channels, n_steps) float
-        Measured response [SI].
-    tolerance : float
-        Accepted change of the response in a channel, relative to the norm of the response.
-
-    Returns
-    -------
-    int, float
-        Index of the number, and the change of the response that explains its difference, relative as for `tolerance`;
-        None if all numbers agree.
-
-    Notes
-    -----
-    The norm of a response is at most r, the sum of the norms of its residual and of the measured response. If the
-    response changes by t r, the sum of squares s^2 changes by at most 2 s t r + (t r)^2, and so does a sum of products
-    of two residuals of the channel.
-    """
-    if np.array_equal(stored, new):
-        return None
-    channels = np.arange(len(stored)) % len(measured)
-    sums = np.sort([stored[: len(measured)], new[: len(measured)]], axis=0)
-    s = np.sqrt(sums[0])[channels]
-    r = (np.sqrt(sums[1]) + np.linalg.norm(measured, axis=1))[channels]
-    difference = np.abs(stored - new)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the positive root of (t r)^2 + 2 s (t r) = difference, in the form that does not cancel
-        change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
-    worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
-    return (worst, float(change[worst])) if not change[worst] <= tolerance else None
-
-
 class _Schedule:
     """How many rows have been used since the last full verification, per table and fingerprint.
 
@@ -162,6 +115,7 @@ class _Schedule:
         self.served: Counter[tuple[str, str]] = Counter()
         self.own: set[bytes] = set()  # keys of rows that were stored here, which need no verification
         self.failed_attempts = 0
+        self.pause_ends, self.rows_in_pause = -np.inf, 0
         self.stale: tuple[str, StaleCache] | None = None  # fingerprint of the row that differed, and the error
         self.stamps: dict[str, tuple] = {}  # of the source files, per fingerprint
         self._lock, self._owner = threading.RLock(), os.getpid()
@@ -198,10 +152,12 @@ class VerifiedCache:
 
     Attributes
     ----------
-    runs : int
-        Simulations that were run for verification.
+    compared : int
+        Rows that were compared with a new simulation.
+    unverified : int
+        Rows whose new simulation was stopped for another reason than the model, so that it could not be compared.
     seconds : float
-        Their wall time [s].
+        Wall time of the simulations for verification [s].
     """
 
     def __init__(self, cache: SimulationCache) -> None:
@@ -209,7 +165,7 @@ class VerifiedCache:
 
     def _set_up(self, cache: SimulationCache, schedule: _Schedule) -> None:
         self.cache, self._schedule = cache, schedule
-        self.runs, self.seconds = 0, 0.0
+        self.compared, self.unverified, self.seconds = 0, 0, 0.0
         self._objects: tuple | None = None  # of the last look-up; None if there was none, or in another process
         self._stamp_time = -np.inf
         self._random = random.Random()  # its own, so that the user's streams of random numbers do not change
@@ -240,21 +196,26 @@ class VerifiedCache:
         rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps)
         known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist())
         if known:
-
-            def candidates(first: bool) -> Iterator[StoredSimulation]:
-                latest = self.cache.latest(fingerprint, run.n_numbers, n_steps) if first else None
-                if latest is not None and (
-                    (latest.reason and self.cache.retry_failures)
-                    or not self._of_others(fingerprint, latest.theta[None], [0])
-                ):
+            failed = [row for row in known if rows.reasons[row]]
+            succeeded = [row for row in known if not rows.reasons[row]]
+            first = not self._schedule.served["simulations", fingerprint]
+            latest = None
+            if first or not succeeded:
+                latest = self.cache.latest_success(fingerprint, run.n_numbers, n_steps)
+                if latest is not None and not self._of_others(fingerprint, latest.theta[None], [0]):
                     latest = None
+            # failures alone do not verify successful rows, which may be used later
+            table = "failed simulations" if first and latest is None and not succeeded else "simulations"
+
+            def candidates() -> Iterator[StoredSimulation]:
                 if latest is not None:
                     yield latest
-                for row in self._random.sample(known, len(known)):
-                    if latest is None or not np.array_equal(latest.theta, thetas[row]):
-                        yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row])
+                for some in (succeeded, failed):
+                    for row in self._random.sample(some, len(some)):
+                        if latest is None or not np.array_equal(latest.theta, thetas[row]):
+                            yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row])
 
-            self._verify_due("simulations", fingerprint, len(known), candidates, run)
+            self._verify_due(table, fingerprint, len(known), candidates, run)
         return rows
 
     def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | None]:
@@ -271,7 +232,7 @@ class VerifiedCache:
         known = self._of_others(fingerprint, thetas, known)
         if known:
 
-            def candidates(first: bool) -> Iterator[StoredSimulation]:
+            def candidates() -> Iterator[StoredSimulation]:
                 for row in self._random.sample(known, len(known)):
                     batch = SimulationBatch(responses[row][None], [""])
                     misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
@@ -296,7 +257,7 @@ class VerifiedCache:
         known = self._of_others(fingerprint, thetas, known)
         if known:
 
-            def candidates(first: bool) -> Iterator[StoredSimulation]:
+            def candidates() -> Iterator[StoredSimulation]:
                 for row in self._random.sample(known, len(known)):
                     yield StoredSimulation(thetas[row], np.full(run.n_numbers, np.nan), reasons[row])
 
@@ -339,28 +300,37 @@ class VerifiedCache:
                 if self.cache.is_stored(differing, error.theta):
                     raise StaleCache(str(error), error.theta)
                 schedule.stale = None
+            if schedule.rows_in_pause < ROWS_PER_VERIFICATION and time.monotonic() < schedule.pause_ends:
+                schedule.rows_in_pause += n
+                return
             before = schedule.served[table, fingerprint]
             first = before == 0
             # one row suffices for responses and for shorter records, if others of the same code were verified
             first_rows = 1 if schedule.served else FIRST_ROWS
             due = first_rows if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
+            start = time.monotonic()
             try:
-                compared = not due or self._verify(candidates(first), due, run)
+                compared = not due or self._verify(candidates(), due, run)
             except StaleCache as error:
                 schedule.stale = fingerprint, error
                 raise
             if not compared:
                 schedule.failed_attempts += 1
-                if schedule.failed_attempts < MAX_FAILED_ATTEMPTS:
-                    return  # verified with the next rows
+                if schedule.failed_attempts >= MAX_FAILED_ATTEMPTS:
+                    now = time.monotonic()
+                    schedule.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
+                    schedule.rows_in_pause = 0
+                return  # verified with the next rows, or after a pause
+            if due:
+                schedule.failed_attempts = 0
             schedule.served[table, fingerprint] = before + n
 
     def _verify(self, rows: Iterable[StoredSimulation], due: int, run: VerifyingRun) -> bool:
         """Simulate the first `due` rows again, and further ones in place of those whose simulation is stopped.
 
-        Returns whether a row was compared.
+        Returns whether a row was compared; two failures do not count if successful rows could not be compared.
         """
-        rows, done, reasons = iter(rows), 0, []
+        rows, done, succeeded, reasons = iter(rows), 0, 0, []
         attempts = max(due, MAX_ATTEMPTS)
         while done < due and attempts > 0:
             chosen = [row for row, _ in zip(rows, range(min(due - done, attempts)), strict=False)]
@@ -371,13 +341,15 @@ class VerifiedCache:
             start = time.perf_counter()
             misfit, new_reasons = misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic)
             self.seconds += time.perf_counter() - start
-            self.runs += len(chosen)
+            self.compared += sum(not _is_transient(reason) for reason in new_reasons)
+            self.unverified += sum(map(_is_transient, new_reasons))
             for row, values, reason in zip(chosen, misfit, new_reasons, strict=True):
                 if _is_transient(reason):
                     reasons.append(reason)
                 else:
                     self._compare(row, values, reason, run)
                     done += 1
+                    succeeded += not row.reason
         self.cache.verified += done
         if reasons:
             logger.warning(
@@ -388,7 +360,7 @@ class VerifiedCache:
                 reasons[0],
                 "" if done else ". Rows are used without verification; the next ones are verified instead",
             )
-        return bool(done)
+        return bool(succeeded or (done and not reasons))
 
     def _compare(self, row: StoredSimulation, new: np.ndarray, reason: str, run: VerifyingRun) -> None:
         """Raise `StaleCache` if a stored simulation differs from a new one."""
@@ -401,7 +373,7 @@ class VerifiedCache:
             if row.reason:
                 advice = ". If failures depend on anything but the parameters, set retry_failures=True"
         else:
-            tolerance = response_tolerance(run.model) if self.cache.tolerance is None else self.cache.tolerance
+            tolerance = self._tolerance(run)
             found = largest_difference(row.misfit, new, run.measured, tolerance)
             if found is None:
                 return
@@ -417,16 +389,39 @@ class VerifiedCache:
                     ". If the model is not exactly repeatable, for example on another machine, accept differences of "
                     f"this size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
                 )
+        scatter = self._scatter(row.theta, new, reason, run)
         served = self._schedule.served.total()
         self._start_again()
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
         rest = f", and discard this run, which has used {served} rows" if served else ""
         raise StaleCache(
             f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
-            f"{difference}. The model has changed in a way that its fingerprint does not contain. Delete its rows with "
-            "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
-            f"{rest}{advice}",
+            f"{difference}. {scatter or CHANGED}{rest}{'' if scatter else advice}",
             row.theta,
+        )
+
+    def _tolerance(self, run: VerifyingRun) -> float:
+        return response_tolerance(run.model) if self.cache.tolerance is None else self.cache.tolerance
+
+    def _scatter(self, theta: np.ndarray, earlier: np.ndarray, reason: str, run: VerifyingRun) -> str:
+        """Advice for a model whose new simulations differ among themselves, after one more; empty if they agree."""
+        start = time.perf_counter()
+        (new,), (new_reason,) = misfit_batch(run.model, theta[None], run.measured, run.pool, run.statistic)
+        self.seconds += time.perf_counter() - start
+        if _is_transient(new_reason) or (reason and new_reason):
+            return ""
+        text = "The model is not repeatable: one more simulation at this point "
+        if reason or new_reason:
+            outcome = f"failed ({new_reason})" if new_reason else "succeeded"
+            return f"{text}{outcome}. Make it depend on its parameters alone, for example with a fixed seed"
+        found = largest_difference(earlier, new, run.measured, self._tolerance(run))
+        if found is None:
+            return ""
+        index, change = found
+        return (
+            f"{text}gave {new[index]:.17g} instead of {earlier[index]:.17g}, a change of {change:.1e} of the response. "
+            "Make it depend on its parameters alone, for example with a fixed seed, or accept such differences with "
+            f"SimulationCache(path, tolerance={10.0 * change:.1e})"
         )
 
     def _notice_changes(self, fingerprint: str, run: VerifyingRun) -> None:

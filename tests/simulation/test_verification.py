@@ -12,7 +12,8 @@ from fe_likelihoods import AutoregressiveNoise, FELikelihood, LinearOscillator, 
 from fe_likelihoods.simulation import verification
 from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
 from fe_likelihoods.simulation.model import SimulationFailed
-from fe_likelihoods.simulation.verification import StaleCache, largest_difference, response_tolerance
+from fe_likelihoods.simulation.tolerance import largest_difference, response_tolerance
+from fe_likelihoods.simulation.verification import StaleCache
 from samplers import SMCSampler
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
@@ -68,7 +69,7 @@ def test_a_change_that_no_fingerprint_contains_is_an_error_that_says_what_to_do(
     assert f"channel 'a', sum of squared residuals: stored {old:.17g}, simulated again {new:.17g}" in str(caught.value)
     assert "forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)" in str(caught.value)
     assert (likelihood.simulations, likelihood.cache_hits, len(likelihood.memory_cache)) == (0, 0, 0)
-    assert likelihood.verifications == likelihood.model.runs == 2
+    assert (likelihood.verifications, likelihood.model.runs) == (2, 3)  # the row that differs is simulated twice
     likelihood.cache.forget(*likelihood.cache_keys)
     np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(Scaled(1.01), None).misfit(thetas))
 
@@ -149,6 +150,39 @@ def test_a_stored_failure_that_succeeds_now_is_a_difference(path, thetas):
 def test_a_stored_success_that_fails_now_is_a_difference(filled, thetas):
     with pytest.raises(StaleCache, match="succeeded; simulated again, it failed .above the limit"):
         likelihood_of(Scaled(limit=0.0), filled).misfit(thetas)
+
+
+def test_failures_that_fail_again_verify_no_successful_row(path, thetas):
+    """A changed model often fails where the earlier one did."""
+    thetas = thetas[np.argsort(thetas[:, 0])]
+    failed = thetas[:, 0] > 0.3
+    likelihood_of(Scaled(limit=0.3), path).misfit(thetas)  # the one that is stored last is a failure
+    for first in (thetas, thetas[failed], thetas[failed][:1]):
+        with pytest.raises(StaleCache, match="sum of squared residuals"):
+            likelihood_of(Scaled(1.01, limit=0.3), path).misfit(first)
+    own = likelihood_of(Scaled(limit=0.3), path)
+    own.misfit(thetas[failed])
+    assert own.verifications == 2
+
+
+def test_failures_alone_leave_the_first_verification_to_successful_rows(path, thetas):
+    failing, succeeding = thetas[thetas[:, 0] > 0.5], thetas[thetas[:, 0] <= 0.5]
+    likelihood_of(Scaled(limit=0.5), path).misfit(failing)
+    likelihood = likelihood_of(Scaled(1.01, limit=0.5), path)
+    likelihood.misfit(failing)
+    likelihood_of(Scaled(limit=0.5), path).misfit(succeeding)
+    with pytest.raises(StaleCache):
+        likelihood.misfit(succeeding)
+
+
+def test_a_model_that_is_not_repeatable_is_named(filled, thetas):
+    class Noisy(Scaled):
+        def simulate(self, theta):
+            return super().simulate(theta) * (1.0 + 1e-6 * self.runs)
+
+    with pytest.raises(StaleCache, match="not repeatable: one more simulation .* tolerance=") as caught:
+        likelihood_of(Noisy(), filled).misfit(thetas)
+    assert "has changed" not in str(caught.value)
 
 
 def test_failures_for_other_measurements_are_verified(path, thetas):
@@ -284,16 +318,32 @@ def test_a_simulation_that_is_stopped_is_not_a_difference(filled, thetas, caplog
     """Another row is verified in its place; the first of them is the one that was stored last."""
     likelihood = likelihood_of(Scaled(fault=thetas[-1:, 0]), filled)
     likelihood.misfit(thetas)
-    assert (likelihood.verifications, likelihood.cache.verified) == (3, 2)
+    assert (likelihood.verifications, likelihood.unverified, likelihood.cache.verified) == (2, 1, 2)
     assert "1 of 3 stored simulations could not be verified" in caplog.text
     assert likelihood.failure_count == 0
+
+
+@pytest.mark.parametrize("after", ["seconds", "rows"])
+def test_verified_again_after_failed_attempts(filled, thetas, after, monkeypatch):
+    if after == "seconds":
+        monkeypatch.setattr(verification, "PAUSE_SECONDS", 0.0)
+        monkeypatch.setattr(verification, "PAUSE_RATIO", 0.0)
+    else:
+        monkeypatch.setattr(verification, "ROWS_PER_VERIFICATION", 50)
+    likelihood = likelihood_of(Scaled(1.01, fault=thetas[:, 0]), filled, memory_rows=0)
+    for _ in range(4):
+        likelihood.misfit(thetas)
+    likelihood.model.fault = None
+    with pytest.raises(StaleCache):
+        likelihood.misfit(thetas)
 
 
 def test_rows_are_used_if_no_simulation_ends(filled, thetas, caplog):
     likelihood = likelihood_of(Scaled(fault=thetas[:, 0]), filled, memory_rows=0)
     for _ in range(5):
         likelihood.misfit(thetas)
-    assert likelihood.verifications == 3 * verification.MAX_ATTEMPTS  # three times four, and then no more
+    # three times four, and then no more for a while
+    assert (likelihood.verifications, likelihood.unverified) == (0, 3 * verification.MAX_ATTEMPTS)
     assert likelihood.cache.verified == 0
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert sum("used without verification" in text for text in warnings) == 3

@@ -1,0 +1,63 @@
+"""How much two simulations with the same parameters may differ."""
+
+import numpy as np
+
+from .model import Model
+from .source_digest import inherits_fingerprint
+
+__all__ = ["largest_difference", "response_tolerance"]
+
+DEFAULT_TOLERANCE = 1e-9
+
+
+def response_tolerance(model: Model) -> float:
+    """Relative difference of responses with the same parameters that a model may have.
+
+    It is the attribute ``response_tolerance`` of the model: zero for the compiled models of this library, whose
+    responses are the same to the last bit. For models without the attribute, and for subclasses of the user, it is
+    1e-9, because sums of several threads may differ in their last digits.
+    """
+    if inherits_fingerprint(type(model)):
+        return DEFAULT_TOLERANCE
+    return float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
+
+
+def largest_difference(
+    stored: np.ndarray, new: np.ndarray, measured: np.ndarray, tolerance: float
+) -> tuple[int, float] | None:
+    """The statistic that differs most between two simulations with the same parameters, if one differs too much.
+
+    Parameters
+    ----------
+    stored, new : (n_numbers,) float
+        Statistics of the residuals, the sums of squares (n_channels,) first; further numbers have the order and the
+        scale of the sums.
+    measured : (n_channels, n_steps) float
+        Measured response [SI].
+    tolerance : float
+        Accepted change of the response in a channel, relative to the norm of the response.
+
+    Returns
+    -------
+    int, float
+        Index of the number, and the change of the response that explains its difference, relative as for `tolerance`;
+        None if all numbers agree.
+
+    Notes
+    -----
+    The norm of a response is at most r, the sum of the norms of its residual and of the measured response. If the
+    response changes by t r, the sum of squares s^2 changes by at most 2 s t r + (t r)^2, and so does a sum of products
+    of two residuals of the channel.
+    """
+    if np.array_equal(stored, new):
+        return None
+    channels = np.arange(len(stored)) % len(measured)
+    sums = np.sort([stored[: len(measured)], new[: len(measured)]], axis=0)
+    s = np.sqrt(sums[0])[channels]
+    r = (np.sqrt(sums[1]) + np.linalg.norm(measured, axis=1))[channels]
+    difference = np.abs(stored - new)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the positive root of (t r)^2 + 2 s (t r) = difference, in the form that does not cancel
+        change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
+    worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
+    return (worst, float(change[worst])) if not change[worst] <= tolerance else None
