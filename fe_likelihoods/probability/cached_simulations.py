@@ -20,7 +20,7 @@ from ..simulation.changed_model import ModelGuard
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
 from ..simulation.faults import ChangedModel
-from ..simulation.fingerprint import simulation_fingerprint
+from ..simulation.fingerprint import read_attributes_again, simulation_fingerprint
 from ..simulation.memory_cache import MemoryCache, ResponseMemory, distinct_keys
 from ..simulation.model import (
     Model,
@@ -79,6 +79,7 @@ class CachedSimulations:
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._verified_cache = None if self.cache is None else VerifiedCache(self.cache)
         self._guard = ModelGuard(model)
+        read_attributes_again(model)
         self._key = None if cache is None else self.simulation_key
         self.chunk_size = 1
         self.simulations = 0

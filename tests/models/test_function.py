@@ -8,6 +8,7 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -15,7 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FunctionModel, LinearOscillator, Record, SimulationFailed
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    LinearOscillator,
+    Measurements,
+    Record,
+    SimulationFailed,
+)
 from fe_likelihoods.simulation.code_digest import code_digest
 from fe_likelihoods.simulation.model import split_seconds
 from tests.faults import treacherous as bad
@@ -411,3 +420,25 @@ def test_objects_that_contain_themselves_have_a_digest():
     other = [2.0]
     other.append(other)
     assert code_digest(scaled(circle)) != code_digest(scaled(other))
+
+
+def test_attributes_of_a_subclass_are_part_of_the_key():
+    class Own(FunctionModel):
+        def __init__(self, factor):
+            self.factor = factor
+            super().__init__(np.sin, ("a",), CHANNELS, DT, N_STEPS, version="1")
+            self.runs, self.lock = 0, threading.Lock()
+
+    measurements = Measurements(CHANNELS, DT, np.ones((len(CHANNELS), N_STEPS)))
+
+    def key(model):
+        return FELikelihood(model, measurements).simulation_key
+
+    model = Own(2.5)
+    first = FELikelihood(model, measurements)
+    kept = first.simulation_key
+    assert key(Own(2.5)) == kept != key(Own(3.0))
+    model.runs = 1  # a counter does not change the key of a likelihood
+    assert first.simulation_key == kept
+    model.factor, model.runs = 3.0, 0
+    assert key(model) == key(Own(3.0))
