@@ -187,6 +187,7 @@ class SentCode(NamedTuple):
         sent, name = self.description, getattr(code, "__qualname__", type(code).__qualname__)
         if (sent.digest, compare_values) in _compared:
             return
+        sources = {file: _source(file, again=False) for file in self.sources}  # as imported just now, or earlier
         here = describe_code(code, strict=False)
         if here.digest != sent.digest:
             for function in sent.code.keys() & here.code.keys():
@@ -196,7 +197,7 @@ class SentCode(NamedTuple):
             common = sent.values.keys() & here.values.keys()
             differing = sorted(value for value in common if sent.values[value] != here.values[value])
             for file in self.sources.keys() & set(here.files):
-                if self.sources[file] != _source(file, again=False):
+                if self.sources[file] != sources[file]:
                     raise different_in_worker(
                         name, f"{', '.join(differing[:5]) or 'a value'} differs, and so does {file}"
                     )

@@ -141,13 +141,16 @@ def test_a_worker_with_other_values_computes(body, caplog):
 def test_a_worker_with_an_earlier_version_of_a_file_refuses(options, old, new):
     """Also with a version, which the main process has changed together with the file."""
     with changes.workshop(EDITED) as folder:
-        changes.likelihood_of(folder, options, None)  # this process has seen the earlier files
+        data = pickle.dumps(SentModel(changes.likelihood_of(folder, options, None).model))
+        changed_model._sources.clear()
+        changed_model._compared.clear()
+        pickle.loads(data)  # a worker has computed with the earlier files
+        worker = dict(changed_model._sources)
         modules = {name: sys.modules[name] for name in ("user", "helper")}
         (folder / "helper.py").write_text(changes.HELPER.replace(old, new))
-        earlier = dict(changed_model._sources)
         data = pickle.dumps(SentModel(changes.likelihood_of(folder, options, None).model))
         sys.modules.update(modules)
-        changed_model._sources.update(earlier)
+        changed_model._sources.update(worker)
         changed_model._compared.clear()
         with pytest.raises(ChangedModel, match="not the same in the worker process"):
             pickle.loads(data)
