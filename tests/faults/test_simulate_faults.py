@@ -18,12 +18,14 @@ from tests.faults.treacherous import CHANNELS, DT, DiesOnce, Treacherous, line
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
+import os
 import sys
 from fe_likelihoods import SimulationCache
 from tests.faults import cached_run, test_simulate_faults
 
 path, responses = sys.argv[1:]
-posterior = cached_run.make(SimulationCache(path, responses=bool(int(responses))), 0.01)[1]
+os.environ["SECONDS_PER_SIMULATION"] = "0.01"
+posterior = cached_run.make(SimulationCache(path, responses=bool(int(responses))))[1]
 posterior.likelihood.simulate(test_simulate_faults.requested())
 """
 
