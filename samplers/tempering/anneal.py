@@ -24,7 +24,7 @@ from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
 from .adaptive_importance import Recycled, StartingDensity, recycle
 from .budget import BudgetExhausted
-from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, warn
+from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, fits_poorly, warn
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights, pareto_shape
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, draw_rounds, start_from_guide
@@ -379,7 +379,8 @@ def _by_recycling(
     if earlier is not None:
         yield from _disagreement(population, earlier, found.log_evidence, found.log_evidence_error)
     distinct = len(np.unique(ancestors))
-    if settings.recycling.closing_sweeps or distinct < ENOUGH_DISTINCT * size:
+    poor = distinct < ENOUGH_DISTINCT * size or fits_poorly(found.check, found.proposals[-1][1], size)
+    if settings.recycling.closing_sweeps or poor:
         mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
     else:
         # the draws are independent already: sweeps would cost evaluations and improve nothing

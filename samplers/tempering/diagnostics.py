@@ -210,6 +210,22 @@ def check_fallback(
     return [Doubt(message, True)]
 
 
+def fits_poorly(check: EvidenceCheck, mixture: Mixture, points: int) -> bool:
+    """Whether fresh draws of a proposal yield less than three quarters of what is usual for Gaussian modes.
+
+    The parameters are those of `check_fit`.
+    """
+    found, expected = _yields(check, mixture, points)
+    return found < POOR_FIT * expected
+
+
+def _yields(check: EvidenceCheck, mixture: Mixture, points: int) -> tuple[float, float]:
+    """Effective share of the draws of a check, and the one expected for Gaussian modes."""
+    components, ndim = mixture.means.shape
+    expected = expected_yield(ndim, mixture.dof, components, points)
+    return check.effective_sample_size / max(check.evaluations, 1), expected
+
+
 def check_fit(
     check: EvidenceCheck, mixture: Mixture, points: int, coords: np.ndarray, log_weights: np.ndarray
 ) -> list[Doubt]:
@@ -235,10 +251,8 @@ def check_fit(
     -------
     list of Doubt
     """
-    components, ndim = mixture.means.shape
-    expected = expected_yield(ndim, mixture.dof, components, points)
-    found = check.effective_sample_size / max(check.evaluations, 1)
-    if found >= POOR_FIT * expected or _neighbour_correlation(coords, log_weights) < SMOOTH_WEIGHTS:
+    found, expected = _yields(check, mixture, points)
+    if not fits_poorly(check, mixture, points) or _neighbour_correlation(coords, log_weights) < SMOOTH_WEIGHTS:
         return []
     message = (
         f"the posterior is bent, or has tails, in a way that its approximation does not follow: fresh draws have an "

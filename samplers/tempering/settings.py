@@ -98,7 +98,8 @@ class RecyclingSettings:
         is used.
     closing_sweeps : bool
         Move the resampled draws of beta = 1 by `min_moves` to `max_moves` sweeps in any case. By default they are moved
-        only where less than 90 % of the resampled points are distinct: else they are independent draws already.
+        only where less than 90 % of the resampled points are distinct, or where the proposal describes the posterior
+        poorly (`samplers.tempering.diagnostics.fits_poorly`): else they are independent draws already.
     """
 
     target_share: float = 0.2
