@@ -112,3 +112,60 @@ def test_impossible_points_are_ignored(rng):
     mixture = fit_mixture(coords[:400], uniform(coords[:400]))
     with_them, without = (cover_basins(mixture, coords[:n], values[:n]) for n in (440, 430))
     assert np.array_equal(with_them.means, without.means)
+
+
+def several_modes(x, centres, log_masses, width=NARROW):
+    """The wide mode at the origin, and narrow ones at given centres."""
+    wide = multivariate_normal(np.zeros(5), WIDE**2).logpdf(x)
+    narrow = [m + multivariate_normal(c, width**2).logpdf(x) for c, m in zip(centres, log_masses, strict=True)]
+    return np.logaddexp.reduce([wide, *narrow])
+
+
+def flanks(rng, centres, n):
+    """Points three to five narrow standard deviations from each centre."""
+    return np.concatenate([flank(rng, n) - DISTANCE * np.eye(5)[0] + centre for centre in centres])
+
+
+def test_two_unknown_modes_are_two_basins(rng):
+    """Their points are not fitted as one mode between them."""
+    centres = DISTANCE * np.eye(5)[[0, 1]]
+    coords = np.concatenate([cloud(rng), flanks(rng, centres, 60)])
+    mixture = fit_mixture(coords[:400], uniform(coords[:400]))
+    covered = cover_basins(mixture, coords, several_modes(coords, centres, (-2.0, -2.5)))
+    assert len(covered.weights) == 3
+    distances = np.linalg.norm(covered.means[1:, None] - centres, axis=2)
+    assert np.all(distances.min(axis=0) < 0.01) and set(distances.argmin(axis=1)) == {0, 1}
+
+
+def test_a_flank_that_two_components_share_is_one_basin(rng):
+    """Half of the points belong to each of the components, and neither has enough of them alone."""
+    middle = 0.5 * DISTANCE * np.array([1.0, 1.4, 0.0, 0.0, 0.0])
+    second = DISTANCE * np.eye(5)[0]
+    coords = np.concatenate([cloud(rng), second + cloud(rng), flanks(rng, [middle], 34)])
+    mixture = fit_mixture(coords[:800], uniform(coords[:800]))
+    assert len(mixture.weights) == 2
+    values = np.logaddexp(several_modes(coords, [middle], (-1.0,)), multivariate_normal(second, WIDE**2).logpdf(coords))
+    owner = np.linalg.norm(coords[800:], axis=1) < np.linalg.norm(coords[800:] - second, axis=1)
+    assert 10 <= np.count_nonzero(owner) <= 24
+    covered = cover_basins(mixture, coords, values)
+    assert min(np.linalg.norm(covered.means[2:] - middle, axis=1)) < 0.1
+
+
+def test_roughness_far_from_the_mode_is_no_basin(rng):
+    """There the fitted quadratic is wrong by more than the errors of the log-density."""
+    coords = np.concatenate([cloud(rng), rng.uniform(3.0, 8.0, (200, 1)) * cloud(rng, 200)])
+    mixture = fit_mixture(coords[:400], uniform(coords[:400]))
+    rough = log_target(coords, shift=False) + rng.uniform(-1.5, 1.5, len(coords))
+    assert cover_basins(mixture, coords, rough) is mixture
+
+
+def test_a_low_flank_is_a_basin(rng):
+    """All points of the narrow mode are far below the highest point, as after a large step of beta."""
+    coords = np.concatenate([cloud(rng), flank(rng, 80)])
+    values = 12.0 * log_target(coords)
+    mixture = fit_mixture(coords[:400] / np.sqrt(12.0), uniform(coords[:400]))
+    assert values[400:].max() < values.max() - 50.0
+    covered = cover_basins(mixture, coords, values)
+    centre = DISTANCE * np.eye(5)[0]
+    nearest = np.linalg.norm(coords[400:] - centre, axis=1).min()
+    assert min(np.linalg.norm(covered.means[1:] - centre, axis=1)) < 0.6 * nearest  # a step is limited in length
