@@ -172,7 +172,7 @@ class CachedSimulations:
         (n, n_numbers) float
             NaN where there is no usable simulation.
         """
-        thetas = self._as_rows(thetas)
+        thetas = _as_rows(thetas, self.model.parameter_names)
         if np.isfinite(thetas).all():
             return self._statistics(thetas)
         result = np.full((len(thetas), self._width), np.nan)
@@ -202,7 +202,7 @@ class CachedSimulations:
         TooManyFailures
             As for `statistics`: the finished simulations are cached.
         """
-        thetas = self._as_rows(thetas)
+        thetas = _as_rows(thetas, self.model.parameter_names)
         finite = np.flatnonzero(np.isfinite(thetas).all(axis=1))
         keys, distinct = distinct_keys(thetas[finite])
         batch = self._responses(keys, distinct)
@@ -234,7 +234,7 @@ class CachedSimulations:
         ValueError
             If the numbers of rows differ, or the statistics are of another noise.
         """
-        thetas, statistics = self._as_rows(thetas), np.asarray(statistics, dtype=float)
+        thetas, statistics = _as_rows(thetas, self.model.parameter_names), np.asarray(statistics, dtype=float)
         if statistics.shape != (len(thetas), self._width) or len(reasons) != len(thetas):
             raise ValueError(
                 f"recall: expected statistics of shape ({len(thetas)}, {self._width}) and {len(thetas)} reasons; got "
@@ -248,11 +248,6 @@ class CachedSimulations:
                 self._outcomes += 1
                 if reasons[row]:
                     self._failures.add(thetas[row], reasons[row])
-
-    def _as_rows(self, thetas: np.ndarray) -> np.ndarray:
-        """Structural parameters in an array (n, n_structural)."""
-        thetas = as_points(thetas, self.model.parameter_names)
-        return thetas if thetas.ndim == 2 else thetas[None]
 
     def _statistics(self, thetas: np.ndarray) -> np.ndarray:
         """Statistics of finite rows; few calls of numpy, because a cached row has to cost less than 10 microseconds."""
@@ -486,3 +481,9 @@ class CachedSimulations:
         if responses:
             batch.response[[bool(reason) for reason in reasons]] = np.nan
         return Simulated(misfit, reasons, batch.response if responses else None)
+
+
+def _as_rows(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Structural parameters in an array (n, n_structural)."""
+    thetas = as_points(thetas, names)
+    return thetas if thetas.ndim == 2 else thetas[None]
