@@ -149,8 +149,9 @@ def _find_basins(mixture: Mixture, points: np.ndarray, target: np.ndarray, most:
     explained = np.full(len(points), -np.inf)
     for k, log_volume in enumerate(log_volumes):
         own, standard = owner == k, _standard(mixture, k, points)
-        fulls.append(_suffice_for_all(np.count_nonzero(own), ndim))
-        if np.count_nonzero(own) < PER_COEFFICIENT * (ndim + 2):
+        count = np.count_nonzero(own)
+        fulls.append(_suffice_for_all(count, ndim))
+        if count < PER_COEFFICIENT * (ndim + 2):
             explained[own] = np.inf
             continue
         quadratic, spread, uncertainty = _fit_most(standard[own], target[own] + log_volume, fulls[k])
@@ -258,9 +259,10 @@ def _highest_basin(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[
         mean = points[top] + weights @ apart[near] / weights.sum()
         return _Basin(-math.inf, mean, FEW_POINTS_SCALE * np.eye(ndim)), near
     weights = 1.0 / ((1.0 - below / (TOP * ndim)) * (1.0 + squared / (2.0 * ndim))) ** 2
+    spread = math.inf
     if _suffice_for_all(len(points), ndim):
         quadratic, spread = _fit_near(apart, below, weights)
-    if not _suffice_for_all(len(points), ndim) or spread > AGREEING:
+    if spread > AGREEING:
         quadratic, spread = _fit_few(apart, below, weights, full)
     curvatures, vectors = np.linalg.eigh(quadratic.curvature)
     curvatures = np.clip(curvatures, *CURVATURES)

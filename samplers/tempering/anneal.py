@@ -2,11 +2,11 @@
 
 Annealing by moves is Sequential Monte Carlo: choose the next beta, weigh, resample, move. Annealing by recycling is
 adaptive importance sampling (`samplers.tempering.adaptive_importance`); its weighted draws are resampled to as many
-points as there are walkers, which then are moved. Both end with an estimate of the evidence from draws that were not
-used for the annealing. With a cheaper (coarse) model, recycling on that model comes first, and recycling on the fine
-model starts from its proposals instead of from the prior (`samplers.tempering.multilevel`). With a guide, its weighted
-draws replace the annealing (`samplers.tempering.guided`), and only where they cannot be trusted does recycling start
-from them.
+points as there are walkers, which are moved only where they are not independent draws already. Both end with an
+estimate of the evidence from draws that were not used for the annealing. With a cheaper (coarse) model, recycling on
+that model comes first, and recycling on the fine model starts from its proposals instead of from the prior
+(`samplers.tempering.multilevel`). With a guide, its weighted draws replace the annealing (`samplers.tempering.guided`),
+and only where they cannot be trusted does recycling start from them.
 
 A limit of simulations ends the annealing wherever it is exceeded. The points known by then are weighted by the
 posterior and resampled (`StoppedEarly`).

@@ -22,6 +22,7 @@ __all__ = [
     "check_fallback",
     "check_fit",
     "check_stages",
+    "fits_poorly",
     "warn",
 ]
 
