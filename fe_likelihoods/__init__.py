@@ -155,6 +155,10 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .signals.error_measures import (
         rrmse,
     )
+    from .signals.events import (
+        Events,
+        EventWindow,
+    )
     from .signals.readers import (
         ImposedTest,
         read_at2,
@@ -204,6 +208,8 @@ __all__ = [
     "Dataset",
     "DisplacementHistory",
     "Distribution",
+    "EventWindow",
+    "Events",
     "Exceedance",
     "ExecutableModel",
     "FELikelihood",
@@ -389,6 +395,10 @@ _EXPORTS = {
     ),
     "signals.durations": ("growing_durations",),
     "signals.error_measures": ("rrmse",),
+    "signals.events": (
+        "EventWindow",
+        "Events",
+    ),
     "signals.readers": (
         "ImposedTest",
         "read_at2",

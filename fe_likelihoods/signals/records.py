@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .response_spectrum import ResponseSpectrum, response_spectrum
-from .sampling import array_digest, check_samples, check_step, sample_window
+from .sampling import array_digest, check_samples, check_step, rest_samples, same_step, sample_window
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,7 +130,7 @@ class Record:
             from scipy import signal  # takes a second to import, in every worker process
 
             samples = signal.resample_poly(self.acceleration, up, down, padtype="antireflect")[:n_steps]
-        return replace(self, dt=new_dt, acceleration=samples, source=self._source(f"resampled to dt = {new_dt:g} s"))
+        return Record(self.name, new_dt, samples, self._source(f"resampled to dt = {new_dt:g} s"))
 
     def trim(self, start: float = 0.0, stop: float | None = None) -> "Record":
         """Return the part of the record between two times, both included. Time starts again from zero.
@@ -152,7 +152,7 @@ class Record:
         """
         window = sample_window(self.name, self.n_steps, self.dt, start, stop)
         note = f"trimmed to {window.start * self.dt:g} ... {(window.stop - 1) * self.dt:g} s"
-        return replace(self, acceleration=self.acceleration[window], source=self._source(note))
+        return Record(self.name, self.dt, self.acceleration[window], self._source(note))
 
     def scale(self, factor: float) -> "Record":
         """Return the record with all samples multiplied by `factor`.
@@ -175,7 +175,48 @@ class Record:
         if not math.isfinite(factor):
             raise ValueError(f"scale factor of {self.name!r} must be a finite number, got {factor!r}")
         note = f"scaled by {factor:g}"
-        return replace(self, acceleration=factor * self.acceleration, source=self._source(note))
+        return Record(self.name, self.dt, factor * self.acceleration, self._source(note))
+
+    def followed_by(self, other: "Record", rest: float = 5.0) -> "Record":
+        """Return this record, a pause without ground motion, and another record as one record.
+
+        A model simulates the result as one loading, so the state of the structure at the end of this record (cracks,
+        yielding, residual displacements) is its state at the beginning of the other one. To keep the times of the
+        events, join the records with `fe_likelihoods.signals.events.Events`.
+
+        Parameters
+        ----------
+        other : Record
+            The later record, with the same time step.
+        rest : float
+            Length of the pause [s], zero or more, rounded to whole time steps: number of zero samples times the step.
+
+        Returns
+        -------
+        Record
+            The samples of this record, zeros, and the samples of the other record.
+
+        Raises
+        ------
+        ValueError
+            If `other` is not a `Record` or has another time step, or `rest` is negative or not finite.
+        """
+        if not isinstance(other, Record):
+            raise ValueError(f"{self.name!r} must be followed by a Record, got {type(other).__name__}")
+        if not same_step(self.dt, other.dt):
+            raise ValueError(
+                f"records that follow each other must have the same time step, got {self.dt!r} s ({self.name!r}) and "
+                f"{other.dt!r} s ({other.name!r}); use Record.resample(dt) on one of them"
+            )
+        zeros = np.zeros(rest_samples(rest, self.dt))
+        samples = np.concatenate([self.acceleration, zeros, other.acceleration])
+        note = f"after a pause of {zeros.size * self.dt:g} s followed by {other.name}"
+        return Record(
+            f"{self.name}, {other.name}",
+            self.dt,
+            samples,
+            self._source(f"{note} ({other.source})" if other.source else note),
+        )
 
     def spectrum(
         self, periods: Sequence[float] | NDArray[np.float64] | None = None, damping_ratio: float = 0.05

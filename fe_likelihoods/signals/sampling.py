@@ -8,7 +8,15 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["array_digest", "check_samples", "check_step", "same_sampling", "same_step", "sample_window"]
+__all__ = [
+    "array_digest",
+    "check_samples",
+    "check_step",
+    "rest_samples",
+    "same_sampling",
+    "same_step",
+    "sample_window",
+]
 
 _TIME_TOLERANCE = 1e-9  # in steps: round-off of times that are multiples of the step
 _STEP_TOLERANCE = 1e-9  # relative difference up to which two steps are equal
@@ -65,6 +73,24 @@ def check_step(dt: float, name: str) -> float:
     if not (math.isfinite(step) and step > 0):
         raise ValueError(f"time step of {name!r} must be a positive number of seconds, got {dt!r}")
     return step
+
+
+def rest_samples(rest: float, dt: float) -> int:
+    """Return the number of zero samples in a pause of `rest` seconds between two records of step `dt` [s].
+
+    Raises
+    ------
+    ValueError
+        If the pause is negative, so that the events would overlap, or not a finite number.
+    """
+    try:
+        seconds = float(rest)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds >= 0.0):
+        overlap = ": the events would overlap" if seconds < 0.0 else ""
+        raise ValueError(f"the pause between two records must be zero or more seconds, got {rest!r}{overlap}")
+    return round(seconds / dt)
 
 
 def same_step(dt: float, other_dt: float) -> bool:

@@ -1,0 +1,216 @@
+"""Several records on one structure, one after the other: `Events` is one loading and knows the times of its events.
+
+The state of the structure is carried from event to event, because a model simulates the joined record as one. Cracks,
+yielded bars and residual displacements of one event are the initial state of the next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .records import Record
+from .sampling import rest_samples, same_step
+
+__all__ = ["EventWindow", "Events"]
+
+
+class EventWindow(NamedTuple):
+    """Place of one event in the joined record.
+
+    Attributes
+    ----------
+    name : str
+        Name of the event.
+    first : int
+        Index of its first sample.
+    stop : int
+        Index after its last sample.
+    start : float
+        Time of its first sample [s].
+    end : float
+        Time of its last sample [s].
+    """
+
+    name: str
+    first: int
+    stop: int
+    start: float
+    end: float
+
+    @property
+    def samples(self) -> slice:
+        """Samples of the event in the joined record."""
+        return slice(self.first, self.stop)
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Events(Record):
+    """Records that follow each other on one structure, with pauses without ground motion between them.
+
+    The object is a `Record`: a model takes it as its excitation. `trim` returns a plain `Record`, without events.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        The events in their order in time, with the same time step. Events among them are taken apart, and keep the
+        pauses between them.
+    rest : float or sequence of float
+        Length of the pauses [s], zero or more, rounded to whole time steps; a sequence has one for each pause. The
+        pause should be long enough for the free vibration to decay, as it was in the test.
+    names : sequence of str, optional
+        Names of the events, which must differ. Default: the names of the records; a name that comes again has a number
+        ("EQ1", "EQ1_2").
+
+    Attributes
+    ----------
+    records : tuple of Record
+        The events.
+    windows : tuple of EventWindow
+        Names, times and samples of the events.
+    rests : tuple of float
+        The pauses between the events [s], in whole time steps.
+
+    Raises
+    ------
+    ValueError
+        If there are no records, their time steps differ, a pause is negative (the events would overlap), or names are
+        repeated or do not match the records.
+
+    Examples
+    --------
+    >>> events = Events([eq1, eq2], rest=10.0)
+    >>> response = RCColumn.lhpost(events).simulate(np.ones(5))
+    >>> response[:, events.window("EQ2").samples]  # the response to EQ2 of the column that EQ1 has damaged
+    """
+
+    records: tuple[Record, ...]
+    windows: tuple[EventWindow, ...]
+    rests: tuple[float, ...]
+
+    def __init__(
+        self, records: Sequence[Record], rest: float | Sequence[float] = 10.0, names: Sequence[str] | None = None
+    ) -> None:
+        given = [records] if isinstance(records, Record) else list(records)
+        if not given or not all(isinstance(record, Record) for record in given):
+            found = ", ".join(type(record).__name__ for record in given) or "none"
+            raise ValueError(f"Events expects a sequence of one Record or more, got {found}")
+        parts, pauses = _flatten(given, _pauses(rest, len(given) - 1))
+        for part in parts[1:]:
+            if not same_step(parts[0].dt, part.dt):
+                raise ValueError(
+                    f"events must have the same time step, got {parts[0].dt!r} s ({parts[0].name!r}) and {part.dt!r} s "
+                    f"({part.name!r}); use Record.resample(dt) on one of them"
+                )
+        names = _unique(given) if names is None else _checked_names(names, len(parts))
+        dt = parts[0].dt
+        zeros = [rest_samples(pause, dt) for pause in pauses]
+        samples, windows, first = [], [], 0
+        for part, name, n_zeros in zip(parts, names, [*zeros, 0], strict=True):
+            stop = first + part.n_steps
+            windows.append(EventWindow(name, first, stop, first * dt, (stop - 1) * dt))
+            samples += [part.acceleration, np.zeros(n_zeros)]
+            first = stop + n_zeros
+        fields = {
+            "name": ", ".join(names),
+            "dt": dt,
+            "acceleration": np.concatenate(samples),
+            "source": "; ".join(f"{name}: {part.source}" for name, part in zip(names, parts, strict=True)),
+            "records": tuple(parts),
+            "windows": tuple(windows),
+            "rests": tuple(n * dt for n in zeros),
+        }
+        for field, value in fields.items():
+            object.__setattr__(self, field, value)
+        self.__post_init__()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the events."""
+        return tuple(window.name for window in self.windows)
+
+    def window(self, name: str) -> EventWindow:
+        """Return the window of one event; raise ValueError if there is no event of this name."""
+        if name not in self.names:
+            raise ValueError(f"no event {name!r}; the events are {', '.join(self.names)}")
+        return self.windows[self.names.index(name)]
+
+    def split(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Split histories at the samples of the joined record into those of the events, without the pauses.
+
+        Parameters
+        ----------
+        values : (..., n_steps) array_like
+            Histories, such as a response (n_channels, n_steps).
+
+        Returns
+        -------
+        dict of str to ndarray, shape (..., n_steps of the event)
+            The part of each event.
+
+        Raises
+        ------
+        ValueError
+            If the number of samples differs from that of the joined record.
+        """
+        values = np.asarray(values)
+        if values.shape[-1:] != (self.n_steps,):
+            raise ValueError(f"expected histories of {self.n_steps} samples, got shape {values.shape}")
+        return {window.name: values[..., window.samples] for window in self.windows}
+
+    def resample(self, dt: float) -> Events:
+        """Return the events with another time step, each resampled by itself as by `Record.resample`."""
+        return Events([record.resample(dt) for record in self.records], self.rests, self.names)
+
+    def scale(self, factor: float) -> Events:
+        """Return the events with all samples multiplied by `factor`; ValueError if it is not finite."""
+        return Events([record.scale(factor) for record in self.records], self.rests, self.names)
+
+    def followed_by(self, other: Record, rest: float = 5.0) -> Events:
+        """Return these events, a pause of `rest` [s] and another record or further events; see `Record.followed_by`."""
+        return Events([self, other], rest)
+
+
+def _pauses(rest: float | Sequence[float], n: int) -> list[float]:
+    """Return the n pauses."""
+    if isinstance(rest, str | Mapping) or np.ndim(rest) == 0:
+        return [rest] * n
+    pauses = list(rest)
+    if len(pauses) != n:
+        raise ValueError(f"expected one pause, or one for each of the {n} pauses between the records; got {rest!r}")
+    return pauses
+
+
+def _flatten(given: list[Record], pauses: list[float]) -> tuple[list[Record], list[float]]:
+    """Replace `Events` among the records by their parts; return the parts and the pauses between them."""
+    parts, between = [], []
+    for record, pause in zip(given, [*pauses, None], strict=True):
+        inner = isinstance(record, Events)
+        parts += record.records if inner else [record]
+        between += record.rests if inner else ()
+        between += [] if pause is None else [pause]
+    return parts, between
+
+
+def _unique(given: list[Record]) -> list[str]:
+    """Names of the events, with a number where a name comes again."""
+    names: list[str] = []
+    for wanted in [name for each in given for name in (each.names if isinstance(each, Events) else [each.name])]:
+        count, name = 1, wanted
+        while name in names:
+            count += 1
+            name = f"{wanted}_{count}"
+        names.append(name)
+    return names
+
+
+def _checked_names(names: Sequence[str], n: int) -> list[str]:
+    """The given names of n events; raise ValueError if they are not n different texts."""
+    given = [names] if isinstance(names, str) else list(names)
+    if len(given) != n or len(set(given)) != n or not all(isinstance(name, str) and name for name in given):
+        raise ValueError(f"names must be {n} different texts, one for each event; got {names!r}")
+    return given
