@@ -84,7 +84,8 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
     ground : ndarray (n_steps,)
         Base acceleration at the samples of the record, linear between them [m/s²].
     weights : ndarray (n_steps, 2)
-        Normal load on the bearings at the samples [N].
+        Load on the bearings at the samples, linear between them [N]. At instants at which it is negative, the bearing
+        carries no load.
     n_sub : int
         Integration steps per step of the record.
     tolerance : float
@@ -124,8 +125,9 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
             u[12] = ground[k] + (ground[k + 1] - ground[k]) * at
             u[13] = ground[k] + (ground[k + 1] - ground[k]) * to
             u[14], u[15] = f0, f1
-            w0 = weights[k, 0] + (weights[k + 1, 0] - weights[k, 0]) * to
-            w1 = weights[k, 1] + (weights[k + 1, 1] - weights[k, 1]) * to
+            # limited at this instant, not at the samples: between samples of opposite sign it is zero for a part
+            w0 = max(0.0, weights[k, 0] + (weights[k + 1, 0] - weights[k, 0]) * to)
+            w1 = max(0.0, weights[k, 1] + (weights[k + 1, 1] - weights[k, 1]) * to)
             for i in range(16):
                 r[i] = 0.0
             for j in range(0, 16, 4):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from . import (
     bridge,
+    bridge_steps,
     cache,
     column,
     cost,
@@ -33,6 +34,7 @@ BENCHMARKS = {
     "simulation": column.simulation,
     "batch": column.batch,
     "bridge": bridge.simulation,
+    "bridge_steps": bridge_steps.steps,
     "imports": startup.imports,
     "compilation": startup.compilation,
     "cost": cost.cost,

@@ -101,19 +101,20 @@ def test_a_block_on_a_sliding_table():
         dampers=(FEEBLE, FEEBLE),
         rubber=NO_RUBBER,
         friction="coulomb",
+        step=0.25e-3,
         parameters=("fmin_1",),
         outputs=("Ud", "acc_d", "Ub_1"),
     )
     displacement, acceleration, _ = model.simulate([1.0])
     time = model.record.time
-    late = model.step / time[-1]  # the force is constant over a step, so it is one step late
+    late = model.integration_step / time[-1]  # the force is constant over a step, so it is one step late
     np.testing.assert_allclose(displacement, -0.5 * (3.0 - mu * G) * time**2, atol=2.0 * late * abs(displacement[-1]))
     np.testing.assert_allclose(acceleration[1:], mu * G, rtol=1e-6)
     gentle = model.with_record(Record("gentle", 0.01, 0.9 * mu * G * np.sin(np.linspace(0.0, 12.0, 101))))
     _, acceleration, bearing_displacement = gentle.simulate([1.0])
     assert np.abs(bearing_displacement).max() < 1e-7  # at rest at every step; the table reverses in between
     steepest = np.abs(np.diff(gentle.record.acceleration)).max() / gentle.dt
-    np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=3.0 * model.step * steepest)
+    np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=3.0 * model.integration_step * steepest)
 
 
 def test_without_hysteresis_the_bridge_is_linear(rng):
@@ -347,6 +348,17 @@ def test_negative_parameters_fail(rng, name):
 def test_wrong_arguments_are_rejected(rng, changes, message):
     with pytest.raises(ValueError, match=message):
         replace(IsolatedBridge(shaking(rng, duration=1.0)), **changes)
+
+
+@pytest.mark.parametrize(("friction", "longest"), [("bouc-wen", 0.25), ("elastic-plastic", 0.05), ("coulomb", 0.025)])
+def test_default_step_divides_any_step_of_a_record(friction, longest):
+    for dt in (1e-5, 1e-3, 1.0 / 256.0, 5e-3, 0.02 / 3.0):
+        model = IsolatedBridge(Record("flat", dt, np.zeros(5)), friction=friction)
+        divisions = dt / model.integration_step
+        assert divisions == pytest.approx(max(1, math.ceil(1e3 * dt / longest - 1e-6)), rel=1e-9)
+    assert replace(model, step=dt).integration_step == dt
+    law = IsolatedBridge(Record("flat", 5e-3, np.zeros(5)), friction=friction)
+    assert law.integration_step == 1e-3 * longest  # to the bit, where it divides
 
 
 def test_vertical_motion_must_have_the_same_samples(rng):
