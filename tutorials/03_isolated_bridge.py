@@ -296,7 +296,8 @@ for channel, error, share in zip(measured.channels, errors, covered, strict=True
 bearing = "Ub_1" if args.data == "twin" else "mean_Ub"
 strengths, n_motions, few_draws = ((0.6, 0.9, 1.2, 1.5, 1.8), 6, 50) if args.preset != "fast" else ((0.8, 1.4), 2, 10)
 motions = [table_motion(seed) for seed in range(101, 101 + n_motions)]
-future = propagate(posterior, draws[: 4 * few_draws], quantity=peak(bearing), record=motions[0], progress=False)
+new = {"from_state": "virgin", "progress": False}  # the bridge before any motion, not after the recorded one
+future = propagate(posterior, draws[: 4 * few_draws], quantity=peak(bearing), record=motions[0], **new)
 low, high = 1e3 * future.quantile(0.05), 1e3 * future.quantile(0.95)
 beyond = exceedance(future, 1.01 * future.mean)
 print(
@@ -310,7 +311,7 @@ curve = fragility(
     peak(bearing),
     50.0,
     unit="mm",
-    progress=False,
+    **new,
 )
 figure = plot_fragility(curve)
 figure.suptitle(f"P(peak of {bearing} > 50 mm | data, motion)", fontsize="small")

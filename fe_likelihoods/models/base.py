@@ -49,12 +49,20 @@ class History:
 
 
 class StructuralModel:
-    """Base class of all models of this package; a subclass defines `_respond`."""
+    """Base class of all models of this package; a subclass defines `_respond`.
+
+    Attributes
+    ----------
+    path_dependent : bool
+        Whether the response to an excitation depends on earlier ones. False for linear structures, whose free vibration
+        decays.
+    """
 
     parameter_names: tuple[str, ...]
     channels: tuple[Channel, ...]
     dt: float
     n_steps: int
+    path_dependent: ClassVar[bool] = True
     _time_label = "time [s]"
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:

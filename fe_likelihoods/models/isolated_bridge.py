@@ -31,7 +31,7 @@ from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Sl
 from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, step_isolated
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sampling import same_sampling, sample_window
+from ..signals.sampling import rest_samples, same_sampling, sample_window
 from ..simulation.model import SimulationFailed
 from .base import History
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS, channel_matrix
@@ -264,9 +264,50 @@ class IsolatedBridge(ThreadedModel):
             self.deck_mass, self.piers, self.bearings, self.rubber, self.gravity, self.p_delta
         )
 
-    def with_record(self, record: Record) -> IsolatedBridge:
-        """Return the same bridge under another acceleration of the table, without vertical acceleration."""
-        return replace(self, record=record, vertical=None)
+    def with_record(self, record: Record | tuple[Record, Record]) -> IsolatedBridge:
+        """Return the same bridge under another acceleration of the table.
+
+        Parameters
+        ----------
+        record : Record or pair of Record
+            Horizontal acceleration, without vertical acceleration, or horizontal and vertical acceleration.
+
+        Returns
+        -------
+        IsolatedBridge
+        """
+        horizontal, vertical = _components(record)
+        return replace(self, record=horizontal, vertical=vertical)
+
+    def followed_by(self, record: Record | tuple[Record, Record], rest: float = 10.0) -> IsolatedBridge:
+        """Return the same bridge under its own records, a pause and further accelerations of the table.
+
+        Parameters
+        ----------
+        record : Record or pair of Record
+            As for `with_record`.
+        rest : float
+            Length of the pause [s], lengthened to whole steps of the response.
+
+        Returns
+        -------
+        IsolatedBridge
+            Its response ends with the samples of ``with_record(record)``. Where one of the two excitations has a
+            vertical acceleration, that of the other one is its own or zero.
+
+        Raises
+        ------
+        ValueError
+            As `Record.followed_by`.
+        """
+        horizontal, vertical = _components(record)
+        n_zeros = rest_samples(rest, self.record.dt)
+        n_zeros += -(self.record.n_steps + n_zeros) % self.every
+        rest = n_zeros * self.record.dt
+        joined = None
+        if self.vertical is not None or vertical is not None:
+            joined = (self.vertical or self.record.scale(0.0)).followed_by(vertical or horizontal.scale(0.0), rest)
+        return replace(self, record=self.record.followed_by(horizontal, rest), vertical=joined)
 
     def first(self, seconds: float) -> IsolatedBridge:
         """Return the same bridge under the first part of its records.
@@ -444,3 +485,13 @@ class IsolatedBridge(ThreadedModel):
         check_names("outputs", self.outputs, CHANNELS, "give names, or 5, 6 or 10 for a set of CHANNEL_SETS")
         check_names("parameters", self.parameters, PARAMETERS, "see IsolatedBridge.nominal for their values")
         check_nominal(self.parameters, self.nominal)
+
+
+def _components(record: Record | tuple[Record, Record]) -> tuple[Record, Record | None]:
+    """Horizontal and vertical acceleration of a record or a pair of records; no vertical one for a single record."""
+    if isinstance(record, Record):
+        return record, None
+    pair = tuple(record) if isinstance(record, tuple | list) else ()
+    if len(pair) != 2 or not all(isinstance(each, Record) for each in pair):
+        raise invalid("a Record, or a horizontal and a vertical Record", record, "the acceleration of the table")
+    return pair

@@ -53,6 +53,7 @@ class LinearOscillator(StructuralModel):
         Channel("acceleration", "absolute acceleration", "g"),
         Channel("displacement", "relative displacement", "cm"),
     )
+    path_dependent = False
     response_tolerance = 0.0  # the same bits in every process
 
     def __init__(self, record: Record, period: float = 1.0, damping_ratio: float = 0.05) -> None:

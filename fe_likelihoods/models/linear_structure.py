@@ -249,6 +249,8 @@ class LinearStructure(ExternalModel):
     >>> (acceleration,) = model.simulate([3.7, 0.09, 0.8])
     """
 
+    path_dependent = False
+
     def __init__(self, parts: Parts, supports: Record | Sequence[Record], unit: str = "g", lead: float = 0.0) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
         if not supports or not all(isinstance(support, Record) for support in supports):
@@ -281,6 +283,15 @@ class LinearStructure(ExternalModel):
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """Return the same structure under other accelerations of its supports; errors as for a new one."""
         return type(self)(self.parts, record, self.unit, self.lead)
+
+    def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
+        """Return the same structure under its own motions, a pause of `rest` [s] and further motions of its supports.
+
+        Its response ends with the samples of ``with_record(record)``. Errors are those of `Record.followed_by`.
+        """
+        further = self.with_record(record).supports
+        joined = [own.followed_by(each, rest) for own, each in zip(self.supports, further, strict=True)]
+        return self.with_record(joined)
 
     def first(self, seconds: float) -> LinearStructure:
         """Return the same structure under the first part of its records.

@@ -295,6 +295,20 @@ class RCColumn(ThreadedModel):
             )
         return replace(self, loading=record)
 
+    def followed_by(self, record: Record, rest: float = 10.0) -> RCColumn:
+        """Return the same column under its own record, a pause of `rest` [s] and a further record.
+
+        Its response ends with the samples of the response to the further record, of the column that the first one has
+        damaged. Errors are those of `Record.followed_by`; a column under imposed displacement raises ValueError.
+        """
+        if not isinstance(self.loading, Record):
+            raise invalid(
+                "a column under a Record",
+                type(self.loading).__name__,
+                "join the displacements in one DisplacementHistory and build a new RCColumn",
+            )
+        return self.with_record(self.loading.followed_by(record, rest))
+
     def first(self, seconds: float) -> RCColumn:
         """Return the same column under the first part of its loading.
 

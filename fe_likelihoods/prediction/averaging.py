@@ -80,7 +80,7 @@ def average_predictions(
     ------
     ValueError
         If the names differ, the probabilities are negative or do not sum to one, or the predictions differ in channels,
-        step, shape or noise.
+        step, shape, noise or the state from which they start.
     """
     if not predictions or set(predictions) != set(probabilities):
         raise ValueError(
@@ -93,12 +93,12 @@ def average_predictions(
         raise ValueError(f"probabilities must be non-negative and sum to one; got {dict(probabilities)}")
 
     def kind(p: Prediction) -> tuple:
-        return [(c.name, c.dimension) for c in p.channels], p.dt, p.mean.shape, p.noise
+        return [(c.name, c.dimension) for c in p.channels], p.dt, p.mean.shape, p.noise, p.from_state
 
     for name, part in zip(names, parts, strict=True):
         if kind(part) != kind(parts[0]):
             raise ValueError(
-                f"predictions must be of one quantity (channels, step, shape, noise); {names[0]!r} has "
+                f"predictions must be of one quantity (channels, step, shape, noise, state); {names[0]!r} has "
                 f"{kind(parts[0])}, {name!r} has {kind(part)}"
             )
     mean = np.tensordot(weights, [part.mean for part in parts], axes=1)

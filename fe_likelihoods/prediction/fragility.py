@@ -26,7 +26,8 @@ from scipy import optimize, special
 
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
-from .inputs import read_source, split_samples, under_record
+from .excitation import chosen_state, excite
+from .inputs import read_source, split_samples
 from .propagation import check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
 from .reliability import binomial_interval, check_level, threshold_in_si
@@ -83,6 +84,9 @@ class Fragility(NamedTuple):
         The fitted curve, None if the points do not determine one (the reason is logged as a warning).
     threshold : float
         Threshold [SI].
+    from_state : str
+        State of the structure at the beginning of each record, "virgin" or "end", as in
+        `fe_likelihoods.prediction.propagation.propagate`.
     """
 
     names: tuple[str, ...]
@@ -94,6 +98,7 @@ class Fragility(NamedTuple):
     n_failed: np.ndarray
     curve: FragilityCurve | None
     threshold: float
+    from_state: str = "virgin"
 
 
 def peak_ground_acceleration(record: Record) -> float:
@@ -111,6 +116,8 @@ def fragility(
     unit: str | None = None,
     intensity: Callable[[Record], float] = peak_ground_acceleration,
     failures_exceed: bool = False,
+    from_state: str | None = None,
+    rest: float = 10.0,
     effective_sample_size: float | None = None,
     level: float = 0.95,
     seed: int | None = None,
@@ -135,6 +142,9 @@ def fragility(
     failures_exceed : bool
         Count a failed simulation as an exceedance, for models whose simulation fails at collapse. Default: failed
         samples are left out.
+    from_state, rest
+        State of the structure at the beginning of each record, as in `propagate`. With "end" every record follows the
+        excitation of the model, not the other records.
     effective_sample_size : float, optional
         Effective number of independent samples. Default: the number of samples.
     level : float
@@ -170,8 +180,9 @@ def fragility(
     records = list(records)
     if not records:
         raise ValueError("fragility needs one record or more, such as [record.scale(k) for k in factors]; got none")
+    state = chosen_state(source.model, records, from_state)
     for record in records:
-        under_record(source.model, record)
+        excite(source.model, record, state, rest)
     intensities = np.array([float(intensity(record)) for record in records])
     if not np.all((intensities > 0.0) & (intensities < np.inf)):
         raise ValueError(f"intensities must be positive and finite; got {intensities}")
@@ -185,7 +196,15 @@ def fragility(
     for k, record in enumerate(records):
         try:
             prediction = propagate(
-                posterior_or_model, samples, quantity=quantity, record=record, quantiles=(), seed=seed, **settings
+                posterior_or_model,
+                samples,
+                quantity=quantity,
+                record=record,
+                from_state=state,
+                rest=rest,
+                quantiles=(),
+                seed=seed,
+                **settings,
             )
         except SimulationFailed as error:
             if not failures_exceed:
@@ -211,7 +230,7 @@ def fragility(
         logger.warning("no fragility curve: %s", reason)
         curve = None
     names = tuple(record.name for record in records)
-    return Fragility(names, intensities, share, error, lower, upper, failed, curve, float(limit))
+    return Fragility(names, intensities, share, error, lower, upper, failed, curve, float(limit), state)
 
 
 def fit_fragility(intensity: ArrayLike, exceedances: ArrayLike, trials: ArrayLike) -> FragilityCurve:

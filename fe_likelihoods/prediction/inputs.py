@@ -12,7 +12,6 @@ import numpy as np
 from ..probability.inputs import as_points
 from ..probability.likelihood import FELikelihood
 from ..probability.noise import sampled_noise
-from ..signals.records import Record
 from ..simulation.executors import as_executor
 from ..simulation.memory_cache import distinct_keys
 from ..simulation.model import Model
@@ -25,7 +24,6 @@ __all__ = [
     "samples_of_rows",
     "simulates_in_batches",
     "split_samples",
-    "under_record",
 ]
 
 
@@ -106,16 +104,6 @@ def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
             f"expected a Posterior, an FELikelihood or a model with simulate(theta); got {posterior_or_model!r}"
         )
     return PredictionSource(posterior_or_model, None, None, as_executor(pool, posterior_or_model))
-
-
-def under_record(model: Model, record: Record) -> Model:
-    """Return the model under another excitation; raise ValueError if it has no method ``with_record``."""
-    if not hasattr(model, "with_record"):
-        raise ValueError(
-            f"{type(model).__name__} has one excitation only: write a model class (docs/own_model.rst) with a method "
-            "with_record(record) that returns the same model under another excitation"
-        )
-    return model.with_record(record)
 
 
 def simulates_in_batches(model: Model) -> bool:

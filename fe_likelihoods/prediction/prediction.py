@@ -58,6 +58,9 @@ class Prediction:
         Time step of the histories [s], None for other quantities.
     noise : bool
         Whether the measurement noise is included.
+    from_state : str
+        State of the structure at the beginning: "virgin", that of the model before any excitation, or "end", that after
+        the excitation with which the model was made.
     """
 
     mean: np.ndarray
@@ -75,6 +78,7 @@ class Prediction:
     channels: tuple[Channel, ...] = ()
     dt: float | None = None
     noise: bool = False
+    from_state: str = "virgin"
 
     @property
     def sd(self) -> np.ndarray:

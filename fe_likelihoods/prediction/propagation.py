@@ -31,13 +31,13 @@ from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed, simulate_batch
 from .accumulator import Accumulator
+from .excitation import chosen_state, excite
 from .inputs import (
     distinct_rows,
     read_source,
     samples_of_rows,
     simulates_in_batches,
     split_samples,
-    under_record,
 )
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
@@ -57,6 +57,8 @@ def propagate(
     *,
     quantity: Quantity = None,
     record: Record | None = None,
+    from_state: str | None = None,
+    rest: float = 10.0,
     noise: bool = False,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
     effective_sample_size: float | None = None,
@@ -83,6 +85,13 @@ def propagate(
         Exceptions of this function are not caught.
     record : Record, optional
         Another excitation, for models with a method ``with_record(record)``. Default: the excitation of the model.
+    from_state : {"virgin", "end"}, optional
+        State of the structure at the beginning of `record`. "virgin" is the state of the model before any excitation.
+        "end" is the state after the excitation of the model (such as the calibration record, or `Events`): the model
+        runs its own excitation, a pause, and `record`, and the prediction covers `record` only. Default: "virgin", with
+        a warning if the model is path dependent.
+    rest : float
+        Length of the pause without motion before `record`, for "end" [s].
     noise : bool
         Predict measurements: the response plus the noise of each sample, with its correlation in time. For histories,
         mean and variance are exact in the noise (the law of total variance adds the mean variance of the noise), and
@@ -118,7 +127,8 @@ def propagate(
     ------
     ValueError
         Before any simulation: for samples of another shape, without rows, or not finite; unknown channels; noise of a
-        bare model, or impossible parameters of the noise; a model with one excitation only; settings out of range.
+        bare model, or impossible parameters of the noise; a model with one excitation only, or one that cannot continue
+        from the end of its excitation; settings out of range.
         Later: for a function that returns arrays of different shapes.
     SimulationFailed
         If every simulation fails.
@@ -132,7 +142,8 @@ def propagate(
         raise ValueError(f"batch must be a whole number of simulations, 1 or more; got {batch!r}")
     if memory_bytes is not None and not memory_bytes >= 0:
         raise ValueError(f"memory_bytes must be a number of bytes, or None for no limit; got {memory_bytes!r}")
-    model = source.model if record is None else under_record(source.model, record)
+    state = chosen_state(source.model, record, from_state)
+    model, first, n_steps, _ = excite(source.model, record, state, rest)
     evaluate = evaluator(quantity, model.channels)
 
     distinct, row_of_sample = distinct_rows(thetas)
@@ -152,16 +163,16 @@ def propagate(
     )
     response_size = len(model.channels) * model.n_steps
     if evaluate.rows is not None:
-        accumulator.allocate((len(evaluate.rows), model.n_steps))
+        accumulator.allocate((len(evaluate.rows), n_steps))
     if batch is None:
         together = source.executor is not None or simulates_in_batches(model)
         batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
             responses, reasons = simulate_batch(model, distinct[start : start + batch], source.executor)
-            accumulator.add(start, responses, reasons)
+            accumulator.add(start, np.ascontiguousarray(responses[:, :, first:]), reasons)
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
-    return _prediction(accumulator, n, effective, evaluate.channels, model.dt)
+    return _prediction(accumulator, n, effective, evaluate.channels, model.dt, state)
 
 
 def fit_measures(posterior: Any, samples: Any) -> np.ndarray:
@@ -206,7 +217,7 @@ def check_effective_sample_size(effective_sample_size: float | None, n: int) -> 
 
 
 def _prediction(
-    accumulator: Accumulator, n: int, effective: float, channels: tuple[Channel, ...], dt: float
+    accumulator: Accumulator, n: int, effective: float, channels: tuple[Channel, ...], dt: float, from_state: str
 ) -> Prediction:
     failed = np.sort(np.concatenate(accumulator.failed)) if accumulator.failed else np.zeros(0, dtype=int)
     frequent = "; ".join(f"{count}: {reason}" for reason, count in accumulator.reasons.most_common(3))
@@ -252,6 +263,7 @@ def _prediction(
         channels=channels,
         dt=dt if histories else None,
         noise=noise,
+        from_state=from_state,
     )
 
 

@@ -111,7 +111,11 @@ class Model(Protocol):
     A model may also have ``simulate_batch(thetas) -> SimulationBatch`` and
     ``misfit_batch(thetas, measured) -> MisfitBatch``, whose rows must be the results of `simulate`, and
     ``with_record(record)``, which returns the same model under another excitation, for predictions. An attribute
-    ``time_limit`` is the largest duration of a simulation [s], or None.
+    ``time_limit`` is the largest duration of a simulation [s], or None. An attribute ``path_dependent`` is False if the
+    response to an excitation does not depend on earlier ones. For predictions that start from the end of the model's
+    excitation, a model has its `Record` in the attribute ``record`` and one sample of the response per sample of the
+    record, or a method ``followed_by(record, rest)``, which returns the same model under its own excitation, a pause of
+    ``rest`` seconds and another excitation; the response must end with the samples of the latter.
 
     With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
     returns the same model under the first part of its excitation. The response of that model must be the first samples

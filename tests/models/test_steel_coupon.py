@@ -119,7 +119,7 @@ def test_a_coupon_works_as_a_model(coupon, rng):
     points = np.array([[*truth, 5e6], [1.05, 1.08, 5e6], [1.0, 0.98, 5e6]])
     log_prob = posterior(points)
     assert log_prob[0] > log_prob[1:].max() + 5.0
-    ahead = propagate(posterior, points, record=CYCLES[:20], progress=False)
+    ahead = propagate(posterior, points, record=CYCLES[:20], from_state="virgin", progress=False)
     np.testing.assert_allclose(
         ahead.mean[0], np.mean([model.simulate(p[:2])[0, :20] for p in points], axis=0), rtol=1e-6
     )

@@ -18,6 +18,7 @@ class Flexible:
     parameter_names = ("log_flexibility",)
     channels = (Channel("displacement", "relative displacement", "cm"),)
     fingerprint = "flexible"
+    path_dependent = False
 
     def __init__(self, record, collapse=np.inf):
         self.record, self.collapse = record, collapse
