@@ -286,7 +286,7 @@ class RCColumn(ThreadedModel):
 
     def with_record(self, record: Record | DisplacementHistory) -> RCColumn:
         """Return the same column under another loading of the same type; ValueError for another type."""
-        kind = type(self.loading)
+        kind = Record if isinstance(self.loading, Record) else DisplacementHistory
         if not isinstance(record, kind):
             raise invalid(
                 f"a {kind.__name__}, the type of this column's loading",

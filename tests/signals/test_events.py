@@ -58,6 +58,7 @@ class TestFollowedBy:
             theta = np.full(len(ours.parameter_names), 1.1)
             np.testing.assert_array_equal(ours.simulate(theta), theirs.simulate(theta))
             assert ours.fingerprint == theirs.fingerprint
+            assert structure(Events([eq1, eq2])).with_record(long).fingerprint == theirs.fingerprint
 
     def test_components_of_the_bridge_are_joined_one_by_one(self, eq1, eq2):
         pairs = [(each.scale(3.0), each.scale(0.5)) for each in (eq1, eq2)]
