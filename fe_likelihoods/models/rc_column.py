@@ -25,20 +25,30 @@ a full-scale bridge-column using sequential Monte Carlo (2022): the tested colum
 
 from __future__ import annotations
 
+import logging
+import weakref
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..kernels.frame import allocate
-from ..kernels.newmark import Dynamics
+from ..kernels.newmark import HISTORY_ROWS, Dynamics
 from ..kernels.static import Iteration
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
 from ..units import G0, find_unit
 from .circular_section import Confinement, gauss_lobatto
-from .rc_column_analysis import BaseMotion, ColumnHistory, ImposedMotion, check_physical_values, set_materials
+from .rc_column_analysis import (
+    IMPOSED_ROWS,
+    BaseMotion,
+    ColumnHistory,
+    ImposedMotion,
+    check_physical_values,
+    largest_bar_strain,
+    set_materials,
+)
 from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
 from .rc_column_presets import lhpost_arguments
 from .rc_column_section import ReinforcedSection
@@ -57,6 +67,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["PARAMETERS", "RCColumn"]
+
+logger = logging.getLogger(__name__)
 
 PARAMETERS = {
     "Ec": "modulus of concrete [Pa]",
@@ -81,6 +93,7 @@ _HISTORY_OF_CHANNEL = {
     "displacement": "relative displacement",
     "force": "force",
 }
+_WARNED: weakref.WeakSet[RCColumn] = weakref.WeakSet()
 
 
 class _Prepared(NamedTuple):
@@ -386,11 +399,28 @@ class RCColumn(ThreadedModel):
         gravity = np.zeros(3 * self.n_elements)
         gravity[-2] = -(self.axial_load if self.axial_load is not None else values["mass"] * G0)
         if isinstance(prepared.motion, ImposedMotion):
-            return prepared.motion.run(column, gravity, iteration)
+            return self._checked(IMPOSED_ROWS, *prepared.motion.run(column, gravity, iteration), theta)
         mass = np.zeros(3 * self.n_elements)
         mass[-3:] = values["mass"], values["mass"] * self.vertical_mass, self.rotational_inertia
         dynamics = Dynamics(gravity, mass, float(values["a0"]), float(values["a1"]), 0.0)
-        return prepared.motion.run(column, dynamics, iteration)
+        return self._checked(HISTORY_ROWS, *prepared.motion.run(column, dynamics, iteration), theta)
+
+    def _checked(self, names: tuple[str, ...], values: np.ndarray, retries: int, theta: np.ndarray) -> ColumnHistory:
+        """History of a simulation; warns once per model where bars exceed the strain at which they fracture."""
+        strains = (values[names.index(row)] for row in ("base axial strain", "base curvature"))
+        limit = self.steel.ultimate_strain
+        beyond = largest_bar_strain(*strains, self.bar_circle_radius) / limit
+        if beyond > 1.0 and self not in _WARNED:
+            _WARNED.add(self)
+            logger.warning(
+                "a bar strain of %.3g at the base exceeds the ultimate strain of the steel, %.3g, at which bars "
+                "fracture; the law was continued along its tangent, at %s. This model gives no further warnings: "
+                "check history(theta).beyond_range, or use a weaker loading",
+                beyond * limit,
+                limit,
+                dict(zip(self.parameters, theta.tolist(), strict=True)),
+            )
+        return ColumnHistory(names, values, retries, beyond)
 
     @property
     def _time_label(self) -> str:

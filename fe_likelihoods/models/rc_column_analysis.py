@@ -22,11 +22,19 @@ from .circular_section import Confinement
 from .rc_column_parts import Concrete, Steel
 from .validation import check_values
 
-__all__ = ["BaseMotion", "ColumnHistory", "ImposedMotion", "check_physical_values", "set_materials"]
+__all__ = [
+    "IMPOSED_ROWS",
+    "BaseMotion",
+    "ColumnHistory",
+    "ImposedMotion",
+    "check_physical_values",
+    "largest_bar_strain",
+    "set_materials",
+]
 
 _MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 
-_IMPOSED_ROWS = (
+IMPOSED_ROWS = (
     "displacement",
     "vertical displacement",
     "rotation",
@@ -50,9 +58,13 @@ class ColumnHistory(History):
         The histories.
     retries : int
         Number of steps that were repeated with half their size.
+    beyond_range : float
+        Largest strain of a bar in the base section, divided by the ultimate strain of the steel. Above 1, real bars
+        fracture, whereas the law of the steel was continued along its tangent.
     """
 
     retries: int
+    beyond_range: float
 
 
 class BaseMotion(NamedTuple):
@@ -82,14 +94,21 @@ class BaseMotion(NamedTuple):
         acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
         return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
 
-    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration) -> ColumnHistory:
-        """Integrate the equations of motion; SimulationFailed if a step does not converge."""
+    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration) -> tuple[np.ndarray, int]:
+        """Integrate the equations of motion; SimulationFailed if a step does not converge.
+
+        Returns
+        -------
+        history : ndarray[n_rows, n_steps]
+            Rows `HISTORY_ROWS`.
+        retries : int
+        """
         history = np.zeros((len(HISTORY_ROWS), self.n_steps))
         status, retries, _ = newmark(column, dynamics, self.acceleration, self.dt, self.substeps, iteration, history)
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings))
-        return ColumnHistory(HISTORY_ROWS, history, retries)
+        return history, retries
 
 
 class ImposedMotion(NamedTuple):
@@ -112,18 +131,36 @@ class ImposedMotion(NamedTuple):
         finer = history.subdivide(max_increment)
         return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices))
 
-    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration) -> ColumnHistory:
-        """Solve the static equilibrium at each target; SimulationFailed if a step does not converge."""
-        history = np.zeros((len(_IMPOSED_ROWS), len(self.targets)))
+    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration) -> tuple[np.ndarray, int]:
+        """Solve the static equilibrium at each target; SimulationFailed if a step does not converge.
+
+        Returns
+        -------
+        history : ndarray[n_rows, n_steps]
+            Rows `IMPOSED_ROWS`.
+        retries : int
+        """
+        history = np.zeros((len(IMPOSED_ROWS), len(self.targets)))
         status, retries = impose_displacement(column, gravity, self.targets, iteration, history)
         if status:
             raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings))
-        return ColumnHistory(_IMPOSED_ROWS, history[:, self.kept], retries)
+        return history[:, self.kept], retries
 
 
 def check_physical_values(values: dict[str, float], steel: Steel) -> None:
     """Raise SimulationFailed for physical parameter `values` [SI] that describe no column."""
     check_values(values, _MAY_BE_ZERO)
+    fc = values["fc"]
+    if values["ft"] >= fc:
+        raise SimulationFailed(
+            f"the concrete is stronger in tension than in compression: ft = {values['ft']:.4g} Pa is not below "
+            f"fc = {fc:.4g} Pa"
+        )
+    if values["Ec"] <= fc:
+        raise SimulationFailed(
+            f"the concrete would reach its strength at a strain above 1: Ec = {values['Ec']:.4g} Pa is not above "
+            f"fc = {fc:.4g} Pa"
+        )
     if values["fy"] / values["Es"] >= steel.hardening_strain:
         raise SimulationFailed(
             "the steel has no yield plateau: fy/Es is not below the strain at the onset of hardening"
@@ -132,6 +169,11 @@ def check_physical_values(values: dict[str, float], steel: Steel) -> None:
         raise SimulationFailed(
             f"the steel has no hardening: fu = {values['fu']:.4g} Pa is not above fy = {values['fy']:.4g} Pa"
         )
+
+
+def largest_bar_strain(base_axial_strain: np.ndarray, base_curvature: np.ndarray, radius: float) -> float:
+    """Largest absolute strain on a circle of `radius` [m], over histories of axial strain and curvature [1/m]."""
+    return float((np.abs(base_axial_strain) + radius * np.abs(base_curvature)).max())
 
 
 def set_materials(

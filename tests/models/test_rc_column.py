@@ -36,7 +36,7 @@ from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from fe_likelihoods.kernels.static import Iteration
 from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column import PARAMETERS
-from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data
+from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
 from fe_likelihoods.units import G0
 from tests.opensees_column import CORE, COVER, INCH, KIP, KSI, STEEL, peer_of
 
@@ -544,6 +544,9 @@ def test_a_cyclic_test_is_updated_end_to_end(rng):
         ([math.nan, 1, 1, 1, 1], "nan"),
         ([1, math.inf, 1, 1, 1], "inf"),
         ([1, 0.2, 1, 1, 1], "plateau"),
+        ([1, 1, 1, 1, 21], "is not below fc = 4.206e"),
+        ([1, 1, 1, 1, 1000], "stronger in tension than in compression"),
+        ([0.0018, 1, 1, 1, 1], "at a strain above 1: Ec"),
     ],
 )
 def test_parameters_that_describe_no_column_fail(column, theta, words):
@@ -561,6 +564,30 @@ def test_damping_and_tensile_strength_may_be_zero(column):
 def test_steel_without_hardening_fails(strong):
     with pytest.raises(SimulationFailed, match="fu"):
         RCColumn.lhpost(strong, parameters=("fy",)).simulate([1.4])
+
+
+def test_strains_beyond_the_fracture_of_bars_are_reported_once(pushed, caplog):
+    """At a drift of 5 % the bars are within the law of the steel, at 20 % they would have fractured."""
+    assert 0.3 < pushed.history([1, 1, 1]).beyond_range < 0.6
+    assert not caplog.records
+    violent = replace(pushed, loading=DisplacementHistory("push", np.linspace(0.0, 0.2 * pushed.height, 40)))
+    history = violent.history([1, 1, 1])
+    steel = np.abs(history["base axial strain"][-1] - history["base curvature"][-1] * violent.bar_circle_radius)
+    assert history.beyond_range >= steel / violent.steel.ultimate_strain > 1.0
+    violent.simulate([1, 1, 1])
+    assert "exceeds the ultimate strain of the steel, 0.122" in caplog.text and "'Ec': 1.0" in caplog.text
+    assert len(caplog.records) == 1, "one warning per model, not one per simulation"
+
+
+def test_draws_of_the_prior_are_within_range(strong, caplog):
+    """No check of the range is a false alarm: the widest draws of the published prior, and a record twice as strong."""
+    draws = bridge_column_prior().rvs(400, random_state=5)[:, :5]
+    extreme = np.unique(np.concatenate([draws.argmin(axis=0), draws.argmax(axis=0)]))
+    model = RCColumn.lhpost(strong.trim(0.0, 3.0).scale(2.0))
+    batch = model.simulate_batch(draws[extreme])
+    assert all(reason == "" or "no yield plateau" in reason for reason in batch.reasons)
+    assert sum(map(bool, batch.reasons)) <= 1  # a modulus of the steel of 7 % of the nominal one
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("load", [7e7, 2e8, 5e8])
