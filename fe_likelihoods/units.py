@@ -64,8 +64,18 @@ _FACTORS = {
         "psi": POUND_FORCE / INCH**2,
         "ksi": 1e3 * POUND_FORCE / INCH**2,
     },
-    "strain": {"1": 1.0, "%": 1e-2},
-    "rotation": {"rad": 1.0, "deg": np.pi / 180},
+    "moment": {
+        "N m": 1.0,
+        "kN m": 1e3,
+        "MN m": 1e6,
+        "lbf in": POUND_FORCE * INCH,
+        "lbf ft": POUND_FORCE * FOOT,
+        "kip in": 1e3 * POUND_FORCE * INCH,
+        "kip ft": 1e3 * POUND_FORCE * FOOT,
+    },
+    "curvature": {"1/m": 1.0, "1/mm": 1e3, "1/km": 1e-3, "1/in": 1.0 / INCH, "1/ft": 1.0 / FOOT},
+    "strain": {"1": 1.0, "%": 1e-2, "microstrain": 1e-6},
+    "rotation": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
     "time": {"s": 1.0, "ms": 1e-3},
 }
 
@@ -79,15 +89,17 @@ DIMENSIONS: dict[str, str] = {
 }
 """The SI unit of each dimension."""
 
-_BY_LOWER_CASE = {name.lower(): unit for name, unit in UNITS.items()}
+_BY_LOWER_CASE = {name.replace(" ", "").lower(): unit for name, unit in UNITS.items()}
+_MICROSTRAIN = ("ue", *(f"{mu}\N{GREEK SMALL LETTER EPSILON}" for mu in "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"))
 
 
 def find_unit(name: str, dimension: str | None = None) -> Unit:
     """Return the unit with a name.
 
     The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are all
-    ``cm/s2``. Letter case is ignored, because file headers are often in capitals, except for the prefix of ``MN`` and
-    ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
+    ``cm/s2``; ``kN-m``, ``kN*m`` and ``kNm`` are ``kN m``; ``ue`` is ``microstrain``. Letter case is ignored, because
+    file headers are often in capitals, except for the prefix of ``MN`` and ``MPa``: ``mN`` would be smaller by a factor
+    of 10⁹.
 
     Parameters
     ----------
@@ -174,6 +186,9 @@ def _lookup(name: str) -> Unit | None:
     text = re.sub(r"\s+", "", name)
     if text in UNITS:
         return UNITS[text]
+    if text.lower() in _MICROSTRAIN:
+        return UNITS["microstrain"]
+    text = re.sub(r"(?<=[A-Za-z])[-*·](?=[A-Za-z])", "", text)
     text = re.sub("sec", "s", text, flags=re.IGNORECASE).replace("**", "").replace("^", "").replace("²", "2")
     text = re.sub(r"/s/s$", "/s2", text.replace("_", "/"), flags=re.IGNORECASE)
     unit = _BY_LOWER_CASE.get(text.lower())

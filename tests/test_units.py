@@ -23,6 +23,12 @@ from fe_likelihoods.units import DIMENSIONS, G0, UNITS, find_unit, from_si, to_s
         (1, "GPa", 1e9),
         (20, "ms", 0.02),
         (180, "deg", np.pi),
+        (1000, "mrad", 1.0),
+        (1, "kip in", 112.9848290276167),  # NIST SP 811
+        (1, "lbf ft", 1.3558179483314004),  # NIST SP 811
+        (1, "1/in", 1 / 0.0254),
+        (2, "1/km", 0.002),
+        (1, "microstrain", 1e-6),
     ],
 )
 def test_factors_agree_with_their_definitions(value, unit, expected):
@@ -47,7 +53,17 @@ def test_spellings_of_file_headers(spelling):
     assert find_unit(spelling, "acceleration").name == "cm/s2"
 
 
-@pytest.mark.parametrize("spelling", ["mN", "mPa", "mpa", "mn"])
+@pytest.mark.parametrize("spelling", ["kN m", "kN-m", "kNm", "kN·m", "kN*m", "KN M"])
+def test_spellings_of_moments(spelling):
+    assert find_unit(spelling, "moment").name == "kN m"
+
+
+@pytest.mark.parametrize("spelling", ["ue", "µε", "με", "microstrain", "Microstrain"])
+def test_spellings_of_microstrain(spelling):
+    assert find_unit(spelling, "strain").factor == 1e-6
+
+
+@pytest.mark.parametrize("spelling", ["mN m", "mN", "mPa", "mpa", "mn"])
 def test_milli_is_not_read_as_mega(spelling):
     with pytest.raises(ValueError, match="unknown unit"):
         find_unit(spelling)
