@@ -62,7 +62,7 @@ class StructuralModel:
     channels: tuple[Channel, ...]
     dt: float
     n_steps: int
-    path_dependent: ClassVar[bool] = True
+    path_dependent: bool = True
     _time_label = "time [s]"
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:

@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
+from ..signals.records import Record
 from ..simulation.code_digest import code_digest
 from ..simulation.faults import TransientReason, reason_of
 from ..simulation.model import SimulationFailed
 from ..simulation.processes import RunFailed, TemporaryFolder, describe_exit, last_lines
 from ..simulation.programs import run_program
 from .dependencies import content_digest
-from .external import ExternalModel
+from .external import UserModel
 from .validation import positive_float
 
 __all__ = ["ExecutableModel"]
@@ -36,7 +37,7 @@ _FREE_BYTES = 2**16  # less free space than this may be the reason of a failure
 _EXIT_CODES_OF_SHELLS = {126, 127, *range(129, 160)}  # no program, or a program killed by signal 1 to 31
 
 
-class ExecutableModel(ExternalModel):
+class ExecutableModel(UserModel):
     """External program as a model.
 
     ``$name`` or ``${name}`` in the templates and in the arguments of the command is replaced by the value of a
@@ -61,15 +62,24 @@ class ExecutableModel(ExternalModel):
         Names of the structural parameters, in the order of theta.
     channels : sequence of Channel
         Channels of the response, in the order of its rows.
-    dt : float
-        Time step of the response [s].
-    n_steps : int
-        Number of samples of the response.
+    dt : float, optional
+        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
+    n_steps : int, optional
+        Number of samples of the response. With a record it follows from `dt`.
     time_limit : float
         Longest duration of a run [s]. A longer run is stopped and counts as failed.
     columns : sequence of int, optional
         Columns of the output file that are the channels, counted from 0. By default the file has one column per channel
         and no others.
+    record : Record, optional
+        Excitation. Its samples [m/s²] are written into the file `record_file` of the folder of the run, one per line,
+        and ``$record_dt`` [s] and ``$record_n_steps`` may stand in templates and arguments. The model can then be
+        simulated under other records (`with_record`, ``propagate(..., record=)``, `fragility`).
+    record_file : str
+        Name of this file.
+    path_dependent : bool
+        Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
+        another record then need no `from_state`.
     files : mapping of str to Path, optional
         Further files, copied into the folder of the run under the given names.
     keep_failures : path, optional
@@ -117,10 +127,13 @@ class ExecutableModel(ExternalModel):
         output: str | Callable[[Path], Any],
         parameter_names: Sequence[str],
         channels: Sequence[Channel],
-        dt: float,
-        n_steps: int,
+        dt: float | None = None,
+        n_steps: int | None = None,
         *,
         time_limit: float,
+        record: Record | None = None,
+        record_file: str = "record.txt",
+        path_dependent: bool = True,
         columns: Sequence[int] | None = None,
         files: Mapping[str, Path] | None = None,
         keep_failures: str | Path | None = None,
@@ -132,7 +145,7 @@ class ExecutableModel(ExternalModel):
         version: str | None = None,
         depends_on: Sequence[Any] = (),
     ) -> None:
-        super().__init__(parameter_names, channels, dt, n_steps, depends_on)
+        super().__init__(parameter_names, channels, dt, n_steps, depends_on, record, path_dependent)
         self.time_limit = positive_float(time_limit, "ExecutableModel: time_limit", "seconds")
         self.max_output = int(positive_float(max_output, "ExecutableModel: max_output", "bytes"))
         self.max_kept = int(positive_float(max_kept, "ExecutableModel: max_kept", "folders"))
@@ -143,9 +156,12 @@ class ExecutableModel(ExternalModel):
         self.command = (_executable(str(command[0])), *map(str, command[1:]))
         self.templates = {_inside(name): _text(name, source) for name, source in templates.items()}
         self.files = {_inside(name): _file(source).resolve() for name, source in (files or {}).items()}
-        if repeated := set(self.templates) & set(self.files):
+        self.record_file = _inside(record_file)
+        names = [*self.templates, *self.files, *([] if record is None else [self.record_file])]
+        if repeated := {name for name in names if names.count(name) > 1}:
             raise ValueError(
-                f"ExecutableModel: {', '.join(repeated)} is both a template and a file; rename one of them"
+                f"ExecutableModel: {', '.join(repeated)} is more than one of a template, a file and the record file; "
+                "rename one of them"
             )
         self._check_placeholders()
         if not callable(output) and not isinstance(output, str):
@@ -165,6 +181,9 @@ class ExecutableModel(ExternalModel):
         named = _named_files(self.command) if hash_executable else []
         self._named = tuple(file for file in named if file.resolve() not in written)
         self.watched_files = (*self._named, *self.files.values(), *self._dependencies.paths)
+        self._prepare()
+
+    def _prepare(self) -> None:
         self.fingerprint = self.current_fingerprint()
 
     def current_fingerprint(self) -> str:
@@ -182,6 +201,8 @@ class ExecutableModel(ExternalModel):
                     f"changed whenever the function changes: {error}"
                 ) from error
         stated = [] if self.env is None else [sorted(self.env.items())]
+        if self.record is not None:
+            stated.append(["record", self.record_file, self.record.fingerprint])
         return self._digest(self.command, contents, sorted(self.templates.items()), copied, parse, version, *stated)
 
     def _check_placeholders(self) -> None:
@@ -196,6 +217,7 @@ class ExecutableModel(ExternalModel):
                     f"ExecutableModel: a dollar sign in {where} starts no placeholder; write $$ for a dollar sign"
                 )
             names = set(template.get_identifiers())
+            names -= set(self._record_values)
             if unknown := sorted(names - set(self.parameter_names)):
                 raise ValueError(
                     f"ExecutableModel: {where} has placeholders for {', '.join(unknown)}; the parameters are "
@@ -208,8 +230,17 @@ class ExecutableModel(ExternalModel):
                 f"have no effect; write ${{{unused[0]}}} where its value belongs"
             )
 
+    @property
+    def _record_values(self) -> dict[str, str]:
+        """Placeholders of the record; a parameter of the same name takes precedence."""
+        if self.record is None:
+            return {}
+        values = {"record_dt": repr(self.record.dt), "record_n_steps": str(self.record.n_steps)}
+        return {name: value for name, value in values.items() if name not in self.parameter_names}
+
     def _respond(self, theta: np.ndarray) -> Any:
         values = {name: repr(float(value)) for name, value in zip(self.parameter_names, theta, strict=True)}
+        values |= self._record_values
         with TemporaryFolder() as place:
             folder = place / "run"
             folder.mkdir()
@@ -236,6 +267,10 @@ class ExecutableModel(ExternalModel):
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, path)
+        if self.record is not None:
+            path = folder / self.record_file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text("".join(f"{value!r}\n" for value in self.record.acceleration.tolist()))
 
     def _execute(self, place: Path, arguments: list[str]) -> None:
         """Run the program in the folder ``run`` of `place`; raise RunFailed unless it succeeds."""

@@ -1,4 +1,6 @@
-"""Base class that validates inputs and outputs of external models: code of the user, programs, assembled matrices.
+"""Base classes that validate inputs and outputs of external models: code of the user, programs, assembled matrices.
+
+`UserModel` adds an excitation, a `Record` that the external code receives, so that the model works under other records.
 
 The reason of a failed simulation ends in its duration, so that a report of failures shows whether runs fail in their
 first second or after an hour.
@@ -6,6 +8,7 @@ first second or after an hour.
 
 from __future__ import annotations
 
+import copy
 import json
 import time
 from collections.abc import Iterable, Sequence
@@ -14,13 +17,15 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
+from ..signals.records import Record
+from ..signals.sampling import rest_samples
 from ..simulation.faults import ChangedModel, TransientReason, reason_of
 from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest
 from .dependencies import Dependencies
 from .validation import check_theta, positive_float
 
-__all__ = ["ExternalModel"]
+__all__ = ["ExternalModel", "UserModel"]
 
 
 class ExternalModel(StructuralModel):
@@ -124,3 +129,121 @@ class ExternalModel(StructuralModel):
             if not np.isfinite(values).all():
                 raise SimulationFailed(f"the response of channel {channel.name!r} is not finite")
         return response
+
+
+class UserModel(ExternalModel):
+    """Model of the user's own code, which receives a `Record` if one is given.
+
+    A subclass defines `_respond`, and `_prepare`, which is called after each change of the record.
+
+    Parameters
+    ----------
+    parameter_names, channels, depends_on
+        As for `ExternalModel`.
+    dt : float or None
+        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
+    n_steps : int or None
+        Number of samples of the response. With a record it follows from `dt`.
+    record : Record or None
+        Excitation that the code receives. The response has a sample at the first sample of the record, and then every
+        `dt` until its end.
+    path_dependent : bool
+        Whether the response to an excitation depends on earlier ones; False for a linear structure.
+
+    Raises
+    ------
+    ValueError
+        As `ExternalModel`, and if `dt` and `n_steps` are missing without a record, or do not fit the record.
+    """
+
+    def __init__(
+        self,
+        parameter_names: Sequence[str],
+        channels: Sequence[Channel],
+        dt: float | None,
+        n_steps: int | None,
+        depends_on: Iterable[Any] = (),
+        record: Record | None = None,
+        path_dependent: bool = True,
+    ) -> None:
+        dt, n_steps = _sampling(type(self).__name__, dt, n_steps, record)
+        super().__init__(parameter_names, channels, dt, n_steps, depends_on)
+        self.record = record
+        self.path_dependent = bool(path_dependent)
+
+    def with_record(self, record: Record) -> UserModel:
+        """Return the same model under another record.
+
+        Parameters
+        ----------
+        record : Record
+            The excitation. If the step of the response is a multiple of that of the present record, it is the same
+            multiple of the new one.
+
+        Returns
+        -------
+        UserModel
+            A model of the same class.
+
+        Raises
+        ------
+        ValueError
+            If the model was made without a record, or `record` is not a `Record`.
+        """
+        kind = type(self).__name__
+        if self.record is None:
+            raise ValueError(
+                f"{kind} has one excitation, which its code contains: make it with record=, so that the code receives "
+                "the record, and other records can be simulated (docs/own_model.rst)"
+            )
+        if not isinstance(record, Record):
+            raise ValueError(f"{kind}: expected a Record as excitation; got {type(record).__name__}")
+        other = copy.copy(self)
+        every = self._every
+        other.record, other.dt, other.n_steps = record, every * record.dt, (record.n_steps - 1) // every + 1
+        other._prepare()
+        return other
+
+    def followed_by(self, record: Record, rest: float = 10.0) -> UserModel:
+        """Return the same model under its own record, a pause of `rest` [s] and a further record.
+
+        The pause is lengthened to whole steps of the response, which ends with the samples of ``with_record(record)``.
+        Errors are those of `with_record` and of `Record.followed_by`.
+        """
+        self.with_record(record)
+        n_zeros = rest_samples(rest, self.record.dt)
+        n_zeros += -(self.record.n_steps + n_zeros) % self._every
+        return self.with_record(self.record.followed_by(record, n_zeros * self.record.dt))
+
+    @property
+    def _every(self) -> int:
+        """Samples of the record per sample of the response."""
+        return round(self.dt / self.record.dt)
+
+    def _prepare(self) -> None:
+        """Compute what depends on the record, the fingerprint among it."""
+        raise NotImplementedError
+
+
+def _sampling(kind: str, dt: float | None, n_steps: int | None, record: Record | None) -> tuple[Any, Any]:
+    """Step and number of samples of a response; raise ValueError if they are missing or do not fit the record."""
+    if record is None:
+        if dt is None or n_steps is None:
+            raise ValueError(f"{kind}: give dt and n_steps of the response, or record=, which determines them")
+        return dt, n_steps
+    if not isinstance(record, Record):
+        raise ValueError(f"{kind}: expected a Record as record; got {type(record).__name__}")
+    step = record.dt if dt is None else positive_float(dt, f"{kind}: dt", "seconds")
+    every = round(step / record.dt)
+    if every < 1 or abs(step - every * record.dt) > 1e-9 * step:
+        raise ValueError(
+            f"{kind}: dt must be a whole multiple of the step of the record, {record.dt!r} s; got {dt!r} s: leave it "
+            "out, or use Record.resample"
+        )
+    expected = (record.n_steps - 1) // every + 1
+    if n_steps is not None and n_steps != expected:
+        raise ValueError(
+            f"{kind}: the response to {record.n_steps} samples of the record has {expected} samples at {step:g} s; got "
+            f"n_steps={n_steps!r}: leave it out"
+        )
+    return every * record.dt, expected

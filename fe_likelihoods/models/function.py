@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
+from ..signals.records import Record
 from ..simulation.changed_model import SentCode, SentFunction, different_in_worker, sent_code
 from ..simulation.code_digest import describe_code
 from ..simulation.sandbox import Sandbox
-from .external import ExternalModel
+from .external import UserModel
 from .validation import positive_float
 
 __all__ = ["FunctionModel"]
@@ -28,23 +29,39 @@ _observed: set[str] = set()
 _changes_itself: set[str] = set()
 
 
-class FunctionModel(ExternalModel):
+class _UnderRecord:
+    """Function of theta that calls the user's function with theta and the record."""
+
+    def __init__(self, function: Callable[..., Any], record: Record) -> None:
+        self.function, self.record = function, record
+
+    def __call__(self, theta: np.ndarray) -> Any:
+        return self.function(theta, self.record)
+
+
+class FunctionModel(UserModel):
     """Python function as a model.
 
     Parameters
     ----------
     function : callable
-        Function of theta (n_parameters,) that returns the response (n_channels, n_steps) in SI units. It may raise any
-        exception, preferably `SimulationFailed` with a reason. For a pool of processes, or with `isolated`, it must be
-        picklable: defined at the top level of a module.
+        Function of theta (n_parameters,), and of the record if one is given, that returns the response (n_channels,
+        n_steps) in SI units. It may raise any exception, preferably `SimulationFailed` with a reason. For a pool of
+        processes, or with `isolated`, it must be picklable: defined at the top level of a module.
     parameter_names : sequence of str
         Names of the structural parameters, in the order of theta.
     channels : sequence of Channel
         Channels of the response, in the order of its rows.
-    dt : float
-        Time step of the response [s].
-    n_steps : int
-        Number of samples of the response.
+    dt : float, optional
+        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
+    n_steps : int, optional
+        Number of samples of the response. With a record it follows from `dt`.
+    record : Record, optional
+        Excitation, which the function receives as its second argument. The model can then be simulated under other
+        records (`with_record`, ``propagate(..., record=)``, `fragility`).
+    path_dependent : bool
+        Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
+        another record then need no `from_state`.
     version : str, optional
         Text that replaces the code in the fingerprint; change it whenever the function computes something else. By
         default the fingerprint contains a digest of the code and of everything it uses
@@ -72,6 +89,11 @@ class FunctionModel(ExternalModel):
     --------
     >>> def cantilever(theta): ...
     >>> model = FunctionModel(cantilever, ("stiffness",), (Channel("tip", "displacement", "mm"),), 0.01, 2000)
+
+    With the excitation as an argument of the function:
+
+    >>> def shaken(theta, record): ...
+    >>> model = FunctionModel(shaken, ("stiffness",), (Channel("tip", "displacement", "mm"),), record=eq1)
     """
 
     def __init__(
@@ -79,9 +101,11 @@ class FunctionModel(ExternalModel):
         function: Callable[[np.ndarray], Any],
         parameter_names: Sequence[str],
         channels: Sequence[Channel],
-        dt: float,
-        n_steps: int,
+        dt: float | None = None,
+        n_steps: int | None = None,
         *,
+        record: Record | None = None,
+        path_dependent: bool = True,
         version: str | None = None,
         depends_on: Sequence[Any] = (),
         isolated: bool = False,
@@ -89,7 +113,7 @@ class FunctionModel(ExternalModel):
         memory_limit: int | None = None,
         runs_per_process: int | None = None,
     ) -> None:
-        super().__init__(parameter_names, channels, dt, n_steps, depends_on)
+        super().__init__(parameter_names, channels, dt, n_steps, depends_on, record, path_dependent)
         kind = type(self).__name__
         if not callable(function):
             raise ValueError(f"{kind}: expected a function of the parameters; got {function!r}")
@@ -109,10 +133,13 @@ class FunctionModel(ExternalModel):
         self.watched_files = tuple(map(str, self._dependencies.paths))
         self._sent_code: SentCode | None = None
         self._code_at_start = self._code()
+        self._prepare()
+
+    def _prepare(self) -> None:
         self.fingerprint = self._digest(*self._identity(self._code_at_start))
-        self._run = function
+        self._run = self.function if self.record is None else _UnderRecord(self.function, self.record)
         if self.isolated:
-            sent = SentFunction(function, self._fingerprinted, self._sent_code, self.version is None)
+            sent = SentFunction(self._run, self._fingerprinted, self._sent_code, self.version is None)
             self._run = Sandbox(sent, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process)
 
     def current_fingerprint(self) -> str:
@@ -170,7 +197,8 @@ class FunctionModel(ExternalModel):
 
     def _identity(self, code: str) -> list[Any]:
         """Texts that identify what the function computes."""
-        return [["code", code] if self.version is None else ["version", str(self.version)]]
+        identity = ["code", code] if self.version is None else ["version", str(self.version)]
+        return [identity] if self.record is None else [identity, ["record", self.record.fingerprint]]
 
     def _respond(self, theta: np.ndarray) -> Any:
         if self.isolated or self.version is not None or self.fingerprint in _observed:

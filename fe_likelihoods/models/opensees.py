@@ -15,22 +15,23 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Channel
+from ..signals.records import Record
 from .function import FunctionModel
 
 __all__ = ["OpenSeesModel"]
 
 
 class _WithOpenSees:
-    """Function of theta that calls the user's function with a wiped OpenSees."""
+    """Function of theta, and of a record if there is one, that calls the user's function with a wiped OpenSees."""
 
-    def __init__(self, build_and_run: Callable[[Any, np.ndarray], Any]) -> None:
+    def __init__(self, build_and_run: Callable[..., Any]) -> None:
         self.build_and_run = build_and_run
 
-    def __call__(self, theta: np.ndarray) -> Any:
+    def __call__(self, theta: np.ndarray, *record: Record) -> Any:
         import openseespy.opensees as ops
 
         ops.wipe()
-        return self.build_and_run(ops, theta)
+        return self.build_and_run(ops, theta, *record)
 
 
 class OpenSeesModel(FunctionModel):
@@ -39,17 +40,24 @@ class OpenSeesModel(FunctionModel):
     Parameters
     ----------
     build_and_run : callable
-        Function of the wiped module ``openseespy.opensees`` and of theta (n_parameters,) that returns the response
-        (n_channels, n_steps) in SI units. It must be defined at the top level of a module. It should raise an exception
-        if ``ops.analyze`` does not return 0, because OpenSees itself only prints a message.
+        Function of the wiped module ``openseespy.opensees``, of theta (n_parameters,), and of the record if one is
+        given, that returns the response (n_channels, n_steps) in SI units. It must be defined at the top level of a
+        module. It should raise an exception if ``ops.analyze`` does not return 0, because OpenSees itself only prints a
+        message.
     parameter_names : sequence of str
         Names of the structural parameters, in the order of theta.
     channels : sequence of Channel
         Channels of the response, in the order of its rows.
-    dt : float
-        Time step of the response [s].
-    n_steps : int
-        Number of samples of the response.
+    dt : float, optional
+        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
+    n_steps : int, optional
+        Number of samples of the response. With a record it follows from `dt`.
+    record : Record, optional
+        Excitation, which the function receives as its third argument. The model can then be simulated under other
+        records (`with_record`, ``propagate(..., record=)``, `fragility`).
+    path_dependent : bool
+        Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
+        another record then need no `from_state`.
     time_limit : float, optional
         Longest duration of a run [s]. A longer run is stopped and counts as failed.
     memory_limit : int, optional
@@ -74,16 +82,25 @@ class OpenSeesModel(FunctionModel):
     ...     ops.model("basic", "-ndm", 2, "-ndf", 3)
     ...     ...
     >>> model = OpenSeesModel(frame, ("stiffness",), (Channel("top", "displacement", "mm"),), 0.01, 2000)
+
+    With the excitation as an argument of the function, for predictions under other records:
+
+    >>> def shaken_frame(ops, theta, record):
+    ...     ops.timeSeries("Path", 1, "-dt", record.dt, "-values", *record.acceleration)
+    ...     ...
+    >>> model = OpenSeesModel(shaken_frame, ("stiffness",), (Channel("top", "displacement", "mm"),), record=eq1)
     """
 
     def __init__(
         self,
-        build_and_run: Callable[[Any, np.ndarray], Any],
+        build_and_run: Callable[..., Any],
         parameter_names: Sequence[str],
         channels: Sequence[Channel],
-        dt: float,
-        n_steps: int,
+        dt: float | None = None,
+        n_steps: int | None = None,
         *,
+        record: Record | None = None,
+        path_dependent: bool = True,
         time_limit: float | None = None,
         memory_limit: int | None = None,
         runs_per_process: int | None = 1000,
@@ -104,6 +121,8 @@ class OpenSeesModel(FunctionModel):
             channels,
             dt,
             n_steps,
+            record=record,
+            path_dependent=path_dependent,
             version=version,
             depends_on=depends_on,
             isolated=True,

@@ -235,7 +235,7 @@ def test_failures_are_counted_by_the_posterior():
         ({"templates": {"/in.txt": "$offset $slope"}}, "inside the folder of the run"),
         ({"templates": {"in.txt": Path("/no/such/template")}}, "Path of an existing file"),
         ({"files": {"record.txt": Path("/no/such/record")}}, "Path of an existing file"),
-        ({"files": {"in.txt": PROGRAM}}, "both a template and a file"),
+        ({"files": {"in.txt": PROGRAM}}, "in.txt is more than one of a template, a file"),
         ({"output": 3}, "output must be a file name or a function"),
         ({"columns": [0, 1]}, "one column, 0 or more, for each of the 1 channels"),
         ({"columns": [-1]}, "one column, 0 or more"),
