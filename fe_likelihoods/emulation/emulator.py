@@ -39,6 +39,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..signals.comparison import Comparison
 from ..simulation.model import SimulationBatch, SimulationFailed
 from .gaussian_process import GaussianProcess, fit_process, left_out_errors, predict
 from .quadratic import bilinear_form
@@ -244,6 +245,11 @@ class ResponseEmulator:
         inside = self.squared_distance(coords) <= self.reach
         mean, _ = predict(self.process, np.where(inside[:, None], self._inputs(coords), 0.0))
         residuals = self._mean + np.einsum("nk,kct->nct", mean, self._components, optimize=True)
+        if isinstance(self._target.comparison, Comparison):
+            raise ValueError(
+                "the emulator was fitted to measurements with missing samples, or with times of their own, and "
+                "predicts the response at their samples only: predict with the posterior or the model"
+            )
         response = self._target.measured - residuals
         response[~inside] = np.nan
         reason = "the parameters are outside the region that the emulator was fitted to"

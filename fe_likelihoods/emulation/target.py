@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
 from .quadratic import check_quadratic, sums_of_squares
 
@@ -46,6 +47,8 @@ class _Likelihood(Protocol):
 
     model: Any
     measurements: Any
+    measured: Any
+    n_samples: Any
     noise: Any
     simulations: int
 
@@ -76,7 +79,7 @@ class Runs(NamedTuple):
     Attributes
     ----------
     residuals : (n, n_channels, n_steps) float
-        Measured minus simulated response [SI]; NaN where the simulation failed.
+        Measured minus simulated response [SI]; zero where a sample is missing, NaN where the simulation failed.
     statistics : (n, n_numbers) float
         Statistics of the residuals; NaN where the simulation failed.
     failed : (n,) bool
@@ -145,6 +148,16 @@ class Archive:
         self._statistics += list(statistics)
 
 
+class _WithoutMissing(NamedTuple):
+    """A statistic of residuals, which are zero where a sample is missing, for a noise that expects NaN there."""
+
+    statistic: Callable[[np.ndarray], np.ndarray]
+    missing: np.ndarray
+
+    def __call__(self, residuals: np.ndarray) -> np.ndarray:
+        return self.statistic(np.where(self.missing, np.nan, residuals))
+
+
 class ResponseTarget:
     """A posterior in standard normal coordinates.
 
@@ -158,7 +171,9 @@ class ResponseTarget:
     ndim, n_structural, n_noise : int
         Numbers of coordinates: all, structural (the first ones), of the noise.
     n_steps : int
-        Samples per channel.
+        Steps of the measurements.
+    n_samples : int or SampleCounts
+        Samples of every channel, or of each where some are missing.
     archive : Archive
         The simulations run through this object.
 
@@ -175,9 +190,13 @@ class ResponseTarget:
         self.model, self.noise = self._likelihood.model, self._likelihood.noise
         self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)
         self.n_noise = self.ndim - self.n_structural
-        self.measured = self._likelihood.measurements.values
+        self.comparison = self._likelihood.measured
+        self.measured = measured_values(self.comparison)
         self.n_steps = self.measured.shape[1]
+        self.n_samples = self._likelihood.n_samples
         self.statistic: Callable[[np.ndarray], np.ndarray] = getattr(self.noise, "statistic", None) or sums_of_squares
+        if isinstance(self.comparison, Comparison) and self.statistic is not sums_of_squares:
+            self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)
         check_quadratic(self.statistic, self.measured)
         self._logarithmic = [d.logarithmic for d in list(self._prior.distributions.values())[: self.n_structural]]
         self._median = self._prior.from_normal(np.zeros(self.ndim))
@@ -194,10 +213,21 @@ class ResponseTarget:
         if not hasattr(self.model, "first"):
             return []
         # differences, because a residual displacement is not motion
-        durations = growing_durations(np.diff(self.measured, axis=1), self.model.dt, shares)[:-1]
-        return [
-            ResponseTarget(_Shortened(self._likelihood.first(seconds), self._prior, self.ndim)) for seconds in durations
-        ]
+        steps, measurements = np.diff(self.measured, axis=1), self._likelihood.measurements
+        if isinstance(self.comparison, Comparison):
+            if not measurements.simultaneous:
+                return []
+            steps[self.comparison.missing[:, 1:] | self.comparison.missing[:, :-1]] = 0.0
+            if not steps.any():
+                return []
+        parts = []
+        for seconds in growing_durations(steps, measurements.dt, shares)[:-1]:
+            try:
+                parts.append(self._likelihood.first(measurements.start + seconds))
+            except ValueError:
+                if not isinstance(self.comparison, Comparison):
+                    raise  # else a channel has no sample in this part
+        return [ResponseTarget(_Shortened(part, self._prior, self.ndim)) for part in parts]
 
     # ------------------------------------------------------------------ coordinates
 
@@ -252,11 +282,13 @@ class ResponseTarget:
             batch = self._likelihood.simulate(thetas)
             computed.append(True)
             with np.errstate(over="ignore"):
-                residuals = (self.measured - batch.response).astype(np.float32)
+                residuals = self._residuals(batch.response).astype(np.float32)
             reasons = np.frombuffer(json.dumps(list(batch.reasons)).encode(), dtype=np.uint8)
             return [residuals, self._likelihood.statistics(thetas), reasons]
 
         text = f"residuals of {self.model.fingerprint}".encode()  # earlier journals have responses
+        if isinstance(self.comparison, Comparison):
+            text += self._likelihood.measurements.fingerprint.encode()
         key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
         residuals, statistics, reasons = remember(key, compute)
         if not computed:
@@ -265,6 +297,16 @@ class ResponseTarget:
         self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
         return Runs(residuals.astype(float), statistics, failed)
 
+    def _residuals(self, responses: np.ndarray) -> np.ndarray:
+        """Measured minus simulated responses (n, n_channels, n_samples); zero where a sample is missing."""
+        if not isinstance(self.comparison, Comparison):
+            return self.measured - responses
+        residuals = np.full((len(responses), *self.measured.shape), np.nan)
+        for row, response in zip(residuals, responses, strict=True):
+            if np.isfinite(response).all():
+                row[:] = -self.comparison.known_residuals(response)
+        return residuals
+
     # ------------------------------------------------------------------ the noise
 
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
@@ -272,7 +314,7 @@ class ResponseTarget:
         full = np.zeros((len(coords), self.ndim))
         full[:, self.n_structural :] = coords
         parameters = self._prior.from_normal(full)[:, self.n_structural :] if self.n_noise else coords
-        return self.noise.log_likelihood(statistics, self.n_steps, parameters)
+        return self.noise.log_likelihood(statistics, self.n_samples, parameters)
 
     def _noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood and log-prior (n,) of coordinates (n, n_noise) at the same statistics (n_numbers,)."""

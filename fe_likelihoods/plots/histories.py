@@ -13,7 +13,18 @@ import numpy as np
 
 from ..units import find_unit, from_si
 from .protocols import ChannelHistories, ChannelLike, RecordLike, ResidualChecksLike, SpectrumLike
-from .style import BLUE, GREY, ORANGE, add_legend_row, channel_label, new_axes, select_names, set_time_axis, stack_axes
+from .style import (
+    BLUE,
+    GREY,
+    ORANGE,
+    add_legend_row,
+    channel_label,
+    marker_of,
+    new_axes,
+    select_names,
+    set_time_axis,
+    stack_axes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -177,15 +188,18 @@ def plot_histories(
         if measured:
             width, shade, alpha = (1.8, ORANGE, 0.65) if simulated else (0.8, BLUE, 1.0)
             values = from_si(measurements.channel(name), unit)
-            axes.plot(measurements.time, values, color=shade, linewidth=width, alpha=alpha, label="measured")
+            drawn = {"color": shade, "linewidth": width, "alpha": alpha, "label": "measured"}
+            axes.plot(measurements.times(name), values, marker=marker_of(values), markersize=2.0, **drawn)
         if simulated:
             text = label + (f", RRMSE {100 * errors[name]:.3g} %" if name in errors else "")
-            axes.plot(response.time, from_si(response.channel(name), unit), color=BLUE, linewidth=0.8, label=text)
+            values = from_si(response.channel(name), unit)
+            axes.plot(response.times(name), values, color=BLUE, linewidth=0.8, label=text)
         if measured and simulated:
             add_legend_row(axes, 2)
         axes.set_ylabel(channel_label(known[name]))
         axes.grid(alpha=0.25)
-    set_time_axis(rows, max(source.time[-1] for source in sources), time_label)
+    last = max(source.times(name)[-1] for source in sources for name in names if _find(source, name))
+    set_time_axis(rows, last, time_label)
     if measurements is not None and measurements.description:
         figure.suptitle(measurements.description, fontsize="small", wrap=True)
     return figure
@@ -235,7 +249,7 @@ def plot_residual_checks(
     Parameters
     ----------
     residuals : ndarray, shape (n_channels, n_steps)
-        Measured minus simulated response [SI].
+        Measured minus simulated response [SI]; NaN where a sample is missing.
     channels : sequence of ChannelLike
         The channels, one per row of `residuals`.
     dt : float
@@ -269,21 +283,24 @@ def plot_residual_checks(
         layout="constrained",
         width_ratios=(2, 1, 1),
     )
-    normal = ndtri((np.arange(n) + 0.5) / n)
     for k, (history, lags, quantiles) in enumerate(rows):
         values = from_si(np.asarray(residuals[k], dtype=float), channels[k].unit)
-        history.plot(np.arange(n) * dt, values, color=BLUE, linewidth=0.7)
+        history.plot(np.arange(n) * dt, values, color=BLUE, linewidth=0.7, marker=marker_of(values), markersize=2.0)
+        values = np.sort(values[~np.isnan(values)])
+        samples = len(values)
+        normal = ndtri((np.arange(samples) + 0.5) / samples)
         history.set_ylabel(channel_label(channels[k]))
         # Beyond about ten correlation times the estimated autocorrelation is noise.
-        shown = min(n, 20 + int(10.0 * n / checks.n_effective[k]))
-        lags.fill_between([0.0, (shown - 1) * dt], *(s * 1.96 / np.sqrt(n) for s in (-1, 1)), color=GREY, alpha=0.3)
+        shown = min(n, 20 + int(10.0 * samples / checks.n_effective[k]))
+        band = 1.96 / np.sqrt(samples)
+        lags.fill_between([0.0, (shown - 1) * dt], -band, band, color=GREY, alpha=0.3)
         lags.plot(np.arange(shown) * dt, correlation[k, :shown], color=BLUE, linewidth=0.9)
         lags.set_title(
-            f"lag-one correlation {checks.lag_one[k]:.2f}, {checks.n_effective[k]:.0f} effective samples of {n}",
+            f"lag-one correlation {checks.lag_one[k]:.2f}, {checks.n_effective[k]:.0f} effective samples of {samples}",
             fontsize="x-small",
         )
         quantiles.plot(normal, values.mean() + values.std() * normal, color=GREY, linewidth=0.9)
-        quantiles.plot(normal, np.sort(values), ".", color=BLUE, markersize=2)
+        quantiles.plot(normal, values, ".", color=BLUE, markersize=2)
         for axes in (history, lags, quantiles):
             axes.grid(alpha=0.25)
     for axes, text in zip(rows[-1], ("time [s]", "lag [s]", "quantile of a standard normal [-]"), strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..units import from_si
 from .protocols import ChannelHistories, FragilityLike, PredictionLike
-from .style import BLUE, GREY, ORANGE, add_legend_row, channel_label, select_names, set_time_axis, stack_axes
+from .style import BLUE, GREY, ORANGE, add_legend_row, channel_label, marker_of, select_names, set_time_axis, stack_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,8 +29,7 @@ def plot_bands(
     prediction : PredictionLike
         Prediction of histories, such as the result of `fe_likelihoods.propagate`.
     measurements : ChannelHistories, optional
-        Measurements with the step and the length of the prediction. Channels that were not measured are drawn without
-        measurements.
+        Measurements, drawn at their own times. Channels that were not measured are drawn without measurements.
     channels : sequence of str, optional
         Names of the channels to draw. Default: all channels of the prediction.
 
@@ -42,14 +41,13 @@ def plot_bands(
     Raises
     ------
     ValueError
-        If the prediction has no histories, a channel does not exist, or the measurements have another step or length.
+        If the prediction has no histories, or a channel does not exist.
     """
     time = prediction.time
     names = [channel.name for channel in prediction.channels]
     wanted = select_names(channels, names, names)
     measured = set()
     if measurements is not None:
-        prediction.check_sampling(measurements)
         measured = {channel.name for channel in measurements.channels}
     low, high = (min(prediction.probabilities), max(prediction.probabilities)) if prediction.probabilities else (0, 0)
 
@@ -63,7 +61,8 @@ def plot_bands(
             axes.fill_between(time, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
         if name in measured:
             values = from_si(measurements.channel(name), channel.unit)
-            axes.plot(time, values, color=ORANGE, linewidth=2.2, alpha=0.6, label="measured")
+            drawn = {"color": ORANGE, "linewidth": 2.2, "alpha": 0.6, "label": "measured"}
+            axes.plot(measurements.times(name), values, marker=marker_of(values), markersize=3.0, **drawn)
         axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
         axes.set_ylabel(channel_label(channel))
         axes.grid(alpha=0.25)

@@ -67,12 +67,11 @@ class ChannelHistories(Protocol):
     channels: Sequence[ChannelLike]
     description: str
 
-    @property
-    def time(self) -> np.ndarray:
-        """Times of the samples, shape (n_steps,) [s]."""
+    def times(self, name: str) -> np.ndarray:
+        """Times of the samples of one channel, shape (n_steps,) [s]."""
 
     def channel(self, name: str) -> np.ndarray:
-        """History of one channel, shape (n_steps,) [SI]."""
+        """History of one channel, shape (n_steps,) [SI]; NaN where a sample is missing."""
 
 
 class SpectrumLike(Protocol):
@@ -99,9 +98,6 @@ class PredictionLike(Protocol):
 
     def quantile(self, probability: float) -> np.ndarray:
         """Quantile of all channels, shape (n_channels, n_steps) [SI]."""
-
-    def check_sampling(self, measurements: ChannelHistories) -> None:
-        """Raise ValueError if the measurements have another time step or number of samples."""
 
 
 class CurveLike(Protocol):

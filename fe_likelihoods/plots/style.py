@@ -19,6 +19,7 @@ __all__ = [
     "ORANGE",
     "add_legend_row",
     "channel_label",
+    "marker_of",
     "new_axes",
     "select_names",
     "set_time_axis",
@@ -58,6 +59,12 @@ def add_legend_row(axes: Axes, n_columns: int) -> None:
     axes.legend(frameon=False, fontsize="small", ncols=n_columns, loc="upper right", borderaxespad=0.1)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))
+
+
+def marker_of(values: np.ndarray) -> str:
+    """Return the marker of a line: a dot if a sample has no neighbour, which a line alone would not show."""
+    there = np.concatenate([[False], ~np.isnan(values), [False]])
+    return "." if (there[1:-1] & ~there[:-2] & ~there[2:]).any() else ""
 
 
 def channel_label(channel: ChannelLike) -> str:

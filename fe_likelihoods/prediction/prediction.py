@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
+from ..signals.comparison import Comparison, compare_with
 from ..signals.error_measures import rrmse
-from ..signals.sampling import same_sampling
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -111,7 +111,8 @@ class Prediction:
         Parameters
         ----------
         measurements : Measurements
-            Measurements of all channels, with the step and the length of the histories.
+            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
+            has times of its own, the histories are interpolated there.
         part : slice
             The samples of the history to compare. Default: all.
 
@@ -123,11 +124,12 @@ class Prediction:
         Raises
         ------
         ValueError
-            If the prediction has no histories, the measurements lack a channel or have another step or length, or a
-            measured channel is zero at all samples.
+            If the prediction has no histories, the measurements lack a channel or have samples outside of the
+            histories, or a measured channel is zero, or has no sample, in the part.
         """
-        measured = self._measured(measurements)[:, part]
-        return rrmse(self.mean[:, part], measured, [channel.name for channel in self.channels])
+        compared = self._compared(measurements)
+        measured, mean = _values_of(compared), _at_samples(compared, self.mean)
+        return rrmse(mean[:, part], measured[:, part], [channel.name for channel in self.channels])
 
     def coverage(
         self, measurements: Measurements, lower: float = 0.05, upper: float = 0.95, part: slice = slice(None)
@@ -137,7 +139,8 @@ class Prediction:
         Parameters
         ----------
         measurements : Measurements
-            Measurements of all channels, with the step and the length of the histories.
+            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
+            has times of its own, the histories are interpolated there.
         lower, upper : float
             Probabilities of the two quantiles.
         part : slice
@@ -153,22 +156,21 @@ class Prediction:
         ------
         ValueError
             As `rrmse`, and if the prediction lacks one of the quantiles or `lower` is not below `upper`.
+
+        Notes
+        -----
+        Between the samples of the histories, the quantiles are interpolated, which is approximate.
         """
         if not lower < upper:
             raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
-        measured = self._measured(measurements)
-        inside = (self.quantile(lower) <= measured) & (measured <= self.quantile(upper))
-        return inside[:, part].mean(axis=1)
-
-    def check_sampling(self, measurements: Measurements) -> None:
-        """Raise ValueError if measurements have another time step or number of samples than the histories."""
-        self._need_histories()
-        n_steps = self.mean.shape[1]
-        if not same_sampling(self.dt, n_steps, measurements.dt, measurements.n_steps):
-            raise ValueError(
-                f"the prediction has {n_steps} samples at {self.dt} s, the measurements have {measurements.n_steps} at "
-                f"{measurements.dt} s; make them equal with Measurements.trim and Measurements.decimate"
-            )
+        compared = self._compared(measurements)
+        measured = _values_of(compared)[:, part]
+        below, above = (_at_samples(compared, self.quantile(p))[:, part] for p in (lower, upper))
+        samples = np.isfinite(measured).sum(axis=1)
+        if not samples.all():
+            empty = [c.name for c, n in zip(self.channels, samples, strict=True) if not n]
+            raise ValueError(f"channels {', '.join(empty)} have no sample in this part; choose another one")
+        return ((below <= measured) & (measured <= above)).sum(axis=1) / samples
 
     def plot(self, measurements: Measurements | None = None, channels: "Sequence[str] | None" = None) -> "Figure":
         """Plot mean, band and measurements, see `fe_likelihoods.plots.predictions.plot_bands`."""
@@ -180,8 +182,8 @@ class Prediction:
         if self.dt is None:
             raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
 
-    def _measured(self, measurements: Measurements) -> np.ndarray:
-        """Return the measured values, shape (n_channels, n_steps), in the order of `channels`."""
+    def _compared(self, measurements: Measurements) -> np.ndarray | Comparison:
+        """Return what the histories are compared with, in the order of `channels`."""
         self._need_histories()
         chosen = measurements.select([channel.name for channel in self.channels])
         for predicted, measured in zip(self.channels, chosen.channels, strict=True):
@@ -190,5 +192,12 @@ class Prediction:
                     f"channel {predicted.name!r} is {predicted.quantity!r} in the prediction, {measured.quantity!r} in "
                     "the measurements"
                 )
-        self.check_sampling(measurements)
-        return chosen.values
+        return compare_with(chosen, self.dt, self.mean.shape[1])
+
+
+def _values_of(compared: np.ndarray | Comparison) -> np.ndarray:
+    return compared.values if isinstance(compared, Comparison) else compared
+
+
+def _at_samples(compared: np.ndarray | Comparison, histories: np.ndarray) -> np.ndarray:
+    return compared.at_samples(histories) if isinstance(compared, Comparison) else histories

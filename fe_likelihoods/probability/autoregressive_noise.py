@@ -11,6 +11,7 @@ import numpy as np
 from ..signals.channels import Channel
 from .noise import HALF_LOG_TWO_PI, PerChannel, Statistic, options_repr, set_channels, total_deviations
 from .residuals import lag_one_sums
+from .sample_counts import SampleCounts
 
 __all__ = ["AutoregressiveNoise"]
 
@@ -47,6 +48,10 @@ class AutoregressiveNoise:
     with differences instead of the products r_t r_{t-1}, because for rho near one their sum would cancel against J. The
     mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
 
+    Where samples are missing, the correlation of a sample with the one before it, g steps earlier, is rho^g. The factor
+    of the pair is the normal density of r_t with mean rho^g r_{t-g} and variance sigma^2 (1 - rho^(2 g)), so gaps are
+    bridged exactly. The sums are then formed for each distance g that occurs.
+
     Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one and the
     likelihood becomes that of the differences. Decimate the measurements (`Measurements.decimate`) to a step at which
     rho is well below one.
@@ -74,19 +79,21 @@ class AutoregressiveNoise:
 
     @property
     def statistic(self) -> Statistic:
-        """Statistic of the residuals: `fe_likelihoods.probability.residuals.lag_one_sums`, three per channel."""
+        """Statistic of the residuals: `fe_likelihoods.probability.residuals.lag_one_sums`."""
         return lag_one_sums
 
-    def log_likelihood(self, statistics: np.ndarray, n_steps: int, parameters: np.ndarray) -> np.ndarray:
+    def log_likelihood(
+        self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
+    ) -> np.ndarray:
         """Log-likelihood of the measurements.
 
         Parameters
         ----------
         statistics : (n, 3 n_channels) float
             J of all channels, then D, then E (see Notes of the class) [SI unit of the channel, squared]; NaN where the
-            simulation failed.
-        n_steps : int
-            Number of samples per channel.
+            simulation failed. With missing samples, those of `lag_one_sums`.
+        n_samples : int or SampleCounts
+            Number of samples of every channel, or those of each channel where samples are missing.
         parameters : (n, 2 n_channels) float
             Standard deviations of the errors of all channels [SI], then their lag-one correlations.
 
@@ -97,7 +104,9 @@ class AutoregressiveNoise:
             and where a statistic is NaN or infinite; never NaN.
         """
         statistics = np.asarray(statistics, dtype=float)
-        n_channels = len(self.channels)
+        if isinstance(n_samples, SampleCounts):
+            return self._log_likelihood_with_gaps(statistics, n_samples, parameters)
+        n_steps, n_channels = n_samples, len(self.channels)
         squares, differences, ends = (statistics[:, k * n_channels : (k + 1) * n_channels] for k in range(3))
         sigma, rho = self.standard_deviations(parameters), self.lag_one_correlations(parameters)
         with np.errstate(all="ignore"):
@@ -106,6 +115,28 @@ class AutoregressiveNoise:
             ratio = np.sqrt(np.maximum(quadratic, 0.0) / spread) / sigma
             terms = -n_steps * (HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * (n_steps - 1) * np.log(spread) - 0.5 * ratio**2
         possible = (sigma > 0.0) & (sigma < np.inf) & (np.abs(rho) < 1.0) & np.isfinite(squares + differences + ends)
+        return np.where(possible, terms, -np.inf).sum(axis=-1)
+
+    def _log_likelihood_with_gaps(
+        self, statistics: np.ndarray, counts: SampleCounts, parameters: np.ndarray
+    ) -> np.ndarray:
+        """`log_likelihood` where samples are missing: the product of the factors of all pairs of neighbours."""
+        sigma, rho = self.standard_deviations(parameters), self.lag_one_correlations(parameters)
+        sums = statistics.reshape(len(statistics), -1, len(self.channels))
+        with np.errstate(all="ignore"):
+            quadratic, logarithms = sums[:, 1], np.zeros_like(rho)
+            for k, (gap, times) in enumerate(zip(counts.gaps, counts.transitions, strict=True)):
+                later, earlier, differences = (sums[:, 2 + 3 * k + j] for j in range(3))
+                mean = rho ** int(gap)
+                # the variance, in units of sigma^2, without the cancellation of 1 - rho^(2 g) near one
+                spread = -np.expm1(2.0 * gap * np.log(np.abs(rho)))
+                # sum (r_t - mean r_{t-g})^2, with differences as in the form without gaps
+                squares = (1.0 - mean) * (later - mean * earlier) + mean * differences
+                quadratic = quadratic + np.maximum(squares, 0.0) / spread
+                logarithms = logarithms + times * np.log(spread)
+            ratio = np.sqrt(quadratic) / sigma
+            terms = -counts.samples * (HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * logarithms - 0.5 * ratio**2
+        possible = (sigma > 0.0) & (sigma < np.inf) & (np.abs(rho) < 1.0) & np.isfinite(sums).all(axis=1)
         return np.where(possible, terms, -np.inf).sum(axis=-1)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Measurements
+from ..signals.comparison import Comparison, compare_with
 from ..simulation.changed_model import ModelGuard
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
@@ -30,11 +31,13 @@ from ..simulation.model import (
     misfit_batch,
     misfit_of_responses,
     simulate_batch,
+    statistic_width,
 )
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
-from .inputs import as_points, match_measurements
+from .inputs import as_points, check_statistic, match_measurements
 from .requested_simulations import Requested, Simulated
+from .sample_counts import count_samples
 
 __all__ = ["CachedSimulations"]
 
@@ -70,8 +73,12 @@ class CachedSimulations:
         self.measurements = match_measurements(model, measurements)
         self._statistic = statistic
         self._n_structural = len(model.parameter_names)
-        n_channels = self.measurements.n_channels
-        self._width = n_channels if statistic is None else len(statistic(self.measurements.values))
+        # what responses are compared with: the measured values, or a Comparison where samples are missing
+        self.measured = compare_with(self.measurements, model.dt, model.n_steps)
+        self.n_samples = count_samples(self.measurements.values)
+        self._response_shape = (len(model.channels), model.n_steps)
+        self._width = statistic_width(self.measured, statistic)
+        check_statistic(statistic, self.measured)
         self.pool = as_executor(pool, model)
         self.max_failure_share = max_failure_share
         self.memory_cache = MemoryCache(memory_rows)
@@ -130,6 +137,8 @@ class CachedSimulations:
         text = f"{self.model.fingerprint} {self.measurements.fingerprint}"
         if self._statistic is not None:
             text += f" {self._statistic.__module__}.{self._statistic.__qualname__}"
+        if isinstance(self.measured, Comparison) and self.measured.interpolated:
+            text += f" {self.model.dt} {self.model.n_steps} six points"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
@@ -268,7 +277,7 @@ class CachedSimulations:
     def _responses(self, keys: list[bytes], distinct: list[int]) -> SimulationBatch:
         """Responses of distinct keys; `distinct` has the key of every row that was requested, for the counts."""
         misfit, known = self.memory_cache.look_up(keys, self._width)
-        response = np.full((len(keys), *self.measurements.values.shape), np.nan)
+        response = np.full((len(keys), *self._response_shape), np.nan)
         requested = self._requested(keys, misfit, np.array(known, dtype=bool), response)
         self._obtain(requested)
         counts = np.bincount(distinct, minlength=len(keys))
@@ -324,7 +333,7 @@ class CachedSimulations:
 
     def _verified(self, look_up: Callable, *arguments: Any) -> Any:
         """Rows from the disk, of which some are simulated again; if these differ, the caches in memory are emptied."""
-        run = VerifyingRun(self.model, self.pool, self.measurements.values, self._statistic, self._width)
+        run = VerifyingRun(self.model, self.pool, self.measured, self._statistic, self._width)
         earlier = self._verified_cache.seconds
         try:
             return look_up(*arguments, run)
@@ -355,7 +364,7 @@ class CachedSimulations:
         if not places:
             return
         rows, outcomes = rows[places], [outcomes[place] for place in places]
-        nothing = np.full(self.measurements.values.shape, np.nan)
+        nothing = np.full(self._response_shape, np.nan)
         reasons = [outcome if isinstance(outcome, str) else "" for outcome in outcomes]
         response = np.array([nothing if isinstance(outcome, str) else outcome for outcome in outcomes])
         if requested.response is not None:
@@ -363,7 +372,7 @@ class CachedSimulations:
         new = np.flatnonzero(~requested.known[rows])
         if len(new):
             batch = SimulationBatch(response[new], [reasons[place] for place in new])
-            misfit, reasons_of_new = misfit_of_responses(self.model, batch, self.measurements.values, self._statistic)
+            misfit, reasons_of_new = misfit_of_responses(self.model, batch, self.measured, self._statistic)
             requested.misfit[rows[new]], requested.known[rows[new]] = misfit, True
             for row, reason in zip(rows[new], reasons_of_new, strict=True):
                 requested.reasons[row] = reason
@@ -419,7 +428,7 @@ class CachedSimulations:
     @property
     def _most_responses(self) -> int:
         """Number of responses that are held at once where they are cached."""
-        return max(1, _RESPONSE_VALUES // self.measurements.values.size)
+        return max(1, _RESPONSE_VALUES // (self._response_shape[0] * self._response_shape[1]))
 
     def _chunk_limits(self, n: int, responses: bool) -> tuple[int, int]:
         """Smallest (all workers are busy) and largest number of simulations, of n, between two writes to disk."""
@@ -452,13 +461,12 @@ class CachedSimulations:
         self._failures.check(self._outcomes)
         self._check_model(self._guard.before)
         start = time.perf_counter()
-        measured = self.measurements.values
         batch = None
         if responses or (self.cache is not None and self.cache.responses):
             batch = simulate_batch(self.model, thetas, self.pool)
-            misfit, reasons = misfit_of_responses(self.model, batch, measured, self._statistic)
+            misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self._statistic)
         else:
-            misfit, reasons = misfit_batch(self.model, thetas, measured, self.pool, self._statistic)
+            misfit, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self._statistic)
         seconds = time.perf_counter() - start
         self.seconds += seconds
         self.simulations += len(thetas)

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from ..signals.channels import Measurements
-from ..signals.sampling import same_step
-from ..simulation.model import Model
+from ..signals.comparison import Comparison
+from ..simulation.model import Model, Statistic
 from .noise import Noise, noise_channels
 
-__all__ = ["as_points", "check_model", "check_noise_channels", "match_measurements"]
+__all__ = ["as_points", "check_model", "check_noise_channels", "check_statistic", "match_measurements"]
 
 _MODEL_MEMBERS = ("parameter_names", "channels", "dt", "n_steps", "fingerprint", "simulate")
 
@@ -70,13 +70,25 @@ def check_noise_channels(model: Model, noise: Noise) -> None:
         )
 
 
+def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparison) -> None:
+    """Raise ValueError if samples are missing and the statistic of a noise has no rule for them."""
+    if statistic is None or not isinstance(measured, Comparison):
+        return
+    if not np.isfinite(statistic(measured.values)).all():
+        raise ValueError(
+            f"samples are missing, and the statistic {statistic!r} of the noise is not finite with residuals of NaN at "
+            "these samples; leave such residuals out in the statistic, or use GaussianNoise, SharedGaussianNoise or "
+            "AutoregressiveNoise"
+        )
+
+
 def match_measurements(model: Model, measurements: Measurements) -> Measurements:
     """Measurements in the order of the model's channels.
 
     Raises
     ------
     ValueError
-        If channels, quantities, time step or number of samples of model and measurements differ.
+        If channels or quantities of model and measurements differ.
     """
     expected = [channel.name for channel in model.channels]
     got = [channel.name for channel in measurements.channels]
@@ -92,14 +104,4 @@ def match_measurements(model: Model, measurements: Measurements) -> Measurements
             raise ValueError(
                 f"channel {ours.name!r} is {ours.quantity!r} in the model and {theirs.quantity!r} in the measurements"
             )
-    if not same_step(model.dt, matched.dt):
-        raise ValueError(
-            f"the time step of the model's response is {model.dt} s, that of the measurements {matched.dt} s; make "
-            "them equal with Record.resample(dt) on the excitation or Measurements.decimate(factor)"
-        )
-    if matched.n_steps != model.n_steps:
-        raise ValueError(
-            f"the model's response has {model.n_steps} samples, the measurements have {matched.n_steps}; make them "
-            "equal with Record.trim(start, stop) and Measurements.trim(start, stop)"
-        )
     return matched

@@ -6,12 +6,15 @@ of the residuals, see `fe_likelihoods.probability.noise`.) The simulations are r
 `fe_likelihoods.probability.cached_simulations`. The equations are on the page ``docs/theory/likelihood.rst``.
 """
 
+import math
 import os
 from typing import Any
 
 import numpy as np
 
 from ..signals.channels import Measurements
+from ..signals.comparison import Comparison
+from ..signals.sampling import same_step
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
 from .cached_simulations import CachedSimulations
@@ -31,7 +34,9 @@ class FELikelihood(CachedSimulations):
     model : Model
         Computes the response from structural parameters (see `fe_likelihoods.simulation.model`).
     measurements : Measurements
-        The model's channels (matched by name, in any order) at the model's time step and length.
+        The model's channels (matched by name, in any order), up to the end of the model's response. NaN marks missing
+        samples, which are left out. A channel may have its own step and start: the response is interpolated at the
+        times of its samples, without a filter (`fe_likelihoods.signals.comparison`).
     noise : Noise, optional
         A noise of `fe_likelihoods.probability.noise` or any object with that protocol; by default `GaussianNoise` of
         the model's channels.
@@ -85,9 +90,10 @@ class FELikelihood(CachedSimulations):
     Raises
     ------
     ValueError
-        If a member of `Model` is missing, if the channels, time step or length of model and measurements differ, or the
-        channels of the noise, if parameter names repeat, if `pool` is neither a number nor has ``map`` or ``gather``,
-        if the model cannot be sent to its processes, or if the file of the cache cannot be used.
+        If a member of `Model` is missing, if the channels or the durations of model and measurements differ, or the
+        channels of the noise, if samples are missing and the noise has no rule for them, if parameter names repeat, if
+        `pool` is neither a number nor has ``map`` or ``gather``, if the model cannot be sent to its processes, or if
+        the file of the cache cannot be used.
     """
 
     def __init__(
@@ -149,7 +155,12 @@ class FELikelihood(CachedSimulations):
         """
         measurements = self.measurements.trim(0.0, seconds)
         # the time of a sample, which leaves no doubt about the length of the response
-        model = first_part(self.model, (measurements.n_steps - 1) * measurements.dt)
+        if measurements.simultaneous and measurements.start == 0.0 and same_step(self.model.dt, measurements.dt):
+            last = (measurements.n_steps - 1) * measurements.dt
+        else:
+            steps = math.ceil(measurements.end / self.model.dt - 1e-6)
+            last = min(steps, self.model.n_steps - 1) * self.model.dt
+        model = first_part(self.model, last)
         return self._with(model, measurements, self.noise)
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
@@ -163,7 +174,7 @@ class FELikelihood(CachedSimulations):
         Returns
         -------
         (n_channels, n_steps) float
-            [SI], in the order of the model's channels.
+            [SI], in the order of the model's channels; NaN where a sample is missing.
 
         Raises
         ------
@@ -181,6 +192,8 @@ class FELikelihood(CachedSimulations):
         response, (reason,) = simulate_batch(self.model, theta[None, : self._n_structural])
         if reason:
             raise SimulationFailed(reason)
+        if isinstance(self.measured, Comparison):
+            return -self.measured.residuals(response[0])
         return self.measurements.values - response[0]
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
@@ -200,16 +213,16 @@ class FELikelihood(CachedSimulations):
         points = as_points(x, self.parameter_names)
         rows = np.atleast_2d(points)
         thetas, noise = np.split(rows, [self._n_structural], axis=1)
-        n_steps = self.measurements.n_steps
+        n_samples = self.n_samples
         possible = np.isfinite(rows).all(axis=1)
         if self.fast_parameters:
             # statistics of zero (a perfect fit) show before any simulation which noise parameters are possible
             perfect = np.zeros((len(rows), self._width))
-            possible &= ~np.isneginf(self.noise.log_likelihood(perfect, n_steps, noise))
+            possible &= ~np.isneginf(self.noise.log_likelihood(perfect, n_samples, noise))
         result = np.full(len(rows), -np.inf)
         if possible.any():
             misfit = self.statistics(thetas[possible])
-            values = self.noise.log_likelihood(misfit, n_steps, noise[possible])
+            values = self.noise.log_likelihood(misfit, n_samples, noise[possible])
             usable = values < np.inf  # neither NaN nor infinite
             simulated = np.isfinite(misfit).all(axis=1)
             for row in np.flatnonzero(simulated & ~usable):

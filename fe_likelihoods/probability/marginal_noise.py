@@ -23,6 +23,7 @@ import numpy as np
 from .distributions import Distribution, RandomState, Uniform
 from .noise import GaussianNoise, SharedGaussianNoise
 from .priors import Prior
+from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = ["MarginalNoise"]
 
@@ -88,7 +89,7 @@ class MarginalNoise:
         """No parameters."""
         return ()
 
-    def log_likelihood(self, misfit: np.ndarray, n_steps: int, parameters: Any = None) -> np.ndarray:
+    def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, parameters: Any = None) -> np.ndarray:
         """Log-likelihood of the measurements.
 
         Parameters
@@ -96,8 +97,8 @@ class MarginalNoise:
         misfit : (n, n_channels) float
             Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
             failed.
-        n_steps : int
-            Number of samples per channel.
+        n_samples : int or SampleCounts
+            Number of samples of every channel, or those of each channel where samples are missing.
         parameters : optional
             Ignored; the noise has no parameters.
 
@@ -111,20 +112,20 @@ class MarginalNoise:
         total = np.full(len(misfit), -np.inf)
         usable = np.isfinite(misfit).all(axis=1)
         if usable.any():
-            squares, counts, constant = self._sums(misfit[usable], n_steps)
+            squares, counts, constant = self._sums(misfit[usable], n_samples)
             terms = [_integral(*one) for one in zip(squares.T, counts, self.priors, strict=True)]
             total[usable] = constant + np.sum(terms, axis=0)
         return total
 
-    def draw(self, misfit: np.ndarray, n_steps: int, rng: RandomState = None) -> np.ndarray:
+    def draw(self, misfit: np.ndarray, n_samples: int | SampleCounts, rng: RandomState = None) -> np.ndarray:
         """Draws of the standard deviations from their conditional posterior, given the misfit, one per row.
 
         Parameters
         ----------
         misfit : (n, n_channels) float
             As for `log_likelihood`; finite and positive.
-        n_steps : int
-            Number of samples per channel.
+        n_samples : int or SampleCounts
+            Number of samples of every channel, or those of each channel where samples are missing.
         rng : int, numpy.random.Generator, numpy.random.RandomState or None
             A seed, a generator, or None for NumPy's global stream.
 
@@ -145,17 +146,18 @@ class MarginalNoise:
                 f"the noise can only be drawn where the misfit is finite and positive; in {(~good).sum()} of "
                 f"{len(good)} rows it is not, because the simulation failed or fits exactly: leave these rows out"
             )
-        squares, counts, _ = self._sums(misfit, n_steps)
+        squares, counts, _ = self._sums(misfit, n_samples)
         uniform = Uniform(0.0, 1.0).rvs(squares.shape, rng)
         columns = [_draws(*one) for one in zip(squares.T, counts, self.priors, uniform.T, strict=True)]
         return np.stack(columns, axis=1)
 
-    def _sums(self, misfit: np.ndarray, n_steps: int) -> tuple[np.ndarray, np.ndarray, float]:
+    def _sums(self, misfit: np.ndarray, n_samples: int | SampleCounts) -> tuple[np.ndarray, np.ndarray, float]:
         """Sums of squares (n, n_noise) and numbers of samples (n_noise,) per sigma, and a constant of the logarithm."""
-        counts = np.full(misfit.shape[1], float(n_steps))
+        n = samples_per_channel(n_samples)
+        counts = np.full(misfit.shape[1], n, dtype=float)
         if self.noise.effective_samples is not None:
             counts = np.minimum(counts, self.noise.effective_samples)
-            misfit = misfit * (counts / n_steps)
+            misfit = misfit * (counts / n)
         if isinstance(self.noise, GaussianNoise):
             return misfit, counts, 0.0
         scales = np.array(self.noise.scales)

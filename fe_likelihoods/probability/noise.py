@@ -31,6 +31,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
+from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = [
     "GaussianNoise",
@@ -57,6 +58,7 @@ class Noise(Protocol):
     * ``channels``, the measured channels in the order of the statistics; checked against those of the model.
     * ``statistic``, a function of a module that takes the residuals (n_channels, n_steps) and returns the numbers
       (n_numbers,) which `log_likelihood` needs, the sums of squares (n_channels,) first. Without it these are all.
+      Residuals of missing samples are NaN; a statistic without a rule for them is refused with such measurements.
     * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
       errors (n, n_channels) [SI]; needed for predictions with noise.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
@@ -67,10 +69,13 @@ class Noise(Protocol):
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters of the noise."""
 
-    def log_likelihood(self, statistics: np.ndarray, n_steps: int, parameters: np.ndarray) -> np.ndarray:
+    def log_likelihood(
+        self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
+    ) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) of the residuals at parameters (n, n_noise).
 
-        The value is -inf where a parameter is impossible, also for statistics of zero.
+        The number of samples is that of every channel; measurements with missing samples have `SampleCounts`. The value
+        is -inf where a parameter is impossible, also for statistics of zero.
         """
 
 
@@ -113,7 +118,8 @@ class GaussianNoise:
 
     Notes
     -----
-    With n samples in channel c and the sum of squared residuals J_c, the log-likelihood is [1]_, eqs. (2) and (3)::
+    With n samples in channel c (those that are not missing) and the sum of squared residuals J_c, the log-likelihood is
+    [1]_, eqs. (2) and (3)::
 
         log L = sum_c [ -n/2 log(2 pi) - n log(sigma_c) - J_c / (2 sigma_c^2) ]
 
@@ -148,7 +154,7 @@ class GaussianNoise:
         """``sigma_<channel>``: standard deviations, each in the SI unit of its channel."""
         return tuple(f"sigma_{channel.name}" for channel in self.channels)
 
-    def log_likelihood(self, misfit: np.ndarray, n_steps: int, sigma: np.ndarray) -> np.ndarray:
+    def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, sigma: np.ndarray) -> np.ndarray:
         """Log-likelihood of the measurements.
 
         Parameters
@@ -156,8 +162,8 @@ class GaussianNoise:
         misfit : (n, n_channels) float
             Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
             failed.
-        n_steps : int
-            Number of samples per channel.
+        n_samples : int or SampleCounts
+            Number of samples of every channel, or those of each channel where samples are missing.
         sigma : (n, n_channels) float
             Standard deviations of the noise [SI unit of the channel]; of the model error where sensor noise is given.
 
@@ -167,7 +173,7 @@ class GaussianNoise:
             -inf where a sigma is impossible (zero or negative; with sensor noise only negative) and where the misfit is
             NaN or infinite; never NaN.
         """
-        return _log_likelihood(misfit, n_steps, self.standard_deviations(sigma), self.effective_samples)
+        return _log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
         """Standard deviation of the errors of every channel, sensor noise included.
@@ -252,7 +258,8 @@ class SharedGaussianNoise:
         **options
             `sensor` and `effective_samples`, as for the class.
         """
-        return cls(measurements.channels, np.sqrt(np.mean(np.square(measurements.values), axis=1)), **options)
+        mean = np.mean if measurements.complete else np.nanmean
+        return cls(measurements.channels, np.sqrt(mean(np.square(measurements.values), axis=1)), **options)
 
     def __repr__(self) -> str:
         named = [f"{c.name}: {c.quantity} / {scale!r}" for c, scale in zip(self.channels, self.scales, strict=True)]
@@ -278,7 +285,7 @@ class SharedGaussianNoise:
         """
         return total_deviations(np.asarray(parameters, dtype=float) * np.array(self.scales), self.sensor)
 
-    def log_likelihood(self, misfit: np.ndarray, n_steps: int, sigma: np.ndarray) -> np.ndarray:
+    def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, sigma: np.ndarray) -> np.ndarray:
         """Log-likelihood of the measurements.
 
         Parameters
@@ -286,8 +293,8 @@ class SharedGaussianNoise:
         misfit : (n, n_channels) float
             Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
             failed.
-        n_steps : int
-            Number of samples per channel.
+        n_samples : int or SampleCounts
+            Number of samples of every channel, or those of each channel where samples are missing.
         sigma : (n, 1) float
             Shared standard deviation, in units of the scales.
 
@@ -297,7 +304,7 @@ class SharedGaussianNoise:
             -inf where sigma is impossible (see `GaussianNoise.log_likelihood`) and where the misfit is NaN or infinite;
             never NaN.
         """
-        return _log_likelihood(misfit, n_steps, self.standard_deviations(sigma), self.effective_samples)
+        return _log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
 
 
 def set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) -> None:
@@ -359,15 +366,15 @@ def total_deviations(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.
 
 
 def _log_likelihood(
-    misfit: np.ndarray, n_steps: int, sigma: np.ndarray, effective: tuple[float, ...] | None
+    misfit: np.ndarray, n_samples: int | SampleCounts, sigma: np.ndarray, effective: tuple[float, ...] | None
 ) -> np.ndarray:
     """Log-likelihood (n,) of independent Gaussian residuals with standard deviations `sigma` (n, n_channels)."""
-    misfit = np.asarray(misfit, dtype=float)
+    misfit, n = np.asarray(misfit, dtype=float), samples_per_channel(n_samples)
     with np.errstate(all="ignore"):
         # the ratio is squared instead of sigma: the square of a tiny sigma would be zero, and 0 / 0 for zero misfit
         ratio = np.sqrt(misfit) / sigma
-        terms = -n_steps * (HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * ratio * ratio
+        terms = -n * (HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * ratio * ratio
     if effective is not None:
-        terms = terms * np.minimum(np.array(effective) / n_steps, 1.0)
+        terms = terms * np.minimum(np.array(effective) / n, 1.0)
     possible = (sigma > 0.0) & np.isfinite(misfit)
     return np.where(possible, terms, -np.inf).sum(axis=-1)

@@ -260,7 +260,7 @@ class Posterior:
             )
         points = np.atleast_2d(as_points(x, self.prior.names))
         misfit = self.likelihood.misfit(points)
-        sigmas = noise.draw(misfit, self.likelihood.measurements.n_steps, rng)
+        sigmas = noise.draw(misfit, self.likelihood.n_samples, rng)
         names = (*self.prior.names, *noise.noise.parameter_names)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..signals.channels import Channel
+from .sample_counts import distinct_gaps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,17 +69,36 @@ def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     residuals : (n_channels, n_steps) float
-        [SI unit of the channel].
+        [SI unit of the channel]; NaN where a sample is missing.
 
     Returns
     -------
-    (3 n_channels,) float
+    (3 n_channels,) float, or (2 n_channels + 3 n_gaps n_channels,) float where samples are missing
         Sums of squares of all channels, then sums of squared differences of successive residuals, then the square of
-        the first plus the square of the last residual [SI unit of the channel, squared].
+        the first plus the square of the last residual [SI unit of the channel, squared]. Where samples are missing:
+        sums of squares of all channels, then the squares of the first residuals, then for each distance of
+        `SampleCounts.gaps` three numbers per channel: over the pairs of neighbours with this distance, the sums of the
+        squares of the later residuals, of the earlier ones, and of their differences.
     """
+    if np.isnan(residuals).any():
+        return _sums_with_gaps(residuals)
     squares = np.square(residuals).sum(axis=-1)
     differences = np.square(np.diff(residuals, axis=-1)).sum(axis=-1)
     return np.concatenate([squares, differences, residuals[:, 0] ** 2 + residuals[:, -1] ** 2])
+
+
+def _sums_with_gaps(residuals: np.ndarray) -> np.ndarray:
+    places = [np.flatnonzero(there) for there in ~np.isnan(residuals)]
+    gaps = distinct_gaps(places)
+    sums = np.zeros((2 + 3 * len(gaps), len(residuals)))
+    for c, (row, one) in enumerate(zip(residuals, places, strict=True)):
+        values = row[one]
+        sums[0, c], sums[1, c] = np.square(values).sum(), values[0] ** 2
+        pairs = np.searchsorted(gaps, np.diff(one))
+        later, earlier = values[1:], values[:-1]
+        for k, each in enumerate((later, earlier, later - earlier)):
+            sums[2 + k :: 3, c] = np.bincount(pairs, each * each, minlength=len(gaps))
+    return sums.ravel()
 
 
 def autocorrelation(residuals: np.ndarray) -> np.ndarray:
@@ -87,12 +107,13 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     residuals : (n_channels, n_steps) float
-        Any unit.
+        Any unit; NaN where a sample is missing.
 
     Returns
     -------
     (n_channels, n_steps) float
-        sum_t r_t r_{t+k} / sum_t r_t^2; one at lag zero.
+        sum_t r_t r_{t+k} / sum_t r_t^2; one at lag zero. Where samples are missing, the mean product of the pairs that
+        are there takes the place of that of all pairs; zero at lags without a pair.
 
     Raises
     ------
@@ -100,11 +121,38 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
         If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel.
     """
     residuals = _checked(residuals)
+    missing = np.isnan(residuals)
+    if missing.any():
+        correlation = _lagged_products(np.where(missing, 0.0, residuals))
+        shares = _pair_shares(missing)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(shares > 0.0, correlation / shares, 0.0)
+    return _lagged_products(residuals)
+
+
+def _lagged_products(residuals: np.ndarray) -> np.ndarray:
+    """Sums of r_t r_{t+k} divided by that of lag zero, (n_channels, n_steps)."""
     n = residuals.shape[1]
     size = 2 ** (2 * n - 1).bit_length()  # zero padding, so that no lag wraps around
     spectrum = np.fft.rfft(residuals / np.abs(residuals).max(axis=1, keepdims=True), size, axis=1)
     products = np.fft.irfft(spectrum * spectrum.conj(), size, axis=1)[:, :n]
     return products / products[:, :1]
+
+
+def _pair_counts(missing: np.ndarray) -> np.ndarray:
+    """Number of pairs of samples at each lag (n_channels, n_steps)."""
+    there = (~missing).astype(float)
+    return np.rint(_lagged_products(there) * there.sum(axis=1, keepdims=True))
+
+
+def _pair_shares(missing: np.ndarray) -> np.ndarray:
+    """Number of pairs at each lag, over n (1 - k / s) for n samples in a span of s steps: one if none is missing."""
+    n = missing.shape[1]
+    span = n - np.argmax(~missing[:, ::-1], axis=1) - np.argmax(~missing, axis=1)
+    inside = np.maximum(1.0 - np.arange(n) / span[:, None], 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = _pair_counts(missing) / ((~missing).sum(axis=1)[:, None] * inside)
+    return np.where(inside > 0.0, shares, 0.0)
 
 
 def effective_samples(residuals: np.ndarray) -> np.ndarray:
@@ -113,12 +161,12 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     residuals : (n_channels, n_steps) float
-        Measured minus simulated response at parameters that fit; any unit.
+        Measured minus simulated response at parameters that fit; any unit. NaN where a sample is missing.
 
     Returns
     -------
     (n_channels,) float
-        Between one and n_steps.
+        Between one and the number of samples of the channel.
 
     Raises
     ------
@@ -141,6 +189,9 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
     The integrated autocorrelation time of a mean, which samplers report, is not suitable: it is less than one for
     oscillating residuals, which are typical of structures.
 
+    Where samples are missing, n is the number of those that are there, and a lag counts by the share of its pairs that
+    are there: n_eff = n / (1 + 2 sum_k s_k rho_k^2), with s_k = 1 where no sample is missing.
+
     The sum ends at the first lag of at least five correlation times 1 + 2 sum_k rho_k^2 (Sokal's window), because later
     terms are dominated by estimation errors.
 
@@ -152,12 +203,15 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
     .. [2] C. S. Bretherton et al. (1999), "The effective number of spatial degrees of freedom of a time-varying field",
        Journal of Climate 12, 1990-2009.
     """
-    correlation = autocorrelation(residuals)
+    correlation, missing = autocorrelation(residuals), np.isnan(residuals)
     n = correlation.shape[1]
-    times = 2.0 * np.cumsum(correlation**2, axis=1) - 1.0
+    squares, samples = correlation**2, n
+    if missing.any():
+        squares, samples = squares * _pair_shares(missing), (~missing).sum(axis=1)
+    times = 2.0 * np.cumsum(squares, axis=1) - 1.0
     wide = np.arange(n) >= _WINDOW * times
     last = np.where(wide.any(axis=1), np.argmax(wide, axis=1), n - 1)
-    return n / np.clip(np.take_along_axis(times, last[:, None], axis=1)[:, 0], 1.0, n)
+    return samples / np.clip(np.take_along_axis(times, last[:, None], axis=1)[:, 0], 1.0, samples)
 
 
 def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
@@ -166,14 +220,15 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     residuals : (n_channels, n_steps) float
-        [SI unit of the channel].
+        [SI unit of the channel]; NaN where a sample is missing.
     lag_one : (n_channels,) float
         Correlations of successive residuals, between -1 and 1.
 
     Returns
     -------
     (n_channels, n_steps - 1) float
-        (r_t - rho r_{t-1}) / sqrt(1 - rho^2) [SI unit of the channel].
+        (r_t - rho r_{t-1}) / sqrt(1 - rho^2) [SI unit of the channel]. After a gap, with the last sample before it:
+        (r_t - rho^g r_{t-g}) / sqrt(1 - rho^(2 g)); NaN where a sample is missing and for the first one.
 
     Raises
     ------
@@ -187,6 +242,13 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"lag_one must be a correlation between -1 and 1 for each of {len(residuals)} channels; got {lag_one!r}"
         )
+    if np.isnan(residuals).any():
+        white = np.full((len(residuals), residuals.shape[1] - 1), np.nan)
+        for row, one, correlation in zip(white, residuals, rho, strict=True):
+            places = np.flatnonzero(~np.isnan(one))
+            mean = correlation ** np.diff(places)
+            row[places[1:] - 1] = (one[places[1:]] - mean * one[places[:-1]]) / np.sqrt(1.0 - mean**2)
+        return white
     return (residuals[:, 1:] - rho[:, None] * residuals[:, :-1]) / np.sqrt(1.0 - rho[:, None] ** 2)
 
 
@@ -196,7 +258,8 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     Parameters
     ----------
     residuals : (n_channels, n_steps) float
-        Measured minus simulated response at parameters that fit [SI unit of the channel].
+        Measured minus simulated response at parameters that fit [SI unit of the channel]. NaN where a sample is
+        missing.
 
     Returns
     -------
@@ -205,7 +268,8 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     Raises
     ------
     ValueError
-        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel.
+        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel, or
+        if a channel has no two successive samples.
 
     Notes
     -----
@@ -224,11 +288,21 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     residuals = _checked(residuals)
     n_effective = effective_samples(residuals)
     lag_one = autocorrelation(residuals)[:, 1]
-    n = residuals.shape[1]
-    score = n_effective / 6.0 * (stats.skew(residuals, axis=1) ** 2 + 0.25 * stats.kurtosis(residuals, axis=1) ** 2)
+    n, missing = residuals.shape[1], np.isnan(residuals)
+    if missing.any():
+        n = 1.0 + _pair_counts(missing)[:, 1]
+        if not (n > 1.0).all():
+            raise ValueError(
+                f"channels {np.flatnonzero(n == 1.0).tolist()} have no two successive samples, so their lag-one "
+                "correlation is unknown: check residuals with a longer step, without the missing samples between"
+            )
+    # rows without their missing samples; one array where none is missing
+    groups = [row[None, ~gap] for row, gap in zip(residuals, missing, strict=True)] if missing.any() else [residuals]
+    shape = [stats.skew(rows, axis=1) ** 2 + 0.25 * stats.kurtosis(rows, axis=1) ** 2 for rows in groups]
+    score = n_effective / 6.0 * np.concatenate(shape)
     return ResidualChecks(
-        mean=residuals.mean(axis=1),
-        standard_deviation=residuals.std(axis=1),
+        mean=np.concatenate([rows.mean(axis=1) for rows in groups]),
+        standard_deviation=np.concatenate([rows.std(axis=1) for rows in groups]),
         lag_one=lag_one,
         n_effective=n_effective,
         white=2.0 * stats.norm.sf(np.sqrt(n) * np.abs(lag_one)),
@@ -273,11 +347,16 @@ def _checked(residuals: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"expected residuals of shape (n_channels, n_steps) with two samples or more; got {residuals.shape}"
         )
-    if not np.isfinite(residuals).all():
-        raise ValueError("residuals must be finite; these are not, perhaps because a simulation failed")
-    if not residuals.any(axis=1).all():
+    missing = np.isnan(residuals)
+    if np.isinf(residuals).any() or ((~missing).sum(axis=1) < 2).any():
         raise ValueError(
-            f"the residuals of channels {np.flatnonzero(~residuals.any(axis=1)).tolist()} are all zero and have no "
+            "residuals must be finite, with two samples or more in each channel; these are not, perhaps because a "
+            "simulation failed"
+        )
+    zero = ~np.nan_to_num(residuals).any(axis=1)
+    if zero.any():
+        raise ValueError(
+            f"the residuals of channels {np.flatnonzero(zero).tolist()} are all zero and have no "
             "correlation; leave these channels out"
         )
     return residuals

@@ -5,9 +5,10 @@ Values are always in SI units. The unit of a `Channel` is its display unit, used
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,52 +73,77 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Simultaneous samples of several channels at a constant step.
+    """Samples of several channels, each at a constant step.
 
     Parameters
     ----------
     channels : tuple of Channel
         The channels, with unique names.
-    dt : float
-        Time step [s].
-    values : (n_channels, n_steps) array_like
-        Samples in SI units, one row per channel, stored as a read-only copy.
+    dt : float or sequence of float
+        Time step [s], or one per channel.
+    values : (n_channels, n_steps) array_like, or sequence of n_channels arrays
+        Samples in SI units, one row per channel, stored as a read-only copy. NaN marks a missing sample: a gap, or
+        times at which a channel was not measured. Rows of different lengths are filled with NaN at their ends.
     description : str, optional
         What was measured, where and when.
+    start : float or sequence of float, optional
+        Time of the first sample [s] after the first sample of the excitation, or one per channel. Default: zero.
+
+    Attributes
+    ----------
+    dt, start : float or tuple of float
+        As given; a single number where all channels have the same.
 
     Raises
     ------
     ValueError
-        If names repeat, the shape does not match the channels, the step is not positive, or a sample is not finite.
+        If names repeat, the shape does not match the channels, a step is not positive, a sample is infinite, or a
+        channel has no sample.
+
+    Examples
+    --------
+    A channel with a gap, and one at half the rate that begins 0.37 s later:
+
+    >>> acceleration = Channel("acceleration", "acceleration", "g")
+    >>> displacement = Channel("displacement", "displacement", "mm")
+    >>> measurements = Measurements(
+    ...     (acceleration, displacement), (0.01, 0.02), [[0.1, np.nan, 0.3], [0.001, 0.002]], start=(0.0, 0.37)
+    ... )
+    >>> measurements.times("displacement")
+    array([0.37, 0.39, 0.41])
     """
 
     channels: tuple[Channel, ...]
-    dt: float
+    dt: float | tuple[float, ...]
     values: NDArray[np.float64]
     description: str = ""
+    start: float | tuple[float, ...] = 0.0
 
     def __post_init__(self) -> None:
         channels = tuple(self.channels)
         names = [channel.name for channel in channels]
         if not channels or len(set(names)) != len(names):
             raise ValueError(f"measurements need channels with different names, got {names}")
-        if np.iscomplexobj(self.values):
-            raise ValueError("values must be real numbers, got complex ones; give the real part if it is the data")
-        values = np.array(self.values, dtype=np.float64)
-        if values.ndim != 2 or values.shape[0] != len(channels) or values.shape[1] < 1:
-            raise ValueError(
-                f"expected values of shape (n_channels, n_steps) = ({len(channels)}, n_steps), got {values.shape}"
-            )
-        bad = np.argwhere(~np.isfinite(values))
+        values = _values_array(self.values, names)
+        bad = np.argwhere(np.isinf(values))
         if bad.size:
             row, step = bad[0]
             raise ValueError(
-                f"values must be finite: {len(bad)} are not, the first is sample {step} of channel {names[row]!r} "
-                f"({values[row, step]}); repair or cut the data"
+                f"values must be finite, or NaN where a sample is missing: {len(bad)} are infinite, the first is "
+                f"sample {step} of channel {names[row]!r}; repair or cut the data"
+            )
+        empty = [name for name, there in zip(names, ~np.isnan(values).all(axis=1), strict=True) if not there]
+        if empty:
+            raise ValueError(
+                f"a channel needs at least one sample, all samples of {', '.join(map(repr, empty))} are missing (NaN); "
+                "leave these channels out with Measurements.select"
             )
         values.flags.writeable = False
+        steps = [check_step(dt, "the measurements") for dt in _per_channel(self.dt, len(names), "time step")]
+        starts = [_check_start(start) for start in _per_channel(self.start, len(names), "start")]
         object.__setattr__(self, "channels", channels)
-        object.__setattr__(self, "dt", check_step(self.dt, "the measurements"))
+        object.__setattr__(self, "dt", _single(steps))
+        object.__setattr__(self, "start", _single(starts))
         object.__setattr__(self, "values", values)
 
     @property
@@ -131,17 +157,58 @@ class Measurements:
         return self.values.shape[1]
 
     @property
+    def steps(self) -> tuple[float, ...]:
+        """Time step of each channel [s]."""
+        return _per_channel(self.dt, self.n_channels, "time step")
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Time of the first sample of each channel [s]."""
+        return _per_channel(self.start, self.n_channels, "start")
+
+    @property
+    def simultaneous(self) -> bool:
+        """Whether all channels have the same times."""
+        return not isinstance(self.dt, tuple) and not isinstance(self.start, tuple)
+
+    @property
+    def complete(self) -> bool:
+        """Whether no sample is missing."""
+        return not np.isnan(self.values).any()
+
+    @property
     def time(self) -> NDArray[np.float64]:
-        """Times of the samples, from zero, shape (n_steps,) [s]."""
-        return np.arange(self.n_steps) * self.dt
+        """Times of the samples, shape (n_steps,) [s]; ValueError if they differ between channels (see `times`)."""
+        if not self.simultaneous:
+            raise ValueError(
+                f"the channels {', '.join(channel.name for channel in self.channels)} have different times; call "
+                "times(name) for those of one channel"
+            )
+        return self.times(self.channels[0].name)
+
+    def times(self, name: str) -> NDArray[np.float64]:
+        """Return the times of the samples of one channel, shape (n_steps,) [s], those of missing samples included."""
+        row = self._row(name)
+        times = np.arange(self.n_steps) * self.steps[row]
+        return times + self.starts[row] if self.starts[row] else times
+
+    @property
+    def end(self) -> float:
+        """Time of the last sample of all channels [s]."""
+        last = self.n_steps - 1 - np.argmax(np.isfinite(self.values)[:, ::-1], axis=1)
+        return float(max(start + k * dt for start, k, dt in zip(self.starts, last, self.steps, strict=True)))
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest (BLAKE2b, 128 bits) of names, quantities, step and values. Display units are not included."""
+        """Hex digest (BLAKE2b, 128 bits) of names, quantities, times and values. Display units are not included."""
         state = hashlib.blake2b(digest_size=16)
         state.update(json.dumps([[channel.name, channel.quantity] for channel in self.channels]).encode())
-        state.update(np.array([self.dt, self.n_steps], dtype="<f8").tobytes())
-        state.update(np.ascontiguousarray(self.values, dtype="<f8").tobytes())
+        if self.simultaneous and self.start == 0.0:
+            state.update(np.array([self.dt, self.n_steps], dtype="<f8").tobytes())
+        else:
+            state.update(np.array([*self.steps, *self.starts, self.n_steps], dtype="<f8").tobytes())
+        values = self.values if self.complete else np.where(np.isnan(self.values), np.nan, self.values)  # one NaN
+        state.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
         return state.hexdigest()
 
     def channel(self, name: str) -> NDArray[np.float64]:
@@ -153,12 +220,44 @@ class Measurements:
         if isinstance(names, str):
             raise ValueError(f"select takes a sequence of names, for instance [{names!r}]")
         rows = [self._row(name) for name in names]
-        return replace(self, channels=tuple(self.channels[row] for row in rows), values=self.values[rows])
+        return self._with_rows(rows, [self.values[row] for row in rows], self.starts, self.steps)
 
     def trim(self, start: float = 0.0, stop: float | None = None) -> "Measurements":
-        """Return the samples between two times [s], both included, as in `Record.trim`. Time starts at zero again."""
-        window = sample_window("the measurements", self.n_steps, self.dt, start, stop)
-        return replace(self, values=self.values[:, window])
+        """Return the samples between two times, both included. Time starts again from zero.
+
+        Parameters
+        ----------
+        start, stop : float
+            Times [s] with 0 <= start < stop, as in `Record.trim`. Default of `stop`: the end of the measurements.
+
+        Returns
+        -------
+        Measurements
+            The samples. Channels that begin at zero begin at zero again, as the record that is trimmed to the same
+            times; for others, `start` is the new zero.
+
+        Raises
+        ------
+        ValueError
+            If the times are out of order or outside of the measurements, or a channel has no sample between them.
+        """
+        if self.simultaneous and self.start == 0.0:
+            window = sample_window("the measurements", self.n_steps, self.dt, start, stop)
+            return replace(self, values=self.values[:, window])
+        stop = self.end if stop is None else stop
+        if not (0.0 <= start < stop <= self.end * (1.0 + 1e-12)):
+            raise ValueError(
+                f"expected 0 <= start < stop <= {self.end:g} s, the end of the measurements, got start = {start}, "
+                f"stop = {stop}"
+            )
+        rows, starts = [], []
+        for channel, values, dt in zip(self.channels, self.values, self.steps, strict=True):
+            times = self.times(channel.name)
+            inside = np.flatnonzero((times >= start - 1e-9 * dt) & (times <= stop + 1e-9 * dt))
+            rows.append(values[inside] if inside.size else [np.nan])
+            first = float(times[inside[0]]) - start if inside.size else 0.0
+            starts.append(0.0 if abs(first) <= 1e-9 * dt else first)
+        return self._with_rows(range(self.n_channels), rows, starts, self.steps)
 
     def decimate(self, factor: int) -> "Measurements":
         """Return every `factor`-th sample, starting with the first one, without a filter.
@@ -190,7 +289,8 @@ class Measurements:
         """
         if not isinstance(factor, (int, np.integer)) or not 1 <= factor <= self.n_steps:
             raise ValueError(f"factor must be a whole number from 1 to {self.n_steps}, got {factor!r}")
-        return replace(self, dt=self.dt * factor, values=self.values[:, ::factor])
+        dt = self.dt * factor if self.simultaneous else tuple(dt * factor for dt in self.steps)
+        return replace(self, dt=dt, values=self.values[:, ::factor])
 
     def plot(
         self, response: "Measurements | None" = None, channels: Sequence[str] | None = None, **options
@@ -222,19 +322,82 @@ class Measurements:
         return plot_histories(self, response, channels, errors=errors, **options)
 
     def _errors(self, response: "Measurements") -> dict[str, float]:
-        """Return the RRMSE of each channel that both have [-]; none if step or length differ or the channel is zero."""
-        if not same_sampling(self.dt, self.n_steps, response.dt, response.n_steps):
-            return {}
+        """Return the RRMSE of each channel that both have [-]; none if the times differ or the channel is zero."""
         simulated = {channel.name for channel in response.channels}
         common = [channel.name for channel in self.channels if channel.name in simulated]
-        nonzero = [name for name in common if self.channel(name).any()]
-        return {name: float(rrmse(response.channel(name), self.channel(name))) for name in nonzero}
+        return {
+            name: float(rrmse(response.channel(name), self.channel(name)))
+            for name in common
+            if self._same_times(response, name) and np.nan_to_num(self.channel(name)).any()
+        }
+
+    def _same_times(self, other: "Measurements", name: str) -> bool:
+        row, place = self._row(name), other._row(name)
+        same = same_sampling(self.steps[row], self.n_steps, other.steps[place], other.n_steps)
+        return same and self.starts[row] == other.starts[place]
+
+    def _with_rows(
+        self, rows: Sequence[int], values: Sequence[Any], starts: Sequence[float], steps: Sequence[float]
+    ) -> "Measurements":
+        """Return measurements of some channels, with new samples."""
+        return replace(
+            self,
+            channels=tuple(self.channels[row] for row in rows),
+            values=values,
+            start=tuple(starts[row] for row in rows),
+            dt=tuple(steps[row] for row in rows),
+        )
 
     def _row(self, name: str) -> int:
         names = [channel.name for channel in self.channels]
         if name not in names:
             raise ValueError(f"no channel {name!r}; the channels are {', '.join(names)}")
         return names.index(name)
+
+
+def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
+    """Samples as a new array (n_channels, n_steps); rows of different lengths are filled with NaN at their ends."""
+    if not isinstance(values, np.ndarray):
+        try:
+            rows = [np.asarray(row) for row in values]
+            lengths = [row.size for row in rows]
+            ragged = len(set(lengths)) > 1 and all(row.ndim == 1 for row in rows)
+        except TypeError:
+            ragged = False
+        if ragged:
+            values = np.full((len(rows), max(lengths)), np.nan, dtype=np.result_type(float, *rows))
+            for row, samples in zip(values, rows, strict=True):
+                row[: samples.size] = samples
+    if np.iscomplexobj(values):
+        raise ValueError("values must be real numbers, got complex ones; give the real part if it is the data")
+    values = np.array(values, dtype=np.float64)
+    if values.ndim != 2 or values.shape[0] != len(names) or values.shape[1] < 1:
+        raise ValueError(
+            f"expected values of shape (n_channels, n_steps) = ({len(names)}, n_steps), got {values.shape}"
+        )
+    return values
+
+
+def _per_channel(value: Any, n_channels: int, what: str) -> tuple[Any, ...]:
+    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str):
+        return (value,) * n_channels
+    if len(value) != n_channels:
+        raise ValueError(f"expected one {what}, or one for each of {n_channels} channels, got {len(value)}")
+    return tuple(value)
+
+
+def _single(numbers: Sequence[float]) -> float | tuple[float, ...]:
+    return numbers[0] if len(set(numbers)) == 1 else tuple(numbers)
+
+
+def _check_start(start: Any) -> float:
+    try:
+        seconds = float(start)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise ValueError(f"start of the measurements must be a finite number of seconds, got {start!r}")
+    return seconds
 
 
 def plot_response(response: Measurements, measurements: Measurements | None = None, **options) -> "Figure":

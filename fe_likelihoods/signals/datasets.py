@@ -83,6 +83,7 @@ def write_dataset(path: str | Path, record: Record, measurements: Measurements, 
             samples.attrs.update({"units": DIMENSIONS["acceleration"], "dt_units": "s"})
             values = file.create_dataset("measurements/values", data=measurements.values, dtype="<f8")
             values.attrs.update({"description": measurements.description, "dt": measurements.dt, "dt_units": "s"})
+            values.attrs["start"] = measurements.start  # [s]; NaN among the values is a missing sample
             for key, column in _channel_columns(measurements.channels).items():
                 values.attrs.create(key, column, dtype=h5py.string_dtype())
         os.replace(temporary, path)
@@ -125,7 +126,9 @@ def read_dataset(path: str | Path) -> Dataset:
             record = Record(samples.attrs["name"], samples.attrs["dt"], acceleration, samples.attrs["source"])
             columns = [values.attrs[key] for key in ("channel_names", "quantities", "display_units")]
             channels = tuple(Channel(*map(str, each)) for each in zip(*columns, strict=True))
-            measurements = Measurements(channels, values.attrs["dt"], responses, values.attrs["description"])
+            dt, start = (np.atleast_1d(values.attrs.get(key, 0.0)).tolist() for key in ("dt", "start"))
+            dt, start = (each[0] if len(each) == 1 else each for each in (dt, start))
+            measurements = Measurements(channels, dt, responses, values.attrs["description"], start)
             units = [samples.attrs["units"], *values.attrs["units"]]
         found, free = _checksum(record, measurements, text), json.loads(text)
     except (*DAMAGE, RecursionError) as error:

@@ -22,7 +22,8 @@ def rrmse(
     predicted : (..., n_steps) array_like
         Predicted values :math:`\hat y`.
     measured : (..., n_steps) array_like
-        Measured values :math:`y` in the same unit, of the same shape.
+        Measured values :math:`y` in the same unit, of the same shape. The sums are over the samples that are there:
+        those that are NaN are left out.
     names : sequence of str, optional
         Names of the histories, for the message of an error.
 
@@ -34,7 +35,7 @@ def rrmse(
     Raises
     ------
     ValueError
-        If the shapes differ, or a measured history is zero at all samples.
+        If the shapes differ, or a measured history has no sample or is zero at all of them.
 
     Examples
     --------
@@ -44,7 +45,11 @@ def rrmse(
     predicted, measured = np.asarray(predicted, dtype=float), np.asarray(measured, dtype=float)
     if predicted.shape != measured.shape or not measured.ndim:
         raise ValueError(f"expected histories of one shape, (..., n_steps); got {predicted.shape} and {measured.shape}")
-    return np.sqrt(np.square(predicted - measured).sum(axis=-1) / sum_of_squares(measured, names))
+    squares = np.square(predicted - measured)
+    missing = np.isnan(measured)
+    if missing.any():
+        squares[missing] = 0.0
+    return np.sqrt(squares.sum(axis=-1) / sum_of_squares(measured, names))
 
 
 def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> NDArray[np.float64] | np.float64:
@@ -53,7 +58,7 @@ def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> N
     Parameters
     ----------
     measured : (..., n_steps) array_like
-        Measured values.
+        Measured values; those that are NaN are left out.
     names : sequence of str, optional
         Names of the histories, for the message of an error.
 
@@ -65,9 +70,10 @@ def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> N
     Raises
     ------
     ValueError
-        If a history is zero at all samples, so that no error relative to it exists.
+        If a history has no sample or is zero at all of them, so that no error relative to it exists.
     """
-    sums = np.square(np.asarray(measured, dtype=float)).sum(axis=-1)
+    squares = np.square(np.asarray(measured, dtype=float))
+    sums = (np.nan_to_num(squares, nan=0.0) if np.isnan(squares).any() else squares).sum(axis=-1)
     if not np.all(sums):
         rows = np.flatnonzero(np.ravel(sums) == 0.0)
         zero = ", ".join(f"row {row}" if names is None else repr(names[row]) for row in rows)

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..signals.channels import Channel
+from ..signals.comparison import Comparison
 from .changed_model import SentModel
 from .faults import ChangedModel, FailedRun, MisfitReason, is_transient, reason_of
 
@@ -35,6 +36,7 @@ __all__ = [
     "real_response",
     "simulate_batch",
     "split_seconds",
+    "statistic_width",
 ]
 
 logger = logging.getLogger(__name__)
@@ -42,6 +44,7 @@ logger = logging.getLogger(__name__)
 Statistic = Callable[[np.ndarray], np.ndarray]
 """Function of residuals (n_channels, n_steps) that returns (n_numbers,), the sums of squares (n_channels,) first.
 
+Residuals of missing samples are NaN. Which samples are missing is the same for all residuals of a likelihood.
 It must be defined at the top level of a module, so that it can be sent to workers.
 """
 
@@ -209,7 +212,11 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
 
 
 def misfit_batch(
-    model: Model, thetas: np.ndarray, measured: np.ndarray, pool: Any = None, statistic: Statistic | None = None
+    model: Model,
+    thetas: np.ndarray,
+    measured: np.ndarray | Comparison,
+    pool: Any = None,
+    statistic: Statistic | None = None,
 ) -> MisfitBatch:
     """Sums of squared residuals, or another statistic of them, for many parameter sets; responses are not kept.
 
@@ -218,8 +225,8 @@ def misfit_batch(
     model : Model
     thetas : (n, n_parameters) float
         Parameter sets.
-    measured : (n_channels, n_steps) float
-        Measured response [SI].
+    measured : (n_channels, n_steps) float, or Comparison
+        Measured response [SI]. With a `Comparison`, the model's own ``misfit_batch`` is not used.
     pool : object with ``map(function, items)``, optional
         As for `simulate_batch`.
     statistic : Statistic, optional
@@ -230,8 +237,9 @@ def misfit_batch(
     MisfitBatch
     """
     reduce = _sums_of_squares if statistic is None else statistic
-    shape = (len(reduce(measured)),)
-    whole = getattr(model, "misfit_batch", None) if pool is None and statistic is None else None
+    shape = (statistic_width(measured, statistic),)
+    own = pool is None and statistic is None and not isinstance(measured, Comparison)
+    whole = getattr(model, "misfit_batch", None) if own else None
     if whole is not None:
         whole = partial(whole, thetas, measured)
     elif pool is None and hasattr(model, "simulate_batch"):
@@ -244,7 +252,7 @@ def misfit_batch(
 
 
 def misfit_of_responses(
-    model: Model, batch: SimulationBatch, measured: np.ndarray, statistic: Statistic | None = None
+    model: Model, batch: SimulationBatch, measured: np.ndarray | Comparison, statistic: Statistic | None = None
 ) -> MisfitBatch:
     """Sums of squared residuals, or another statistic of them, for given responses.
 
@@ -252,7 +260,7 @@ def misfit_of_responses(
     ----------
     model : Model
     batch : SimulationBatch
-    measured : (n_channels, n_steps) float
+    measured : (n_channels, n_steps) float, or Comparison
         Measured response [SI].
     statistic : Statistic, optional
         As for `misfit_batch`.
@@ -263,32 +271,48 @@ def misfit_of_responses(
     """
     reduce = _sums_of_squares if statistic is None else statistic
     rows = [_reduced(response, measured, reduce) for response in batch.response]
-    misfit = np.reshape(rows, (len(rows), len(reduce(measured))))
+    misfit = np.reshape(rows, (len(rows), statistic_width(measured, statistic)))
     reasons = [reason or _not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
     misfit[[bool(reason) for reason in reasons]] = np.nan
     return MisfitBatch(misfit, reasons)
+
+
+def statistic_width(measured: np.ndarray | Comparison, statistic: Statistic | None = None) -> int:
+    """Number of numbers that a statistic of the residuals has, by default the sums of squares."""
+    values = measured.values if isinstance(measured, Comparison) else measured
+    return len((_sums_of_squares if statistic is None else statistic)(values))
 
 
 def _sums_of_squares(residuals: np.ndarray) -> np.ndarray:
     return np.square(residuals).sum(axis=-1)
 
 
-def _reduced(response: np.ndarray, measured: np.ndarray, reduce: Statistic) -> np.ndarray:
-    # contiguous rows, because the order of summation, and so the last bit, must not depend on the array's layout
-    residuals = np.ascontiguousarray(response - measured)
+def _reduced(response: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
+        if isinstance(measured, Comparison):
+            if not np.isfinite(response).all():  # also where no sample is affected
+                return np.full(len(reduce(measured.values)), np.nan)
+            known = reduce is _sums_of_squares
+            return reduce(measured.known_residuals(response) if known else measured.residuals(response))
+        # contiguous rows, because the order of summation, and so the last bit, must not depend on the array's layout
+        residuals = np.ascontiguousarray(response - measured)
+        if reduce is not _sums_of_squares and np.isnan(residuals).any():
+            # a failed simulation: for a statistic, NaN marks a missing sample
+            return np.full(len(reduce(measured)), np.nan)
         return reduce(residuals)
 
 
-def _misfit_from_responses(model: Model, thetas: np.ndarray, measured: np.ndarray, reduce: Statistic) -> MisfitBatch:
+def _misfit_from_responses(
+    model: Model, thetas: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic
+) -> MisfitBatch:
     """Statistics from the model's own ``simulate_batch``, in parts of bounded memory."""
     misfits, reasons = [], []
-    rows = max(1, _RESPONSE_VALUES // measured.size)
+    rows = max(1, _RESPONSE_VALUES // (len(model.channels) * model.n_steps))
     for start in range(0, len(thetas), rows):
         batch = simulate_batch(model, thetas[start : start + rows])
         misfits += [_reduced(response, measured, reduce) for response in batch.response]
         reasons += batch.reasons
-    return MisfitBatch(np.reshape(misfits, (len(thetas), len(reduce(measured)))), reasons)
+    return MisfitBatch(np.reshape(misfits, (len(thetas), statistic_width(measured, reduce))), reasons)
 
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
@@ -335,7 +359,7 @@ def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> n
     return response
 
 
-def _misfit(measured: np.ndarray, reduce: Statistic, model: Model, theta: np.ndarray) -> np.ndarray:
+def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, theta: np.ndarray) -> np.ndarray:
     response = _response(model, theta)
     if reason := _not_finite(model, response):
         raise SimulationFailed(reason)

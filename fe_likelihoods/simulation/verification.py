@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..signals.comparison import Comparison, measured_values
 from .cache_rows import CachedRows, StoredSimulation, simulation_keys
 from .disk_cache import SimulationCache
 from .faults import TransientReason
@@ -84,7 +85,7 @@ class VerifyingRun(NamedTuple):
     model : Model
     pool : executor or None
         Where the simulations of the likelihood run.
-    measured : (n_channels, n_steps) float
+    measured : (n_channels, n_steps) float, or Comparison
         Measured response [SI].
     statistic : Statistic or None
         Statistic of the residuals that is stored; None for the sums of squares.
@@ -94,7 +95,7 @@ class VerifyingRun(NamedTuple):
 
     model: Model
     pool: Any
-    measured: np.ndarray
+    measured: np.ndarray | Comparison
     statistic: Statistic | None
     n_numbers: int
 
@@ -192,7 +193,7 @@ class VerifiedCache:
         StaleCache
             If a stored row and a new simulation differ.
         """
-        n_steps = run.measured.shape[1]
+        n_steps = measured_values(run.measured).shape[1]
         rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps)
         known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist())
         if known:
@@ -374,7 +375,7 @@ class VerifiedCache:
                 advice = ". If failures depend on anything but the parameters, set retry_failures=True"
         else:
             tolerance = self._tolerance(run)
-            found = largest_difference(row.misfit, new, run.measured, tolerance)
+            found = largest_difference(row.misfit, new, measured_values(run.measured), tolerance)
             if found is None:
                 return
             index, change = found
@@ -414,7 +415,7 @@ class VerifiedCache:
         if reason or new_reason:
             outcome = f"failed ({new_reason})" if new_reason else "succeeded"
             return f"{text}{outcome}. Make it depend on its parameters alone, for example with a fixed seed"
-        found = largest_difference(earlier, new, run.measured, self._tolerance(run))
+        found = largest_difference(earlier, new, measured_values(run.measured), self._tolerance(run))
         if found is None:
             return ""
         index, change = found

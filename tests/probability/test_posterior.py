@@ -250,7 +250,7 @@ def test_channels_are_matched_by_name(oscillator, measurements):
 def test_measurements_that_do_not_fit_are_refused(oscillator, measurements):
     cases = {
         "select": measurements.select(["acceleration"]),
-        "decimate": measurements.decimate(2),
+        "correct the step": Measurements(measurements.channels, 2.0 * measurements.dt, measurements.values),
         "trim": measurements.trim(0.0, 3.0),
         "relative acceleration": Measurements(
             (Channel("acceleration", "relative acceleration", "g"), measurements.channels[1]),

@@ -55,8 +55,9 @@ class TestMeasurements:
             ((TOP,), 0.1, np.ones(3), r"got \(3,\)"),
             ((TOP,), 0.1, np.ones((1, 3)) + 0j, "values must be real numbers, got complex ones"),
             ((TOP,), 0.1, np.ones((1, 0)), r"got \(1, 0\)"),
+            ((TOP, DRIFT), 0.1, [[0, np.nan], [np.nan, np.nan]], "all samples of 'drift' are missing"),
             ((TOP,), 0.0, np.ones((1, 3)), "positive number of seconds, got 0.0"),
-            ((TOP, DRIFT), 0.1, [[0, 1], [2, np.nan]], "1 are not, the first is sample 1 of channel 'drift'"),
+            ((TOP, DRIFT), 0.1, [[0, 1], [2, np.inf]], "1 are infinite, the first is sample 1 of channel 'drift'"),
         ],
     )
     def test_refusals(self, channels, dt, values, message):

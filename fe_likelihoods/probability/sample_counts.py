@@ -1,0 +1,58 @@
+"""Numbers of samples of measurements with missing samples, as the noises need them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["SampleCounts", "count_samples", "distinct_gaps", "samples_per_channel"]
+
+
+class SampleCounts(NamedTuple):
+    """Which samples of measurements are there, in numbers.
+
+    Attributes
+    ----------
+    samples : ndarray of int, shape (n_channels,)
+        Number of samples of each channel.
+    gaps : ndarray of int, shape (n_gaps,)
+        Distances from one sample to the next that is there, in steps: one where no sample is missing between them. The
+        distances of all channels, each once, ascending.
+    transitions : ndarray of int, shape (n_gaps, n_channels)
+        How often each distance occurs in each channel.
+    """
+
+    samples: np.ndarray
+    gaps: np.ndarray
+    transitions: np.ndarray
+
+
+def count_samples(values: np.ndarray) -> int | SampleCounts:
+    """Numbers of samples of measurements.
+
+    Parameters
+    ----------
+    values : (n_channels, n_steps) float
+        The samples, NaN where one is missing.
+
+    Returns
+    -------
+    int or SampleCounts
+        The number of steps if no sample is missing.
+    """
+    if not np.isnan(values).any():
+        return values.shape[1]
+    places = [np.flatnonzero(there) for there in ~np.isnan(values)]
+    gaps = distinct_gaps(places)
+    transitions = [np.bincount(np.searchsorted(gaps, np.diff(one)), minlength=len(gaps)) for one in places]
+    return SampleCounts(np.array([len(one) for one in places]), gaps, np.array(transitions, dtype=int).T)
+
+
+def distinct_gaps(places: Sequence[np.ndarray]) -> np.ndarray:
+    """The field `gaps` of `SampleCounts`, shape (n_gaps,), from the places of the samples of each channel."""
+    return np.flatnonzero(np.bincount(np.concatenate([np.diff(one) for one in places])))
+
+
+def samples_per_channel(n_samples: int | SampleCounts) -> int | np.ndarray:
+    """Number of samples: of all channels, or (n_channels,) of each."""
+    return n_samples.samples if isinstance(n_samples, SampleCounts) else n_samples

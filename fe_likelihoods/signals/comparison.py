@@ -1,0 +1,147 @@
+"""Comparison of the response of a model with measurements that have gaps, or times of their own.
+
+Measurements with all samples of the model's response need none of this: their residuals are a difference of arrays.
+Here a channel is compared where it was measured. Samples that are missing have residuals of NaN, so that a statistic of
+the residuals sees which samples are there.
+
+The response is evaluated at the times of the samples by interpolation (`fe_likelihoods.signals.interpolation`), without
+a filter, also where a channel has longer steps than the response. A sample is the value of the quantity at one instant,
+and the value of the response at the same instant is what it is compared with. A filter of the response would remove
+motion that the sensor has measured; the noise of thinned white samples stays white.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .channels import Measurements
+from .interpolation import Interpolation, interpolate, make_interpolation
+from .sampling import same_sampling, same_step
+
+__all__ = ["Comparison", "compare_with", "measured_values"]
+
+_LATEST = 1e-6  # in steps: how far a sample may be after the end of the response, for round-off
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Measurements that have gaps, or times of their own, prepared for a response.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n_channels, n_samples)
+        Samples [SI], NaN where there is none.
+    places : tuple of Interpolation or None, one per channel
+        How the response is evaluated at the times of each channel; None where its times are those of the response.
+    """
+
+    values: NDArray[np.float64]
+    places: tuple[Interpolation | None, ...]
+
+    @property
+    def interpolated(self) -> bool:
+        """Whether the response of a channel is evaluated between its samples."""
+        return any(place is not None and place.weights is not None for place in self.places)
+
+    @cached_property
+    def missing(self) -> NDArray[np.bool_]:
+        """Whether a sample is missing, shape (n_channels, n_samples)."""
+        return np.isnan(self.values)
+
+    def at_samples(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the response (n_channels, n_steps) at the times of the samples, shape (n_channels, n_samples)."""
+        if all(place is None for place in self.places):
+            return response
+        n_samples = self.values.shape[1]
+        return np.stack(
+            [
+                row[:n_samples] if place is None else interpolate(row, place)
+                for row, place in zip(response, self.places, strict=True)
+            ]
+        )
+
+    def residuals(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return response minus measurement, shape (n_channels, n_samples) [SI], NaN where a sample is missing."""
+        return np.ascontiguousarray(self.at_samples(response) - self.values)  # as for a complete response
+
+    def known_residuals(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `residuals` with zero where a sample is missing."""
+        residuals = self.residuals(response)
+        residuals[self.missing] = 0.0
+        return residuals
+
+
+def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray[np.float64] | Comparison:
+    """Return what a response is compared with.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The measurements, in the order of the response's channels.
+    dt : float
+        Time step of the response [s].
+    n_steps : int
+        Number of samples of the response.
+
+    Returns
+    -------
+    ndarray, shape (n_channels, n_steps), or Comparison
+        The measured values if each sample of the response has one, else the comparison.
+
+    Raises
+    ------
+    ValueError
+        If the measurements do not end with the response, or a sample is before the first one of the response.
+
+    Notes
+    -----
+    With the step of the response, the measurements must have all its samples, of which some may be missing (NaN). With
+    other steps or starts, they must end within one step before the end of the response, so that a wrong step is
+    noticed.
+    """
+    end = (n_steps - 1) * dt
+    _check_end(measurements, dt, n_steps)
+    places: list[Interpolation | None] = []
+    for row, channel in enumerate(measurements.channels):
+        step, start = measurements.steps[row], measurements.starts[row]
+        if start == 0.0 and same_sampling(dt, n_steps, step, measurements.n_steps):
+            places.append(None)
+            continue
+        times = measurements.times(channel.name)
+        there = np.isfinite(measurements.values[row])
+        known = times[there]
+        if known[0] < -_LATEST * dt:
+            raise ValueError(
+                f"the samples of channel {channel.name!r} are from {known[0]:g} to {known[-1]:g} s, the response of "
+                f"the model is from 0 to {end:g} s; correct their start, or replace the samples before zero by NaN"
+            )
+        # a missing sample may be outside the response: any place within serves
+        places.append(make_interpolation(dt, n_steps, np.where(there, times, known[0])))
+    if all(place is None for place in places) and not np.isnan(measurements.values).any():
+        return measurements.values
+    return Comparison(measurements.values, tuple(places))
+
+
+def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
+    """Raise ValueError if the measurements do not end with the response."""
+    end, last = (n_steps - 1) * dt, measurements.end
+    if measurements.simultaneous and measurements.start == 0.0 and same_step(dt, measurements.dt):
+        fits = measurements.n_steps == n_steps
+    else:
+        # missing samples at the end of simultaneous channels count: they say that the end was not measured
+        stated = measurements.time[-1] if measurements.simultaneous else last
+        fits = last <= end + _LATEST * dt and stated >= end - (1.0 + _LATEST) * max(dt, *measurements.steps)
+    if not fits:
+        raise ValueError(
+            f"the response has {n_steps} samples at {dt} s, the measurements have {measurements.n_steps} at "
+            f"{measurements.dt} s (step), which end at {last:g} s instead of {end:g} s; make them equal with "
+            "Record.trim(start, stop) and Measurements.trim(start, stop), correct the step, or fill times that were "
+            "not measured with NaN"
+        )
+
+
+def measured_values(measured: NDArray[np.float64] | Comparison) -> NDArray[np.float64]:
+    """Return the measured values (n_channels, n_samples) [SI], with zero where a sample is missing."""
+    return np.nan_to_num(measured.values, nan=0.0) if isinstance(measured, Comparison) else measured

@@ -1,0 +1,379 @@
+"""Missing samples: every noise is the normal density of the samples that are there."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import integrate, linalg, stats
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    HalfNormal,
+    MarginalNoise,
+    Measurements,
+    Posterior,
+    SharedGaussianNoise,
+    SimulationCache,
+    SimulationFailed,
+    TruncatedNormal,
+    Uniform,
+    effective_samples,
+    find_modes,
+    innovations,
+    plot_residuals,
+    propagate,
+    residual_checks,
+    rrmse,
+)
+from fe_likelihoods.probability.residuals import autocorrelation, lag_one_sums
+from fe_likelihoods.probability.sample_counts import SampleCounts, count_samples
+from fe_likelihoods.simulation.model import SimulationBatch
+from tests.emulation.problems import CHANNELS as MODES_CHANNELS
+from tests.emulation.problems import DT, N_STEPS, free_vibration
+
+CHANNELS = (Channel("top", "acceleration", "g"), Channel("drift", "displacement", "mm"))
+TIME = 0.02 * np.arange(60)
+
+
+def wave(theta):
+    """Two channels of sixty samples; fails for a large second parameter."""
+    if theta[1] > 3.0:
+        raise SimulationFailed("too fast")
+    return np.stack([theta[0] * np.sin(9.0 * theta[1] * TIME), 0.1 * theta[0] * np.cos(9.0 * theta[1] * TIME)])
+
+
+def with_gaps(rng, shape=(2, 60), share=0.3):
+    """Mask of samples that are there: a late first sample, an early last one, single ones and a long gap."""
+    there = rng.random(shape) > share
+    there[0, :4], there[1, -9:], there[0, 20:37] = False, False, False
+    return there
+
+
+def measured(rng, there):
+    values = wave(np.array([1.0, 1.0])) + 0.1 * rng.normal(size=(2, 60))
+    return Measurements(CHANNELS, 0.02, np.where(there, values, np.nan))
+
+
+def statistics_of(noise, residuals):
+    statistic = getattr(noise, "statistic", None)
+    known = np.square(np.nan_to_num(residuals)).sum(axis=1)
+    return (known if statistic is None else statistic(residuals))[None]
+
+
+# the closed form ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rho", [0.0, -0.7, 0.5, 0.98, 0.9999])
+def test_autoregressive_noise_bridges_gaps_exactly(rng, rho):
+    noise, there = AutoregressiveNoise(CHANNELS, sensor={"top": 0.3}), with_gaps(rng)
+    residuals = np.where(there, rng.normal(size=(2, 60)) * [[1.0], [0.02]], np.nan)
+    parameters = np.array([[0.7, 0.03, rho, -0.5 * rho]])
+    expected = sum(
+        stats.multivariate_normal.logpdf(r[one], cov=s**2 * linalg.toeplitz(q ** np.arange(60.0))[np.ix_(one, one)])
+        for r, one, s, q in zip(residuals, there, (math.hypot(0.7, 0.3), 0.03), (rho, -0.5 * rho), strict=True)
+    )
+    got = noise.log_likelihood(statistics_of(noise, residuals), count_samples(residuals), parameters)[0]
+    assert got == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("options", [{}, {"sensor": {"top": 0.3}}, {"effective_samples": {"top": 11.0, "drift": 1e9}}])
+def test_white_noises_count_the_samples_that_are_there(rng, options):
+    there = with_gaps(rng)
+    residuals = np.where(there, rng.normal(size=(2, 60)) * [[1.0], [0.02]], np.nan)
+    counts = count_samples(residuals)
+    assert counts.samples.tolist() == there.sum(axis=1).tolist()
+    powers = [min(11.0 / there[0].sum(), 1.0) if "effective_samples" in options else 1.0, 1.0]
+    for noise, parameters in (
+        (GaussianNoise(CHANNELS, **options), np.array([[0.7, 0.03]])),
+        (SharedGaussianNoise(CHANNELS, (2.0, 0.1), **options), np.array([[0.4]])),
+    ):
+        sigmas = noise.standard_deviations(parameters)[0]
+        expected = sum(
+            power * stats.multivariate_normal.logpdf(r[one], cov=s**2 * np.eye(one.sum()))
+            for r, one, s, power in zip(residuals, there, sigmas, powers, strict=True)
+        )
+        got = noise.log_likelihood(statistics_of(noise, residuals), counts, parameters)[0]
+        assert got == pytest.approx(expected, rel=1e-10)
+
+
+def test_marginal_noise_counts_the_samples_that_are_there(rng):
+    there = with_gaps(rng)
+    residuals = np.where(there, rng.normal(size=(2, 60)), np.nan)
+    priors = {"sigma_top": HalfNormal(2.0), "sigma_drift": Uniform(0.2, 3.0)}
+    noise, misfit = MarginalNoise(GaussianNoise(CHANNELS), priors), statistics_of(GaussianNoise(CHANNELS), residuals)
+    expected, each = 0.0, 0.0
+    for k, (channel, prior) in enumerate(zip(CHANNELS, priors.values(), strict=True)):
+        one, white = there[k], GaussianNoise([channel])
+        each += MarginalNoise(white, {f"sigma_{channel.name}": prior}).log_likelihood(misfit[:, [k]], int(one.sum()))[0]
+        top = stats.norm.logpdf(residuals[k, one], scale=residuals[k, one].std()).sum()
+        integral = integrate.quad(
+            lambda s, r=residuals[k, one], p=prior, t=top: math.exp(
+                stats.norm.logpdf(r, scale=s).sum() - t + p.logpdf(s)
+            ),
+            0.3,
+            3.0,
+            epsabs=0.0,
+            epsrel=1e-11,
+        )[0]
+        expected += top + math.log(integral)
+    got = noise.log_likelihood(misfit, count_samples(residuals))[0]
+    assert got == pytest.approx(each, rel=1e-13)
+    assert got == pytest.approx(expected, rel=1e-7)
+    draws = noise.draw(np.repeat(misfit, 4000, axis=0), count_samples(residuals), 0)
+    known = np.sqrt(misfit[0] / there.sum(axis=1))
+    np.testing.assert_allclose(draws.mean(axis=0), known, rtol=0.1)
+
+
+def test_nothing_missing_is_as_before(rng):
+    residuals = rng.normal(size=(2, 60))
+    assert count_samples(residuals) == 60
+    squares, steps = np.square(residuals).sum(axis=-1), np.square(np.diff(residuals, axis=-1)).sum(axis=-1)
+    expected = np.concatenate([squares, steps, residuals[:, 0] ** 2 + residuals[:, -1] ** 2])
+    np.testing.assert_array_equal(lag_one_sums(residuals), expected)
+    complete = measured(rng, np.ones((2, 60), dtype=bool))
+    model = FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
+    likelihood = FELikelihood(model, complete)
+    x = np.array([1.1, 0.9, 0.2, 0.03])
+    misfit = np.square(wave(x) - complete.values).sum(axis=-1)
+    ratio = np.sqrt(misfit) / x[2:]
+    terms = -60 * (0.5 * math.log(2.0 * math.pi) + np.log(x[2:])) - 0.5 * ratio * ratio
+    assert likelihood.log_likelihood(x) == terms.sum(axis=-1)
+    # digests of data without a gap are those of earlier files
+    fixed = Measurements(CHANNELS, 0.5, [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
+    assert fixed.fingerprint == "4eb0ce4a0d1f4d8d4c36612aa6cfbf39"
+
+
+def test_equals_the_density_with_all_samples_in_one_pattern(rng):
+    """The form with gaps, where there are none, is the form without."""
+    residuals = rng.normal(size=(2, 60))
+    squares, steps = np.square(residuals).sum(axis=1), np.square(np.diff(residuals, axis=1)).sum(axis=1)
+    later, earlier = np.square(residuals[:, 1:]).sum(axis=1), np.square(residuals[:, :-1]).sum(axis=1)
+    sums = np.concatenate([squares, residuals[:, 0] ** 2, later, earlier, steps])[None]
+    counts = SampleCounts(np.array([60, 60]), np.array([1]), np.array([[59, 59]]))
+    noise, parameters = AutoregressiveNoise(CHANNELS), np.array([[0.8, 1.3, 0.6, -0.2]])
+    expected = noise.log_likelihood(lag_one_sums(residuals)[None], 60, parameters)
+    np.testing.assert_allclose(noise.log_likelihood(sums, counts, parameters), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("parameters", [[0.0, 1.0, 0.1, 0.1], [-1.0, 1.0, 0.1, 0.1], [1.0, 1.0, 1.0, 0.1]])
+def test_impossible_parameters_have_no_likelihood(rng, parameters):
+    residuals = np.where(with_gaps(rng), rng.normal(size=(2, 60)), np.nan)
+    noise = AutoregressiveNoise(CHANNELS)
+    statistics = statistics_of(noise, residuals)
+    assert noise.log_likelihood(statistics, count_samples(residuals), np.array([parameters])) == -np.inf
+    possible = np.array([[1.0, 1.0, 0.1, 0.1]])
+    assert noise.log_likelihood(np.full_like(statistics, np.nan), count_samples(residuals), possible) == -np.inf
+
+
+# the likelihood -------------------------------------------------------------------------------------------------------
+
+
+class Batch:
+    """The model with batch methods of its own; that of the misfit knows no gaps."""
+
+    parameter_names, channels, dt, n_steps, fingerprint = ("size", "speed"), CHANNELS, 0.02, 60, "wave in batches"
+
+    def __init__(self):
+        self.runs = 0
+
+    def simulate(self, theta):
+        self.runs += 1
+        return wave(theta)
+
+    def simulate_batch(self, thetas):
+        self.runs += len(thetas)
+        good = [theta[1] <= 3.0 for theta in thetas]
+        rows = [wave(theta) if ok else np.full((2, 60), np.nan) for theta, ok in zip(thetas, good, strict=True)]
+        return SimulationBatch(np.array(rows), ["" if ok else "too fast" for ok in good])
+
+    def misfit_batch(self, thetas, measured):
+        raise AssertionError("called with measurements that have gaps")
+
+
+@pytest.mark.parametrize("noise", [GaussianNoise, AutoregressiveNoise])
+@pytest.mark.parametrize("own", [False, True])
+def test_likelihood_with_gaps(rng, tmp_path, noise, own):
+    there = with_gaps(rng)
+    data = measured(rng, there)
+    model = Batch() if own else FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
+    cache = SimulationCache(tmp_path / "cache.db")
+    likelihood = FELikelihood(model, data.select(["drift", "top"]), noise(CHANNELS), cache=cache)
+    x = np.column_stack([rng.uniform(0.5, 1.5, (9, 2)), rng.uniform(0.05, 0.3, (9, 2)), rng.uniform(-0.9, 0.9, (9, 2))])
+    x = x[:, : likelihood.ndim]
+    x[0, 1] = 4.0
+    values = likelihood.log_likelihood(x)
+    assert values[0] == -np.inf and np.isfinite(values[1:]).all() and likelihood.failure_count == 1
+    for row, value in zip(x[1:], values[1:], strict=True):
+        residuals = likelihood.residuals(row)
+        np.testing.assert_array_equal(np.isnan(residuals), ~there)
+        statistics = statistics_of(likelihood.noise, residuals)
+        assert value == likelihood.noise.log_likelihood(statistics, count_samples(residuals), row[None, 2:])[0]
+    x[:, 2:] *= 0.9
+    likelihood.log_likelihood(x)
+    assert likelihood.simulations == 9  # sums are sufficient: other parameters of the noise need no simulation
+    again = FELikelihood(model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
+    np.testing.assert_array_equal(again.log_likelihood(x), likelihood.log_likelihood(x))
+    assert again.simulations == 0
+    shifted = FELikelihood(model, measured(rng, there), noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
+    assert shifted.fingerprint != likelihood.fingerprint
+
+
+class Unaware:
+    """A noise whose statistic knows no gaps."""
+
+    parameter_names = ()
+
+    @staticmethod
+    def statistic(residuals):
+        return np.square(residuals).sum(axis=-1)
+
+    def log_likelihood(self, statistics, n_samples, parameters):
+        return -statistics.sum(axis=1)
+
+
+def test_a_statistic_without_a_rule_for_gaps_is_refused(rng):
+    model = FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
+    FELikelihood(model, measured(rng, np.ones((2, 60), dtype=bool)), Unaware())
+    with pytest.raises(ValueError, match="samples are missing, and the statistic"):
+        FELikelihood(model, measured(rng, with_gaps(rng)), Unaware())
+
+
+def test_a_response_that_is_not_finite_fails_also_where_no_sample_is(rng):
+    def broken(theta):
+        response = wave(theta)
+        response[0, 0] = np.nan
+        return response
+
+    there = with_gaps(rng)
+    assert not there[0, 0]
+    model = FunctionModel(broken, ["size", "speed"], CHANNELS, 0.02, 60)
+    for noise in (GaussianNoise(CHANNELS), AutoregressiveNoise(CHANNELS)):
+        likelihood = FELikelihood(model, measured(rng, there), noise)
+        assert likelihood.log_likelihood([1.0, 1.0, *([0.1] * (likelihood.ndim - 2))]) == -np.inf
+        assert "not finite" in likelihood.failures[0]["reason"]
+
+
+# guides ---------------------------------------------------------------------------------------------------------------
+
+
+def gappy_vibration(noise, there, rows=None):
+    """Posterior of a vibrating mass with missing samples, or of a model that returns only the samples `rows`."""
+    errors = np.array([[2e-3], [5.0]]) * np.random.default_rng(1).standard_normal((2, N_STEPS))
+    values = free_vibration([1.2, 0.8]) + errors
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
+    prior |= {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
+    if noise is AutoregressiveNoise:
+        prior |= {"rho_top": Uniform(-0.5, 0.9), "rho_base": Uniform(-0.5, 0.9)}
+    if rows is None:
+        function, data = free_vibration, np.where(there, values, np.nan)
+    else:
+        function, data = (lambda theta: free_vibration(theta)[:, rows]), values[:, rows]
+    model = FunctionModel(function, ["stiffness", "damping"], MODES_CHANNELS, DT, data.shape[1])
+    return Posterior(FELikelihood(model, Measurements(MODES_CHANNELS, DT, data), noise(MODES_CHANNELS)), prior)
+
+
+def test_modes_are_those_of_the_samples_that_are_there(rng):
+    rows = np.flatnonzero(rng.random(N_STEPS) > 0.4)
+    there = np.zeros((2, N_STEPS), dtype=bool)
+    there[:, rows] = True
+    found, expected = (
+        find_modes(gappy_vibration(GaussianNoise, there, which), starts=1, seed=0).modes[0] for which in (None, rows)
+    )
+    np.testing.assert_allclose(found.parameters, expected.parameters, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-4, atol=1e-8)
+    assert found.log_evidence == pytest.approx(expected.log_evidence, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_modes_with_correlated_noise_and_channels_with_windows(rng):
+    there = rng.random((2, N_STEPS)) > 0.2
+    there[1, :90] = False  # no sample in the first parts of the record
+    posterior = gappy_vibration(AutoregressiveNoise, there)
+    mode = find_modes(posterior, starts=3, seed=0).modes[0]
+    density = posterior.log_likelihood(mode.parameters) + stats.norm.logpdf(mode.coords).sum()
+    assert mode.log_density == pytest.approx(density, abs=1e-3)  # residuals are kept in single precision
+    assert (np.abs(mode.parameters[:2] - [1.2, 0.8]) < 0.1).all()
+
+
+# checks of residuals --------------------------------------------------------------------------------------------------
+
+
+def test_checks_of_residuals_with_gaps(rng):
+    """Effective samples from what is there: the variance of the mean square over many series."""
+    n, rho = 400, 0.8
+    there = rng.random((1, n)) > 0.3
+    there[:, 100:180] = False
+    z = rng.standard_normal((2000, n))
+    for t in range(1, n):
+        z[:, t] = rho * z[:, t - 1] + math.sqrt(1.0 - rho**2) * z[:, t]
+    gappy = np.where(there, z, np.nan)
+    variance = np.nanmean(np.square(gappy), axis=1).var()
+    lags = rho ** np.abs(np.subtract.outer(np.flatnonzero(there[0]), np.flatnonzero(there[0])))
+    exact = there.sum() ** 2 / np.square(lags).sum()
+    assert 2.0 / variance == pytest.approx(exact, rel=0.1)
+    estimates = [effective_samples(one[None])[0] for one in gappy[:40]]
+    assert np.mean(estimates) == pytest.approx(exact, rel=0.15)
+    checks = [residual_checks(one[None]) for one in gappy[:40]]
+    assert np.mean([each.lag_one[0] for each in checks]) == pytest.approx(rho, abs=0.05)
+    white = [residual_checks(np.where(there, rng.normal(size=(1, n)), np.nan)) for _ in range(100)]
+    assert 0.01 < np.mean([each.white[0] < 0.05 for each in white]) < 0.10
+    assert 0.0 < np.mean([each.normal[0] < 0.05 for each in white]) < 0.10
+    correlation = autocorrelation(gappy[:1])[0]
+    values = np.where(there[0], z[0], 0.0)
+    pairs = (there[0, 3:] & there[0, :-3]).sum()
+    expected = (values[3:] @ values[:-3] / pairs) / (values @ values / there.sum())
+    first, last = np.flatnonzero(there[0])[[0, -1]]
+    assert correlation[3] == pytest.approx(expected * (1.0 - 3 / (last - first + 1)), rel=1e-9)
+    step = innovations(gappy[:1], [rho])[0]
+    places = np.flatnonzero(there[0])
+    np.testing.assert_array_equal(np.flatnonzero(~np.isnan(step)) + 1, places[1:])
+    k = int(np.argmax(np.diff(places)))
+    mean = rho ** (places[k + 1] - places[k])
+    expected = (z[0, places[k + 1]] - mean * z[0, places[k]]) / math.sqrt(1.0 - mean**2)
+    assert step[places[k + 1] - 1] == pytest.approx(expected, rel=1e-12)
+    figure = plot_residuals(gappy[:1], CHANNELS[:1], 0.01)
+    assert len(figure.axes[2].lines[1].get_xdata()) == there.sum()
+
+
+def test_checks_refuse_channels_with_too_few_samples():
+    alternating = np.where(np.arange(20) % 2, np.nan, np.arange(20.0))[None]
+    with pytest.raises(ValueError, match="no two successive samples"):
+        residual_checks(alternating)
+    with pytest.raises(ValueError, match="two samples or more in each channel"):
+        effective_samples(np.where(np.arange(20) == 3, 1.0, np.nan)[None])
+
+
+# errors, predictions --------------------------------------------------------------------------------------------------
+
+
+def test_errors_and_coverage_are_over_the_samples_that_are_there(rng):
+    there = with_gaps(rng)
+    data = measured(rng, there)
+    model = FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
+    prior = {
+        "size": HalfNormal(2.0),
+        "speed": HalfNormal(2.0),
+        "sigma_top": HalfNormal(1.0),
+        "sigma_drift": HalfNormal(1.0),
+    }
+    posterior = Posterior(FELikelihood(model, data), prior)
+    samples = np.column_stack([rng.normal(1.0, 0.01, (60, 2)), np.full((60, 2), 0.1)])
+    prediction = propagate(posterior, samples, noise=True, seed=0, progress=False)
+    expected = [
+        math.sqrt(np.square((m - y)[one]).sum() / np.square(y[one]).sum())
+        for m, y, one in zip(prediction.mean, data.values, there, strict=True)
+    ]
+    np.testing.assert_allclose(prediction.rrmse(data), expected)
+    np.testing.assert_allclose(rrmse(prediction.mean, data.values), expected)
+    low, high = prediction.quantile(0.05), prediction.quantile(0.95)
+    inside = [((a <= y) & (y <= b))[one].mean() for a, b, y, one in zip(low, high, data.values, there, strict=True)]
+    np.testing.assert_allclose(prediction.coverage(data), inside)
+    with pytest.raises(ValueError, match="channels top have no sample in this part"):
+        prediction.coverage(data, part=slice(0, 4))
+    assert len(prediction.plot(data).axes) == len(data.plot().axes) == 2
+    scales = SharedGaussianNoise.of(data).scales
+    assert scales[0] == pytest.approx(math.sqrt(np.square(data.values[0][there[0]]).mean()))
