@@ -26,7 +26,8 @@ logger = logging.getLogger(__name__)
 
 # fingerprints of functions that have run in this process, and of those that change what they use when they run
 _observed: set[str] = set()
-_changes_itself: set[str] = set()
+# (True: all that they change is known from their code)
+_changes_itself: dict[str, bool] = {}
 
 
 class _UnderRecord:
@@ -132,6 +133,7 @@ class FunctionModel(UserModel):
         self.isolated = bool(isolated) or any(setting is not None for setting in settings)
         self.watched_files = tuple(map(str, self._dependencies.paths))
         self._sent_code: SentCode | None = None
+        self._steady_at_start = ""
         self._code_at_start = self._code()
         self._prepare()
 
@@ -145,20 +147,26 @@ class FunctionModel(UserModel):
     def current_fingerprint(self) -> str:
         """The fingerprint of the function as it is now, computed again.
 
-        If the function itself changes what it uses, such as a counter or a table of earlier results, its code counts as
-        unchanged: no other change of values can be told from these.
+        If the function itself changes what it uses, such as a counter or a table of earlier results, these values count
+        as unchanged: no other change of them can be told from that.
         """
-        code = self._code_at_start if self.fingerprint in _changes_itself else self._code()
-        return self._digest(*self._identity(code))
+        known = _changes_itself.get(self.fingerprint)
+        same = self.version is None and (known is False or (known and self._steady() == self._steady_at_start))
+        return self._digest(*self._identity(self._code_at_start if same else self._code()))
+
+    def only_own_changes(self) -> bool:
+        """Whether nothing has changed but values that the function may itself change when it runs."""
+        same_inputs = self._digest(*self._identity(self._code_at_start)) == self.fingerprint
+        return same_inputs and (self.version is not None or self._steady() == self._steady_at_start)
 
     def accept_own_changes(self) -> None:
-        """State that the function may change what it uses; values of its code are then not compared any more."""
+        """State that the function has changed what it uses; these values are then not compared any more."""
         if self.isolated or self.version is not None or self.fingerprint in _changes_itself:
             return
-        _changes_itself.add(self.fingerprint)
+        _changes_itself[self.fingerprint] = self._steady() == self._steady_at_start
         logger.info(
             "%s changes what it uses when it runs, such as a counter or a table of earlier results; other changes of "
-            "its values are not noticed during a run. version= replaces its digest",
+            "these values are not noticed during a run. version= replaces its digest",
             getattr(self.function, "__qualname__", self.function),
         )
 
@@ -181,7 +189,12 @@ class FunctionModel(UserModel):
             ) from error
         self.watched_files = tuple(code.files) + tuple(map(str, self._dependencies.paths))
         self._sent_code = self._sent_code or sent_code(self._fingerprinted, code)
+        self._steady_at_start = self._steady_at_start or code.steady
         return code.digest
+
+    def _steady(self) -> str:
+        """Digest of the code as it is now, without the values that it may itself change."""
+        return describe_code(self._fingerprinted, strict=False).steady
 
     def compare_with_sender(self) -> None:
         """Compare code and files in a worker process with those of the process that has made the model.

@@ -11,6 +11,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from ..simulation.model import (
     simulate_batch,
     statistic_width,
 )
+from ..simulation.repeated_points import RepeatedPoints
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .inputs import as_points, check_statistic, match_measurements
@@ -85,7 +87,7 @@ class CachedSimulations:
         self.response_memory = ResponseMemory(memory_bytes)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._verified_cache = None if self.cache is None else VerifiedCache(self.cache)
-        self._guard = ModelGuard(model)
+        self._guard, self._repeated_points = ModelGuard(model), RepeatedPoints()
         read_attributes_again(model)
         self._key = None if cache is None else self.simulation_key
         self.chunk_size = 1
@@ -100,8 +102,9 @@ class CachedSimulations:
 
     @property
     def verifications(self) -> int:
-        """Number of rows of the cache on disk that were compared with a new simulation, besides `simulations`."""
-        return 0 if self._verified_cache is None else self._verified_cache.compared
+        """Number of earlier simulations that were compared with a new one, besides `simulations`."""
+        stored = 0 if self._verified_cache is None else self._verified_cache.compared
+        return stored + self._repeated_points.compared
 
     @property
     def unverified(self) -> int:
@@ -445,8 +448,9 @@ class CachedSimulations:
 
     def _check_model(self, check: Callable, *arguments: Any) -> None:
         """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
+        run = VerifyingRun(self.model, self.pool, self.measurements.values, self._statistic, self._width)
         try:
-            check(self.model, *arguments)
+            check(self.model, partial(self._repeated_points.agree, run, self.cache), *arguments)
         except ChangedModel:
             self.memory_cache.clear()
             self.response_memory.clear()
@@ -474,7 +478,9 @@ class CachedSimulations:
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self._failures.add(theta, reason)
-        self._check_model(self._guard.after, thetas, self.pool is None)
+        self._check_model(self._guard.after, thetas, self.pool is None, seconds)
+        if not self._guard.unchecked:
+            self._repeated_points.add(thetas, misfit, reasons)
         self.memory_cache.store(keys, misfit)
         if responses:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]

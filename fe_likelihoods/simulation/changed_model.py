@@ -17,6 +17,7 @@ import numpy as np
 
 from .code_digest import CodeDescription, describe_code
 from .faults import ChangedModel
+from .fingerprint import state_of_user
 
 __all__ = [
     "ModelGuard",
@@ -32,6 +33,7 @@ logger = logging.getLogger(__name__)
 
 _SHARE_OF_TIME = 0.01  # for fingerprints that are computed again
 _NO_TIME = 5e-5  # [s]; a fingerprint that takes less is always computed again, since storing a row takes longer
+_ROWS_PER_REPETITION = 100  # simulations between two repetitions of earlier ones
 
 
 _compared: set[tuple[str, bool]] = set()  # descriptions of code with which that of this process agrees
@@ -47,6 +49,10 @@ def current_fingerprint(model: Any) -> str:
 class ModelGuard:
     """Compares the fingerprint of a model with that at the start, in about 1 % of the time.
 
+    Code of the user may change values itself, such as a counter, also where the user calls it between two batches. If
+    nothing else differs (method ``only_own_changes()`` of the model), earlier points are simulated again, once for 100
+    simulations, and the model counts as unchanged if they give the same results.
+
     Parameters
     ----------
     model : Model
@@ -58,16 +64,23 @@ class ModelGuard:
     """
 
     def __init__(self, model: Any) -> None:
-        self._fingerprint = model.fingerprint
+        self._fingerprint, self._state = model.fingerprint, state_of_user(model)
         self.unchecked: list[np.ndarray] = []
         self._not_before = -np.inf
-        self._is_due = False
+        self._is_due = self._has_repeated = False
+        self._seconds = np.inf  # of a comparison
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"unchecked": [], "_not_before": -np.inf}
 
-    def before(self, model: Any) -> None:
+    def before(self, model: Any, repeats: Callable[[], bool]) -> None:
         """Compare before simulations, unless the last comparison was too short ago.
+
+        Parameters
+        ----------
+        model : Model
+        repeats : callable
+            Simulates earlier points again; returns whether their results are the same.
 
         Raises
         ------
@@ -77,15 +90,29 @@ class ModelGuard:
         start = time.monotonic()
         self._is_due = start >= self._not_before
         if self._is_due:
-            self._compare(model)
+            self._require_same(model, repeats)
             now = time.monotonic()
-            self._not_before = now + max(0.0, 2.0 * (now - start) - _NO_TIME) / _SHARE_OF_TIME
+            self._seconds = now - start
+            self._not_before = now + max(0.0, 2.0 * self._seconds - _NO_TIME) / _SHARE_OF_TIME
 
-    def after(self, model: Any, thetas: np.ndarray, in_process: bool) -> None:
-        """Compare after simulations at `thetas` (n, n_structural), if they were compared before them.
+    def after(
+        self, model: Any, repeats: Callable[[], bool], thetas: np.ndarray, in_process: bool, seconds: float
+    ) -> None:
+        """Compare after simulations at `thetas` (n, n_structural), if they were compared before them or took long.
 
         A model that ran in this process may have changed its own values. It then says so, with its method
         ``accept_own_changes()``, and only its other inputs are compared.
+
+        Parameters
+        ----------
+        model, repeats
+            As for `before`.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        in_process : bool
+            Whether the simulations ran in this process.
+        seconds : float
+            Their wall time [s].
 
         Raises
         ------
@@ -93,24 +120,28 @@ class ModelGuard:
             As for `before`.
         """
         self.unchecked.append(thetas)
-        if not self._is_due:
+        if not self._is_due and (in_process or _SHARE_OF_TIME * seconds < self._seconds):
             return
-        try:
-            self._compare(model)
-        except ChangedModel:
-            if not in_process or not hasattr(model, "accept_own_changes"):
-                raise
-            model.accept_own_changes()
-            self._compare(model)
-        self.unchecked.clear()
+        if in_process and self._difference(model) is not None:
+            self._state = state_of_user(model)
+            if hasattr(model, "accept_own_changes"):
+                model.accept_own_changes()
+        self._require_same(model, repeats)
 
-    def _compare(self, model: Any) -> None:
-        try:
-            if current_fingerprint(model) == self._fingerprint:
+    def _require_same(self, model: Any, repeats: Callable[[], bool]) -> None:
+        """Raise `ChangedModel` if the model differs in more than values that it may change itself."""
+        why = self._difference(model)
+        if why is None:
+            self.unchecked.clear()
+            return
+        if self._state == state_of_user(model) and hasattr(model, "only_own_changes") and model.only_own_changes():
+            if self._has_repeated and sum(map(len, self.unchecked)) < _ROWS_PER_REPETITION:
                 return
-            why = "its fingerprint differs"
-        except ValueError as error:
-            why = str(error)
+            if repeats():
+                self._has_repeated = True
+                self.unchecked.clear()
+                return
+            why += ", and an earlier simulation gives another result"
         raise ChangedModel(
             f"the {type(model).__name__} has changed since the likelihood was made ({why}): a value or file that it "
             "uses was changed, or another model was set. Its simulations cannot be stored with the earlier ones. Make "
@@ -118,6 +149,15 @@ class ModelGuard:
             "changes a value that does not matter, such as a counter, give it a version="
             f".{getattr(model, 'change_advice', '')}"
         )
+
+    def _difference(self, model: Any) -> str | None:
+        """What differs from the model at the start, None if nothing does."""
+        try:
+            if current_fingerprint(model) != self._fingerprint:
+                return "its fingerprint differs"
+        except ValueError as error:
+            return str(error)
+        return None if state_of_user(model) == self._state else "an attribute of its class or object differs"
 
 
 class SentModel:

@@ -10,7 +10,7 @@ from typing import Any
 from .code_digest import code_digest, describe_code
 from .source_digest import LIBRARY, inherits_fingerprint, object_digest
 
-__all__ = ["read_attributes_again", "simulation_fingerprint"]
+__all__ = ["read_attributes_again", "simulation_fingerprint", "state_of_user"]
 
 _attributes: dict[int, tuple[weakref.ref, str]] = {}  # digests of the user's attributes, per id of a model
 
@@ -69,11 +69,33 @@ def _attributes_of_user(model: Any) -> str:
     """Digest of the attributes that are set by no class of the library; it is kept until `read_attributes_again`."""
     kept, digest = _attributes.get(id(model), (None, ""))
     if kept is None or kept() is not model:
-        library = set().union(*map(_names_set_by, type(model).__mro__))
-        own = {name: value for name, value in sorted(vars(model).items()) if name not in library}
+        own = _own_attributes(model)
         digest = describe_code(own, strict=False).digest if own else ""
         _attributes[id(model)] = weakref.ref(model, lambda _, key=id(model): _attributes.pop(key, None)), digest
     return digest
+
+
+def state_of_user(model: Any) -> str:
+    """Digest of what a class of the user adds to a model of the library, as it is now; empty for other models.
+
+    Values that the class may itself change when it runs are left out.
+    """
+    cls = type(model)
+    if not inherits_fingerprint(cls):
+        return ""
+    own = _Attributes()
+    vars(own).update(_own_attributes(model))
+    return describe_code([cls, own], strict=False, user=cls).steady
+
+
+class _Attributes:
+    """Object with the attributes of another one."""
+
+
+def _own_attributes(model: Any) -> dict[str, Any]:
+    """Attributes that are set by no class of the library."""
+    library = set().union(*map(_names_set_by, type(model).__mro__))
+    return {name: value for name, value in sorted(vars(model).items()) if name not in library}
 
 
 @functools.cache

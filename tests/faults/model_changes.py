@@ -9,6 +9,7 @@
 The modules of the user are written into a folder, imported, edited, and imported afresh, as by a new program.
 """
 
+import builtins
 import importlib
 import os
 import pickle
@@ -31,7 +32,7 @@ from fe_likelihoods import (
     SimulationCache,
     StaleCache,
 )
-from fe_likelihoods.simulation import changed_model, code_digest, source_digest
+from fe_likelihoods.simulation import changed_model, source_digest, used_modules
 from fe_likelihoods.simulation.changed_model import SentModel
 from fe_likelihoods.simulation.faults import ChangedModel
 
@@ -279,6 +280,36 @@ CODE = [
         "    k.__set_name__(None, 'k')\n    def r(self, t): return self.k * line(t)\nf = A().r",
     ),
     number(
+        "an attribute of a function with a cache of results",
+        "import functools\n@functools.cache\ndef g(x): return g.k * x\ng.k = 2.5\ndef f(t): return g(t[0]) + line(t)",
+    ),
+    number(
+        "an attribute of a partial",
+        "import functools\ndef g(t): return f.k * line(t)\nf = functools.partial(g)\nf.k = 2.5",
+    ),
+    number(
+        "an attribute of a wrapped function",
+        "import functools\ndef g(t): return line(t)\ng.k = 2.5\n@functools.wraps(g)\n"
+        "def f(t): return f.__wrapped__.k * line(t)",
+    ),
+    number(
+        "a method of a metaclass",
+        "class M(type):\n    def k(cls): return 2.5\nclass A(metaclass=M): pass\ndef f(t): return A.k() * line(t)",
+    ),
+    number("a name in builtins", "import builtins\nbuiltins.WAY = 2.5\ndef f(t): return WAY * line(t)"),
+    Between(
+        "another function in builtins",
+        NOTICED,
+        user("import builtins, math\nbuiltins.way = math.floor\ndef f(t): return line(t) + way(2.5)"),
+        in_user("floor", "ceil"),
+    ),
+    number(
+        "a value that replaces a cached property",
+        "import functools\nclass A:\n    @functools.cached_property\n    def k(self): return 1.0\n"
+        "    def r(self, t): return self.k * line(t)\na = A()\na.k = 2.5\nf = a.r",
+        expected=VERIFIED,
+    ),
+    number(
         "the statistic of a noise of the user",
         "from fe_likelihoods import GaussianNoise\nclass Noise(GaussianNoise):\n    @staticmethod\n"
         "    def statistic(r): return 2.5 * (r**2).sum(axis=1)\ndef f(t): return line(t)\n"
@@ -480,6 +511,15 @@ def reload_user(folder: Path, module: Any, *_: Any) -> None:
 
 CALLS_HELPER = user("import helper\ndef f(t): return helper.g(line(t)) * helper.E", helper=HELPER)
 
+SUBCLASS = (
+    "from fe_likelihoods import FunctionModel, Channel\nclass Own(FunctionModel):\n    c = 1.0\n"
+    "    def _respond(self, t): return self.c * self.k * line(t)\ndef model(folder):\n"
+    "    own = Own(line, ('offset', 'slope'), (Channel('a', 'displacement', 'm'),), 0.1, 20)\n    own.k = 2.5\n"
+    "    return own"
+)
+META = "class M(type):\n    k = 2.5\nclass A(metaclass=M): pass\ndef f(t): return A.k * line(t)"
+BUILTIN = "import builtins\nbuiltins.WAY = 2.5\ndef f(t): return WAY * line(t)"
+
 DURING = [
     During("a global number", user("E = 2.5\ndef f(t): return E * line(t)"), assign("E", 2.6)),
     During("a global dict, in place", user("E = {'E': 2.5}\ndef f(t): return E['E'] * line(t)"), item("E", "E", 2.6)),
@@ -499,6 +539,14 @@ DURING = [
         user("class A:\n    k = 2.5\n    def r(self, t): return self.k * line(t)\nf = A().r"),
         assign("A.k", 2.6),
     ),
+    During(
+        "an attribute of a subclass of a model of the library",
+        user(SUBCLASS),
+        lambda folder, module, likelihood: setattr(likelihood.model, "k", 2.6),
+    ),
+    During("a class attribute of such a subclass", user(SUBCLASS), assign("Own.c", 1.1)),
+    During("a metaclass attribute", user(META), assign("M.k", 2.6)),
+    During("a name in builtins", user(BUILTIN), assign("builtins.WAY", 2.6)),
     During("a variable of another module", CALLS_HELPER, assign("helper.E", 2.6)),
     During("importlib.reload", CALLS_HELPER, reload_user),
     During("an attribute of a function", user("def f(t): return f.k * line(t)\nf.k = 2.5"), assign("f.k", 2.6)),
@@ -551,6 +599,8 @@ def workshop(files: dict[str, str]):
                 sys.modules.setdefault(name, module)
             changed_model._SHARE_OF_TIME, sys.dont_write_bytecode = share, writes
             os.environ.pop("WAY", None)
+            for name in ("WAY", "way"):
+                vars(builtins).pop(name, None)
 
 
 def forget_modules(folder: Path) -> None:
@@ -560,7 +610,7 @@ def forget_modules(folder: Path) -> None:
     for name in own & set(sys.modules):
         del sys.modules[name]
     importlib.invalidate_caches()
-    for cached in (code_digest._is_own, code_digest._package_version, source_digest.is_standard):
+    for cached in (used_modules.is_own, used_modules.package_version, source_digest.is_standard):
         cached.cache_clear()
 
 

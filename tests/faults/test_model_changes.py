@@ -1,6 +1,7 @@
 """No way of changing a model lets the cache use simulations of another model in silence."""
 
 import importlib
+import os
 import pickle
 import sys
 import time
@@ -83,8 +84,8 @@ def test_rows_since_the_last_comparison_are_deleted_after_a_change(tmp_path, mon
     )
     start = time.monotonic()
     while time.monotonic() < start + 0.25:
-        guard.before(likelihood.model)
-        guard.after(likelihood.model, THETAS, True)
+        guard.before(likelihood.model, lambda: True)
+        guard.after(likelihood.model, lambda: True, THETAS, True, 0.0)
     assert 2 <= len(computed) <= 6
 
 
@@ -214,7 +215,7 @@ def test_a_file_that_the_program_writes_is_named(tmp_path):
     assert current_fingerprint(named) == named.fingerprint == model(written=[log]).fingerprint
     assert current_fingerprint(plain) != plain.fingerprint != model().fingerprint
     with pytest.raises(ChangedModel, match="the program itself writes belongs in written="):
-        changed_model.ModelGuard(plain).before(plain)
+        changed_model.ModelGuard(plain).before(plain, lambda: True)
 
 
 def test_the_digest_of_a_function_takes_milliseconds():
@@ -226,3 +227,113 @@ def test_the_digest_of_a_function_takes_milliseconds():
             code_digest(function)
             seconds.append(time.perf_counter() - start)
     assert min(seconds) < 0.01
+
+
+# calls of the user between two batches with a pool -------------------------------------------------------------------
+
+FORKS = pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
+BETWEEN_BATCHES = HONEST | {
+    "a list of some runs": RARELY,
+    "an argument": "known = []\ndef keep(table, t): table.append(t)\ndef f(t):\n    keep(known, t)\n    return line(t)",
+    "a local name": "known = {}\ndef f(t):\n    table = known\n    table[t[0]] = t\n    return line(t)",
+    "a closure": (
+        "def make():\n    calls = 0\n    def f(t):\n        nonlocal calls\n        calls += 1\n"
+        "        return line(t)\n    return f\nf = make()"
+    ),
+    "another module": "import helper\ndef f(t):\n    helper.calls += 1\n    return line(t)",
+    "a class attribute": (
+        "class A:\n    calls = 0\n    def __call__(self, t):\n        type(self).calls += 1\n"
+        "        return line(t)\nf = A()"
+    ),
+    "a private attribute": OBJECT.replace("calls", "__calls"),
+    "a counter of numpy": "calls = np.zeros(2)\ndef f(t):\n    calls[0] += 1\n    return line(t)",
+    "a workspace": "work = np.zeros((1, 20))\ndef f(t):\n    np.copyto(work, line(t))\n    return work.copy()",
+    "an output argument": "work = np.zeros((1, 20))\ndef f(t): return np.add(line(t), 0.0, out=work).copy()",
+    "an open file": (
+        "import os\nclass A:\n    log = None\n    def __call__(self, t):\n        if self.log is None:\n"
+        "            self.log = open(os.devnull, 'w')\n        return line(t)\nf = A()"
+    ),
+    "a lambda": "known = []\nf = lambda t: known.append(t) or line(t)",
+    "an iterator": "import itertools\ncount = itertools.count()\ndef f(t): return line(t) + 0 * next(count)",
+    "random numbers": "rng = np.random.default_rng(1)\ndef f(t): return line(t) + 0 * rng.normal()",
+}
+
+
+class Processes:
+    """A pool whose workers are processes that begin with the values of this one, and leave these as they are."""
+
+    n_workers = 2
+
+    def map(self, function, items):
+        reader, writer = os.pipe()
+        child = os.fork()
+        if not child:
+            os.write(writer, pickle.dumps([function(item) for item in items]))
+            os._exit(0)
+        os.waitpid(child, 0)
+        os.close(writer)
+        with open(reader, "rb") as file:
+            return pickle.load(file)
+
+
+def pooled(folder):
+    """Likelihood with a pool, and the module of the user."""
+    likelihood = changes.likelihood_of(folder, {}, SimulationCache(folder / "cache.sqlite"))
+    likelihood.pool = Processes()
+    return likelihood, sys.modules["user"]
+
+
+@pytest.mark.parametrize("body", BETWEEN_BATCHES.values(), ids=BETWEEN_BATCHES)
+@FORKS
+def test_a_user_may_call_the_function_between_two_batches_of_a_pool(body):
+    with changes.workshop(changes.user(body, helper="calls = 0\n")) as folder:
+        likelihood, module = pooled(folder)
+        for start in range(0, 6, 2):
+            module.f(THETAS[start] + 0.5)
+            values = likelihood.misfit(THETAS[start : start + 2])
+        assert np.isfinite(values).all()
+        assert likelihood.cache.info().simulations == likelihood.simulations == 6
+        # two points are simulated again before the second batch, and none before the third
+        assert likelihood.verifications in (0, 2)
+
+
+OTHERS = {
+    "a global number": (f"E = 2.5\n{COUNTS.replace('line', 'E * line')}", "module.E = 2.6"),
+    "an attribute that __init__ sets": (
+        "class A:\n    def __init__(self): self.k, self.calls = 2.5, 0\n"
+        "    def __call__(self, t):\n        self.calls += 1\n        return self.k * line(t)\nf = A()",
+        "module.f.k = 2.6",
+    ),
+    "an array in a function with a work array": (
+        "E = np.array([2.5])\ndef f(t):\n    x = np.zeros((1, 20))\n    x[:] = E * line(t)\n    return x",
+        "module.E[0] = 2.6",
+    ),
+    "an item of the table with the counter": (
+        "D = {'E': 2.5, 'calls': 0}\ndef f(t):\n    D['calls'] += 1\n    return D['E'] * line(t)",
+        "module.D['E'] = 2.6",
+    ),
+    "a variable that the function assigns": (
+        "E, last = 2.5, 0\ndef f(t):\n    global last, E\n    last, E = t, E\n    return E * line(t)",
+        "module.E = 2.6",
+    ),
+}
+
+
+@pytest.mark.parametrize(("body", "change"), OTHERS.values(), ids=OTHERS)
+@FORKS
+def test_a_function_that_counts_is_still_compared(body, change, monkeypatch):
+    """With calls between the batches; what the function cannot change itself is noticed without a simulation."""
+    with changes.workshop(changes.user(body)) as folder:
+        likelihood, module = pooled(folder)
+        likelihood.misfit(THETAS[:2])
+        module.f(THETAS[0])
+        likelihood.misfit(THETAS[2:4])
+        repeated = likelihood.verifications
+        exec(change, {"module": module})
+        monkeypatch.setattr(changed_model, "_ROWS_PER_REPETITION", 2)
+        with pytest.raises(ChangedModel) as caught:
+            likelihood.misfit(THETAS[4:])
+        by_repetition = "an earlier simulation gives another result" in str(caught.value)
+        assert by_repetition == (likelihood.verifications > repeated) == ("D[" in body or "global last, E" in body)
+        # simulations since the last time that nothing differed, or that earlier points were repeated, are deleted
+        assert likelihood.cache.info().simulations == (2 if "calls" in body else 4)
