@@ -145,6 +145,10 @@ def _is_plain(thing: Any) -> bool:
     cls = type(thing)
     if cls.__reduce_ex__ is not object.__reduce_ex__ or cls.__reduce__ is not object.__reduce__:
         return False
+    if isinstance(getattr(cls, "__getstate__", None), types.MethodDescriptorType) and (
+        cls.__getstate__ is not getattr(object, "__getstate__", None)
+    ):  # of a compiled type
+        return False
     try:
         thing.__reduce_ex__(2)
     except TypeError:
