@@ -86,7 +86,7 @@ class CachedSimulations:
         self.memory_cache = MemoryCache(memory_rows)
         self.response_memory = ResponseMemory(memory_bytes)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
-        self._verified_cache = None if self.cache is None else VerifiedCache(self.cache)
+        self._verified_cache = None if self.cache is None else VerifiedCache(self.cache, model, self.pool)
         self._guard, self._repeated_points = ModelGuard(model), RepeatedPoints()
         read_attributes_again(model)
         self._key = None if cache is None else self.simulation_key

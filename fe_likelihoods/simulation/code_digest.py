@@ -297,7 +297,7 @@ class _Digest:
         parts += [bytecode, *values]
         self.names.update(_names(function.__code__))
         self.files.add(function.__code__.co_filename)
-        for name in sorted(set(_global_names(function.__code__))):
+        for name in _global_names(function.__code__):
             if self._is_skipped(name, _module_name(function)):
                 continue
             if name in function.__globals__:
@@ -426,14 +426,15 @@ def _contents(cell: types.CellType) -> Any:
         return None
 
 
-def _global_names(code: types.CodeType) -> Iterator[str]:
+@functools.lru_cache(maxsize=4096)
+def _global_names(code: types.CodeType) -> tuple[str, ...]:
     """Names of globals, without attributes, that a code object and the functions defined in it read."""
-    for step in dis.get_instructions(code):
-        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"):
-            yield step.argval
+    reads = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")
+    names = {step.argval for step in dis.get_instructions(code) if step.opname in reads}
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
-            yield from _global_names(constant)
+            names.update(_global_names(constant))
+    return tuple(sorted(names))
 
 
 def _names(code: types.CodeType) -> Iterator[str]:

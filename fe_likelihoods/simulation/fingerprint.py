@@ -10,7 +10,7 @@ from typing import Any
 from .code_digest import code_digest, describe_code
 from .source_digest import LIBRARY, inherits_fingerprint, object_digest
 
-__all__ = ["read_attributes_again", "simulation_fingerprint", "state_of_user"]
+__all__ = ["read_attributes_again", "simulation_fingerprint", "state_of", "state_of_user"]
 
 _attributes: dict[int, tuple[weakref.ref, str]] = {}  # digests of the user's attributes, per id of a model
 
@@ -80,8 +80,13 @@ def state_of_user(model: Any) -> str:
 
     Values that the class may itself change when it runs are left out.
     """
+    return state_of(model) if inherits_fingerprint(type(model)) else ""
+
+
+def state_of(model: Any) -> str:
+    """As `state_of_user`, also for a class of the user with a fingerprint of its own, which need not contain it."""
     cls = type(model)
-    if not inherits_fingerprint(cls):
+    if cls.__module__.split(".")[0] == LIBRARY:
         return ""
     own = _Attributes()
     vars(own).update(_own_attributes(model))

@@ -64,7 +64,20 @@ def package_version(module: str) -> str:
 
 def imports_of(function: types.FunctionType) -> Iterator[str]:
     """Full names of the modules that a function imports when it runs."""
-    codes = [function.__code__]
+    for module, items in _import_statements(function.__code__):
+        try:
+            name = importlib.util.resolve_name(module, function.__globals__.get("__package__") or "")
+        except ImportError:
+            raise ValueError(f"{function.__qualname__} imports {module}, but is not in a package") from None
+        yield name
+        yield from (f"{name}.{item}" for item in items if _is_submodule(name, item))
+
+
+@functools.lru_cache(maxsize=4096)
+def _import_statements(code: types.CodeType) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """Modules, with a dot for each level of a relative import, and the names that are imported from them."""
+    found: list[tuple[str, tuple[str, ...]]] = []
+    codes = [code]
     while codes:
         code = codes.pop()
         codes += [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
@@ -72,14 +85,9 @@ def imports_of(function: types.FunctionType) -> Iterator[str]:
         for step in dis.get_instructions(code):
             if step.opname == "IMPORT_NAME":
                 level = next((value for value in before[-2:] if isinstance(value, int)), 0)
-                name, package = "." * level + step.argval, function.__globals__.get("__package__") or ""
-                try:
-                    name = importlib.util.resolve_name(name, package)
-                except ImportError:
-                    raise ValueError(f"{function.__qualname__} imports {name}, but is not in a package") from None
-                yield name
-                yield from (f"{name}.{item}" for item in before[-1] or () if _is_submodule(name, item))
+                found.append(("." * level + step.argval, tuple(before[-1] or ())))
             before.append(step.argval)
+    return tuple(found)
 
 
 def _is_submodule(package: str, name: str) -> bool:

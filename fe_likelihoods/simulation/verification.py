@@ -5,8 +5,9 @@ on. Therefore rows of a file are compared with new simulations: two before the f
 that was stored last, and one at random of those that are requested), and one more for every 1000 rows used. Failures
 count only where there is no successful simulation, since a changed model often fails at the same points. For the
 likelihoods of other noises or of a part of the record that are made from a verified one, one row is compared before the
-first is used. Rows that the same likelihood has stored itself need no verification. The first comparison is repeated
-after a change of the model object, of its pool, or of a source file.
+first is used. Likelihoods that are made with one model object, pool and file share their comparisons. Rows that the
+same likelihood has stored itself need no verification. The first comparison is repeated after a change of the model
+object, of its pool, or of a source file.
 
 A difference is an error, because either the stored rows or the new simulations belong to another model.
 """
@@ -15,10 +16,7 @@ import logging
 import os
 import random
 import sys
-import threading
 import time
-import uuid
-from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -31,6 +29,7 @@ from .faults import TransientReason
 from .fingerprint import simulation_fingerprint
 from .model import Model, SimulationBatch, Statistic, misfit_batch, misfit_of_responses
 from .tolerance import largest_difference, response_tolerance
+from .verification_schedule import Schedule, shared_schedule
 
 __all__ = ["StaleCache", "VerifiedCache", "VerifyingRun"]
 
@@ -45,13 +44,10 @@ CHANGED = (
     "The model has changed in a way that its fingerprint does not contain. Delete its rows with "
     "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
 )
-MAX_SCHEDULES = 32
 MAX_OWN = 200_000  # keys of 16 bytes, about 100 bytes each in memory
 MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used for a while without verification
 PAUSE_SECONDS = 60.0  # after failed attempts; at least
 PAUSE_RATIO = 20.0  # of the duration of the last attempt
-
-_schedules: "OrderedDict[str, _Schedule]" = OrderedDict()  # of pickled objects: copies in a process share one
 
 
 class StaleCache(ValueError):
@@ -100,47 +96,6 @@ class VerifyingRun(NamedTuple):
     n_numbers: int
 
 
-class _Schedule:
-    """How many rows have been used since the last full verification, per table and fingerprint.
-
-    It is shared by the likelihoods that were derived from one, and by its copies in a process.
-
-    Parameters
-    ----------
-    token : str
-        Identifies the schedule in other processes, where it starts anew.
-    """
-
-    def __init__(self, token: str) -> None:
-        self.token = token
-        self.served: Counter[tuple[str, str]] = Counter()
-        self.own: set[bytes] = set()  # keys of rows that were stored here, which need no verification
-        self.failed_attempts = 0
-        self.pause_ends, self.rows_in_pause = -np.inf, 0
-        self.stale: tuple[str, StaleCache] | None = None  # fingerprint of the row that differed, and the error
-        self.stamps: dict[str, tuple] = {}  # of the source files, per fingerprint
-        self._lock, self._owner = threading.RLock(), os.getpid()
-
-    def __reduce__(self) -> tuple:
-        return _schedule, (_schedule(self.token, self).token,)
-
-    @property
-    def lock(self) -> threading.RLock:
-        """A lock that no thread of a parent process held at the time of the fork."""
-        if self._owner != os.getpid():
-            self._lock, self._owner = threading.RLock(), os.getpid()
-        return self._lock
-
-
-def _schedule(token: str, new: _Schedule | None = None) -> _Schedule:
-    """The schedule of this process with a token."""
-    if token not in _schedules:
-        _schedules[token] = new or _Schedule(token)
-        while len(_schedules) > MAX_SCHEDULES:
-            _schedules.popitem(last=False)
-    return _schedules[token]
-
-
 class VerifiedCache:
     """A `SimulationCache` whose rows are verified before they are used.
 
@@ -150,6 +105,9 @@ class VerifiedCache:
     ----------
     cache : SimulationCache
         Its settings `verify` and `tolerance` apply.
+    model : Model
+        As it is when the likelihood is made. Objects for the same model, pool and file share what they have verified.
+    pool : executor or None
 
     Attributes
     ----------
@@ -161,14 +119,16 @@ class VerifiedCache:
         Wall time of the simulations for verification [s].
     """
 
-    def __init__(self, cache: SimulationCache) -> None:
-        self._set_up(cache, _Schedule(uuid.uuid4().hex))
+    def __init__(self, cache: SimulationCache, model: Model, pool: Any) -> None:
+        self._set_up(cache, shared_schedule(cache, model, pool))
 
-    def _set_up(self, cache: SimulationCache, schedule: _Schedule) -> None:
+    def _set_up(self, cache: SimulationCache, schedule: Schedule) -> None:
         self.cache, self._schedule = cache, schedule
         self.compared, self.unverified, self.seconds = 0, 0, 0.0
         self._objects: tuple | None = None  # of the last look-up; None if there was none, or in another process
         self._stamp_time = -np.inf
+        # keys of rows that were stored here since a restart of the schedule, which need no verification
+        self._own: tuple[int, set[bytes]] = (0, set())
         self._random = random.Random()  # its own, so that the user's streams of random numbers do not change
 
     def __getstate__(self) -> tuple:
@@ -195,7 +155,7 @@ class VerifiedCache:
         """
         n_steps = measured_values(run.measured).shape[1]
         rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps)
-        known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist())
+        known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist(), run)
         if known:
             failed = [row for row in known if rows.reasons[row]]
             succeeded = [row for row in known if not rows.reasons[row]]
@@ -203,7 +163,7 @@ class VerifiedCache:
             latest = None
             if first or not succeeded:
                 latest = self.cache.latest_success(fingerprint, run.n_numbers, n_steps)
-                if latest is not None and not self._of_others(fingerprint, latest.theta[None], [0]):
+                if latest is not None and not self._of_others(fingerprint, latest.theta[None], [0], run):
                     latest = None
             # failures alone do not verify successful rows, which may be used later
             table = "failed simulations" if first and latest is None and not succeeded else "simulations"
@@ -230,7 +190,7 @@ class VerifiedCache:
         responses = self.cache.look_up_responses(run.model, thetas)
         known = [place for place, response in enumerate(responses) if response is not None]
         fingerprint = simulation_fingerprint(run.model) if known else ""
-        known = self._of_others(fingerprint, thetas, known)
+        known = self._of_others(fingerprint, thetas, known, run)
         if known:
 
             def candidates() -> Iterator[StoredSimulation]:
@@ -255,7 +215,7 @@ class VerifiedCache:
         reasons = self.cache.look_up_failures(run.model, thetas)
         known = [row for row, reason in enumerate(reasons) if reason and not _is_transient(reason)]
         fingerprint = simulation_fingerprint(run.model) if known else ""
-        known = self._of_others(fingerprint, thetas, known)
+        known = self._of_others(fingerprint, thetas, known, run)
         if known:
 
             def candidates() -> Iterator[StoredSimulation]:
@@ -275,19 +235,31 @@ class VerifiedCache:
         *fingerprints : str
             As for `SimulationCache.look_up`.
         """
-        if len(self._schedule.own) < MAX_OWN:
+        own = self._own_rows()
+        if len(own) < MAX_OWN:
             for fingerprint in fingerprints:
-                self._schedule.own.update(simulation_keys(fingerprint, thetas))
+                own.update(simulation_keys(fingerprint, thetas))
 
     def share_schedule(self, other: "VerifiedCache") -> None:
         """Verify no row that another object has verified or stored."""
         self._schedule = other._schedule
+        self._own = self._schedule.restarts, other._own_rows()
 
-    def _of_others(self, fingerprint: str, thetas: np.ndarray, rows: list[int]) -> list[int]:
+    def _own_rows(self) -> set[bytes]:
+        """Keys of the rows that were stored here since the last change of the model."""
+        if self._own[0] != self._schedule.restarts:
+            self._own = self._schedule.restarts, set()
+        return self._own[1]
+
+    def _of_others(self, fingerprint: str, thetas: np.ndarray, rows: list[int], run: VerifyingRun) -> list[int]:
         """Those of some rows that were not stored here; none if the cache is not to be verified."""
-        own = self._schedule.own
-        if not self.cache.verify or not own:
-            return rows if self.cache.verify else []
+        if not self.cache.verify or not rows:
+            return []
+        with self._schedule.lock:
+            self._notice_changes(fingerprint, run)  # after an edit of the source files no row counts as stored here
+        own = self._own_rows()
+        if not own:
+            return rows
         keys = simulation_keys(fingerprint, thetas[rows])
         return [row for row, key in zip(rows, keys, strict=True) if key not in own]
 
@@ -442,7 +414,7 @@ class VerifiedCache:
 
     def _start_again(self) -> None:
         self._schedule.served.clear()
-        self._schedule.own.clear()
+        self._schedule.restarts += 1
 
 
 def watched_files(model: Model) -> list[str]:

@@ -337,3 +337,22 @@ def test_a_function_that_counts_is_still_compared(body, change, monkeypatch):
         assert by_repetition == (likelihood.verifications > repeated) == ("D[" in body or "global last, E" in body)
         # simulations since the last time that nothing differed, or that earlier points were repeated, are deleted
         assert likelihood.cache.info().simulations == (2 if "calls" in body else 4)
+
+
+@pytest.mark.parametrize(("seconds", "noticed"), [(10.0, True), (1e-6, False)], ids=["long", "short"])
+def test_a_long_batch_is_compared_before_it_is_stored(seconds, noticed, monkeypatch):
+    """However short ago the last comparison was: it takes less than 1 % of the time of the simulations."""
+    with changes.workshop(changes.user("E = 2.5\ndef f(t): return E * line(t)")) as folder:
+        model = changes.likelihood_of(folder, {}, None).model
+        monkeypatch.setattr(changed_model, "_SHARE_OF_TIME", 0.01)
+        guard = changed_model.ModelGuard(model)
+        guard.before(model, lambda: True)
+        guard._not_before = np.inf
+        guard.before(model, lambda: True)
+        sys.modules["user"].E = 2.6
+        if noticed:
+            with pytest.raises(ChangedModel):
+                guard.after(model, lambda: True, THETAS, False, seconds)
+        else:
+            guard.after(model, lambda: True, THETAS, False, seconds)
+        assert len(guard.unchecked) == 1

@@ -1,4 +1,4 @@
-"""What an object of a user may hold, for the digest of a model: made anew by each call, and a variant with another value.
+"""What an object of a user may hold, for the digest of a model: functions of a number that make the values anew.
 
 ``python -m tests.simulation.held_values`` prints the digests, which have to be the same in every process.
 """
@@ -103,7 +103,7 @@ VALUES = {
     "Decimal": lambda k: decimal.Decimal(k) / 10,
     "complex": lambda k: 1j * k,
     "SimpleNamespace": lambda k: types.SimpleNamespace(k=k),
-    "datetime": lambda k: datetime.datetime(2020, 1, k, tzinfo=datetime.timezone.utc),
+    "datetime": lambda k: datetime.datetime(2020, 1, k, tzinfo=datetime.UTC),
     "date": lambda k: datetime.date(2020, 1, k),
     "time": lambda k: datetime.time(k),
     "timedelta": lambda k: datetime.timedelta(k),

@@ -4,12 +4,13 @@ import logging
 import os
 import pickle
 import time
+from collections import OrderedDict
 
 import numpy as np
 import pytest
 
 from fe_likelihoods import AutoregressiveNoise, FELikelihood, LinearOscillator, Measurements, Record, SimulationCache
-from fe_likelihoods.simulation import verification
+from fe_likelihoods.simulation import verification, verification_schedule
 from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
 from fe_likelihoods.simulation.model import SimulationFailed
 from fe_likelihoods.simulation.tolerance import largest_difference, response_tolerance
@@ -369,7 +370,7 @@ def test_rows_that_the_same_likelihood_has_stored_are_not_verified(path, thetas)
 
 def test_a_process_verifies_once_for_all_copies_of_a_likelihood(filled, thetas, monkeypatch):
     data = pickle.dumps(likelihood_of(Scaled(), filled))
-    monkeypatch.setattr(verification, "_schedules", type(verification._schedules)())  # as in a new process
+    monkeypatch.setattr(verification_schedule, "_schedules", OrderedDict())  # as in a new process
     copies = [pickle.loads(data) for _ in range(3)]  # as for the tasks of a pool
     for copy in copies:
         copy.misfit(thetas)
@@ -391,3 +392,66 @@ def test_a_fork_while_another_thread_verifies_does_not_block(filled, thetas):
                 break
             time.sleep(0.05)
     assert os.waitstatus_to_exitcode(status) == 2
+
+
+# many likelihoods -----------------------------------------------------------------------------------------------------
+
+
+def test_twenty_likelihoods_of_one_model_are_verified_once(filled, thetas):
+    model, thetas = Scaled(), thetas[:10]
+    likelihoods = [likelihood_of(model, filled) for _ in range(20)]
+    for likelihood in likelihoods:
+        likelihood.misfit(thetas)
+    assert model.runs == sum(likelihood.verifications for likelihood in likelihoods) == 2
+    for likelihood in (likelihood_of(model, filled, noise=AutoregressiveNoise(CHANNELS)) for _ in range(20)):
+        likelihood.misfit(thetas)
+        likelihoods.append(likelihood)
+    # other statistics: ten are simulated, of which one is simulated again for the others
+    assert (model.runs, likelihoods[20].simulations) == (2 + 10 + 1, 10)
+    for copy in pickle.loads(pickle.dumps(likelihoods)):
+        copy.misfit(thetas)
+        assert copy.verifications == 0
+    with pytest.raises(StaleCache):
+        likelihood_of(Scaled(2.0), filled).misfit(thetas)
+
+
+@pytest.mark.parametrize("what", ["factor", "object", "file", "tolerance"])
+def test_another_state_of_the_model_is_verified_again(filled, thetas, what, tmp_path):
+    model = Scaled()
+    first = likelihood_of(model, filled)
+    first.misfit(thetas)
+    path, options, expected = filled, {}, 2
+    if what == "factor":
+        model.factor = 2.0
+    elif what == "object":
+        model = Scaled()
+    elif what == "file":
+        path = tmp_path / "other.sqlite"
+        likelihood_of(Scaled(), path).misfit(thetas)
+    else:
+        options = {"tolerance": 1e-12}
+    second = likelihood_of(model, SimulationCache(path, **options))
+    if what == "factor":
+        with pytest.raises(StaleCache):
+            second.misfit(thetas)
+    else:
+        second.misfit(thetas)
+    assert second.verifications == expected
+
+
+def test_own_rows_are_verified_after_an_edit_of_the_source(path, thetas, tmp_path, monkeypatch):
+    monkeypatch.setattr(verification, "STAMP_SECONDS", 0.0)
+    data = tmp_path / "data.txt"
+    data.write_text("1")
+    likelihood = likelihood_of(Scaled(), path, memory_rows=0)
+    likelihood.model.watched_files = [data]
+    likelihood.misfit(thetas)
+    likelihood.misfit(thetas)
+    assert likelihood.verifications == 0
+    data.write_text("two")
+    likelihood.misfit(thetas)
+    assert likelihood.verifications == 2
+    data.write_text("three")
+    likelihood.model.factor = 2.0
+    with pytest.raises(StaleCache):
+        likelihood.misfit(thetas)
