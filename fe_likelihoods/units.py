@@ -90,7 +90,8 @@ DIMENSIONS: dict[str, str] = {
 """The SI unit of each dimension."""
 
 _BY_LOWER_CASE = {name.replace(" ", "").lower(): unit for name, unit in UNITS.items()}
-_MICROSTRAIN = ("ue", *(f"{mu}\N{GREEK SMALL LETTER EPSILON}" for mu in "\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"))
+_MICRO = "u\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}"
+_MICROSTRAIN = {"ue", *(f"{mu}{each}" for mu in _MICRO for each in ("\N{GREEK SMALL LETTER EPSILON}", "m/m", "strain"))}
 
 
 def find_unit(name: str, dimension: str | None = None) -> Unit:

@@ -106,23 +106,41 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
     return replace(record, source=chosen[0].file.removeprefix(f"{Path(path).parent}/"))
 
 
-def read_csv(path: str | Path, units: str | None = None, dt: float | None = None, column: str | None = None) -> Record:
-    """Read a ground motion from a CSV file with a header line such as ``time_s,acc_g``.
+def read_csv(
+    path: str | Path,
+    units: str | None = None,
+    dt: float | None = None,
+    column: str | None = None,
+    *,
+    time_unit: str | None = None,
+    skip: int | None = None,
+) -> Record:
+    """Read a ground motion from a CSV file with a header line such as ``time_s,acc_g``, or from an Excel workbook.
 
-    The unit is the suffix of the name of the column (``acc_g``, ``acc_cm_s2``, ``acc [m/s2]``), the comment
-    ``# units: g``, or `units`. If more than one of them is given, they must agree. Times must be uniform within the
-    rounding of their printed digits. The comments ``# dt = 0.02 s`` and ``# npts = 1559`` are checked if present.
+    Cells are separated by commas, semicolons, tabs or blanks. Decimal commas are read where commas do not separate.
+    The text is UTF-8 or Latin-1. Text above the table is left out. Workbooks need the package openpyxl.
+
+    The unit is the suffix of the name of the column (``acc_g``, ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell of a
+    line of units below the header line, the comment ``# units: g``, or `units`. If more than one of them is given, they
+    must agree. Times must be uniform within the rounding of their printed digits. The first sample of the record is at
+    time zero, also where the times of the file begin later (see `read_columns`). The comments ``# dt = 0.02 s`` and ``#
+    npts = 1559`` are checked if present.
 
     Parameters
     ----------
     path : str or path
-        The file. Without a header line it must have a single column. Lines that start with ``#`` are comments.
+        The file. Without a header line it must have a single column, or two columns, times and values, with
+        `time_unit`. Lines that start with ``#`` are comments.
     units : str, optional
         Unit of the samples.
     dt : float, optional
         Time step [s], needed for a file without times.
     column : str, optional
         Name of the column, needed if there is more than one besides the time.
+    time_unit : str, optional
+        Unit of the times, if the name of their column does not end with it.
+    skip : int, optional
+        Number of lines above the table, if they are not found.
 
     Returns
     -------
@@ -133,9 +151,9 @@ def read_csv(path: str | Path, units: str | None = None, dt: float | None = None
     ------
     ValueError
         If the file or the column does not exist, unit or step are missing or contradictory, a cell is not a finite
-        number, or a time step is irregular (the message names the first one).
+        number or is empty, or a time step is irregular (the message names the first one).
     """
-    series = tables.csv_series(tables.read_table(path), column, dt)
+    series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt)
     return _record(series, units, path, Path(path).stem)
 
 
@@ -146,8 +164,14 @@ def read_columns(
     units: str | Sequence[str] | None = None,
     dt: float | None = None,
     description: str = "",
+    *,
+    time_unit: str | None = None,
+    skip: int | None = None,
+    zero: float = 0.0,
 ) -> Measurements:
-    """Read measured responses from the columns of a CSV file with a header line (see `read_csv`).
+    """Read measured responses from the columns of a CSV file or workbook with a header line (see `read_csv`).
+
+    An empty cell, ``NaN`` or ``#N/A`` is a missing sample.
 
     Parameters
     ----------
@@ -164,11 +188,18 @@ def read_columns(
         Time step [s], needed for a file without times.
     description : str, optional
         Description of the measurements.
+    time_unit : str, optional
+        Unit of the times, if the name of their column does not end with it.
+    skip : int, optional
+        Number of lines above the table, if they are not found.
+    zero : float, optional
+        Time in the file at which the excitation begins [s].
 
     Returns
     -------
     Measurements
-        The channels.
+        The channels. They start at the first time of the file minus `zero`, so a file that begins at 0.37 s keeps this
+        time; give ``zero=0.37`` if the excitation begins with it.
 
     Raises
     ------
@@ -176,9 +207,12 @@ def read_columns(
         If a column is missing, a unit is missing or has another dimension than its channel, the times are not uniform,
         or a cell is not a finite number.
     """
-    table = tables.read_table(path)
+    table = tables.read_table(path, skip, time_unit)
     values = _channel_values(table, channels, columns, units)
-    return Measurements(tuple(channels), tables.table_step(table, dt), values, description)
+    step = tables.table_step(table, dt)
+    start = tables.table_start(table, step) - zero
+    start = 0.0 if abs(start) <= 1e-9 * step else start
+    return Measurements(tuple(channels), step, values, description, start)
 
 
 def read_imposed_test(
@@ -189,6 +223,8 @@ def read_imposed_test(
     units: str | Sequence[str] | None = None,
     displacement_unit: str | None = None,
     description: str = "",
+    *,
+    skip: int | None = None,
 ) -> ImposedTest:
     """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
 
@@ -208,6 +244,8 @@ def read_imposed_test(
         Unit of the displacement, if the name of its column does not end with it.
     description : str, optional
         Description of the measurements.
+    skip : int, optional
+        Number of lines above the table, if they are not found.
 
     Returns
     -------
@@ -219,7 +257,7 @@ def read_imposed_test(
     ValueError
         As `read_columns`, except for times, which the test does not have.
     """
-    table = tables.read_table(path)
+    table = tables.read_table(path, skip)
     imposed = Channel(displacement, "displacement", displacement_unit or "m")
     (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit)
     values = _channel_values(table, channels, columns, units)
@@ -246,7 +284,8 @@ def _channel_values(
         )
     rows = []
     for channel, column, unit in zip(channels, columns, given, strict=True):
-        samples = table.values[:, tables.value_column(table, column)]
+        place = tables.value_column(table, column)
         where = f"{table.file}, column {column!r}"
-        rows.append(to_si(samples, agree_on_unit(tables.column_unit(column), unit, channel.dimension, where)))
+        unit = agree_on_unit(tables.stated_unit(table, place), unit, channel.dimension, where)
+        rows.append(to_si(table.values[:, place], unit))
     return np.array(rows)

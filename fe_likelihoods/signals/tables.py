@@ -1,9 +1,8 @@
-"""Tables of numbers in text files: CSV with comments, an optional header line, and times.
+"""Tables of numbers in text files and workbooks: columns with names, units and times.
 
 The functions return plain numbers, with the units and the step that the file states. They convert nothing but times.
 """
 
-import csv
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -12,11 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import find_unit, to_si
-from .text_files import NUMBER, Series, agree_on_unit, check_count, is_number, parse_count, parse_number, read_text
+from .table_rows import read_rows
+from .text_files import NUMBER, Series, agree_on_unit, check_count, parse_count, parse_number
 
-__all__ = ["Table", "column_unit", "csv_series", "read_table", "table_step", "value_column"]
+__all__ = [
+    "Table",
+    "column_unit",
+    "csv_series",
+    "read_table",
+    "stated_unit",
+    "table_start",
+    "table_step",
+    "value_column",
+]
 
 _LONGEST_UNIT = 100
+_TIME = re.compile(r"(elapsed |relative )?(t|time|zeit|temps|tempo|tiempo)(\b|_)", re.IGNORECASE)
 
 
 class Table(NamedTuple):
@@ -36,6 +46,10 @@ class Table(NamedTuple):
         Largest number of digits printed after the decimal point, per column.
     comments : str
         Text of the comment lines.
+    units : tuple of str
+        Units below the header line, an empty string per column if there are none.
+    time_unit : str or None
+        Unit of the times as given by the caller.
     """
 
     file: str
@@ -44,69 +58,57 @@ class Table(NamedTuple):
     lines: tuple[int, ...]
     decimals: tuple[int, ...]
     comments: str
+    units: tuple[str, ...]
+    time_unit: str | None = None
 
 
-def read_table(path: str | Path) -> Table:
-    """Read columns of numbers from a text file.
+def read_table(path: str | Path, skip: int | None = None, time_unit: str | None = None) -> Table:
+    """Read columns of numbers from a text file or an Excel workbook.
 
-    Columns are separated by commas, or by blanks in lines without commas. A header line is optional. Lines that start
-    with ``#`` are comments.
+    Columns are separated by commas, semicolons, tabs or blanks, with decimal points or decimal commas. Text above the
+    table, a header line and a line of units are optional. Lines that start with ``#`` are comments.
 
     Parameters
     ----------
     path : str or path
         The file.
+    skip : int, optional
+        Number of lines above the table. By default they are found.
+    time_unit : str, optional
+        Unit of the times, if the file does not state it. Without a header line, the first column then has the times.
 
     Returns
     -------
     Table
-        The columns.
+        The columns, with NaN for empty cells and cells ``NaN`` or ``#N/A``.
 
     Raises
     ------
     ValueError
         If the file cannot be read, has no rows, has rows of different length, or a cell is not a finite number.
     """
-    file = str(path)
-    rows: list[tuple[int, list[str]]] = []
-    comments = []
-    names: tuple[str, ...] = ()
-    for number, line in enumerate(read_text(path).removeprefix("\xef\xbb\xbf").splitlines(), 1):
-        if line.lstrip().startswith("#"):
-            comments.append(line.lstrip("# \t"))
-        elif line.strip():
-            try:
-                cells = next(csv.reader([line], skipinitialspace=True)) if "," in line else line.split()
-            except csv.Error as error:
-                raise ValueError(f"{file}, line {number}: expected cells separated by commas ({error})") from None
-            cells = [cell.strip() for cell in cells]
-            if not rows and not names and not any(is_number(cell) for cell in cells):
-                names = tuple(cells)
-            else:
-                rows.append((number, cells))
-    if not rows:
-        raise ValueError(f"{file}: expected rows of numbers, found none")
-    first = names or rows[0][1]
-    width = len(first)
-    advice = "; separate cells by commas (the first line contains ';')" if ";" in "".join(first) else ""
-    for number, cells in rows:
-        if len(cells) != width:
-            raise ValueError(
-                f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}{advice}"
-            )
-    try:
-        values = np.array([[parse_number(cell, f"{file}, line {number}") for cell in cells] for number, cells in rows])
-    except ValueError as error:
-        raise ValueError(f"{error}{advice}") from None
-    decimals = tuple(max(_decimals(cells[i]) for _, cells in rows) for i in range(width))
-    return Table(file, names, values, tuple(number for number, _ in rows), decimals, "\n".join(comments))
+    file, rows = str(path), read_rows(path, skip)
+    width = len(rows.cells[0][1])
+    if time_unit is not None:
+        find_unit(time_unit, "time")
+    values = np.array(
+        [
+            [parse_number(cell, f"{file}, line {number}") if cell else np.nan for cell in cells]
+            for number, cells in rows.cells
+        ]
+    )
+    decimals = tuple(max(_decimals(cells[i]) for _, cells in rows.cells) for i in range(width))
+    lines = tuple(number for number, _ in rows.cells)
+    units = rows.units or ("",) * width
+    return Table(file, rows.names, values, lines, decimals, "\n".join(rows.comments), units, time_unit)
 
 
 def value_column(table: Table, column: str | None = None) -> int:
     """Return the index of the named column, or of the only column that is not the time."""
-    if not table.names and table.values.shape[1] > 1:
+    if not table.names and table.values.shape[1] - (_time_column(table) is not None) > 1:
         raise ValueError(
             f"{table.file} has {table.values.shape[1]} columns and no header line; write one such as 'time_s,acc_g'"
+            ", or give time_unit= if there are two columns, times and values"
         )
     candidates = [i for i in range(table.values.shape[1]) if i != _time_column(table)]
     if column is not None:
@@ -120,12 +122,22 @@ def value_column(table: Table, column: str | None = None) -> int:
     return candidates[0]
 
 
+def stated_unit(table: Table, place: int) -> str | None:
+    """Return the unit of a column as the file states it, in its name or below the header line, or None."""
+    named = column_unit(table.names[place]) if table.names else None
+    below = table.units[place] or None
+    if named is not None and below is not None:
+        return agree_on_unit(named, below, find_unit(below).dimension, f"{table.file} (name and line of units)")
+    return named if below is None else below
+
+
 def column_unit(name: str) -> str | None:
-    """Return the unit at the end of a column name (``acc_cm_s2``, ``force [kip]``, ``disp (in)``), or None."""
+    """Return the unit at the end of a column name (``acc_cm_s2``, ``force [kip]``, ``acc, g``), or None."""
     name = name[-_LONGEST_UNIT:]
     bracket = re.search(r"[\[(]([^\])]+)[\])]\s*$", name)
     parts = name.split("_")
-    for text in [bracket[1]] if bracket else ["_".join(parts[i:]) for i in range(1, len(parts))]:
+    texts = ["_".join(parts[i:]) for i in range(1, len(parts))] + name.split(", ")[1:][-1:]
+    for text in [bracket[1]] if bracket else texts:
         try:
             unit = find_unit(text).name
         except ValueError:
@@ -185,23 +197,56 @@ def csv_series(table: Table, column: str | None = None, dt: float | None = None)
         where = f"{table.file}: npts in the comments"
         check_count(len(table.values), parse_count(stated[1], where), where)
     comment = re.search(r"\bunits:\s*([^\s;,]+)", table.comments)
-    unit = column_unit(table.names[place]) if table.names else None
+    unit = stated_unit(table, place)
     if comment and unit is not None:
         unit = agree_on_unit(unit, comment[1], find_unit(unit).dimension, f"{table.file} (column and comment)")
+    missing = np.flatnonzero(np.isnan(table.values[:, place]))
+    if missing.size:
+        raise ValueError(
+            f"{table.file}, line {table.lines[missing[0]]}: expected a number, got an empty cell or NaN; an excitation "
+            f"needs all samples, {missing.size} are missing: interpolate them, or cut the file"
+        )
     title = table.comments.split("\n", 1)[0]
     return Series(title, table_step(table, dt), unit or (comment and comment[1]), table.values[:, place])
 
 
+def table_start(table: Table, step: float) -> float:
+    """Return the time of the first row [s], zero for a file without times.
+
+    A printed time is rounded. A start that is a whole number of steps within this rounding is that number of steps.
+    """
+    place = _time_column(table)
+    if place is None:
+        return 0.0
+    unit = _time_unit(table, place)
+    start, rounding = (float(to_si(each, unit)) for each in (table.values[0, place], 10.0 ** -table.decimals[place]))
+    nearest = round(start / step)
+    return nearest * step if abs(start - nearest * step) <= rounding + 1e-9 * step else start
+
+
 def _time_column(table: Table) -> int | None:
-    return next((i for i, name in enumerate(table.names) if re.match(r"t(ime)?(\b|_)", name.lower())), None)
+    if not table.names:
+        return 0 if table.time_unit is not None and table.values.shape[1] > 1 else None
+    return next((i for i, name in enumerate(table.names) if _TIME.match(name)), None)
+
+
+def _time_unit(table: Table, place: int) -> str:
+    stated = stated_unit(table, place)
+    if stated is None and table.time_unit is None:
+        raise ValueError(
+            f"{table.file}: the column {table.names[place]!r} has no unit; call it time_s or time_ms, or give "
+            "time_unit="
+        )
+    return agree_on_unit(stated, table.time_unit, "time", f"{table.file} (times)")
 
 
 def _uniform_step(table: Table, place: int) -> tuple[float, float]:
     """Return the mean step of a column of times [s] and the largest error that their rounding can cause in it."""
-    unit = column_unit(table.names[place])
-    if unit is None:
-        raise ValueError(f"{table.file}: the column {table.names[place]!r} has no unit; call it time_s or time_ms")
+    unit = _time_unit(table, place)
     times = to_si(table.values[:, place], unit, "time")
+    if np.isnan(times).any():
+        line = table.lines[int(np.argmax(np.isnan(times)))]
+        raise ValueError(f"{table.file}, line {line}: expected a time, got an empty cell or NaN; write all times")
     if times.size < 2 or not times[-1] > times[0]:
         raise ValueError(f"{table.file}: expected times that increase over 2 rows or more, got {times.size} row(s)")
     increments = np.diff(times)

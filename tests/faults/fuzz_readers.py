@@ -101,6 +101,8 @@ def cases(folder):
         b"# units: g; dt = 0.5 s\n# npts = 3\nacc\n1\n2\n3\n",
         b"time_s,acc_g\n0,1\n0.5,2\n1,3\n",
         b"Time(s)  a(g)\n0 1\n0.5 2\n1 3\n",
+        "Logger 7\nZeit [s];a [m/s²];\n0,0;1,5;\n0,5;2,0;\n1,0;-3;\n".encode(),
+        "Time\tAcc\ns\tm/s²\n0\t1\n0.5\t2\n1\t3\n".encode("utf-16"),
     ]
     record, measured = Record("a", 0.01, values), Measurements((TOP,), 0.01, values[None])
     write_dataset(folder / "valid.h5", record, measured, {"truth": [1.0, 2.0]})

@@ -6,6 +6,7 @@ The same holds for the newer CSMIP form and for COSMOS V2. The older CSMIP form 
 
 import csv
 import re
+import sys
 import zipfile
 
 import numpy as np
@@ -99,6 +100,48 @@ class TestAT2:
             read_at2(tmp_path / "none.at2")
 
 
+def lines(*rows, encoding="utf-8", end="\r\n"):
+    return end.join([*rows, ""]).encode(encoding)
+
+
+POINTS = ("0.00,0.1", "0.01,-0.25", "0.02,12.5", "0.03,0.0")
+SEMICOLONS = tuple(row.replace(",", ";").replace(".", ",") for row in POINTS)
+TABS = tuple(row.replace(",", "\t") for row in POINTS)
+PREAMBLE = ("Logger 7, firmware 2.1", "Sampling rate,100", "Date: 2019-07-06", "")
+# files as loggers and spreadsheets write them, with the arguments that they need
+LOGGERS = {
+    "plain": (lines("time_s,acc_m_s2", *POINTS), {}),
+    "UTF-8 header": (lines("Time [s],Acceleration [m/s²]", *POINTS), {}),
+    "UTF-8 with mark": (lines("Time [s],Acceleration [m/s²]", *POINTS, encoding="utf-8-sig"), {}),
+    "Latin-1 header": (lines("Time (s),Acceleration (m/s²)", *POINTS, encoding="latin-1"), {}),
+    "UTF-16": (lines("Time (s)\tAcceleration (m/s²)", *TABS, encoding="utf-16"), {}),
+    "units by arguments": (lines("Time,Acceleration", *POINTS), {"time_unit": "s", "units": "m/s2"}),
+    "tabs": (lines("time_s\tacc_m/s2", *TABS, end="\n"), {}),
+    "tabs, decimal commas": (lines("time_s\tacc_m/s2", *(row.replace(".", ",") for row in TABS)), {}),
+    "semicolons": (lines("Zeit [s];a [m/s²]", *(row.replace(",", ";") for row in POINTS)), {}),
+    "semicolons, decimal commas": (lines("Zeit [s];a [m/s²]", *SEMICOLONS), {}),
+    "quoted decimal commas": (lines("t_s,a_gal", '"0,00","10"', '"0,01","-25"', '"0,02","1250"', '"0,03","0"'), {}),
+    "blanks": (lines("time_s   acc_m/s2", *("   ".join(row.split(",")) for row in POINTS)), {}),
+    "blanks, decimal commas": (lines("t_s a_m/s2", *(row.replace(";", " ") for row in SEMICOLONS)), {}),
+    "preamble": (lines(*PREAMBLE, "Time [s],Acceleration [m/s²]", *POINTS), {}),
+    "preamble, skipped": (lines(*PREAMBLE, "time_s,acc_m/s2", *POINTS), {"skip": 4}),
+    "preamble, semicolons": (lines(*PREAMBLE, "Zeit [s];a [m/s²]", *SEMICOLONS), {}),
+    "line of units": (lines("Time,Acceleration", "s,m/s²", *POINTS), {}),
+    "line of units in brackets": (
+        lines(*PREAMBLE, "Time\tAcc", "[ms]\t[gal]", "0\t10", "10\t-25", "20\t1250", "30\t0"),
+        {},
+    ),
+    "quoted names": (lines('"Time, s","Acceleration, m/s²"', *POINTS), {}),
+    "separators at ends": (lines("time_s;acc_m/s2;", *(f"{row};" for row in SEMICOLONS)), {}),
+    "more columns": (
+        lines("No;time_s;acc_m/s2", *(f"{k};{row}" for k, row in enumerate(SEMICOLONS))),
+        {"column": "acc_m/s2"},
+    ),
+    "no header": (lines(*POINTS), {"time_unit": "s", "units": "m/s²"}),
+    "numbers with exponents": (lines("time_s,acc_m/s2", "0,1e-1", "1E-2,-2.5e-1", "2e-2,1.25E1", "3.0e-2,0"), {}),
+}
+
+
 class TestCSV:
     @pytest.mark.parametrize("name", REAL_RECORDS)
     def test_real_records(self, shared, name):
@@ -143,17 +186,25 @@ class TestCSV:
             ("time_s,acc_g\n0,1\n0.5,2\n1,3\n", {"dt": 0.25}, "0.25 s by the argument dt but 0.5 s by the time column"),
             ("# dt = 0.25 s\ntime_s,acc_g\n0,1\n0.5,2\n1,3\n", {}, "0.25 s by the comments but 0.5 s by the time"),
             ("# npts = 4\ntime_s,acc_g\n0,1\n1,2\n", {}, "npts in the comments announces 4 samples, the file has 2"),
-            ("time_s,acc_g\n0,1\n1,nan\n", {}, "line 3: expected a finite number, got 'nan'"),
-            ("time_s,acc_g\n0,1\n1,\n", {}, "line 3: expected a number, got ''"),
+            ("time_s,acc_g\n0,1\n1,nan\n", {}, "line 3: expected a number, got an empty cell or NaN"),
+            ("time_s,acc_g\n0,1\n1,inf\n", {}, "line 3: expected a finite number, got 'inf'"),
+            ("time_s,acc_g\n0,1\n,2\n", {}, "line 3: expected a time, got an empty cell"),
+            ("time_s,acc_g\n0,1\n1,\n", {}, "line 3: expected a number, got an empty cell or NaN; .* 1 are missing"),
             ("time_s,acc_g\n0,1\n1,two\n", {}, "line 3: expected a number, got 'two'"),
             ("time_s,acc_g\n0,1\n1\n", {}, "line 3: expected 2 cells"),
             (
-                "time_s;acc_g\n0,0;1,0\n",
+                "time_s;acc_g\n0,0;1,0\n0.5;2,0\n",
                 {},
-                r"1 cells .* got 3; separate cells by commas \(the first line contains ';'",
+                "points or decimal commas, got '0,0' in line 2 and '0.5' in line 3",
             ),
-            ("time_s;acc_g\n0.0;1.0\n", {}, r"a number, got '0.0;1.0'; separate cells by commas"),
-            ("0.0;1.0\n0.1;2.0\n", {}, r"a number, got '0.1;2.0'; separate cells by commas"),
+            ("time_s;acc_g\n0,0;1.234,5\n0,1;2,0\n", {}, "line 2: expected a number, got '1.234,5'"),
+            ("time_s;acc_g\n0.0;1.0\n", {}, "times that increase over 2 rows or more, got 1 row"),
+            ("0.0;1.0\n0.1;2.0\n", {}, "2 columns and no header line; .* or give time_unit="),
+            ("time_s,acc_g\n0,one\n0.5,2\n1,3\n", {}, "line 2: expected a number, got 'one'"),
+            ("0,one\n0.5,2\n1,3\n", {"units": "g", "time_unit": "s"}, "line 1: expected a number, got 'one'"),
+            ("Time,acc_g\n0,1\n1,2\n", {"time_unit": "g"}, "expected a unit of time, got 'g'"),
+            ("Time,acc_g\ns,m/s2\n0,1\n1,2\n", {}, "states the unit 'g' but units = 'm/s2'"),
+            ("Time_s,acc_g\n0,1\n1,2\n", {"skip": -1}, "skip must be a number of lines"),
             ("time_s,acc_g\n", {}, "expected rows of numbers, found none"),
             ("time_s,acc_g\n1,1\n0,2\n", {}, "times that increase"),
             ("0,1\n1,2\n", {}, "2 columns and no header line"),
@@ -166,6 +217,14 @@ class TestCSV:
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             read_csv(path, **given)
+
+    @pytest.mark.parametrize(("content", "given"), LOGGERS.values(), ids=LOGGERS)
+    def test_files_of_loggers_and_spreadsheets(self, tmp_path, content, given):
+        path = tmp_path / "a.csv"
+        path.write_bytes(content)
+        record = read_csv(path, **given)
+        np.testing.assert_allclose(record.acceleration, [0.1, -0.25, 12.5, 0.0])
+        assert record.dt == 0.01
 
     @pytest.mark.parametrize(
         ("step", "digits"), [(1 / 120, 5), (1 / 128, 3), (0.0125, 3), (0.01, 2), (0.02, 2), (0.005, 4)]
@@ -387,6 +446,42 @@ class TestColumns:
         path.write_text("time_s,acc_g,disp\n0,1,2\n0.01,3,4\n")
         with pytest.raises(ValueError, match=message):
             read_columns(path, channels, columns, units)
+
+    def test_empty_cells_are_missing_samples(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text("Time [s];Acc [g];Top [µm/m]\n0,37;1;\n0,38;;2\n0,39;NaN;3\n0,40;4;#N/A\n", encoding="utf-8")
+        strain = Channel("strain", "strain", "microstrain")
+        found = read_columns(path, (TOP, strain), ("Acc [g]", "Top [µm/m]"))
+        nan = np.nan
+        np.testing.assert_allclose(found.values, [[G0, nan, nan, 4 * G0], [nan, 2e-6, 3e-6, nan]])
+        assert found.dt == 0.01 and found.start == pytest.approx(0.37)
+        np.testing.assert_allclose(found.time, [0.37, 0.38, 0.39, 0.40])
+        assert read_columns(path, (TOP,), ("Acc [g]",), zero=0.37).start == 0.0
+
+    def test_a_printed_start_is_a_whole_number_of_steps_within_its_rounding(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text("time_s,acc_g\n" + "".join(f"{(k + 1) / 120:.5f},{k}\n" for k in range(500)))
+        found = read_columns(path, (TOP,), ("acc_g",))
+        assert (found.dt, found.start) == (1 / 120, 1 / 120)
+
+    def test_excel(self, tmp_path):
+        book = pytest.importorskip("openpyxl").Workbook()
+        for row in (["Logger 7"], ["Time", "Acc"], ["s", "m/s²"], [0, 0.1], [0.01, None], [0.02, 12.5], [0.03, 0]):
+            book.active.append(row)
+        book.save(tmp_path / "a.xlsx")
+        found = read_columns(tmp_path / "a.xlsx", (TOP,), ("Acc",))
+        np.testing.assert_array_equal(found.values, [[0.1, np.nan, 12.5, 0.0]])
+        assert found.dt == 0.01
+        with pytest.raises(ValueError, match="line 5: expected a number, got an empty cell"):
+            read_csv(tmp_path / "a.xlsx")
+        (tmp_path / "b.xlsx").write_bytes(b"PK no workbook")
+        with pytest.raises(ValueError, match="not a readable Excel workbook"):
+            read_csv(tmp_path / "b.xlsx")
+
+    def test_excel_without_its_package(self, tmp_path, monkeypatch):
+        monkeypatch.setitem(sys.modules, "openpyxl", None)
+        with pytest.raises(ValueError, match="install it with pip install openpyxl, or save the sheet as CSV"):
+            read_csv(tmp_path / "a.xlsx")
 
     def test_bridge_response_is_that_of_its_v2_files(self, shared):
         folder = shared / "measured/meloland_bridge"

@@ -1,0 +1,263 @@
+"""Rows of cells of CSV files, as loggers and spreadsheets write them, and of Excel workbooks.
+
+Cells are separated by semicolons, tabs, commas or blanks; the separator is the one that splits most of the last lines
+into numbers. Decimal commas are read where commas do not separate. Text before the header line is left out. A line with
+numbers and words is never taken for such text unless a header line follows it.
+"""
+
+import codecs
+import csv
+import itertools
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from ..units import find_unit
+from .text_files import LARGEST_FILE, is_number, read_bytes
+
+__all__ = ["Rows", "decode_table", "read_rows"]
+
+_SEPARATORS = (";", "\t", ",", " ")
+_LAST_LINES = 50  # lines that determine the separator
+_MISSING = frozenset({"", "nan", "#n/a"})
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
+_EXCEL = {".xlsx", ".xlsm"}
+_LARGEST_WORKBOOK, _MOST_CELLS = 256 * 2**20, 50_000_000  # bytes of the unpacked workbook; cells of the sheet
+
+
+class Rows(NamedTuple):
+    """Rows of a table, not yet numbers.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Cells of the header line. Empty if there is none.
+    units : tuple of str
+        Cells of a line of units below the header line. Empty if there is none.
+    cells : list of (int, list of str)
+        Number of the line and cells, with decimal points. A missing cell is an empty string.
+    comments : list of str
+        Comment lines, without the ``#``.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    cells: list[tuple[int, list[str]]]
+    comments: list[str]
+
+
+def decode_table(content: bytes) -> str:
+    """Return the text of a file: UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", errors="replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def read_rows(path: str | Path, skip: int | None = None) -> Rows:
+    """Read the rows of a text file, or of the first sheet of an Excel workbook.
+
+    Parameters
+    ----------
+    path : str or path
+        The file. Workbooks (``.xlsx``) need the package openpyxl.
+    skip : int, optional
+        Number of lines above the table. By default they are found.
+
+    Returns
+    -------
+    Rows
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, has no rows of numbers, or a row has another number of cells than the others.
+    """
+    if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
+        raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
+    if Path(path).suffix.lower() in _EXCEL:
+        return _arrange([line for line in _workbook(path) if line[0] > (skip or 0)], [], str(path))
+    lines, comments = [], []
+    for number, line in enumerate(decode_table(read_bytes(path)).splitlines(), 1):
+        if number <= (skip or 0) or not line.strip():
+            continue
+        if line.lstrip().startswith("#"):
+            comments.append(line.lstrip("# \t"))
+        else:
+            lines.append((number, line))
+    separator = _find_separator([line for _, line in lines[-_LAST_LINES:]])
+    cells = [(number, _split(line, separator, f"{path}, line {number}")) for number, line in lines]
+    return _arrange(cells, comments, str(path))
+
+
+def _split(line: str, separator: str, where: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    try:
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=separator != "\t"))
+    except csv.Error as error:
+        raise ValueError(f"{where}: expected cells separated by {separator!r} ({error})") from None
+    return [cell.strip() for cell in cells]
+
+
+def _find_separator(lines: Sequence[str]) -> str:
+    """The separator that splits most of the lines into several numbers, or into one if none does."""
+    best, most = " ", (0, 0)
+    for separator in _SEPARATORS:
+        widths: Counter[int] = Counter()
+        for line in lines:
+            try:
+                cells = _split(line, separator, "")
+            except ValueError:
+                continue
+            if any(_known(cell) for cell in cells) and all(_known(cell) or _is_missing(cell) for cell in cells):
+                widths[len(cells)] += 1
+        width, count = max(widths.items(), key=lambda item: item[1], default=(0, 0))
+        if (count * (width > 1), count) > most:
+            best, most = separator, (count * (width > 1), count)
+    if most == (0, 0):  # no line of numbers: the separator that is there, for the message
+        best = next((each for each in _SEPARATORS if any(each in line for line in lines)), " ")
+    return best
+
+
+def _known(cell: str) -> bool:
+    return not _is_missing(cell) and (is_number(cell) or bool(_DECIMAL_COMMA.match(cell)))
+
+
+def _is_missing(cell: str) -> bool:
+    return cell.lower() in _MISSING
+
+
+def _arrange(lines: list[tuple[int, list[str]]], comments: list[str], file: str) -> Rows:
+    """Find header line, line of units and rows of numbers."""
+    data = itertools.islice((place for place, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)
+    places = list(data)
+    if places:
+        # the width of most of the first rows: a number above the table is no row
+        width = Counter(len(lines[place][1]) for place in places).most_common(1)[0][0]
+        first = next(place for place in places if len(lines[place][1]) == width)
+    else:
+        width, first = max((len(cells) for _, cells in lines), default=0), len(lines)
+    names, units, after = _find_header(lines[:first], width)
+    if not names:
+        # a damaged first row is an error and no text above the table
+        damaged = (k for k in range(first) if len(lines[k][1]) == width and any(_known(c) for c in lines[k][1]))
+        after = next(damaged, first)
+    rows = lines[after:]
+    if not rows:
+        raise ValueError(f"{file}: expected rows of numbers, found none")
+    for number, cells in rows:
+        if len(cells) != width:
+            raise ValueError(f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}")
+    return _without_empty_columns(names, units, _with_points(rows, file), comments)
+
+
+def _is_data(cells: Sequence[str]) -> bool:
+    return any(_known(cell) for cell in cells) and all(_known(cell) or _is_missing(cell) for cell in cells)
+
+
+def _find_header(lines: Sequence[tuple[int, list[str]]], width: int) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    """Names, units and the place after them: the last line of words as wide as the rows, and a line of units below.
+
+    Separators at the ends of the rows may be missing at the end of the header line, and the other way round.
+    """
+    found: list[tuple[int, tuple[str, ...]]] = []
+    for place, (_, cells) in enumerate(lines):
+        words = list(cells)
+        while len(words) > width and not words[-1]:
+            words.pop()
+        if len(words) == width - 1 and width > 2:
+            words.append("")
+        if len(words) == width and _is_text(words):
+            found.append((place, tuple(words)))
+    if not found:
+        return (), (), len(lines)
+    place, last = found[-1]
+    if len(found) > 1 and found[-2][0] == place - 1 and all(cell == "" or _unit_of(cell) for cell in last):
+        return found[-2][1], tuple(_unit_of(cell) for cell in last), place + 1
+    return last, (), place + 1
+
+
+def _is_text(cells: Sequence[str]) -> bool:
+    return any(any(map(str.isalpha, cell)) for cell in cells) and not any(_known(cell) for cell in cells)
+
+
+def _unit_of(cell: str) -> str:
+    """The unit that a cell consists of, with or without brackets; an empty string if it is none."""
+    text = cell.strip("[]() ")
+    try:
+        find_unit(text)
+    except ValueError:
+        return ""
+    return text
+
+
+def _with_points(rows: list[tuple[int, list[str]]], file: str) -> list[tuple[int, list[str]]]:
+    """Rows with decimal points and empty strings for missing cells."""
+    commas = [(number, cell) for number, cells in rows for cell in cells if _DECIMAL_COMMA.match(cell)]
+    if commas:
+        point = next(((n, cell) for n, cells in rows for cell in cells if "." in cell and is_number(cell)), None)
+        if point is not None:
+            raise ValueError(
+                f"{file}: expected decimal points or decimal commas, got {commas[0][1]!r} in line {commas[0][0]} and "
+                f"{point[1]!r} in line {point[0]}; write all numbers alike, without separators of thousands"
+            )
+    swap = bool(commas)
+    return [
+        (number, ["" if _is_missing(c) else c.replace(",", ".") if swap and _known(c) else c for c in cells])
+        for number, cells in rows
+    ]
+
+
+def _without_empty_columns(
+    names: tuple[str, ...], units: tuple[str, ...], rows: list[tuple[int, list[str]]], comments: list[str]
+) -> Rows:
+    """Rows without the columns that have neither a name nor a number, as after a separator at the end of each line."""
+    width = len(rows[0][1])
+    empty = {k for k in range(width) if (not names or not names[k]) and not any(cells[k] for _, cells in rows)}
+    if not empty or len(empty) == width:
+        return Rows(names, units, rows, comments)
+    kept = [k for k in range(width) if k not in empty]
+    names, units = (tuple(each[k] for k in kept) if each else () for each in (names, units))
+    return Rows(names, units, [(number, [cells[k] for k in kept]) for number, cells in rows], comments)
+
+
+def _workbook(path: str | Path) -> list[tuple[int, list[str]]]:
+    """Rows of the first sheet of an Excel workbook, without empty ones; formulas have their stored values."""
+    try:
+        from openpyxl import load_workbook
+    except ImportError as error:
+        raise ValueError(
+            f"reading {path} needs the package openpyxl: install it with pip install openpyxl, or save the sheet as CSV"
+        ) from error
+    read_bytes(path)  # the checks of existence and size
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > min(_LARGEST_WORKBOOK, LARGEST_FILE):
+            raise ValueError(f"{path}: expected a workbook of at most {_LARGEST_WORKBOOK} bytes, got {size}")
+        book = load_workbook(path, read_only=True, data_only=True)
+        sheet, rows, count = book.worksheets[0], [], 0
+        for number, values in enumerate(sheet.iter_rows(values_only=True), 1):
+            count += len(values)
+            if count > _MOST_CELLS:
+                raise ValueError(f"{path}: expected at most {_MOST_CELLS} cells; save the table as CSV")
+            cells = ["" if value is None else _cell_text(value) for value in values]
+            if any(cells) and not cells[0].startswith("#"):
+                rows.append((number, cells))
+        book.close()
+    except ValueError:
+        raise
+    except Exception as error:  # a damaged workbook may raise anything
+        raise ValueError(f"{path}: not a readable Excel workbook ({error}); save it as CSV") from error
+    width = max((len(cells) for _, cells in rows), default=0)
+    return [(number, cells + [""] * (width - len(cells))) for number, cells in rows]
+
+
+def _cell_text(value: object) -> str:
+    return repr(float(value)) if isinstance(value, int | float) and not isinstance(value, bool) else str(value).strip()
