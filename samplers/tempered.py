@@ -12,7 +12,6 @@ Three collaborators do the rest: `samplers.storage.evaluation.Evaluator` evaluat
 ladder and the evidence.
 """
 
-import contextlib
 import copy
 import logging
 import time
@@ -37,7 +36,8 @@ from .storage.evaluation import CallingConvention, FailureLimit
 from .storage.evaluators import make_evaluators
 from .storage.journal import RunStart
 from .storage.recording import record, show_progress
-from .storage.resumption import Resumption
+from .storage.resumption import PresentCall, Resumption
+from .storage.script import Request, describe_options
 from .storage.user_functions import UserFunctions
 from .tempering.anneal import anneal
 from .tempering.budget import Budget, BudgetExhausted, as_limit
@@ -214,6 +214,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
 
     def reset(self):
         """Clear the chain, as in emcee. Ladder and state at beta = 1 are kept: burn in, reset, continue."""
+        self._leave_open_loop()
         super().reset()
         self._checkpoint.store_result(self._result, self._verdict)
 
@@ -244,14 +245,15 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         emcee.State
             The last state.
         """
-        self._start_is_open = initial_state is None
+        self._start_is_open, self._runs_to_end = initial_state is None, True
         if initial_state is None and get_previous_state(self) is None:
             initial_state = self._last_or_prior()
-        result = super().run_mcmc(initial_state, nsteps, **kwargs)
-        if result is None:
-            result = self._annealed_state
-            set_previous_state(self, result)
-        return result
+        with self._interruptible():
+            result = super().run_mcmc(initial_state, nsteps, **kwargs)
+            if result is None:
+                result = self._annealed_state
+                set_previous_state(self, result)
+            return result
 
     def sample(
         self,
@@ -276,6 +278,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
             raise ValueError("'store' must be False when 'iterations' is None")
         if int(thin_by if thin is None else thin) <= 0:
             raise ValueError("Invalid thinning argument")
+        self._leave_open_loop()
         state = State(self._last_or_prior() if initial_state is None else initial_state, copy=True)
         start_is_open, self._start_is_open = self._start_is_open or initial_state is None, False
         for name, value in (("log_prob", log_prob0), ("random_state", rstate0), ("blobs", blobs0)):
@@ -287,84 +290,85 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
             state.log_prob, state.blobs = copy.deepcopy((last.log_prob, last.blobs))
 
         self._evaluator.pool = self.pool
-        failure_count, complete, made, start = self.failure_count, False, 0, time.perf_counter()
-        bar = {"progress": progress, "progress_kwargs": progress_kwargs}
-        given = state.coords
-        start_is_open = start_is_open or np.array_equal(given, self._returned)
-        if self._checkpoint.lost_journal:
-            self._compare_last_state()
-        call = self._checkpoint.find_call(iterations, None if start_is_open else given) if store else None
-        if call is not None and call.complete:
-            yield from self._repeat(call, bar)
-            return
+        start_is_open = start_is_open or np.array_equal(state.coords, self._returned)
+        request = Request(iterations, state.coords, describe_options(thin_by, thin, tune, store))
+        arguments = {"tune": tune, "thin_by": thin_by, "thin": thin, "store": store}
+        arguments |= {"progress": progress, "progress_kwargs": progress_kwargs}
+        yield from self._run_call(state, request, start_is_open, skip_initial_state_check, arguments)
+
+    def _run_call(
+        self, state: State, request: Request, is_open: bool, skip_check: bool, arguments: dict
+    ) -> Iterator[State]:
+        """Make, repeat or complete a call of `sample`; `is_open`: whether it was given no state."""
+        present = self._begin_call(arguments["store"])
         try:
-            if call is not None:  # it was interrupted
-                made, iterations = call.made, max(iterations - call.made, 0)
-            state, is_known = self._first_state(state, call, start_is_open, skip_initial_state_check, bar)
-            skip_initial_state_check = skip_initial_state_check or is_known
-            self._annealed_state = state
-            if store and call is None:
-                self._checkpoint.begin_call(iterations, given)
-            self.seconds += time.perf_counter() - start
-            start = time.perf_counter()
-            self._evaluator.evaluates_parts = False
-            halted, advanced, stored, new = self._result.halt is not None, None, State(state, copy=True), 0
-            steps = (
-                ()
-                if halted
-                else super().sample(
-                    state,
-                    iterations=iterations,
-                    tune=tune,
-                    skip_initial_state_check=skip_initial_state_check,
-                    thin_by=thin_by,
-                    thin=thin,
-                    store=store,
-                    **bar,
-                )
-            )
-            try:
-                for advanced in steps:
-                    new += 1
-                    set_previous_state(self, State(advanced, copy=True))  # the next call without a state goes on here
-                    if self._budget.limit is not None:
-                        stored = State(advanced, copy=True)
-                        self._checkpoint.stepped(stored, store)
-                    self.seconds += time.perf_counter() - start
-                    yield advanced
-                    start = time.perf_counter()
-            except BudgetExhausted:
-                halted = True
-            complete = not halted
-            missing = 0 if iterations is None else iterations - new
-            self._judge(missing)
-            if halted:
-                if advanced is not None:  # the move that exceeded the limit may have changed some of its walkers
-                    for name in State.__slots__:
-                        setattr(advanced, name, getattr(stored, name))
-                self.random_state = stored.random_state
-                self._checkpoint.halt(stored, store and missing > 0 and not self._checkpoint.has_steps)
-                warn(describe_halt(self.verdict, self._budget.limit, self._result, made + new, missing))
-                if new == 0 and missing > 0:
-                    yield stored
-        except Exception:  # of the user's function, or of a disk that is full: the same call goes on
-            with contextlib.suppress(OSError, RuntimeError):
-                self._checkpoint.prepare_to_continue()
+            if self._checkpoint.lost_journal:
+                self._compare_last_state()
+            present.find(request._replace(coords=None if is_open else request.coords))
+            bar = {name: arguments[name] for name in ("progress", "progress_kwargs")}
+            if present.call is not None and present.call.complete:
+                yield from self._repeat(present, bar)
+            else:
+                yield from self._advance(present, state, request, is_open, skip_check, arguments, bar)
+        except BaseException as error:
+            self._end_call(present, error)
             raise
-        except GeneratorExit:  # the user wants no more states
-            complete = True
-            raise
-        except KeyboardInterrupt:
-            if not self._checkpoint.place:
-                raise
-            self._checkpoint.prepare_to_continue()
-            raise KeyboardInterrupt(
-                f"{self.evaluations} evaluations and {self.iteration} steps are kept in {self._checkpoint.place}: run "
-                "the same script again, or make the same call, to go on"
-            ) from None
-        finally:
-            self._checkpoint.end_call(complete and store)
-            self._warn_of_failures(failure_count)
+        self._end_call(present)
+
+    def _advance(
+        self,
+        present: PresentCall,
+        state: State,
+        request: Request,
+        is_open: bool,
+        skip_check: bool,
+        arguments: dict,
+        bar: dict,
+    ) -> Iterator[State]:
+        """Anneal where it is needed, and make the steps of a call that are not stored."""
+        start, call, store, iterations = time.perf_counter(), present.call, arguments["store"], request.steps
+        made = 0 if call is None else call.made
+        state, is_known = self._first_state(state, call, is_open, skip_check, bar)
+        self._annealed_state = state
+        if call is not None:  # it was interrupted, or left by the user
+            yield from self._repeat_steps(present, state)
+            iterations = max(iterations - made * int(arguments["thin"] or 1), 0)
+        elif store:
+            self._checkpoint.begin_call(request)
+        self.seconds += time.perf_counter() - start
+        start = time.perf_counter()
+        self._evaluator.evaluates_parts = False
+        halted, advanced, stored, new = self._result.halt is not None, None, State(state, copy=True), 0
+        check = {"skip_initial_state_check": skip_check or is_known}
+        steps = () if halted else super().sample(state, iterations=iterations, **check, **arguments)
+        try:
+            for advanced in steps:
+                new += 1
+                set_previous_state(self, State(advanced, copy=True))  # the next call without a state goes on here
+                if self._budget.limit is not None:
+                    stored = State(advanced, copy=True)
+                    self._checkpoint.stepped(stored, store)
+                self.seconds += time.perf_counter() - start
+                present.complete = store and new == iterations
+                yield advanced
+                present.check_is_present()
+                start = time.perf_counter()
+        except BudgetExhausted:
+            halted = True
+        present.complete = store and not halted
+        missing = 0 if iterations is None else iterations - new
+        self._judge(missing)
+        if halted:
+            if advanced is not None:  # the move that exceeded the limit may have changed some of its walkers
+                for name in State.__slots__:
+                    setattr(advanced, name, getattr(stored, name))
+            self.random_state = stored.random_state
+            self._checkpoint.halt(stored, store and missing > 0 and not self._checkpoint.has_steps)
+            warn(describe_halt(self.verdict, self._budget.limit, self._result, made + new, missing))
+            if new == 0 and missing > 0:
+                yield stored
+        elif present.runs_to_end and not store:
+            self._checkpoint.pass_call(request, state if advanced is None else advanced)
 
     def _judge(self, missing: int) -> None:
         """Store the verdict on an annealing of this object, or keep that of the backend."""

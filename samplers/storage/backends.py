@@ -22,40 +22,27 @@ from emcee.backends import HDFBackend
 from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.population import Stage
 from ..tempering.verdict import Verdict
-from .chain_file import (
-    DAMAGE,
-    StoredRun,
-    adopt,
-    compare,
-    create_group,
-    is_unfinished,
-    ladder_differs,
-    read_run,
-    rebuild,
-    set_aside,
-    write_marks,
-)
+from .chain_file import create_group, rebuild, write_marks
 from .emcee_internals import append_steps, drop_last_step
 from .file_lock import FileLock
+from .guarded_backend import FAULTS, PATIENCE
 from .journal import EvaluatedBatch, Journal, RunStart, Step, lock_path
-from .journal_contents import Contents, read_journal
+from .journal_contents import Contents, StoredStep, read_call, read_journal
 from .ladder_file import write_check, write_stage, write_verdict
-from .script import Script, digest
+from .recovery import RUN, Recovery
+from .script import Request, Script, digest
 
 __all__ = ["JournaledBackend"]
 
 logger = logging.getLogger(__name__)
 
-RUN = "run"
 SECONDS_BETWEEN_WRITES = 0.25
-# How long to wait for a process that reads the file, which locks it
-PATIENCE = 30.0
 
 # the objects of this process that write to a journal
 _writers: "weakref.WeakValueDictionary[Path, JournaledBackend]" = weakref.WeakValueDictionary()
 
 
-class JournaledBackend(HDFBackend):
+class JournaledBackend(Recovery):
     """emcee's HDF5 backend, with a journal beside it.
 
     Steps are written to the journal at once, and to the HDF5 file a few times per second and before anything is read
@@ -120,21 +107,22 @@ class JournaledBackend(HDFBackend):
 
     # ------------------------------------------------------------------ the chain, as emcee writes it
 
-    def open(self, mode="r"):
-        """emcee's: the open HDF5 file, after pending steps have been written."""
-        self.flush()
-        return self._open(mode)
+    def rebuild_file(self) -> None:
+        """Rebuild the file from the journal, with the pending steps."""
+        if self._journal is not None:
+            with self._guarded():
+                rebuild(self, read_journal(self.journal_path), self._run)
+            self._pending, self._pending_start, self._accepted = [], None, None
+        super().rebuild_file()
 
-    def _open(self, mode: str, patience: float = PATIENCE) -> h5py.File:
-        """The open file; waits while another process has locked it by reading."""
-        end = time.monotonic() + patience
-        while True:
-            try:
-                return super().open(mode)
-            except BlockingIOError:
-                if time.monotonic() > end:
-                    raise
-                time.sleep(0.02)
+    def advice(self) -> str:
+        """What is kept after an error of the file, and how to go on."""
+        if not self.journal_path.exists():
+            return super().advice()
+        return (
+            f"All evaluations and steps are kept in {self.journal_path.name}. Free some disk space, and make the same "
+            "call or run the same script again: the file is rebuilt, and the run continues"
+        )
 
     def reset(self, nwalkers, ndim):
         """emcee's: clear the chain."""
@@ -147,7 +135,8 @@ class JournaledBackend(HDFBackend):
         self._accepted = None
         with FileLock(lock_path(self.journal_path)):
             self._run = secrets.token_hex(8) if self._journal is None else self._run
-            create_group(self, nwalkers, ndim, self._run)
+            with self._guarded():
+                create_group(self, nwalkers, ndim, self._run)
         self._fresh = self._journal is None
         if self._journal is not None:
             self._journal.wipe(self.script.begin(None))
@@ -189,9 +178,13 @@ class JournaledBackend(HDFBackend):
         """
         if not self._pending:
             return
+        if self._is_broken:
+            self.rebuild_file()
+            if not self._pending:
+                return
         steps, self._pending = self._pending, []
         try:
-            with self._open("a", patience) as file:
+            with self._writing(patience) as file:
                 group = file[self.name]
                 if self._accepted is None:
                     self._accepted = group["accepted"][...]
@@ -233,7 +226,8 @@ class JournaledBackend(HDFBackend):
                 fresh = self._fresh and file[self.name].attrs.get(RUN) == self._run
             if not fresh:
                 self._run = secrets.token_hex(8)
-                create_group(self, *self.shape, self._run)
+                with self._guarded():
+                    create_group(self, *self.shape, self._run)
             self._write_to(Journal.create(path, {**header, RUN: self._run}, start))
         self._fresh, self.script = False, Script()
 
@@ -246,7 +240,8 @@ class JournaledBackend(HDFBackend):
             self._enter_adopted(contents)
             contents = read_journal(self.journal_path)
             self.script.calls = contents.script.calls
-            rebuild(self, contents, self._run)
+            with self._guarded():
+                rebuild(self, contents, self._run)
             self._accepted = None
         return contents
 
@@ -280,18 +275,40 @@ class JournaledBackend(HDFBackend):
             self._journal.verdict(verdict)
         write_verdict(self, verdict)
 
-    def call(self, nsteps: int, coords: np.ndarray) -> None:
-        """Enter a call in the journal: the steps that it asks for, and where it starts."""
-        index = self.script.begin(int(nsteps), digest(coords), self.annealings)
+    def call(self, request: Request) -> None:
+        """Enter a call in the journal."""
+        steps, begin = int(request.steps), digest(request.coords)
+        index = self.script.begin(steps, begin, self.annealings, request.options)
         if self._journal is not None:
-            self._journal.call(index, int(nsteps), digest(coords))
+            self._journal.call(index, steps, begin, request.options)
+
+    def go_on(self) -> None:
+        """Enter that the present call goes on, although others were made after it."""
+        self.script.go_on()
+        if self._journal is not None:
+            self._journal.more(self.script.position)
+
+    def passed(self, request: Request, last: Step) -> None:
+        """Enter a complete call that stores no steps."""
+        if self._journal is None:
+            return
+        steps, begin = int(request.steps), digest(request.coords)
+        index = self.script.begin(steps, begin, self.annealings, request.options)
+        self._journal.passed(index, steps, begin, request.options, last)
+        self.script.finish(last)
+        self._mark()
 
     def done(self) -> None:
-        """Enter that the call is complete, or was ended by the user."""
-        self.script.complete()
+        """Enter that the call is complete."""
         if self._journal is not None:
             self._journal.done()
+        self.script.complete()
         self._mark()
+
+    def stored_steps(self) -> list[StoredStep]:
+        """The stored steps of the present call, which is repeated; empty where they are not known."""
+        found = read_call(self.journal_path, self.script.position) if self._journal is not None else []
+        return found if len(found) == self.script.calls[self.script.position].made else []
 
     def halt(self, shows: bool) -> None:
         """Enter in the journal that the limit of simulations ended the call, and whether the next step shows it."""
@@ -300,10 +317,26 @@ class JournaledBackend(HDFBackend):
             self._journal.halt(shows)
 
     def prepare_to_continue(self) -> None:
-        """Read the journal, so that the run can be continued."""
-        self.flush()
-        if self._journal is not None:
-            self.contents = read_journal(self.journal_path)
+        """Read the journal, so that the run can be continued.
+
+        An error or Ctrl-C may have come between the journal and what follows from it: the journal is right.
+        """
+        if self._journal is None:
+            self.flush()
+            return
+        self.contents = read_journal(self.journal_path)
+        self.script.calls, self._shows = self.contents.script.calls, False
+        self._is_broken = self._is_broken or self._file_is_behind()
+
+    def _file_is_behind(self) -> bool:
+        """Whether file and pending steps are not those of the journal."""
+        try:
+            with self._open() as file:
+                written = int(file[self.name].attrs["iteration"])
+        except FAULTS:
+            return True
+        start = written if self._pending_start is None else self._pending_start
+        return start + len(self._pending) != len(self.contents.steps)
 
     def back(self) -> None:
         """Remove the last step, which only showed the state, from the chain."""
@@ -323,153 +356,6 @@ class JournaledBackend(HDFBackend):
 
     def _write_marks(self, file: h5py.File) -> None:
         write_marks(file[self.name], self._run, 0 if self._journal is None else self._journal.size, self.script)
-
-    def _enter_adopted(self, contents: Contents) -> None:
-        """Enter the steps that only the file of the chain has in the journal, with the calls that made them."""
-        known, calls, missing = read_journal(self.journal_path).script.calls, contents.script.calls, contents.adopted
-        if contents.provisional is not None:
-            missing = missing[:-1]
-        self._journal.halt(False)  # a step that the journal announced has not come
-        if contents.wiped and not any(call.steps is None for call in calls[len(known) :]):
-            self._journal.wipe(len(known))
-        for index, call in enumerate(calls):
-            new = index >= len(known) or known[index][:2] != call[:2]
-            if call.steps is None:
-                if new:
-                    self._journal.wipe(index)
-                continue
-            if new:
-                self._journal.call(index, call.steps, call.begin)
-            later = sum(other.made for other in calls[index + 1 :])
-            here = max(len(missing) - later, 0)
-            for step in missing[:here]:
-                self._journal.step(step)
-            missing = missing[here:]
-            if call.complete and (new or not known[index].complete):
-                self._journal.done()
-        for step in missing:
-            self._journal.step(step)
-        if contents.provisional is not None:
-            self._journal.halt(True)
-            self._journal.step(contents.provisional)
-        if contents.verdict is not None:
-            self._journal.verdict(contents.verdict)
-
-    # ------------------------------------------------------------------ recovery
-
-    def _recover(self, torn: bool) -> None:
-        """Read the journal and the file of the chain, and bring the file up to the journal.
-
-        Parameters
-        ----------
-        torn : bool
-            Whether a process died while it could write to the file. A part of it that cannot be seen may be damaged,
-            so it is rebuilt in any case.
-        """
-        contents = read_journal(self.journal_path)
-        try:
-            stored = read_run(self)
-        except BlockingIOError as error:  # locked, not damaged
-            raise ValueError(
-                f"another run is writing to {self.filename}, or another program has opened it: wait for it or stop it, "
-                "or give this run another file"
-            ) from error
-        except DAMAGE as error:
-            self._replace_damaged(contents, error)
-            return
-        if contents is not None and stored is None:
-            logger.warning(
-                "%s",
-                f"{self.filename} is missing or has no group {self.name}: rebuilt from {self.journal_path}. To start a "
-                "new run instead, remove both files",
-            )
-            self._take(contents, rewrite=True)
-            return
-        if stored is not None and stored.run is None and torn and contents is not None and not stored.fresh:
-            self._replace_damaged(contents, ValueError("the name of the run is lost"))
-            return
-        if stored is None or stored.run is None:
-            return
-        self._run = stored.run
-        if contents is None or contents.header[RUN] != stored.run:
-            self._continue_without_journal(stored, contents)
-            return
-        relation, (stale, foreign) = compare(stored, contents), ladder_differs(stored, contents)
-        if relation == "ahead":
-            logger.warning(
-                "%s",
-                f"{self.journal_path} has {len(contents.steps)} steps and {self.filename} has "
-                f"{len(stored.chain.coords)}, since the journal was truncated or the chain was continued without it: "
-                "the steps of the chain are kept, and evaluations that the journal has lost are made again",
-            )
-            self._take(adopt(stored, contents), rewrite=False)
-            return
-        if relation == "differs" or foreign:
-            aside = set_aside(self.filename, copy=True)
-            what = "the chain" if relation == "differs" else "the ladder"
-            logger.warning("%s in %s differs from its journal: kept as %s, and rebuilt", what, self.filename, aside)
-        self._take(contents, rewrite=torn or relation != "equal" or stale)
-
-    def _take(self, contents: Contents, rewrite: bool) -> None:
-        """Prepare to continue the run of a journal."""
-        self._run, self.contents, self.script = contents.header[RUN], contents, Script(contents.script.calls)
-        self.annealings, self.known_verdict = contents.annealings, contents.verdict
-        self.has_steps = contents.last is not None
-        if rewrite:
-            rebuild(self, contents, self._run)
-
-    def _continue_without_journal(self, stored: StoredRun, contents: Contents | None) -> None:
-        """Use the chain alone, where its journal is lost."""
-        if not stored.intact:
-            raise ValueError(
-                f"{self.filename} is damaged (the chain does not agree with its checksum), and there is no journal of "
-                f"this run at {self.journal_path} to rebuild it from: restore both from a copy, or give another file"
-            )
-        if not stored.has_results:
-            logger.info("%s: the run was killed before its journal had a start", self.filename)
-            return
-        found = "is of another run" if contents is not None else "is missing or ends before the start of the run"
-        n = len(stored.chain.coords)
-        if n > 0:
-            last = adopt(stored._replace(script=[]), _EMPTY).steps[-1]
-            calls = stored.script
-            if calls and calls[-1].steps is not None:
-                calls = [*calls[:-1], calls[-1]._replace(last=last)]
-            self.script, self.lost_journal = Script(calls), True
-            logger.warning(
-                "%s %s: the %d steps in %s are continued without it", self.journal_path, found, n, self.filename
-            )
-            return
-        aside = set_aside(self.filename, copy=True)
-        logger.warning(
-            "%s",
-            f"{self.journal_path} {found}, and {self.filename} has {len(stored.ladder)} stages and no steps: kept as "
-            f"{aside}, and the run starts again",
-        )
-        create_group(self, *self.shape, self._run)
-        self._fresh = True
-
-    def _replace_damaged(self, contents: Contents | None, error: Exception) -> None:
-        """Rebuild a file that cannot be read."""
-        if contents is None and not is_unfinished(self.filename):
-            raise ValueError(
-                f"{self.filename} is damaged or not an HDF5 file ({error}), and there is no journal at "
-                f"{self.journal_path}, or too little of one, to rebuild it from: restore it from a copy, or give "
-                "another file"
-            ) from error
-        aside = set_aside(self.filename)
-        if contents is None:
-            logger.warning(
-                "%s contains nothing, since a process died while it created the file: set aside as %s",
-                self.filename,
-                aside,
-            )
-            return
-        logger.warning("%s is damaged: set aside as %s and rebuilt from its journal", self.filename, aside)
-        self._take(contents, rewrite=True)
-
-
-_EMPTY = Contents({}, None, [], [], 0, 0, [], None, Script())
 
 
 def _signature(path: Path) -> tuple | None:

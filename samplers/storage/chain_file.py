@@ -11,11 +11,14 @@ Attributes of the group of the chain, besides those of emcee:
 ``checksum``  number of steps and CRC-32 of their coordinates, log-probabilities and blobs
 """
 
+import contextlib
+import io
 import itertools
 import json
 import logging
 import os
 import shutil
+from pathlib import Path
 from typing import NamedTuple
 
 import h5py
@@ -127,7 +130,7 @@ def write_marks(group: h5py.Group, run: str, journal_size: int, script: Script) 
         count, crc = 0, 0
     group.attrs[CHECKSUM] = np.array([iteration, checksum(group, count, iteration, crc)], dtype=np.int64)
     group.attrs[RUN], group.attrs[JOURNAL] = run, journal_size
-    group.attrs[SCRIPT] = json.dumps([call[:5] for call in script.calls])
+    group.attrs[SCRIPT] = json.dumps([call[:6] for call in script.calls])
 
 
 def compare(stored: StoredRun, contents: Contents) -> str:
@@ -182,7 +185,7 @@ def adopt(stored: StoredRun, contents: Contents) -> Contents:
         state = ("MT19937", chain.random_state[1], *(value.item() for value in chain.random_state[2:]))
         adopted.append(Step(chain.coords[i].astype(float), chain.log_prob[i].astype(float), share, blobs, state))
     calls = [
-        call._replace(last=old.last) if old is not None and old[:2] == call[:2] else call
+        call._replace(last=old.last) if old is not None and old[:3] == call[:3] else call
         for call, old in itertools.zip_longest(stored.script, contents.script.calls[: len(stored.script)])
     ]
     real = [*kept, *(adopted[:-1] if shows else adopted)]
@@ -214,50 +217,77 @@ def rebuild(backend: HDFBackend, contents: Contents, run: str) -> None:
 def _replace(
     backend: HDFBackend, nwalkers: int, ndim: int, run: str, script: Script, contents: Contents | None = None
 ) -> None:
-    path = f"{backend.filename}.new"
-    if os.path.exists(path):
-        os.remove(path)
-    _copy_other_groups(backend, path)
-    dtype = backend.dtype if backend.dtype_set else None
-    new = HDFBackend(path, backend.name, False, dtype, backend.compression, backend.compression_opts)
-    new.reset(nwalkers, ndim)
-    steps = [] if contents is None else contents.steps
+    # HDF5 writes into memory: on a full disk, it could not be used any more
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        _copy_other_groups(backend, file)
+        new = _OpenBackend(backend, file)
+        new.reset(nwalkers, ndim)
+        if contents is not None:
+            _write_contents(new, contents)
+        write_marks(file[new.name], run, 0 if contents is None else contents.whole, script)
+    path = Path(f"{backend.filename}.new")
+    try:
+        path.write_bytes(image.getbuffer())
+        os.replace(path, backend.filename)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+
+
+class _OpenBackend(HDFBackend):
+    """emcee's backend for a file that is open.
+
+    Parameters
+    ----------
+    backend : HDFBackend
+        Backend of the same group, of which name, dtype and compression are used.
+    file : h5py.File
+        The file.
+    """
+
+    def __init__(self, backend: HDFBackend, file: h5py.File):
+        dtype = backend.dtype if backend.dtype_set else None
+        super().__init__(backend.filename, backend.name, False, dtype, backend.compression, backend.compression_opts)
+        self._file = file
+
+    def open(self, mode: str = "r") -> contextlib.AbstractContextManager[h5py.File]:
+        """emcee's: the open file, which stays open."""
+        return contextlib.nullcontext(self._file)
+
+
+def _write_contents(new: _OpenBackend, contents: Contents) -> None:
+    """Write the contents of a journal to an empty group."""
+    steps = contents.steps
     if steps:
         new.grow(len(steps), steps[0].blobs)
-    with new.open("a") as file:
-        if steps:
-            append_steps(file[new.name], steps, np.zeros(nwalkers))
-        write_marks(file[new.name], run, 0 if contents is None else contents.whole, script)
-    if contents is not None:
-        for index, stage in enumerate(contents.ladder):
-            write_stage(new, index, stage)
-        if contents.check is not None:
-            write_check(new, contents.check)
-        if contents.verdict is not None:
-            write_verdict(new, contents.verdict)
-    os.replace(path, backend.filename)
+        with new.open() as file:
+            append_steps(file[new.name], steps, np.zeros(contents.header["nwalkers"]))
+    for index, stage in enumerate(contents.ladder):
+        write_stage(new, index, stage)
+    if contents.check is not None:
+        write_check(new, contents.check)
+    if contents.verdict is not None:
+        write_verdict(new, contents.verdict)
 
 
-def _copy_other_groups(backend: HDFBackend, path: str) -> None:
+def _copy_other_groups(backend: HDFBackend, new: h5py.File) -> None:
     """Copy what the file contains besides the group of a backend to a new file, object by object."""
     if not os.path.exists(backend.filename):
         return
     top = backend.name.strip("/").split("/")[0]
     try:
         with h5py.File(backend.filename, "r") as file:
-            others = [name for name in file if name != top or name != backend.name.strip("/")]
-            if not others:
-                return
-            with h5py.File(path, "w") as new:
-                for name in others:
+            for name in file:
+                if name != top or name != backend.name.strip("/"):
                     file.copy(name, new)
-                if backend.name in new:
-                    del new[backend.name]
+            if backend.name in new:
+                del new[backend.name]
     except BlockingIOError:
         raise
     except DAMAGE as error:
-        if os.path.exists(path):
-            os.remove(path)
+        for name in list(new):
+            del new[name]
         aside = set_aside(backend.filename, copy=True)
         logger.warning("the other groups of %s cannot be read (%s): kept as %s", backend.filename, error, aside)
 

@@ -21,11 +21,11 @@ from ..tempering.verdict import Verdict
 from .backends import JournaledBackend
 from .compatibility import differences
 from .emcee_internals import trim_chain
-from .journal import EvaluatedBatch, RunStart
-from .journal_contents import Contents
+from .journal import EvaluatedBatch, RunStart, Step
+from .journal_contents import Contents, StoredStep
 from .ladder_file import read_check, read_ladder, read_verdict, write_check, write_stage, write_verdict
 from .memory_record import MemoryRecord
-from .script import Call
+from .script import Call, Request
 
 __all__ = ["Checkpoint", "Replay"]
 
@@ -233,15 +233,37 @@ class Checkpoint:
 
     # ------------------------------------------------------------------ the calls of the script
 
-    def find_call(self, nsteps: int, coords: np.ndarray | None) -> Call | None:
+    def find_call(self, request: Request) -> Call | None:
         """The stored call that a new one repeats (`samplers.storage.script.Script.find`); None without a record."""
         if self._journal is None:
             return None
-        return self._journal.script.find(nsteps, coords, self.interrupted is not None)
+        return self._journal.script.find(request, self.interrupted is not None)
 
-    def skip_call(self) -> None:
-        """Go to the next call of the script: the present one repeats a stored one that is complete."""
-        self._journal.script.skip()
+    @property
+    def position(self) -> int:
+        """Place of the present call in the script."""
+        return 0 if self._journal is None else self._journal.script.position
+
+    def go_to_call(self, position: int) -> None:
+        """Go to a place in the script: after a call that is repeated or left, or back to one that was interrupted."""
+        if self._journal is not None:
+            self._journal.script.position = position
+
+    def go_on_with_call(self) -> bool:
+        """Enter that the present call, which is incomplete, goes on; returns whether others were made after it."""
+        if self._journal is None or self._journal.script.is_last:
+            return False
+        self._journal.go_on()
+        return True
+
+    def stored_steps(self) -> list[StoredStep]:
+        """The stored steps of the present call, which is repeated; empty where they are not known."""
+        return self._journal.stored_steps() if isinstance(self._journal, JournaledBackend) else []
+
+    def show(self, stored: StoredStep | None) -> None:
+        """Show the chain as it was with a stored step; None: all of it."""
+        if isinstance(self.backend, JournaledBackend):
+            self.backend.show(*(None, None) if stored is None else stored[1:])
 
     @property
     def lost_journal(self) -> bool:
@@ -288,10 +310,16 @@ class Checkpoint:
             self._journal.remembered(key, arrays, of_guides())
         return arrays
 
-    def begin_call(self, nsteps: int, coords: np.ndarray) -> None:
-        """Enter a call: the number of steps that it asks for, and where it starts."""
+    def begin_call(self, request: Request) -> None:
+        """Enter a call."""
         if self._journal is not None:
-            self._journal.call(nsteps, coords)
+            self._journal.call(request)
+
+    def pass_call(self, request: Request, state: State) -> None:
+        """Enter a complete call that stores no steps, with its last state; a record in memory has none of these."""
+        if isinstance(self._journal, JournaledBackend):
+            accepted = np.zeros(len(state.coords), dtype=bool)
+            self._journal.passed(request, Step(state.coords, state.log_prob, accepted, state.blobs, state.random_state))
 
     def expect_limit(self, new: bool) -> None:
         """Prepare for a limit of simulations that is set after the sampler was made; `new`: nothing was evaluated."""
@@ -336,6 +364,7 @@ class Checkpoint:
         """Write pending steps, and enter whether the call was completed; evaluations are no longer looked up."""
         self._replayed = None
         self._forget_earlier()
+        trim_chain(self.backend)
         if self._journal is not None:
             self._journal.flush()
             if complete:

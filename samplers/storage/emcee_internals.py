@@ -78,6 +78,9 @@ def append_steps(group: h5py.Group, steps: Sequence[Step], accepted: np.ndarray,
     """
     start = group.attrs["iteration"] if start is None else start
     stop = start + len(steps)
+    for name in ("chain", "log_prob", *(() if steps[0].blobs is None else ("blobs",))):
+        if len(group[name]) < stop:  # a file that was rebuilt has room for its steps only
+            group[name].resize(stop, axis=0)
     group["chain"][start:stop] = np.stack([step.coords for step in steps])
     group["log_prob"][start:stop] = np.stack([step.log_prob for step in steps])
     if steps[0].blobs is not None:

@@ -12,7 +12,10 @@ pickled::
     STAG  a tempering stage, after its place in the ladder (JSON); it replaces later stages
     CHCK  the check of the evidence (JSON)
     VERD  the verdict (JSON)
-    CALL  a call of the sampler: its place in the script, the steps at beta = 1 that it asks for, what it starts from
+    CALL  a call of the sampler: its place in the script, the steps at beta = 1 that it asks for, what it starts from,
+          options (JSON)
+    MORE  the call at this place of the script (JSON) goes on, although others were made after it
+    PASS  a complete call that stores no steps: as CALL, and its last state in the form of STEP
     STEP  a stored step: points, log-probabilities, acceptance, blobs, state of the random generator
     DONE  the call is complete
     HALT  the limit of simulations ended the call (JSON): whether a step follows that only shows the state and will be
@@ -56,7 +59,7 @@ __all__ = [
     "unpack_random",
 ]
 
-MAGIC = b"samplers journal 2\n"
+MAGIC = b"samplers journal 3\n"
 HEADER = struct.Struct("<4sQI")
 CHECKSUM = struct.Struct("<I")
 BEFORE_CONTENT = HEADER.size + CHECKSUM.size
@@ -299,12 +302,20 @@ class Journal:
         """Enter the verdict."""
         self._append_text(b"VERD", verdict)
 
-    def call(self, index: int, nsteps: int, begin: str) -> None:
-        """Enter a call: its place in the script, the steps that it asks for, the digest of where it starts."""
-        self._append_text(b"CALL", [index, nsteps, begin])
+    def call(self, index: int, nsteps: int, begin: str, options: str) -> None:
+        """Enter a call: its place in the script, the steps that it asks for, the digest of where it starts, options."""
+        self._append_text(b"CALL", [index, nsteps, begin, options])
+
+    def more(self, index: int) -> None:
+        """Enter that the call at a place of the script goes on."""
+        self._append_text(b"MORE", index)
+
+    def passed(self, index: int, nsteps: int, begin: str, options: str, last: Step) -> None:
+        """Enter a call that stores no steps, and its last state."""
+        self._append(b"PASS", _pack_arrays([_pack_text([index, nsteps, begin, options]), *_step_arrays(last)]))
 
     def done(self) -> None:
-        """Enter that the call is complete, or was ended by the user."""
+        """Enter that the call is complete."""
         self._append(b"DONE")
 
     def halt(self, shows: bool) -> None:
@@ -317,9 +328,7 @@ class Journal:
 
     def step(self, step: Step) -> None:
         """Enter a step of the chain."""
-        blobs = [] if step.blobs is None else [step.blobs]
-        random = _pack_random(step.random_state)
-        self._append(b"STEP", _pack_arrays([step.coords, step.log_prob, step.accepted, *random, *blobs]))
+        self._append(b"STEP", _pack_arrays(_step_arrays(step)))
 
     def wipe(self, index: int) -> None:
         """Enter that the chain has been reset: the place of the reset in the script."""
@@ -327,6 +336,11 @@ class Journal:
 
     def _append_text(self, kind: bytes, value: Any) -> None:
         self._append(kind, json.dumps(value, default=lambda number: number.item()).encode())
+
+
+def _step_arrays(step: Step) -> list[np.ndarray]:
+    blobs = [] if step.blobs is None else [step.blobs]
+    return [step.coords, step.log_prob, step.accepted, *_pack_random(step.random_state), *blobs]
 
 
 def _pack_start(start: RunStart) -> bytes:

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..tempering.evidence_check import EvidenceCheck
 from ..tempering.population import Stage
 from ..tempering.verdict import Verdict
@@ -22,7 +24,7 @@ from .journal import (
 )
 from .script import Script
 
-__all__ = ["Contents", "as_verdict", "ladders", "read_journal"]
+__all__ = ["Contents", "StoredStep", "as_verdict", "ladders", "read_call", "read_journal"]
 
 
 class Contents(NamedTuple):
@@ -45,7 +47,7 @@ class Contents(NamedTuple):
     steps : list of Step
         Steps since the chain was last reset.
     last : Step, or None
-        Last step since the start, even if the chain was reset after it.
+        Last step since the start, even if the chain was reset after it; also of a call that stores no steps.
     script : Script
         The calls, none of them repeated yet.
     annealings : int
@@ -191,17 +193,28 @@ class _Reader:
         self.verdict = as_verdict(json.loads(content))
 
     def enter_call(self, content: bytes) -> None:
-        index, nsteps, begin = json.loads(content)
+        self._begin_call(*json.loads(content))
+
+    def _begin_call(self, index: int, nsteps: int, begin: str, options: str) -> None:
         self.script.position = index
-        self.script.begin(nsteps, begin, self.annealings)
+        self.script.begin(nsteps, begin, self.annealings, options)
         self.shows = False
+
+    def enter_more(self, content: bytes) -> None:
+        self.script.position = json.loads(content)
+        self.script.go_on()
+
+    def enter_pass(self, content: bytes) -> None:
+        call, *arrays = unpack_arrays(content)
+        self._begin_call(*json.loads(call.tobytes()))
+        self.last, self.before_last = _as_step(arrays), len(self.evaluated)
+        self.script.finish(self.last)
 
     def enter_done(self, content: bytes) -> None:
         self.script.complete()
 
     def enter_step(self, content: bytes) -> None:
-        coords, log_prob, accepted, keys, rest, *blobs = unpack_arrays(content)
-        step = Step(coords, log_prob, accepted, blobs[0] if blobs else None, unpack_random([keys, rest]))
+        step = _as_step(unpack_arrays(content))
         self.steps.append(step)
         if self.shows:
             self.shows, self.provisional = False, step
@@ -229,6 +242,11 @@ class _Reader:
         return Contents(**values, size=size, whole=whole)
 
 
+def _as_step(arrays: Sequence[np.ndarray]) -> Step:
+    coords, log_prob, accepted, keys, rest, *blobs = arrays
+    return Step(coords, log_prob, accepted, blobs[0] if blobs else None, unpack_random([keys, rest]))
+
+
 READERS = {
     b"HEAD": _Reader.enter_head,
     b"INIT": _Reader.enter_init,
@@ -238,6 +256,8 @@ READERS = {
     b"CHCK": _Reader.enter_chck,
     b"VERD": _Reader.enter_verd,
     b"CALL": _Reader.enter_call,
+    b"MORE": _Reader.enter_more,
+    b"PASS": _Reader.enter_pass,
     b"STEP": _Reader.enter_step,
     b"DONE": _Reader.enter_done,
     b"HALT": _Reader.enter_halt,
@@ -264,14 +284,58 @@ def read_journal(path: Path) -> Contents | None:
         data = path.read_bytes()
     except FileNotFoundError:
         return None
+    reader, whole = _Reader(), len(MAGIC)
+    for _, end in _read(reader, data, path):
+        whole = end
+    return reader.contents(len(data), whole)
+
+
+def _read(reader: _Reader, data: bytes, path: Path) -> Iterator[tuple[bytes, int]]:
+    """Enter every complete block; kind and end of each."""
     if MAGIC.startswith(data):
-        return None
+        return
     if not data.startswith(MAGIC):
         raise ValueError(_describe_damage(path, "it does not start like a journal of this version"))
-    reader, whole = _Reader(), len(MAGIC)
     for kind, content, end in _blocks(data, path):
         if kind not in READERS:
             raise ValueError(_describe_damage(path, f"it has a block of unknown kind {kind!r}"))
         READERS[kind](reader, content)
-        whole = end
-    return reader.contents(len(data), whole)
+        yield kind, end
+
+
+class StoredStep(NamedTuple):
+    """A stored step of a call, and the chain after it.
+
+    Attributes
+    ----------
+    step : Step
+        The step.
+    length : int, or None
+        Number of steps that the chain had with it; None if the chain was reset later.
+    accepted : (n,) float, or None
+        Number of accepted proposals per walker until then.
+    """
+
+    step: Step
+    length: int | None
+    accepted: np.ndarray | None
+
+
+def read_call(path: Path, index: int) -> list[StoredStep]:
+    """The stored steps of the call at a place in the script; empty without a journal."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    reader, found, accepted = _Reader(), [], 0.0
+    for kind, _ in _read(reader, data, path):
+        if kind == b"WIPE":
+            found, accepted = [stored._replace(length=None, accepted=None) for stored in found], 0.0
+        if kind == b"STEP" and reader.provisional is None:
+            accepted = accepted + reader.last.accepted
+        here = reader.script.position == index
+        if len(reader.script.calls) <= index or (kind == b"CALL" and here):  # another call is to take its place
+            found = []
+        elif kind == b"STEP" and reader.provisional is None and here:
+            found.append(StoredStep(reader.last, len(reader.steps), accepted))
+    return found

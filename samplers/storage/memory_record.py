@@ -13,7 +13,7 @@ from .emcee_internals import drop_last_step
 from .journal import EvaluatedBatch, RunStart, Step
 from .journal_contents import Contents
 from .ladder_file import write_check, write_stage, write_verdict
-from .script import Script, digest
+from .script import Request, Script, digest
 
 __all__ = ["MemoryRecord"]
 
@@ -87,9 +87,13 @@ class MemoryRecord:
         """Store the verdict."""
         write_verdict(self._backend, verdict)
 
-    def call(self, nsteps: int, coords: np.ndarray) -> None:
-        """Enter a call: the steps that it asks for, and where it starts."""
-        self.script.begin(nsteps, digest(coords), self.annealings)
+    def call(self, request: Request) -> None:
+        """Enter a call."""
+        self.script.begin(int(request.steps), digest(request.coords), self.annealings, request.options)
+
+    def go_on(self) -> None:
+        """Enter that the present call goes on, although others were made after it."""
+        self.script.go_on()
 
     def stepped(self, state: State) -> None:
         """Enter a stored step of the chain."""
@@ -100,7 +104,7 @@ class MemoryRecord:
         self.script.stepped(self._last)
 
     def done(self) -> None:
-        """Enter that the call is complete, or was ended by the user."""
+        """Enter that the call is complete."""
         self.script.complete()
 
     def flush(self) -> None:

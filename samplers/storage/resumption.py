@@ -1,9 +1,11 @@
 """How a sampler goes on from what is stored: interrupted calls are completed, and stored ones are repeated.
 
 A script that is started again makes the same calls. One that is complete restores the run, and returns the state that
-it returned, without any step. One that was interrupted goes on from the last stored step.
+it returned, without any step. One that was interrupted goes on from the last stored step. A loop over ``sample`` gets
+its stored states again, and sees the chain as it was with each of them, so that it decides as it did before.
 """
 
+import contextlib
 import copy
 import logging
 from collections.abc import Callable, Iterator
@@ -21,9 +23,9 @@ from .checkpoint import Checkpoint
 from .emcee_internals import get_moves, get_previous_state
 from .evaluation import Evaluator
 from .journal import Step
-from .script import Call
+from .script import Call, Request
 
-__all__ = ["Resumption"]
+__all__ = ["PresentCall", "Resumption"]
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +56,9 @@ class Resumption:
     _restored: State | None = None
     # coordinates that the last repeated call returned
     _returned: np.ndarray | None = None
+    # the call that is being made, and whether the next one is made by `run_mcmc`
+    _present: "PresentCall | None" = None
+    _runs_to_end = False
 
     def _first_state(
         self, state: State, call: Call | None, is_open: bool, skip_check: bool, bar: dict
@@ -125,9 +130,9 @@ class Resumption:
             self._evaluator.count_again(contents.evaluated[: contents.before_last])
         self._restored = state
 
-    def _repeat(self, call: Call, bar: dict) -> Iterator[State]:
-        """Yield the last state of a stored call that is complete, if it has steps; nothing is added to the chain."""
-        failure_count, interrupted = self.failure_count, self._checkpoint.interrupted
+    def _repeat(self, present: "PresentCall", bar: dict) -> Iterator[State]:
+        """Yield the states of a stored call that is complete, the last one only in `run_mcmc`; nothing is evaluated."""
+        call, failure_count, interrupted = present.call, self.failure_count, self._checkpoint.interrupted
         if interrupted is not None and call.annealing == interrupted.annealings:
             self._restore(bar)
             self._verdict = self._checkpoint.stored_verdict()
@@ -136,8 +141,7 @@ class Resumption:
             state = _as_state(call.last)
         elif call.steps > 0 or state is None:
             state = self.get_last_sample()
-        self.random_state, self._annealed_state, self._returned = state.random_state, state, state.coords
-        self._checkpoint.skip_call()
+        self._annealed_state = state
         logger.warning(
             "%s contains this call of %d steps already: nothing is added. To add steps, make another call"
             " after all that the file contains, or ask for another number of steps",
@@ -145,8 +149,114 @@ class Resumption:
             call.steps,
         )
         self._warn_of_failures(failure_count)
-        if call.made > 0:
+        yielded = False
+        for yielded_state in self._states(present):
+            yielded = True
+            yield yielded_state
+        self.random_state, self._returned = state.random_state, state.coords
+        if not yielded and (call.made > 0 or (call.steps > 0 and call.last is not None)):
             yield State(state, copy=True)
+
+    def _repeat_steps(self, present: "PresentCall", state: State) -> Iterator[State]:
+        """Yield the stored states of a call that is not complete, and prepare to go on with it.
+
+        Parameters
+        ----------
+        present : PresentCall
+            The call.
+        state : State
+            The state from which the run goes on.
+        """
+        self._restored = state  # for the next call, if the user leaves now
+        yield from self._states(present)
+        self.random_state, self._restored, present.repeats = state.random_state, None, False
+        if self._checkpoint.go_on_with_call():
+            logger.warning(
+                "%s contains calls after a loop that was left after %d of %d steps, and it goes on now: its steps "
+                "are added at the end of the chain",
+                self.backend.filename,
+                present.call.made,
+                present.call.steps,
+            )
+
+    def _states(self, present: "PresentCall") -> Iterator[State]:
+        """The stored states of a repeated call, for a loop; the chain is shown as it was with each of them."""
+        if present.runs_to_end:
+            return
+        for stored in self._checkpoint.stored_steps():
+            state = _as_state(stored.step)
+            self._returned = state.coords.copy()
+            self._checkpoint.show(stored)
+            yield state
+            present.check_is_present()
+            self._checkpoint.show(None)
+
+    # ------------------------------------------------------------------ beginning and end of a call
+
+    def _begin_call(self, store: bool) -> "PresentCall":
+        """The call that begins now; the sampler has one at a time."""
+        self._present = PresentCall(self, store, self._runs_to_end)
+        self._runs_to_end = False
+        return self._present
+
+    def _end_call(self, present: "PresentCall", error: BaseException | None = None) -> None:
+        """End a call that was completed, left by the user (GeneratorExit) or interrupted; nothing for an earlier one.
+
+        The next call takes the next place in the script, also after one that the user has left. After an error, the
+        same call goes on.
+        """
+        if self._present is not present:
+            return
+        self._present, was_left = None, isinstance(error, GeneratorExit)
+        self._checkpoint.show(None)
+        try:
+            if error is None or was_left:
+                self._finish(present)
+                if was_left and present.has_place:
+                    self._checkpoint.go_to_call(present.position + 1)
+                return
+            with contextlib.suppress(OSError, RuntimeError):  # a disk may be full
+                self._checkpoint.prepare_to_continue()
+                self._finish(present)
+            self._checkpoint.go_to_call(present.position)
+        except BaseException:
+            self._checkpoint.go_to_call(present.position)
+            raise
+        if isinstance(error, KeyboardInterrupt) and self._checkpoint.place:
+            raise KeyboardInterrupt(self._describe_what_is_kept()) from None
+
+    def _finish(self, present: "PresentCall") -> None:
+        if present.repeats:
+            if present.call.complete:
+                self._checkpoint.go_to_call(present.position + 1)
+            return
+        self._checkpoint.end_call(present.complete)
+        self._warn_of_failures(present.failure_count)
+
+    def _leave_open_loop(self) -> None:
+        """End a loop that was left, and whose generator Python has not closed yet."""
+        if self._present is not None:
+            self._end_call(self._present, GeneratorExit())
+
+    @contextlib.contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """`run_mcmc`: wherever an error or Ctrl-C comes, the same call goes on, and adds nothing that is stored."""
+        position = self._checkpoint.position
+        try:
+            yield
+        except BaseException as error:
+            if self._present is not None:  # between two steps
+                self._end_call(self._present, error)
+            self._checkpoint.go_to_call(position)
+            raise
+        finally:
+            self._runs_to_end = False
+
+    def _describe_what_is_kept(self) -> str:
+        return (
+            f"{self.evaluations} evaluations and {self.iteration} steps are kept in {self._checkpoint.place}: run the "
+            "same script again, or make the same call, to go on"
+        )
 
     def _compare_last_state(self) -> None:
         """Raise ValueError if a chain without a journal has other log-probabilities than those of the posterior."""
@@ -167,6 +277,58 @@ class Resumption:
             warn(
                 f"{self.failure_count - before} evaluations failed and count as impossible "
                 f"({self._evaluator.failures.most_common()}); see failures"
+            )
+
+
+class PresentCall:
+    """The call of a sampler that is being made.
+
+    Parameters
+    ----------
+    sampler : Resumption
+        The sampler.
+    store : bool
+        Whether the call stores steps.
+    runs_to_end : bool
+        Whether it was made by `run_mcmc`, which never leaves it.
+
+    Attributes
+    ----------
+    call : Call, or None
+        The stored call that it repeats.
+    position : int
+        Its place in the script.
+    repeats : bool
+        Whether nothing new has been made by now.
+    complete : bool
+        Whether it has made and stored all of its steps.
+    failure_count : int
+        Number of failures before it.
+    """
+
+    def __init__(self, sampler: Resumption, store: bool, runs_to_end: bool):
+        self._sampler, self._store, self.runs_to_end = sampler, store, runs_to_end
+        self.call: Call | None = None
+        self.position, self.failure_count = sampler._checkpoint.position, sampler.failure_count
+        self.repeats = self.complete = False
+
+    @property
+    def has_place(self) -> bool:
+        """Whether the script contains the call."""
+        return self._store or self.call is not None
+
+    def find(self, request: Request) -> None:
+        """Look up the stored call that this one repeats; a loop that stores nothing is in no script."""
+        if self._store or self.runs_to_end:
+            self.call = self._sampler._checkpoint.find_call(request)
+            self.repeats = self.call is not None
+
+    def check_is_present(self) -> None:
+        """Raise RuntimeError if another call of the sampler has begun, or its chain was reset, since the last state."""
+        if self._sampler._present is not self:
+            raise RuntimeError(
+                "this loop over sample() cannot go on, because another call of the sampler or reset() was made since: "
+                "begin a new loop"
             )
 
 

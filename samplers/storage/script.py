@@ -3,7 +3,11 @@
 A script is a sequence of calls that store steps, and of resets of the chain. When it is started again, each of its
 calls is compared with the stored one at the same place. An equal call that is complete returns what it returned; an
 equal call that was interrupted is completed. The first call that differs replaces the stored rest, and its steps are
-added to the chain.
+added to the chain. Calls are equal where the number of steps, the initial state and the `options` are.
+
+A loop over ``sample`` that the user leaves early and one that an error ends look the same from inside: the generator
+is closed. Such a call stays incomplete, and the next call takes the next place. Started again, the loop gets the stored
+states once more; if it does not leave with them, the call goes on.
 """
 
 import zlib
@@ -13,7 +17,7 @@ import numpy as np
 
 from .journal import Step
 
-__all__ = ["Call", "Script", "digest"]
+__all__ = ["Call", "Request", "Script", "describe_options", "digest"]
 
 
 class Call(NamedTuple):
@@ -25,6 +29,8 @@ class Call(NamedTuple):
         Number of steps that it asks for; None for a reset.
     begin : str
         Digest of the coordinates that it starts from (`digest`).
+    options : str
+        Other arguments that determine its steps, such as "thin_by=3".
     made : int
         Number of these steps that are stored.
     complete : bool
@@ -32,15 +38,42 @@ class Call(NamedTuple):
     annealing : int
         How many annealings the file has had when the call began.
     last : Step, or None
-        Its last stored step; None where it has none or where it is not known.
+        Its last stored step, or the last state of a complete call with ``store=False``; None where there is none or it
+        is not known.
     """
 
     steps: int | None
     begin: str = ""
+    options: str = ""
     made: int = 0
     complete: bool = False
     annealing: int = 1
     last: Step | None = None
+
+
+class Request(NamedTuple):
+    """What a call of ``sample`` or ``run_mcmc`` asks for.
+
+    Attributes
+    ----------
+    steps : int
+        Number of steps wanted.
+    coords : (n, ndim) float, optional
+        Where the call is to start; None for a call that leaves this open.
+    options : str
+        As in `Call`.
+    """
+
+    steps: int
+    coords: np.ndarray | None
+    options: str = ""
+
+
+def describe_options(thin_by: int, thin: int | None, tune: bool, store: bool) -> str:
+    """Arguments of ``sample`` that determine its steps, besides initial state and number of steps, as text."""
+    options = [f"thin_by={int(thin_by)}"] if thin is None and int(thin_by) != 1 else []
+    options += [] if thin is None else [f"thin={int(thin)}"]
+    return ", ".join(options + ["tune"] * bool(tune) + ["store=False"] * (not store))
 
 
 def digest(coords: np.ndarray) -> str:
@@ -69,32 +102,39 @@ class Script:
         self.calls = list(calls or [])
         self.position = 0
 
-    def find(self, steps: int, coords: np.ndarray | None, resumable: bool) -> Call | None:
+    def find(self, request: Request, resumable: bool) -> Call | None:
         """The stored call that a new one repeats; None if there is none.
 
         Parameters
         ----------
-        steps : int
-            Number of steps wanted.
-        coords : (n, ndim) float, optional
-            Where the new call is to start; None for a call that leaves this open.
+        request : Request
+            The new call.
         resumable : bool
-            Whether `coords` of an incomplete call are compared elsewhere.
+            Whether the coordinates of an incomplete call are compared elsewhere.
         """
         if self.position >= len(self.calls):
             return None
-        call = self.calls[self.position]
-        if call.steps != steps:
+        call, coords = self.calls[self.position], request.coords
+        if (call.steps, call.options) != (request.steps, request.options):
             return None
         if coords is None or digest(coords) == call.begin or (resumable and not call.complete):
             return call
         goes_on = not call.complete and call.last is not None and np.array_equal(coords, call.last.coords)
         return call if goes_on else None
 
-    def begin(self, steps: int | None, begin: str = "", annealing: int = 1) -> int:
+    @property
+    def is_last(self) -> bool:
+        """Whether no stored call follows the present one."""
+        return self.position >= len(self.calls) - 1
+
+    def go_on(self) -> None:
+        """Enter that the present call goes on, although others were made after it: they do not count any more."""
+        del self.calls[self.position + 1 :]
+
+    def begin(self, steps: int | None, begin: str = "", annealing: int = 1, options: str = "") -> int:
         """Enter a new call at the present place, and return the place; a reset is complete at once."""
         del self.calls[self.position :]
-        self.calls.append(Call(steps, begin, annealing=annealing, complete=steps is None))
+        self.calls.append(Call(steps, begin, options, annealing=annealing, complete=steps is None))
         self.position += steps is None
         return len(self.calls) - 1
 
@@ -104,15 +144,16 @@ class Script:
             call = self.calls[self.position]
             self.calls[self.position] = call._replace(made=call.made + 1, last=step)
 
+    def finish(self, last: Step) -> None:
+        """Enter that the present call, which stores no steps, is complete with this state."""
+        self.calls[self.position] = self.calls[self.position]._replace(last=last)
+        self.complete()
+
     def complete(self) -> None:
         """Enter that the present call is complete."""
         if self.position < len(self.calls):
             self.calls[self.position] = self.calls[self.position]._replace(complete=True)
             self.position += 1
-
-    def skip(self) -> None:
-        """Go to the next call: the present one repeats a stored one."""
-        self.position += 1
 
     def skips_reset(self) -> bool:
         """Whether a reset of the chain repeats a stored one; if so, go to the next call."""

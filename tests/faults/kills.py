@@ -177,19 +177,9 @@ class Writes:
             """An HDF5 file that HDF5 reads and writes through a counted file."""
 
             def __init__(self, name, mode="r", **kwargs):
-                self._raw = None
-                if mode == "r":
-                    super().__init__(name, mode, **kwargs)
-                    return
-                new = not os.path.exists(name)
-                raw = plain_open(name, "w+b" if new else "r+b", buffering=0)
-                super().__init__(Counted(raw), "w" if new else "r+", **kwargs)
-                self._raw = raw
-
-            def close(self):
-                super().close()
-                if self._raw is not None:
-                    self._raw.close()
+                if mode == "r+":
+                    name = Counted(name)
+                super().__init__(name, mode, **kwargs)
 
         h5py.File = CountedFile
         journal_module.open = lambda *args, **kwargs: Counted(plain_open(*args, **kwargs))
