@@ -30,7 +30,7 @@ from .moves.kernels import RandomWalkMove, calibrate_move
 from .moves.snooker import with_snooker_moves
 from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
-from .storage.compatibility import header
+from .storage.compatibility import SEED, header, warn_of_other_seed
 from .storage.emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
 from .storage.evaluation import CallingConvention, FailureLimit
 from .storage.evaluators import make_evaluators
@@ -94,8 +94,8 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         file, and call `run_mcmc` again: the result is that of a run with the larger number from the start.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
-        the run, and two samplers never share a stream. The random state of a backend that contains a chain takes
-        precedence.
+        the run, and two samplers never share a stream. A file that contains a run keeps its seed: another one has no
+        effect, with a warning in the log.
     settings : Settings, optional
         Settings of the annealing; `samplers.tempering.settings.Settings` has their names, meanings and defaults.
     **overrides
@@ -200,6 +200,9 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         self._evaluator, self._coarse_evaluator = make_evaluators(functions, coarse_log_prob_fn, *common)
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._result, self._verdict = self._checkpoint.stored_result(), self._checkpoint.stored_verdict()
+        self._seed = None if seed is None else np.ravel(seed).tolist()
+        if self._checkpoint.interrupted is not None:
+            warn_of_other_seed(self.backend.filename, self._checkpoint.interrupted, self._seed)
         if self.backend.random_state is None:
             get_random(self).seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
 
@@ -272,7 +275,8 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
     ) -> Iterator[State]:
         """Advance the chain as a generator: emcee's ``sample``, preceded by the annealing where it is needed.
 
-        The arguments are those of emcee, with `initial_state` as in `run_mcmc`.
+        The arguments are those of emcee, with `initial_state` as in `run_mcmc`. With a file, a loop that is repeated
+        by the same script gets its stored states once more, without an evaluation, then goes on unless it leaves.
         """
         if iterations is None and store:
             raise ValueError("'store' must be False when 'iterations' is None")
@@ -425,7 +429,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         if not np.array_equal(coords, self._drawn):
             self._functions.check_start(coords, self._evaluator.log_base)
         if self._checkpoint.wants_start:
-            self._checkpoint.begin(self._header(), RunStart(coords, log_base, self.random_state))
+            self._checkpoint.begin(self._header() | {SEED: self._seed}, RunStart(coords, log_base, self.random_state))
         records = None
         if state.log_prob is not None:
             records = self._evaluator.pack(state.log_prob, log_base, state.blobs)

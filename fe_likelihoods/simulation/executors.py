@@ -29,6 +29,7 @@ from multiprocessing.pool import Pool, ThreadPool
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .dask_workers import WorkerWatch
 from .faults import TransientReason, raise_if_refused
 from .local_pool import LocalPool, Outcome
 from .processes import PickledFunction, TemporaryFolder, local_definition
@@ -251,7 +252,8 @@ class DaskExecutor(PoolExecutor):
     first and single items at last, so that the workers finish together. No group takes longer than about a second, by
     the duration of earlier simulations, so that little is repeated if a worker dies. dask retries a group whose worker
     died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). The items of such groups
-    are then run alone, one after the other, and an item that kills its worker again gets ``(None, reason)``.
+    are then run alone, one after the other, and an item that kills its worker again gets ``(None, reason)``. Workers
+    that the cluster has given up are started again, and no map waits for ever (`WorkerWatch`).
 
     Parameters
     ----------
@@ -297,16 +299,17 @@ class DaskExecutor(PoolExecutor):
         if not groups:
             return []
         futures = self.pool.map(partial(_run_group, function), groups, pure=False)
-        try:
-            return self.pool.gather(futures)
-        except Exception as error:
-            if type(error).__name__ != "KilledWorker":
-                raise
-        try:
-            return [self._answer(future) for future in futures]
-        finally:
-            for future in futures:  # otherwise dask repeats the groups whose results were on a dead worker
-                future.release()
+        with WorkerWatch(self.pool, futures):
+            try:
+                return self.pool.gather(futures)
+            except Exception as error:
+                if type(error).__name__ != "KilledWorker":
+                    raise
+            try:
+                return [self._answer(future) for future in futures]
+            finally:
+                for future in futures:  # otherwise dask repeats the groups whose results were on a dead worker
+                    future.release()
 
     @staticmethod
     def _answer(future: Any) -> "_Answer | None":

@@ -22,7 +22,7 @@ from .backends import JournaledBackend
 from .compatibility import differences
 from .emcee_internals import trim_chain
 from .journal import EvaluatedBatch, RunStart, Step
-from .journal_contents import Contents, StoredStep
+from .journal_contents import Contents
 from .ladder_file import read_check, read_ladder, read_verdict, write_check, write_stage, write_verdict
 from .memory_record import MemoryRecord
 from .script import Call, Request
@@ -255,15 +255,6 @@ class Checkpoint:
             return False
         self._journal.go_on()
         return True
-
-    def stored_steps(self) -> list[StoredStep]:
-        """The stored steps of the present call, which is repeated; empty where they are not known."""
-        return self._journal.stored_steps() if isinstance(self._journal, JournaledBackend) else []
-
-    def show(self, stored: StoredStep | None) -> None:
-        """Show the chain as it was with a stored step; None: all of it."""
-        if isinstance(self.backend, JournaledBackend):
-            self.backend.show(*(None, None) if stored is None else stored[1:])
 
     @property
     def lost_journal(self) -> bool:

@@ -15,10 +15,12 @@ from ..tempering.settings import Settings
 from .journal import EvaluatedBatch, merge_batches
 from .journal_contents import Contents
 
-__all__ = ["differences", "header"]
+__all__ = ["SEED", "differences", "header", "warn_of_other_seed"]
 
 logger = logging.getLogger(__name__)
 
+# the seed in the header of a journal, which is not compared where a run is continued
+SEED = "seed"
 CLOSE = {"rtol": 1e-9, "atol": 1e-9}
 
 
@@ -121,3 +123,20 @@ def _compare_points(
         f"log_prob_fn was {log_prob[row]:.10g} at {coords[row]}, is {now[row]:.10g} ({len(different)} of {len(coords)} "
         "points differ)"
     ]
+
+
+def warn_of_other_seed(filename: str, contents: Contents, seed: list | None) -> None:
+    """Warn in the log where a stored run has another seed than one that was given."""
+    if seed is None or contents.header.get(SEED) == seed:
+        return
+    stored = contents.header.get(SEED)
+    logger.warning(
+        "%s contains a run %s: seed=%s has no effect. Use another file for an independent run",
+        filename,
+        "without a seed" if stored is None else f"with seed={_seed_text(stored)}",
+        _seed_text(seed),
+    )
+
+
+def _seed_text(seed: list) -> str:
+    return str(seed[0] if len(seed) == 1 else seed)

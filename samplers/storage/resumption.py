@@ -19,10 +19,12 @@ from ..tempering.diagnostics import warn
 from ..tempering.mutation import MoveSchedule
 from ..tempering.results import AnnealingResult
 from ..tempering.verdict import Verdict
+from .backends import JournaledBackend
 from .checkpoint import Checkpoint
 from .emcee_internals import get_moves, get_previous_state
 from .evaluation import Evaluator
 from .journal import Step
+from .journal_contents import StoredStep
 from .script import Call, Request
 
 __all__ = ["PresentCall", "Resumption"]
@@ -183,13 +185,18 @@ class Resumption:
         """The stored states of a repeated call, for a loop; the chain is shown as it was with each of them."""
         if present.runs_to_end:
             return
-        for stored in self._checkpoint.stored_steps():
+        for stored in self.backend.stored_steps() if isinstance(self.backend, JournaledBackend) else ():
             state = _as_state(stored.step)
             self._returned = state.coords.copy()
-            self._checkpoint.show(stored)
+            self._show(stored)
             yield state
             present.check_is_present()
-            self._checkpoint.show(None)
+            self._show(None)
+
+    def _show(self, stored: StoredStep | None) -> None:
+        """Show the chain as it was with a stored step; None: all of it."""
+        if isinstance(self.backend, JournaledBackend):
+            self.backend.show(*(None, None) if stored is None else stored[1:])
 
     # ------------------------------------------------------------------ beginning and end of a call
 
@@ -208,7 +215,7 @@ class Resumption:
         if self._present is not present:
             return
         self._present, was_left = None, isinstance(error, GeneratorExit)
-        self._checkpoint.show(None)
+        self._show(None)
         try:
             if error is None or was_left:
                 self._finish(present)

@@ -23,10 +23,10 @@ FOLDER = str(Path(samplers.__file__).parent)
 CALLS = (2, 3)
 
 
-def make(path):
+def make(path, **changes):
     """A small sampler with a file."""
     backend = emcee.backends.HDFBackend(str(path))
-    settings = {"seed": 5, "min_moves": 1, "max_moves": 1, "check_draws": 3, "recycle": False}
+    settings = {"seed": 5, "min_moves": 1, "max_moves": 1, "check_draws": 3, "recycle": False, **changes}
     return SMCSampler(6, 1, WithBlobs(ndim=1, sd=0.2), vectorize=True, backend=backend, **settings)
 
 

@@ -175,6 +175,15 @@ def test_a_call_with_other_options_is_another_call(tmp_path, changes, caplog):
     assert "contains this call of 3 steps already" in caplog.text
 
 
+def test_another_seed_has_no_effect_on_a_stored_run_and_says_so(tmp_path, caplog):
+    path = tmp_path / "run.h5"
+    make(path, seed=[5, 7]).run_mcmc(None, 1)
+    make(path, seed=[5, 7])
+    assert "seed" not in caplog.text
+    make(path, seed=6)
+    assert "contains a run with seed=[5, 7]: seed=6 has no effect" in caplog.text
+
+
 def test_steps_of_a_script_that_is_edited(tmp_path):
     """Another number of steps is another call, which adds its steps once."""
     path, lengths = tmp_path / "run.h5", []

@@ -1,0 +1,77 @@
+"""Watch over the workers of a dask cluster while a map waits for them."""
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+__all__ = ["LONGEST_WITHOUT_WORKER", "WorkerWatch"]
+
+logger = logging.getLogger(__name__)
+
+SECONDS_BETWEEN_CHECKS = 5.0
+# How long a map waits for a first or another worker of a cluster that has none [s]
+LONGEST_WITHOUT_WORKER = 3600.0
+
+
+class WorkerWatch:
+    """Context in which a cluster is kept from losing its workers for good, and a wait without workers ends.
+
+    A cluster of dask closes the nanny of a worker that is absent at the instant 15 s after it was lost
+    (``distributed.deploy.lost-worker-timeout``), and never starts it again: on a busy machine the new process may need
+    longer, or a simulation has killed it once more. A cluster that has lost all of its workers in this way makes its
+    client wait for ever. So such workers are asked for again.
+
+    Parameters
+    ----------
+    client : dask.distributed.Client
+        The client.
+    futures : sequence of Future
+        What is waited for; cancelled after `LONGEST_WITHOUT_WORKER` without any worker.
+
+    Raises
+    ------
+    RuntimeError
+        On exit, if the wait was ended for want of a worker.
+    """
+
+    def __init__(self, client: Any, futures: Sequence[Any]):
+        self._client, self._futures = client, futures
+        self._ends, self._gave_up = threading.Event(), False
+        self._thread = threading.Thread(target=self._watch, name="watch of dask workers", daemon=True)
+
+    def __enter__(self) -> "WorkerWatch":
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: Any) -> None:
+        self._ends.set()
+        if self._gave_up and isinstance(error, Exception):
+            raise RuntimeError(
+                f"the dask cluster has had no worker for {LONGEST_WITHOUT_WORKER:g} s: start workers or scale the "
+                "cluster, and run again. Evaluations that are stored are not repeated"
+            ) from error
+
+    def _watch(self) -> None:
+        last_seen = time.monotonic()
+        while not self._ends.wait(SECONDS_BETWEEN_CHECKS):
+            with contextlib.suppress(Exception):  # the cluster or the client is closing
+                restart_lost_workers(getattr(self._client, "cluster", None))
+                if self._client.nthreads():
+                    last_seen = time.monotonic()
+            if time.monotonic() - last_seen > LONGEST_WITHOUT_WORKER:
+                self._gave_up = True
+                with contextlib.suppress(Exception):
+                    self._client.cancel(self._futures, force=True)
+                return
+
+
+def restart_lost_workers(cluster: Any) -> None:
+    """Ask a cluster for the workers that it should have by its own specification, and has given up."""
+    wanted, present = getattr(cluster, "worker_spec", None), getattr(cluster, "workers", None)
+    if wanted is None or present is None or not (lost := set(wanted) - set(present)):
+        return
+    logger.warning("The dask cluster has given up %d of its %d workers: starting them again", len(lost), len(wanted))
+    cluster.scale(len(wanted))
