@@ -116,6 +116,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.failures import (
         TooManyFailures,
     )
+    from .probability.joint import (
+        JointLikelihood,
+    )
     from .probability.likelihood import (
         FELikelihood,
     )
@@ -220,6 +223,7 @@ __all__ = [
     "Hoops",
     "ImposedTest",
     "IsolatedBridge",
+    "JointLikelihood",
     "LinearOscillator",
     "LinearStructure",
     "LocalPool",
@@ -368,6 +372,7 @@ _EXPORTS = {
         "Uniform",
     ),
     "probability.failures": ("TooManyFailures",),
+    "probability.joint": ("JointLikelihood",),
     "probability.likelihood": ("FELikelihood",),
     "probability.marginal_noise": ("MarginalNoise",),
     "probability.noise": (

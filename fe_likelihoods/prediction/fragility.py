@@ -27,7 +27,7 @@ from scipy import optimize, special
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from .excitation import chosen_state, excite
-from .inputs import read_source, split_samples
+from .inputs import part_of, read_source, split_samples
 from .propagation import check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
 from .reliability import binomial_interval, check_level, threshold_in_si
@@ -113,6 +113,7 @@ def fragility(
     quantity: ChannelQuantity | Callable[[np.ndarray], float],
     threshold: float,
     *,
+    part: str | None = None,
     unit: str | None = None,
     intensity: Callable[[Record], float] = peak_ground_acceleration,
     failures_exceed: bool = False,
@@ -135,6 +136,8 @@ def fragility(
         A quantity that is one number, such as ``peak("displacement")``.
     threshold : float
         The threshold.
+    part : str, optional
+        For a `JointLikelihood` or its posterior: the name of the likelihood whose model predicts.
     unit : str, optional
         Unit of the threshold. It must have the dimension of the channel of the quantity. Default: SI.
     intensity : callable
@@ -169,6 +172,7 @@ def fragility(
     """
     if taken := {"record", "quantiles", "memory_bytes"} & set(settings):
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")
+    posterior_or_model, samples = part_of(posterior_or_model, samples, part, settings.get("noise", False))
     source = read_source(posterior_or_model)
     thetas, _ = split_samples(source, samples, settings.get("noise", False))
     known = evaluator(quantity, source.model.channels)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..probability.inputs import as_points
+from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
 from ..probability.noise import sampled_noise
 from ..simulation.executors import as_executor
@@ -20,6 +21,7 @@ __all__ = [
     "PredictionSource",
     "SampleNoise",
     "distinct_rows",
+    "part_of",
     "read_source",
     "samples_of_rows",
     "simulates_in_batches",
@@ -104,6 +106,44 @@ def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
             f"expected a Posterior, an FELikelihood or a model with simulate(theta); got {posterior_or_model!r}"
         )
     return PredictionSource(posterior_or_model, None, None, as_executor(pool, posterior_or_model))
+
+
+def part_of(posterior_or_model: Any, samples: Any, part: str | None, noise: bool) -> tuple[Any, Any]:
+    """Return one likelihood of a `JointLikelihood` and its samples; anything else as it is given.
+
+    Parameters
+    ----------
+    posterior_or_model : Posterior, FELikelihood, JointLikelihood or Model
+        The object to predict with.
+    samples : (n, ndim) array_like, or named values of shape (n,)
+        Samples of its parameters.
+    part : str or None
+        Name of the likelihood, for a `JointLikelihood` only.
+    noise : bool
+        Whether the noise parameters are needed.
+
+    Returns
+    -------
+    object
+        The object to predict with.
+    samples
+        Samples of its parameters.
+
+    Raises
+    ------
+    ValueError
+        If there is one model and `part` is given, or several and it is not.
+    """
+    likelihood = getattr(posterior_or_model, "likelihood", posterior_or_model)
+    if not isinstance(likelihood, JointLikelihood):
+        if part is not None:
+            raise ValueError(f"part={part!r} is for a JointLikelihood; leave it out")
+        return posterior_or_model, samples
+    if part is None:
+        raise ValueError(
+            f"a prediction is of one model: give part= one of {', '.join(map(repr, likelihood.likelihoods))}"
+        )
+    return likelihood[part], likelihood.samples_of(part, samples, noise)
 
 
 def simulates_in_batches(model: Model) -> bool:

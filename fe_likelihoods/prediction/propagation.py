@@ -34,6 +34,7 @@ from .accumulator import Accumulator
 from .excitation import chosen_state, excite
 from .inputs import (
     distinct_rows,
+    part_of,
     read_source,
     samples_of_rows,
     simulates_in_batches,
@@ -55,6 +56,7 @@ def propagate(
     posterior_or_model: Any,
     samples: Any,
     *,
+    part: str | None = None,
     quantity: Quantity = None,
     record: Record | None = None,
     from_state: str | None = None,
@@ -72,12 +74,14 @@ def propagate(
 
     Parameters
     ----------
-    posterior_or_model : Posterior, FELikelihood or Model
+    posterior_or_model : Posterior, FELikelihood, JointLikelihood or Model
         The object to predict with.
     samples : (n, ndim) array_like, or named values of shape (n,)
         Samples of equal weight: all parameters of the posterior (``sampler.get_chain(flat=True)``), or, without noise,
         the structural parameters alone. For a posterior whose noise was integrated out, the result of
         `Posterior.draw_noise`.
+    part : str, optional
+        For a `JointLikelihood` or its posterior: the name of the likelihood whose model and noise predict.
     quantity : optional
         None for the histories of all channels, the name of a channel or several names for their histories,
         ``peak(name)`` or another `fe_likelihoods.prediction.quantities.ChannelQuantity` or several of them, or a
@@ -133,6 +137,7 @@ def propagate(
     SimulationFailed
         If every simulation fails.
     """
+    posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     source = read_source(posterior_or_model, pool)
     thetas, sample_noise = split_samples(source, samples, noise)
     n = len(thetas)
@@ -175,7 +180,7 @@ def propagate(
     return _prediction(accumulator, n, effective, evaluate.channels, model.dt, state)
 
 
-def fit_measures(posterior: Any, samples: Any) -> np.ndarray:
+def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.ndarray:
     """Compute the squared relative error of the response of each sample.
 
     The error is sum (simulated - measured)^2 / sum measured^2, the square of the RRMSE. It needs misfits only, so that
@@ -183,10 +188,12 @@ def fit_measures(posterior: Any, samples: Any) -> np.ndarray:
 
     Parameters
     ----------
-    posterior : Posterior or FELikelihood
+    posterior : Posterior, FELikelihood or JointLikelihood
         The likelihood with the measurements.
     samples : (n, ndim) array_like, or named values of shape (n,)
         All parameters, or the structural parameters alone.
+    part : str, optional
+        As for `propagate`.
 
     Returns
     -------
@@ -198,6 +205,7 @@ def fit_measures(posterior: Any, samples: Any) -> np.ndarray:
     ValueError
         As `propagate`, and if there are no measurements or a measured channel is zero at all samples.
     """
+    posterior, samples = part_of(posterior, samples, part, False)
     source = read_source(posterior)
     if source.likelihood is None:
         raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")

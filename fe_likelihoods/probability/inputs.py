@@ -1,5 +1,7 @@
 """Checks of what a likelihood is made of and called with."""
 
+import re
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -46,6 +48,18 @@ def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
             f"({len(names)},) or (n, {len(names)}); got shape {points.shape}"
         )
     return points
+
+
+def complete_repr(thing: Any) -> str:
+    """The complete ``repr`` of an object, the same in every process; ValueError if it contains an address."""
+    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+        text = repr(thing)
+    if re.search(r"\bat 0x[0-9a-fA-F]+", text):
+        raise ValueError(
+            f"a fingerprint needs a repr that shows all values of {type(thing).__qualname__} instead of its address; "
+            f"make it a frozen dataclass or give it a __repr__; got {text}"
+        )
+    return text
 
 
 def check_model(model: Model) -> None:

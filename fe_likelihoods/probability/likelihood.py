@@ -8,6 +8,7 @@ of the residuals, see `fe_likelihoods.probability.noise`.) The simulations are r
 
 import math
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,11 @@ from ..signals.sampling import same_step
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
 from .cached_simulations import CachedSimulations
-from .inputs import as_points, check_model, check_noise_channels
+from .distributions import Distribution, RandomState
+from .inputs import as_points, check_model, check_noise_channels, complete_repr
+from .marginal_noise import MarginalNoise
 from .noise import GaussianNoise, Noise, noise_statistic
+from .report import simulation_report
 
 __all__ = ["FELikelihood"]
 
@@ -214,11 +218,7 @@ class FELikelihood(CachedSimulations):
         rows = np.atleast_2d(points)
         thetas, noise = np.split(rows, [self._n_structural], axis=1)
         n_samples = self.n_samples
-        possible = np.isfinite(rows).all(axis=1)
-        if self.fast_parameters:
-            # statistics of zero (a perfect fit) show before any simulation which noise parameters are possible
-            perfect = np.zeros((len(rows), self._width))
-            possible &= ~np.isneginf(self.noise.log_likelihood(perfect, n_samples, noise))
+        possible = self.possible(rows)
         result = np.full(len(rows), -np.inf)
         if possible.any():
             misfit = self.statistics(thetas[possible])
@@ -229,6 +229,63 @@ class FELikelihood(CachedSimulations):
                 self._failures.add(thetas[possible][row], f"the log-likelihood of the noise is {values[row]}")
             result[possible] = np.where(simulated & usable, values, -np.inf)
         return result if points.ndim == 2 else float(result[0])
+
+    def possible(self, rows: np.ndarray) -> np.ndarray:
+        """Whether each of the points (n, ndim) is finite and has possible noise parameters; nothing is simulated."""
+        possible = np.isfinite(rows).all(axis=1)
+        if self.fast_parameters:
+            # statistics of zero (a perfect fit) show before any simulation which noise parameters are possible
+            perfect = np.zeros((len(rows), self._width))
+            noise = rows[:, self._n_structural :]
+            possible &= ~np.isneginf(self.noise.log_likelihood(perfect, self.n_samples, noise))
+        return possible
+
+    def density_parts(self) -> list[str]:
+        """Texts that identify the density: fingerprint of the statistics, and class, parameters and repr of the noise.
+
+        Raises
+        ------
+        ValueError
+            If the ``repr`` of the noise does not show its values.
+        """
+        noise = self.noise
+        return [self.fingerprint, type(noise).__qualname__, *noise.parameter_names, complete_repr(noise)]
+
+    def report(self) -> dict:
+        """Summary of the simulations, see `Posterior.report`."""
+        return simulation_report(self)
+
+    def marginal(self, priors: Mapping[str, Distribution]) -> "FELikelihood":
+        """The same likelihood with the standard deviations of its white noise integrated out (`Posterior.marginal`).
+
+        Parameters
+        ----------
+        priors : mapping of str to Distribution
+            Priors of the noise parameters; others may be among them.
+
+        Returns
+        -------
+        FELikelihood
+
+        Raises
+        ------
+        ValueError
+            If the noise is not white, has sensor noise, or is integrated out already.
+        """
+        names = self.parameter_names[self._n_structural :]
+        return self.with_noise(MarginalNoise(self.noise, {name: priors[name] for name in names}))
+
+    def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
+        """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
+        if not isinstance(self.noise, MarginalNoise):
+            raise ValueError(
+                f"the noise parameters {', '.join(self.noise.parameter_names)} are in the samples of this posterior; "
+                "draw_noise is for posteriors from which they are integrated out, see marginal()"
+            )
+        points = np.atleast_2d(as_points(x, self.parameter_names))
+        sigmas = self.noise.draw(self.misfit(points), self.n_samples, rng)
+        names = (*self.parameter_names, *self.noise.noise.parameter_names)
+        return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 
     def fault(self, x: Any) -> str:
         """Reason of a failed simulation whose cause is not the model, such as a worker that was killed.

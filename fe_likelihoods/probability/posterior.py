@@ -8,17 +8,15 @@ density is zero.
 
 import hashlib
 import json
-import re
-import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .distributions import Distribution, RandomState
-from .inputs import as_points
+from .inputs import as_points, complete_repr
+from .joint import JointLikelihood
 from .likelihood import FELikelihood
-from .marginal_noise import MarginalNoise
 from .priors import Prior
 
 if TYPE_CHECKING:
@@ -29,18 +27,6 @@ __all__ = ["Posterior"]
 _ALMOST_INFINITE = 1e100  # below any log-likelihood, and far from overflow when differences of it are squared
 
 
-def _description(thing: Any) -> str:
-    """The complete ``repr`` of an object, the same in every process; ValueError if it contains an address."""
-    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
-        text = repr(thing)
-    if re.search(r"\bat 0x[0-9a-fA-F]+", text):
-        raise ValueError(
-            f"a fingerprint needs a repr that shows all values of {type(thing).__qualname__} instead of its address; "
-            f"make it a frozen dataclass or give it a __repr__; got {text}"
-        )
-    return text
-
-
 class Posterior:
     """Posterior density of structural parameters and noise parameters.
 
@@ -49,7 +35,7 @@ class Posterior:
 
     Parameters
     ----------
-    likelihood : FELikelihood
+    likelihood : FELikelihood or JointLikelihood
     prior : Prior, or mapping of parameter names to distributions
         It must have exactly the likelihood's parameters, in any order.
     coarse : Posterior, optional
@@ -70,7 +56,7 @@ class Posterior:
 
     def __init__(
         self,
-        likelihood: FELikelihood,
+        likelihood: FELikelihood | JointLikelihood,
         prior: Prior | Mapping[str, Distribution],
         coarse: "Posterior | None" = None,
     ) -> None:
@@ -110,10 +96,9 @@ class Posterior:
         ValueError
             If the ``repr`` of the noise or of a distribution does not show its values.
         """
-        noise = self.likelihood.noise
-        parts = [self.likelihood.fingerprint, type(noise).__qualname__, *noise.parameter_names, _description(noise)]
+        parts = self.likelihood.density_parts()
         for name, distribution in self.prior.distributions.items():
-            parts += [name, type(distribution).__qualname__, _description(distribution)]
+            parts += [name, type(distribution).__qualname__, complete_repr(distribution)]
         return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()
 
     @property
@@ -217,15 +202,9 @@ class Posterior:
         ValueError
             If the noise is not white, has sensor noise, or is integrated out already.
         """
-        names, noise = self.parameter_names, self.likelihood.noise
-        n_structural = len(self.likelihood.model.parameter_names)
-        priors = {name: self.prior.distributions[name] for name in names[n_structural:]}
-        structural = {name: self.prior.distributions[name] for name in names[:n_structural]}
-        return Posterior(
-            self.likelihood.with_noise(MarginalNoise(noise, priors)),
-            structural,
-            None if self.coarse is None else self.coarse.marginal(),
-        )
+        likelihood = self.likelihood.marginal(self.prior.distributions)
+        structural = {name: self.prior.distributions[name] for name in likelihood.parameter_names}
+        return Posterior(likelihood, structural, None if self.coarse is None else self.coarse.marginal())
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples of all parameters from samples of the structural ones, for a `marginal` posterior.
@@ -252,17 +231,7 @@ class Posterior:
             If the noise is not integrated out (its parameters are in the samples), or if a simulation fails or fits
             exactly.
         """
-        noise = self.likelihood.noise
-        if not isinstance(noise, MarginalNoise):
-            raise ValueError(
-                f"the noise parameters {', '.join(noise.parameter_names)} are in the samples of this posterior; "
-                "draw_noise is for posteriors from which they are integrated out, see marginal()"
-            )
-        points = np.atleast_2d(as_points(x, self.prior.names))
-        misfit = self.likelihood.misfit(points)
-        sigmas = noise.draw(misfit, self.likelihood.n_samples, rng)
-        names = (*self.prior.names, *noise.noise.parameter_names)
-        return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
+        return self.likelihood.draw_noise(x, rng)
 
     def guide(self, starts: int = 8) -> "ResponseGuide":
         """A guide for samplers: finds the modes from the responses and emulates the responses around them.
@@ -283,14 +252,19 @@ class Posterior:
         Raises
         ------
         ValueError
-            If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory, or
-            the noise uses statistics that are not quadratic in the residuals.
+            If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory or is
+            a `JointLikelihood`, or the noise uses statistics that are not quadratic in the residuals.
 
         Notes
         -----
         The likelihood caches the responses that the guide requests, in memory and in the file of its cache, so another
         sampler with a guide repeats no simulation of them.
         """
+        if isinstance(self.likelihood, JointLikelihood):
+            raise ValueError(
+                "a guide emulates the responses of one model, and this posterior has a JointLikelihood of several: use "
+                "a sampler without a guide"
+            )
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
         return ResponseGuide(self, starts)
@@ -322,20 +296,10 @@ class Posterior:
             came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where
             known and ``"transient"`` where the cause is not the model; the first 1000), ``failure_count``,
             ``transient_failures`` (those of them that a later run simulates again, see `FailureLog`),
-            ``failure_reasons`` (count per reason), ``seconds`` (wall time of the simulations).
+            ``failure_reasons`` (count per reason), ``seconds`` (wall time of the simulations). For a `JointLikelihood`
+            also ``likelihoods``, the report of each part.
         """
-        return {
-            "simulations": self.likelihood.simulations,
-            "verifications": self.likelihood.verifications,
-            "unverified": self.likelihood.unverified,
-            "cache_hits": self.likelihood.cache_hits,
-            "disk_hits": self.likelihood.disk_hits,
-            "failures": list(self.likelihood.failures),
-            "failure_count": self.likelihood.failure_count,
-            "transient_failures": self.likelihood.transient_failure_count,
-            "failure_reasons": dict(self.likelihood.failure_reasons),
-            "seconds": self.likelihood.seconds,
-        }
+        return self.likelihood.report()
 
     def _evaluate(self, x: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points in the given shape, and log-prior (n,) and log-likelihood (n,) of their rows."""

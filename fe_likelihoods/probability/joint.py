@@ -1,0 +1,351 @@
+"""Log-likelihood of several data sets: one `FELikelihood` for each, with parameters in common.
+
+The data sets are independent given the parameters, so their log-likelihoods are added. A component test and a system
+test, or tests of several specimens, then inform the parameters that they have in common. Each likelihood keeps its
+model, noise, pool and caches.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .distributions import Distribution, RandomState
+from .inputs import as_points
+from .likelihood import FELikelihood
+from .noise import sampled_noise
+from .report import simulation_report
+
+__all__ = ["JointLikelihood"]
+
+
+class JointLikelihood:
+    """Sum of the log-likelihoods of several data sets over the union of their parameters.
+
+    Parameters with the same name are one parameter. `Posterior` accepts the object like an `FELikelihood`. Calling it
+    is `log_likelihood`.
+
+    Parameters
+    ----------
+    likelihoods : mapping of str to FELikelihood
+        The likelihoods by name. They are evaluated in this order, and a point at which one is -inf is not simulated for
+        the later ones: give cheap models, or those that fail often, first.
+    separate : sequence of str, optional
+        Names of parameters that each likelihood has for itself, such as the standard deviations of channels with the
+        same name: the parameter ``name`` of the likelihood ``key`` is then ``name_key``.
+
+    Attributes
+    ----------
+    likelihoods : dict of str to FELikelihood
+        As given; ``joint[name]`` returns one of them.
+    parameter_names : tuple of str
+        Structural parameters of all likelihoods in the order of their first appearance, then noise parameters.
+    fast_parameters : tuple of int
+        Indices of the parameters whose change needs no simulation of any likelihood.
+
+    Raises
+    ------
+    ValueError
+        If there are no likelihoods, one is not an `FELikelihood`, a name stands for different units or different
+        nominal values, or for a structural parameter in one likelihood and a noise parameter in another, or a name in
+        `separate` is unknown.
+
+    Notes
+    -----
+    Units are compared where they are known: those of ``sigma_<channel>`` from the quantities of the channels, the
+    nominal values of which parameters are multiples from the attribute ``nominal`` of the models, and the mapping
+    ``parameter_units`` (name to text) that a model of your own may have.
+
+    Examples
+    --------
+    >>> joint = JointLikelihood({"component": bearing_test, "system": bridge_test})
+    >>> posterior = Posterior(joint, prior)
+    """
+
+    def __init__(self, likelihoods: Mapping[str, FELikelihood], *, separate: Sequence[str] = ()) -> None:
+        if not isinstance(likelihoods, Mapping) or not likelihoods:
+            raise ValueError(
+                "JointLikelihood expects a non-empty mapping of names to likelihoods, such as "
+                f'{{"component": likelihood_1, "system": likelihood_2}}; got {likelihoods!r}'
+            )
+        for key, likelihood in likelihoods.items():
+            if not isinstance(key, str) or not key or not isinstance(likelihood, FELikelihood):
+                raise ValueError(
+                    f"JointLikelihood expects an FELikelihood under each name; got {likelihood!r} under {key!r}"
+                )
+        self.likelihoods = dict(likelihoods)
+        self.separate = (separate,) if isinstance(separate, str) else tuple(separate)
+        known = {name for likelihood in self.likelihoods.values() for name in likelihood.parameter_names}
+        if unknown := [name for name in self.separate if name not in known]:
+            raise ValueError(
+                f"separate has the unknown parameters {', '.join(unknown)}; the parameters are "
+                f"{', '.join(sorted(known))}"
+            )
+        if taken := sorted({f"{name}_{key}" for name in self.separate for key in self.likelihoods} & known):
+            raise ValueError(f"separate makes the names {', '.join(taken)}, which exist already; rename likelihoods")
+        structural: dict[str, str] = {}
+        noise: dict[str, str] = {}
+        for key, likelihood in self.likelihoods.items():
+            n_structural = len(likelihood.model.parameter_names)
+            for place, name in enumerate(likelihood.parameter_names):
+                (structural if place < n_structural else noise).setdefault(self._joint_name(key, name), key)
+        if both := [name for name in noise if name in structural]:
+            raise ValueError(
+                f"{both[0]!r} is a structural parameter in {structural[both[0]]!r} and a noise parameter in "
+                f"{noise[both[0]]!r}; rename one of them, or put the name into separate="
+            )
+        self.parameter_names = (*structural, *noise)
+        self.fast_parameters = tuple(range(len(structural), len(self.parameter_names)))
+        index = {name: place for place, name in enumerate(self.parameter_names)}
+        self._columns = {
+            key: [index[self._joint_name(key, name)] for name in likelihood.parameter_names]
+            for key, likelihood in self.likelihoods.items()
+        }
+        self._check_units()
+
+    def __call__(self, x: Any) -> np.ndarray | float:
+        """Same as `log_likelihood`."""
+        return self.log_likelihood(x)
+
+    def __getitem__(self, name: str) -> FELikelihood:
+        """One of the likelihoods; ValueError for an unknown name."""
+        if name not in self.likelihoods:
+            raise ValueError(f"no likelihood {name!r}; the likelihoods are {', '.join(map(repr, self.likelihoods))}")
+        return self.likelihoods[name]
+
+    @property
+    def ndim(self) -> int:
+        """Number of parameters."""
+        return len(self.parameter_names)
+
+    def log_likelihood(self, x: Any) -> np.ndarray | float:
+        """Sum of the log-likelihoods.
+
+        Parameters
+        ----------
+        x : array_like (ndim,) or (n, ndim), or mapping
+            A mapping has a value, or n values, for every parameter name.
+
+        Returns
+        -------
+        float or (n,) float
+            -inf where one of the terms is; never NaN. Nothing is simulated where the noise parameters of one of the
+            likelihoods are impossible.
+        """
+        points = as_points(x, self.parameter_names)
+        rows = np.atleast_2d(points)
+        parts = [(likelihood, rows[:, self._columns[key]]) for key, likelihood in self.likelihoods.items()]
+        left = np.all([likelihood.possible(part) for likelihood, part in parts], axis=0)
+        total = np.where(left, 0.0, -np.inf)
+        for likelihood, part in parts:
+            if left.any():
+                total[left] += likelihood.log_likelihood(part[left])
+                left = total > -np.inf
+        return total if points.ndim == 2 else float(total[0])
+
+    def fault(self, x: Any) -> str:
+        """Reason of a failed simulation whose cause is not the model, as `FELikelihood.fault`; empty if none failed."""
+        point = as_points(x, self.parameter_names)
+        faults = (self.likelihoods[key].fault(point[columns]) for key, columns in self._columns.items())
+        return next(filter(None, faults), "")
+
+    def samples_of(self, name: str, samples: Any, noise: bool = False) -> dict[str, np.ndarray]:
+        """Samples of the parameters of one likelihood, under its own names.
+
+        Parameters
+        ----------
+        name : str
+            Name of the likelihood.
+        samples : (n, ndim) array_like, or named values of shape (n,)
+            Samples of all parameters, or without `noise` of the structural ones. Those of `draw_noise` have names.
+        noise : bool
+            Whether the noise parameters are needed.
+
+        Returns
+        -------
+        dict of str to (n,) ndarray
+            Structural parameters, and with `noise` those of the noise.
+
+        Raises
+        ------
+        ValueError
+            If the name is unknown, a parameter is missing, or an array has another shape.
+        """
+        likelihood = self[name]
+        if not isinstance(samples, Mapping):
+            structural = self.parameter_names[: self.ndim - len(self.fast_parameters)]
+            names = structural if not noise and np.shape(samples)[-1:] == (len(structural),) else self.parameter_names
+            samples = dict(zip(names, as_points(samples, names).T, strict=True))
+        wanted = list(likelihood.model.parameter_names)
+        wanted += sampled_noise(likelihood.noise).parameter_names if noise else ()
+        missing = [joint for each in wanted if (joint := self._joint_name(name, each)) not in samples]
+        if missing:
+            raise ValueError(f"the samples have no {', '.join(missing)}, which the likelihood {name!r} needs")
+        return {each: np.asarray(samples[self._joint_name(name, each)]) for each in wanted}
+
+    # simulations of all likelihoods ------------------------------------------------------------------------------
+
+    @property
+    def simulations(self) -> int:
+        """Simulations run by this object in this process, of all models."""
+        return self._total("simulations")
+
+    @property
+    def verifications(self) -> int:
+        """Number of rows of caches on disk that were compared with a new simulation."""
+        return self._total("verifications")
+
+    @property
+    def unverified(self) -> int:
+        """Number of rows that could not be compared, because the new simulation was stopped."""
+        return self._total("unverified")
+
+    @property
+    def cache_hits(self) -> int:
+        """Rows whose statistics were cached, in memory or on disk, counted for each likelihood."""
+        return self._total("cache_hits")
+
+    @property
+    def disk_hits(self) -> int:
+        """Rows among them that came from a cache on disk."""
+        return self._total("disk_hits")
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the simulations [s]."""
+        return self._total("seconds")
+
+    @property
+    def failure_count(self) -> int:
+        """Number of failed simulations."""
+        return self._total("failure_count")
+
+    @property
+    def transient_failure_count(self) -> int:
+        """Number of failures whose cause is not the model."""
+        return self._total("transient_failure_count")
+
+    @property
+    def failures(self) -> list[dict]:
+        """The first failures of each likelihood, as `FELikelihood.failures`, with its name under ``"likelihood"``."""
+        return [
+            {"likelihood": key, **failure}
+            for key, likelihood in self.likelihoods.items()
+            for failure in likelihood.failures
+        ]
+
+    @property
+    def failure_reasons(self) -> Counter[str]:
+        """Number of failures per reason."""
+        return sum((likelihood.failure_reasons for likelihood in self.likelihoods.values()), Counter())
+
+    def report(self) -> dict:
+        """Summary of all simulations, and under ``"likelihoods"`` that of each likelihood, see `Posterior.report`."""
+        parts = {key: simulation_report(likelihood) for key, likelihood in self.likelihoods.items()}
+        return simulation_report(self) | {"likelihoods": parts}
+
+    # identity ----------------------------------------------------------------------------------------------------
+
+    @property
+    def fingerprint(self) -> str:
+        """Hex digest of everything the cached statistics depend on."""
+        return _digest([likelihood.fingerprint for likelihood in self.likelihoods.values()])
+
+    @property
+    def data_fingerprint(self) -> str:
+        """Hex digest of all measurements, in any order: evidences for the same measurements can be compared."""
+        return _digest(sorted(likelihood.data_fingerprint for likelihood in self.likelihoods.values()))
+
+    def density_parts(self) -> list[str]:
+        """Texts that identify the density, as `FELikelihood.density_parts`."""
+        parts: list[str] = []
+        for key, likelihood in self.likelihoods.items():
+            parts += [json.dumps(self._columns[key]), *likelihood.density_parts()]
+        return [*self.parameter_names, *parts]
+
+    def marginal(self, priors: Mapping[str, Distribution]) -> "JointLikelihood":
+        """The same likelihood with the standard deviations of white noise integrated out, see `Posterior.marginal`.
+
+        Raises
+        ------
+        ValueError
+            As `FELikelihood.marginal`, and if a noise parameter belongs to several likelihoods: its integral is not a
+            product.
+        """
+        owners = Counter(column for columns in self._columns.values() for column in columns)
+        if shared := [self.parameter_names[place] for place in self.fast_parameters if owners[place] > 1]:
+            raise ValueError(
+                f"{', '.join(shared)} belong to several likelihoods and cannot be integrated out; give each likelihood "
+                f"its own with separate={shared!r}"
+            )
+        # a name is shared by all likelihoods or by none, so each part needs its own priors only
+        parts = {
+            key: likelihood.marginal({name: priors[self._joint_name(key, name)] for name in _noise_names(likelihood)})
+            for key, likelihood in self.likelihoods.items()
+        }
+        structural = {name for likelihood in parts.values() for name in likelihood.parameter_names}
+        result = JointLikelihood(parts, separate=[name for name in self.separate if name in structural])
+        result.separate = self.separate  # names of the noise that `draw_noise` draws
+        return result
+
+    def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
+        """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
+        if self.fast_parameters:
+            raise ValueError(
+                f"the noise parameters {', '.join(self.parameter_names[self.fast_parameters[0] :])} are in the samples "
+                "of this posterior; draw_noise is for posteriors from which they are integrated out, see marginal()"
+            )
+        points = np.atleast_2d(as_points(x, self.parameter_names))
+        rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
+        named = dict(zip(self.parameter_names, points.T, strict=True))
+        for key, likelihood in self.likelihoods.items():
+            drawn = likelihood.draw_noise(points[:, self._columns[key]], rng)
+            named |= {self._joint_name(key, name): values for name, values in drawn.items()}
+        return named
+
+    def _joint_name(self, key: str, name: str) -> str:
+        """Name in the joint likelihood of a parameter of one likelihood."""
+        return f"{name}_{key}" if name in self.separate else name
+
+    def _total(self, name: str) -> Any:
+        return sum(getattr(likelihood, name) for likelihood in self.likelihoods.values())
+
+    def _check_units(self) -> None:
+        """Raise ValueError if a parameter has different units, or multiples of different nominal values."""
+        seen: dict[str, tuple[str, str]] = {}
+        for key, likelihood in self.likelihoods.items():
+            for name in likelihood.parameter_names:
+                unit, joint = _unit(likelihood, name), self._joint_name(key, name)
+                if unit is None:
+                    continue
+                other, expected = seen.setdefault(joint, (key, unit))
+                if unit != expected:
+                    raise ValueError(
+                        f"the parameter {joint!r} must have one unit; it is in {expected} in {other!r} and in {unit} "
+                        f"in {key!r}: rename it in one of them, give both models one unit or nominal value, or put the "
+                        "name into separate="
+                    )
+
+
+def _noise_names(likelihood: FELikelihood) -> tuple[str, ...]:
+    return tuple(likelihood.parameter_names[len(likelihood.model.parameter_names) :])
+
+
+def _unit(likelihood: FELikelihood, name: str) -> str | None:
+    """Unit of a parameter in words, None where it is not known."""
+    model = likelihood.model
+    if name in model.parameter_names:
+        # optional members of models of the user
+        units, nominal = getattr(model, "parameter_units", {}), getattr(model, "nominal", {})
+        if name in units:
+            return str(units[name])
+        return f"multiples of {nominal[name]:.12g}" if isinstance(nominal, Mapping) and name in nominal else None
+    channels = {f"sigma_{channel.name}": channel for channel in likelihood.model.channels}
+    return channels[name].si_unit if name in channels else None
+
+
+def _digest(parts: Sequence[str]) -> str:
+    return hashlib.blake2b(json.dumps(list(parts)).encode(), digest_size=16).hexdigest()
