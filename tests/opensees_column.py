@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -60,6 +61,7 @@ class Shake(NamedTuple):
     )  # (3, n): relative displacement [in], absolute acceleration [in/s2], vertical displacement [in]
     iterations: np.ndarray  # (n,)
     seconds: float  # CPU time of the analysis alone
+    recorded: np.ndarray  # (n, n_recorded), empty without recorders
 
 
 class Push(NamedTuple):
@@ -68,6 +70,7 @@ class Push(NamedTuple):
     response: np.ndarray  # (5, n): lateral displacement [in], force [kip], vertical displacement, and rotation of the
     # top, base moment [kip in]
     seconds: float
+    recorded: np.ndarray  # (n, n_recorded), empty without recorders
 
 
 def require_opensees() -> None:
@@ -116,7 +119,12 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
     )
 
 
-def shake(column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10) -> Shake:
+Recorders = Sequence[tuple]  # arguments of eleResponse, with the index of the value last; ("node", node, dof)
+
+
+def shake(
+    column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10, recorders: Recorders = ()
+) -> Shake:
     """Apply gravity, then a base acceleration, in a separate process.
 
     Parameters
@@ -128,17 +136,27 @@ def shake(column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: fl
         Step [s].
     tolerance : float
         Norm of the last displacement increment [in and rad].
+    recorders : sequence of tuple
+        Responses of elements that are recorded after every step.
 
     Returns
     -------
     Shake
     """
-    return _in_process("_shake", column, np.asarray(acceleration, dtype=float), dt, tolerance)
+    return _in_process("_shake", column, np.asarray(acceleration, dtype=float), dt, tolerance, tuple(recorders))
 
 
-def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10) -> Push:
+def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10, recorders: Recorders = ()) -> Push:
     """Apply gravity, then move the top through `targets` (n,) [in], one step each, in a separate process."""
-    return _in_process("_push", column, np.asarray(targets, dtype=float), tolerance)
+    return _in_process("_push", column, np.asarray(targets, dtype=float), tolerance, tuple(recorders))
+
+
+def _record(ops, recorders: Recorders) -> list[float]:
+    """Current values of all recorders."""
+    return [
+        ops.nodeDisp(*arguments[1:]) if arguments[0] == "node" else ops.eleResponse(*arguments[:-1])[arguments[-1]]
+        for arguments in recorders
+    ]
 
 
 def _in_process(function: str, *arguments) -> Shake | Push:
@@ -187,7 +205,7 @@ def _build(ops, column: PeerColumn, tolerance: float) -> None:
     ops.loadConst("-time", 0.0)
 
 
-def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float) -> Shake:
+def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float, recorders) -> Shake:
     _build(ops, column, tolerance)
     top = column.n_elements + 1
     ops.rayleigh(column.a0, 0.0, 0.0, column.a1)
@@ -204,6 +222,8 @@ def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, toleran
     ops.integrator("Newmark", 0.5, 0.25)
     ops.analysis("Transient")
     response = np.empty((3, len(acceleration)))
+    recorded = np.empty((len(acceleration), len(recorders)))
+    recorded[0] = _record(ops, recorders)
     iterations = np.zeros(len(acceleration), dtype=int)
     response[:, 0] = ops.nodeDisp(top, 1), acceleration[0], ops.nodeDisp(top, 2)
     done = 1
@@ -213,19 +233,21 @@ def _shake(ops, column: PeerColumn, acceleration: np.ndarray, dt: float, toleran
         response[1, done] = ops.nodeAccel(top, 1)
         response[2, done] = ops.nodeDisp(top, 2)
         iterations[done] = ops.testIter()
+        recorded[done] = _record(ops, recorders)
         done += 1
     seconds = time.process_time() - start
     response[1, 1:] += acceleration[1:]
-    return Shake(response[:, :done], iterations[:done], seconds)
+    return Shake(response[:, :done], iterations[:done], seconds, recorded[:done])
 
 
-def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float) -> Push:
+def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float, recorders) -> Push:
     _build(ops, column, tolerance)
     top = column.n_elements + 1
     ops.timeSeries("Linear", 2)
     ops.pattern("Plain", 2, 2)
     ops.load(top, 1.0, 0.0, 0.0)
     response = np.empty((5, len(targets)))
+    recorded = np.empty((len(targets), len(recorders)))
     done = 0
     start = time.process_time()
     for target in targets:
@@ -241,8 +263,9 @@ def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float) -> Pus
             ops.nodeDisp(top, 3),
             ops.eleResponse(1, "section", 1, "force")[1],
         )
+        recorded[done] = _record(ops, recorders)
         done += 1
-    return Push(response[:, :done], time.process_time() - start)
+    return Push(response[:, :done], time.process_time() - start, recorded[:done])
 
 
 def main() -> None:

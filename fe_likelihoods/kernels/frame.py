@@ -16,7 +16,7 @@ from .corotational import BasicForces, add_to_stiffness, deformations
 from .fiber_section import Sections
 from .jit import kernel
 
-__all__ = ["Column", "allocate", "initialise_column", "assemble", "commit_sections", "cross_jumps"]
+__all__ = ["Column", "allocate", "initialise_column", "assemble", "commit_sections", "cross_jumps", "record_sections"]
 
 LARGEST_AXIAL_STRAIN = 0.2
 """An element that becomes longer or shorter by more than this share of its length has failed."""
@@ -208,6 +208,18 @@ def commit_sections(column):
         for m in range(n_points):
             k = HEAD + PER_SECTION * m
             fiber_section.commit(state[e, k], state[e, k + 1], e * n_points + m, column.sections)
+
+
+@kernel(inline=True)
+def record_sections(column, out):
+    """Write the axial strain and the curvature [1/m] of every section, from the base up, to `out` (n_sections, 2)."""
+    state = column.elements.state
+    n_points = column.elements.points.shape[0]
+    for e in range(state.shape[0]):
+        for m in range(n_points):
+            k = HEAD + PER_SECTION * m
+            out[e * n_points + m, 0] = state[e, k]
+            out[e * n_points + m, 1] = state[e, k + 1]
 
 
 @kernel

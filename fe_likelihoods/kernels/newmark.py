@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .beam_column import HEAD
-from .frame import assemble, commit_sections, cross_jumps
+from .frame import assemble, commit_sections, cross_jumps, record_sections
 from .jit import kernel
 from .linear_solve import copy_matrix, solve_banded
 from .static import LOOSENING, MAX_CROSSINGS, Position, apply_gravity
@@ -52,6 +52,7 @@ HISTORY_ROWS = (
     "base curvature",
     "base axial force",
     "base moment",
+    "base shear",
 )
 
 
@@ -79,17 +80,25 @@ class Dynamics(NamedTuple):
 
 @kernel(inline=True)
 def _record_forces(column, force, out):
-    """Write the restoring force of the top, and e0, kappa, N and M of the base section, to `out` (5,)."""
+    """Write forces to `out` (6,): restoring force of the top, e0, kappa, N and M of the base section, base shear.
+
+    The base shear is the restoring force that the column transmits to its base: no load acts between its ends, so it is
+    the sum of the nodal forces `force` (n_dof,) along x.
+    """
     state = column.elements.state
-    out[0] = force
+    out[0] = force[force.shape[0] - 3]
     out[1] = state[0, HEAD]
     out[2] = state[0, HEAD + 1]
     out[3] = state[0, HEAD + 5]
     out[4] = state[0, HEAD + 6]
+    shear = 0.0
+    for i in range(0, force.shape[0], 3):
+        shear += force[i]
+    out[5] = shear
 
 
 @kernel
-def newmark(column, dynamics, ground, dt, every, iteration, history):
+def newmark(column, dynamics, ground, dt, every, iteration, history, sections):
     """Apply gravity, then the base acceleration `ground` along x.
 
     Parameters
@@ -103,8 +112,10 @@ def newmark(column, dynamics, ground, dt, every, iteration, history):
     every : int
         One sample in `every` steps is recorded.
     iteration : static.Iteration
-    history : ndarray (12, n_recorded)
+    history : ndarray (13, n_recorded)
         Written; rows as in `HISTORY_ROWS`.
+    sections : ndarray (n_recorded, n_sections, 2)
+        Written: axial strain and curvature [1/m] of every section. Without samples (0, ...), they are not recorded.
 
     Returns
     -------
@@ -148,7 +159,9 @@ def newmark(column, dynamics, ground, dt, every, iteration, history):
     history[4, 0] = 0.0
     history[5, 0] = 0.0
     history[6, 0] = supplied
-    _record_forces(column, force[top], history[7:, 0])
+    _record_forces(column, force, history[7:, 0])
+    if sections.shape[0] > 0:
+        record_sections(column, sections[0])
 
     for step in range(1, ground.shape[0]):
         done, part, loose, crossings = 0.0, 1.0, False, 0
@@ -241,5 +254,7 @@ def newmark(column, dynamics, ground, dt, every, iteration, history):
             history[4, m] = damped
             history[5, m] = absorbed
             history[6, m] = supplied
-            _record_forces(column, force[top], history[7:, m])
+            _record_forces(column, force, history[7:, m])
+            if sections.shape[0] > 0:
+                record_sections(column, sections[m])
     return 0, retries, total_iterations

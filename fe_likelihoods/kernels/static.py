@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .beam_column import HEAD
-from .frame import assemble, commit_sections, cross_jumps, initialise_column
+from .frame import assemble, commit_sections, cross_jumps, initialise_column, record_sections
 from .jit import kernel
 from .linear_solve import copy_matrix, copy_vector, solve_banded
 
@@ -203,7 +203,7 @@ def apply_gravity(column, position, gravity, iteration):
 
 
 @kernel
-def impose_displacement(column, gravity, targets, iteration, history):
+def impose_displacement(column, gravity, targets, iteration, history, sections):
     """Apply gravity, then move the top laterally through `targets`.
 
     Parameters
@@ -214,8 +214,10 @@ def impose_displacement(column, gravity, targets, iteration, history):
     targets : ndarray (n_steps,)
         Lateral displacement of the top [m].
     iteration : Iteration
-    history : ndarray (8, n_steps)
-        Written: ux, uy and theta of the top, lateral force, and e0, kappa, N and M of the base section.
+    history : ndarray (9, n_steps)
+        Written: ux, uy and theta of the top, lateral force, e0, kappa, N and M of the base section, and base shear.
+    sections : ndarray (n_steps, n_sections, 2)
+        Written: axial strain and curvature [1/m] of every section. Without steps (0, ...), they are not recorded.
 
     Returns
     -------
@@ -245,4 +247,10 @@ def impose_displacement(column, gravity, targets, iteration, history):
         history[5, step] = state[0, HEAD + 1]
         history[6, step] = state[0, HEAD + 5]
         history[7, step] = state[0, HEAD + 6]
+        shear = 0.0
+        for i in range(0, force.shape[0], 3):
+            shear += force[i]
+        history[8, step] = shear
+        if sections.shape[0] > 0:
+            record_sections(column, sections[step])
     return 0, retries

@@ -25,30 +25,28 @@ a full-scale bridge-column using sequential Monte Carlo (2022): the tested colum
 
 from __future__ import annotations
 
-import logging
-import weakref
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..kernels.frame import allocate
-from ..kernels.newmark import HISTORY_ROWS, Dynamics
+from ..kernels.newmark import Dynamics
 from ..kernels.static import Iteration
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
-from ..units import G0, find_unit
+from ..units import G0
 from .circular_section import Confinement, gauss_lobatto
 from .rc_column_analysis import (
-    IMPOSED_ROWS,
     BaseMotion,
     ColumnHistory,
     ImposedMotion,
     check_physical_values,
-    largest_bar_strain,
+    checked_history,
     set_materials,
 )
+from .rc_column_outputs import AT_TOP, Output, Sections, check_units, display_channels, parse_outputs, section_heights
 from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
 from .rc_column_presets import lhpost_arguments
 from .rc_column_section import ReinforcedSection
@@ -68,8 +66,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PARAMETERS", "RCColumn"]
 
-logger = logging.getLogger(__name__)
-
 PARAMETERS = {
     "Ec": "modulus of concrete [Pa]",
     "Es": "modulus of steel [Pa]",
@@ -83,17 +79,6 @@ PARAMETERS = {
     "mass": "mass at the top [kg]",
     "penetration": "length of strain penetration into the foundation [m]",
 }
-_CHANNELS = {
-    "acceleration": ("absolute acceleration", "m/s2"),
-    "displacement": ("relative displacement", "m"),
-    "force": ("lateral force", "N"),
-}
-_HISTORY_OF_CHANNEL = {
-    "acceleration": "absolute acceleration",
-    "displacement": "relative displacement",
-    "force": "force",
-}
-_WARNED: weakref.WeakSet[RCColumn] = weakref.WeakSet()
 
 
 class _Prepared(NamedTuple):
@@ -104,7 +89,7 @@ class _Prepared(NamedTuple):
     points: np.ndarray
     weights: np.ndarray
     motion: BaseMotion | ImposedMotion
-    rows: list[str]
+    outputs: tuple[Output, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,9 +141,9 @@ class RCColumn(ThreadedModel):
     max_increment : float or None
         Largest increment of an imposed displacement [m]; larger ones are divided. None: height/5000.
     outputs : tuple of str or None
-        Names of the channels (see the notes). None: all channels of the loading.
+        Names of the channels, that is, of the sensors (see the notes). None: those of the top.
     units : dict or tuple of pairs
-        Display units of the channels, by name.
+        Display units of the channels, by name or by the part of the name before the ``@``.
     tolerance, element_tolerance : float
         Norm of the last Newton correction [m and rad]; work of the last correction of an element [J].
     max_iterations, halvings : int
@@ -171,9 +156,25 @@ class RCColumn(ThreadedModel):
 
     Notes
     -----
-    The channels are ``"acceleration"``, the absolute acceleration of the top [m/s²], and ``"displacement"``, that of
-    the top relative to the base [m], under a `Record`; ``"force"``, the lateral force at the top [N], under a
-    `DisplacementHistory`.
+    The channels are the following outputs. Heights H are measured from the base and positions X from the axis of the
+    column in the direction of loading [m].
+
+    ==================  ==========================================================================================
+    ``"acceleration"``  absolute acceleration of the top [m/s²], under a `Record` (default)
+    ``"displacement"``  displacement of the top relative to the base [m], under a `Record` (default)
+    ``"force"``         lateral force at the top [N], under a `DisplacementHistory` (default)
+    ``"base_moment"``   bending moment of the base section [N m]
+    ``"base_shear"``    restoring force that the column transmits to its base, without damping forces [N]
+    ``"axial_force"``   axial force of the base section [N]
+    ``"curvature@H"``   curvature of the section at height H [1/m]
+    ``"strain@H:X"``    strain at position X in that section, of the concrete or of a bar
+    ``"rotation@H:J"``  rotation of the section at height J relative to that at H [rad]; for H = 0 relative to the
+                        foundation, including the rotation by strain penetration
+    ==================  ==========================================================================================
+
+    Curvatures, rotations, moments and shear forces are positive where the column bends towards positive displacements.
+    Strains and axial forces are positive in tension and include the effect of gravity. Strains and curvatures are
+    those of a section at the heights `section_heights`, and interpolated in between (``docs/sensors.rst``).
 
     Each value of theta is a multiple of a nominal value (`nominal`). The parameters are:
 
@@ -260,12 +261,7 @@ class RCColumn(ThreadedModel):
     @property
     def channels(self) -> tuple[Channel, ...]:
         """Channels of the response, in order."""
-        names = self._channel_names if self.outputs is None else self.outputs
-        units = dict(self.units)
-        return tuple(
-            Channel(name, quantity, units.get(name, si_unit))
-            for name, (quantity, si_unit) in ((name, _CHANNELS[name]) for name in names)
-        )
+        return display_channels(self._parsed_outputs(), dict(self.units))
 
     @property
     def dt(self) -> float:
@@ -276,6 +272,11 @@ class RCColumn(ThreadedModel):
     def n_steps(self) -> int:
         """Number of samples of the response."""
         return self.loading.n_steps
+
+    @property
+    def section_heights(self) -> np.ndarray:
+        """Heights of the integration points above the base [m], where curvatures and strains are those of a section."""
+        return section_heights(self._sections)
 
     @property
     def section(self) -> ReinforcedSection:
@@ -347,11 +348,14 @@ class RCColumn(ThreadedModel):
         return self.with_record(replace(self.loading, displacement=self.loading.displacement[window]))
 
     def history(self, theta: np.ndarray) -> ColumnHistory:
-        """Simulate and return all histories that the kernels record: displacements, forces and energies.
+        """Simulate and return all histories that the kernels record, and the sensors among the outputs.
 
         Parameters and errors are those of `simulate`.
         """
-        return self._run(check_theta(theta, self.parameters))
+        history, outputs = self._run(check_theta(theta, self.parameters))
+        sensors = {name: values for name, values in outputs.items() if name not in AT_TOP}
+        values = np.vstack([history.values, *sensors.values()])
+        return replace(history, names=(*history.names, *sensors), values=values)
 
     def plot_section(self, axes: Axes | None = None) -> Axes:
         """Plot cover, core, mesh and bars of the section (`fe_likelihoods.plots.structures.plot_section`)."""
@@ -366,8 +370,7 @@ class RCColumn(ThreadedModel):
         return plot_column_loops(self, self.history(theta))
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        history = self._run(theta)
-        return np.stack([history[row] for row in self._prepared.rows])
+        return np.stack(list(self._run(theta)[1].values()))
 
     def _prepare(self) -> _Prepared:
         section = self.section
@@ -376,11 +379,11 @@ class RCColumn(ThreadedModel):
             motion = BaseMotion.of(self.loading, self.substeps)
         else:
             motion = ImposedMotion.of(self.loading, self.max_increment or self.height / 5000.0)
-        rows = [_HISTORY_OF_CHANNEL[channel.name] for channel in self.channels]
-        return _Prepared(section, dict(core=core, cover=cover, bars=bars), *gauss_lobatto(self.n_points), motion, rows)
+        fibers = dict(core=core, cover=cover, bars=bars)
+        return _Prepared(section, fibers, *gauss_lobatto(self.n_points), motion, self._parsed_outputs())
 
-    def _run(self, theta: np.ndarray) -> ColumnHistory:
-        """Simulate for multiples `theta` of the nominal parameters."""
+    def _run(self, theta: np.ndarray) -> tuple[ColumnHistory, dict[str, np.ndarray]]:
+        """Simulate for multiples `theta` of the nominal parameters; return the history and the outputs by name."""
         values = self.physical_values(theta)
         check_physical_values(values, self.steel)
         prepared = self._prepared
@@ -396,35 +399,31 @@ class RCColumn(ThreadedModel):
         )
         set_materials(column, values, self.concrete, self.steel, prepared.section.confinement(values["fc"]))
         iteration = Iteration(float(self.tolerance), int(self.max_iterations), int(self.halvings))
+        record = any(output.row is None for output in prepared.outputs)
         gravity = np.zeros(3 * self.n_elements)
         gravity[-2] = -(self.axial_load if self.axial_load is not None else values["mass"] * G0)
         if isinstance(prepared.motion, ImposedMotion):
-            return self._checked(IMPOSED_ROWS, *prepared.motion.run(column, gravity, iteration), theta)
-        mass = np.zeros(3 * self.n_elements)
-        mass[-3:] = values["mass"], values["mass"] * self.vertical_mass, self.rotational_inertia
-        dynamics = Dynamics(gravity, mass, float(values["a0"]), float(values["a1"]), 0.0)
-        return self._checked(HISTORY_ROWS, *prepared.motion.run(column, dynamics, iteration), theta)
-
-    def _checked(self, names: tuple[str, ...], values: np.ndarray, retries: int, theta: np.ndarray) -> ColumnHistory:
-        """History of a simulation; warns once per model where bars exceed the strain at which they fracture."""
-        strains = (values[names.index(row)] for row in ("base axial strain", "base curvature"))
-        limit = self.steel.ultimate_strain
-        beyond = largest_bar_strain(*strains, self.bar_circle_radius) / limit
-        if beyond > 1.0 and self not in _WARNED:
-            _WARNED.add(self)
-            logger.warning(
-                "a bar strain of %.3g at the base exceeds the ultimate strain of the steel, %.3g, at which bars "
-                "fracture; the law was continued along its tangent, at %s. This model gives no further warnings: "
-                "check history(theta).beyond_range, or use a weaker loading",
-                beyond * limit,
-                limit,
-                dict(zip(self.parameters, theta.tolist(), strict=True)),
-            )
-        return ColumnHistory(names, values, retries, beyond)
+            analysis = prepared.motion.run(column, gravity, iteration, record)
+        else:
+            mass = np.zeros(3 * self.n_elements)
+            mass[-3:] = values["mass"], values["mass"] * self.vertical_mass, self.rotational_inertia
+            dynamics = Dynamics(gravity, mass, float(values["a0"]), float(values["a1"]), 0.0)
+            analysis = prepared.motion.run(column, dynamics, iteration, record)
+        rows = dict(zip(analysis.names, analysis.values, strict=True))
+        outputs = {o.name: o.evaluate(rows, analysis.sections, values["penetration"]) for o in prepared.outputs}
+        return checked_history(self, analysis, theta), outputs
 
     @property
     def _time_label(self) -> str:
         return "time [s]" if isinstance(self.loading, Record) else "step"
+
+    @property
+    def _sections(self) -> Sections:
+        return Sections(self.height, 0.5 * self.diameter, self.n_elements, gauss_lobatto(self.n_points)[0])
+
+    def _parsed_outputs(self) -> tuple[Output, ...]:
+        names = self._channel_names if self.outputs is None else self.outputs
+        return parse_outputs(names, self._sections, self._channel_names)
 
     @property
     def _channel_names(self) -> tuple[str, ...]:
@@ -466,14 +465,5 @@ class RCColumn(ThreadedModel):
         if idle and not isinstance(self.loading, Record):
             raise invalid("parameters that act under imposed displacement", idle, "leave damping out of parameters")
         check_nominal(self.parameters, self.nominal)
-        if self.outputs is not None:
-            check_names("outputs", self.outputs, self._channel_names, "these are the channels of the loading")
-        for name, unit in dict(self.units).items():
-            if name not in _CHANNELS:
-                raise invalid(
-                    f"display units of channels out of {tuple(_CHANNELS)}", name, 'such as {"displacement": "in"}'
-                )
-            try:
-                find_unit(unit, name)
-            except ValueError as error:
-                raise invalid(f"a display unit of {name}", unit, str(error)) from error
+        self._parsed_outputs()
+        check_units(dict(self.units))

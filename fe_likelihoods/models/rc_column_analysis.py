@@ -6,8 +6,10 @@ top is solved as a sequence of static steps (`fe_likelihoods.kernels.static`). B
 
 from __future__ import annotations
 
+import logging
+import weakref
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -22,16 +24,22 @@ from .circular_section import Confinement
 from .rc_column_parts import Concrete, Steel
 from .validation import check_values
 
+if TYPE_CHECKING:
+    from .rc_column import RCColumn
+
 __all__ = [
-    "IMPOSED_ROWS",
+    "Analysis",
     "BaseMotion",
     "ColumnHistory",
     "ImposedMotion",
     "check_physical_values",
-    "largest_bar_strain",
+    "checked_history",
     "set_materials",
 ]
 
+logger = logging.getLogger(__name__)
+
+_WARNED: weakref.WeakSet[RCColumn] = weakref.WeakSet()
 _MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 
 IMPOSED_ROWS = (
@@ -43,6 +51,7 @@ IMPOSED_ROWS = (
     "base curvature",
     "base axial force",
     "base moment",
+    "base shear",
 )
 
 
@@ -65,6 +74,27 @@ class ColumnHistory(History):
 
     retries: int
     beyond_range: float
+
+
+class Analysis(NamedTuple):
+    """Result of one analysis.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the rows.
+    values : ndarray[n_rows, n_steps]
+        The histories.
+    retries : int
+        Number of steps that were repeated with half their size.
+    sections : ndarray[n_steps, n_sections, 2]
+        Axial strain and curvature [1/m] of every section, from the base up; (0, n_sections, 2) if not recorded.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    retries: int
+    sections: np.ndarray
 
 
 class BaseMotion(NamedTuple):
@@ -94,21 +124,25 @@ class BaseMotion(NamedTuple):
         acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
         return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
 
-    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration) -> tuple[np.ndarray, int]:
+    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration, record_sections: bool) -> Analysis:
         """Integrate the equations of motion; SimulationFailed if a step does not converge.
+
+        With `record_sections`, the deformations of all sections are returned too.
 
         Returns
         -------
-        history : ndarray[n_rows, n_steps]
-            Rows `HISTORY_ROWS`.
-        retries : int
+        Analysis
+            Rows are `HISTORY_ROWS`.
         """
         history = np.zeros((len(HISTORY_ROWS), self.n_steps))
-        status, retries, _ = newmark(column, dynamics, self.acceleration, self.dt, self.substeps, iteration, history)
+        sections = _allocate_sections(column, self.n_steps if record_sections else 0)
+        status, retries, _ = newmark(
+            column, dynamics, self.acceleration, self.dt, self.substeps, iteration, history, sections
+        )
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings))
-        return history, retries
+        return Analysis(HISTORY_ROWS, history, retries, sections)
 
 
 class ImposedMotion(NamedTuple):
@@ -131,20 +165,24 @@ class ImposedMotion(NamedTuple):
         finer = history.subdivide(max_increment)
         return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices))
 
-    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration) -> tuple[np.ndarray, int]:
+    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration, record_sections: bool) -> Analysis:
         """Solve the static equilibrium at each target; SimulationFailed if a step does not converge.
+
+        With `record_sections`, the deformations of all sections are returned too.
 
         Returns
         -------
-        history : ndarray[n_rows, n_steps]
-            Rows `IMPOSED_ROWS`.
-        retries : int
+        Analysis
+            Rows are `IMPOSED_ROWS`.
         """
         history = np.zeros((len(IMPOSED_ROWS), len(self.targets)))
-        status, retries = impose_displacement(column, gravity, self.targets, iteration, history)
+        sections = _allocate_sections(column, len(self.targets) if record_sections else 0)
+        status, retries = impose_displacement(column, gravity, self.targets, iteration, history, sections)
         if status:
             raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings))
-        return history[:, self.kept], retries
+        return Analysis(
+            IMPOSED_ROWS, history[:, self.kept], retries, sections[self.kept] if record_sections else sections
+        )
 
 
 def check_physical_values(values: dict[str, float], steel: Steel) -> None:
@@ -171,9 +209,22 @@ def check_physical_values(values: dict[str, float], steel: Steel) -> None:
         )
 
 
-def largest_bar_strain(base_axial_strain: np.ndarray, base_curvature: np.ndarray, radius: float) -> float:
-    """Largest absolute strain on a circle of `radius` [m], over histories of axial strain and curvature [1/m]."""
-    return float((np.abs(base_axial_strain) + radius * np.abs(base_curvature)).max())
+def checked_history(model: RCColumn, analysis: Analysis, theta: np.ndarray) -> ColumnHistory:
+    """History of a simulation; warns once per model where bars exceed the strain at which they fracture."""
+    strain, curvature = (analysis.values[analysis.names.index(f"base {row}")] for row in ("axial strain", "curvature"))
+    limit = model.steel.ultimate_strain
+    beyond = float((np.abs(strain) + model.bar_circle_radius * np.abs(curvature)).max()) / limit
+    if beyond > 1.0 and model not in _WARNED:
+        _WARNED.add(model)
+        logger.warning(
+            "a bar strain of %.3g at the base exceeds the ultimate strain of the steel, %.3g, at which bars fracture; "
+            "the law was continued along its tangent, at %s. This model gives no further warnings: check "
+            "history(theta).beyond_range, or use a weaker loading",
+            beyond * limit,
+            limit,
+            dict(zip(model.parameters, theta.tolist(), strict=True)),
+        )
+    return ColumnHistory(analysis.names, analysis.values, analysis.retries, beyond)
 
 
 def set_materials(
@@ -198,6 +249,10 @@ def set_materials(
         steel.ultimate_strain,
         column.sections.steel,
     )
+
+
+def _allocate_sections(column: Column, n_steps: int) -> np.ndarray:
+    return np.zeros((n_steps, len(column.sections.virgin), 2))
 
 
 def _reason(status: int, n_steps: int, at: str, halvings: int) -> str:

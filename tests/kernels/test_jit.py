@@ -224,13 +224,16 @@ def short_subset() -> dict[str, np.ndarray]:
     out["section"] = np.zeros((5, 60))
     e0, kappa = rng.normal(size=(2, 60)) * [[5e-4], [1e-4]]
     golden.section_history(e0, kappa, column(), out["section"])
-    out["pushover"] = np.zeros((8, 12))
+    out["pushover"] = np.zeros((9, 12))
+    out["sections"] = np.zeros((12, 6, 2))
     iteration = Iteration(1e-10, 50, 4)
-    impose_displacement(column(), golden.gravity(), np.linspace(0.0, 4.0, 12), iteration, out["pushover"])
+    impose_displacement(
+        column(), golden.gravity(), np.linspace(0.0, 4.0, 12), iteration, out["pushover"], out["sections"]
+    )
     out["run"] = np.zeros((len(HISTORY_ROWS), 40))
     ground = 300.0 * np.sin(np.linspace(0.0, 6.0, 40))
     dynamics = Dynamics(golden.gravity(), golden.mass(), golden.A0, golden.A1, 0.0)
-    status = newmark(column(), dynamics, ground, 0.02, 1, iteration, out["run"])
+    status = newmark(column(), dynamics, ground, 0.02, 1, iteration, out["run"], np.zeros((0, 6, 2)))
     out["status"] = np.array(status)
     return out
 

@@ -1,0 +1,163 @@
+"""Outputs of the column besides those of its top: names, closed forms, likelihood, wrong names.
+
+`tests/kernels/test_against_opensees.py` compares them with the recorders of OpenSees.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    DisplacementHistory,
+    FELikelihood,
+    Measurements,
+    Patches,
+    RCColumn,
+)
+from fe_likelihoods.models.circular_section import gauss_lobatto
+from fe_likelihoods.models.rc_column_outputs import Sections, parse_outputs
+from fe_likelihoods.problems import bridge_column_data
+
+SENSORS = ("base_moment", "base_shear", "axial_force", "curvature@0.3", "strain@0.3:-0.55", "rotation@0:0.6")
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    """Two seconds of the bundled record, with sensors besides those of the top."""
+    part = bridge_column_data().record.trim(6.0, 8.0)
+    return RCColumn.lhpost(part, outputs=("acceleration", "displacement", *SENSORS))
+
+
+def pushed(*targets, **changes):
+    arguments = dict(parameters=("Ec",), axial_load=0.0) | changes
+    return RCColumn.lhpost(DisplacementHistory("push", np.array(targets, dtype=float)), **arguments)
+
+
+def test_sensors_change_nothing_at_the_top(shaken):
+    plain = replace(shaken, outputs=None)
+    np.testing.assert_array_equal(shaken.simulate(np.ones(5))[:2], plain.simulate(np.ones(5)))
+    assert plain.fingerprint != shaken.fingerprint
+    assert replace(shaken, outputs=(*shaken.outputs[:-1], "rotation@0:0.7")).fingerprint != shaken.fingerprint
+
+
+def test_channels_have_quantities_and_display_units(shaken):
+    channels = {channel.name: channel for channel in replace(shaken, units={"strain": "microstrain"}).channels}
+    assert channels["strain@0.3:-0.55"].quantity == "strain" and channels["strain@0.3:-0.55"].unit == "microstrain"
+    assert [channels[name].si_unit for name in SENSORS] == ["N m", "N", "N", "1/m", "1", "rad"]
+    both = replace(shaken, units={"strain": "%", "strain@0.3:-0.55": "microstrain"})
+    assert both.channels[6].unit == "microstrain"
+    with pytest.raises(ValueError, match="display unit of rotation"):
+        replace(shaken, units={"rotation": "m"})
+    with pytest.raises(ValueError, match="display units of channels"):
+        replace(shaken, units={"tilt": "rad"})
+
+
+def test_history_contains_the_sensors(shaken):
+    history, response = shaken.history(np.ones(5)), shaken.simulate(np.ones(5))
+    for name, row in zip(shaken.outputs[2:], response[2:], strict=True):
+        np.testing.assert_array_equal(history[name], row)
+    np.testing.assert_array_equal(history["base_moment"], -history["base moment"])
+    np.testing.assert_array_equal(history["axial_force"], history["base axial force"])
+
+
+@pytest.mark.parametrize(("n_elements", "n_points"), [(1, 3), (2, 3), (3, 5)])
+def test_elastic_cantilever(n_elements, n_points):
+    """Curvatures are linear over the height, also between the sections; rotations are their integrals."""
+    height = 7.3152
+    heights = (0.0, 0.4, 2.0, 3.0, 3.6576, 5.5, height)
+    outputs = ("force", "base_moment", "base_shear", *(f"curvature@{z}" for z in heights))
+    outputs += ("rotation@0:0.5", "rotation@1:5", f"rotation@0:{height}", "strain@2:0.3", "strain@2:0")
+    column = pushed(0.0, 1e-6, n_elements=n_elements, n_points=n_points, geometry="linear", outputs=outputs)
+    values = dict(zip(outputs, column.simulate([1.0])[:, 1], strict=True))
+    base, force = values["curvature@0.0"], values["force"]
+    assert base > 0.0 and values["base_shear"] == pytest.approx(force, rel=1e-6)
+    assert values["base_moment"] == pytest.approx(force * height, rel=1e-6)
+    for z in heights:
+        assert values[f"curvature@{z}"] == pytest.approx(base * (1 - z / height), rel=1e-4, abs=1e-4 * base)
+    for low, high in ((0.0, 0.5), (1.0, 5.0), (0.0, height)):
+        angle = base * (high - low) * (1.0 - 0.5 * (low + high) / height)
+        assert values[f"rotation@{low:g}:{high:g}"] == pytest.approx(angle, rel=1e-4)
+    assert values[f"rotation@0:{height}"] == pytest.approx(1.5 * 1e-6 / height, rel=1e-4)  # 3/2 of the chord's
+    compressed = -0.3 * base * (1 - 2.0 / height)  # on the side towards which the column bends
+    assert values["strain@2:0.3"] - values["strain@2:0"] == pytest.approx(compressed, rel=1e-4)
+
+
+def test_gravity_is_part_of_strains_and_axial_force():
+    column = pushed(0.0, 0.0, outputs=("strain@0:0.5", "strain@0:-0.5", "axial_force", "curvature@1"), axial_load=2e6)
+    right, left, force, curvature = column.simulate([1.0])[:, 0]
+    assert right == pytest.approx(left, rel=1e-9) and -1e-4 < right < -5e-5
+    assert force == pytest.approx(-2e6, rel=1e-9) and abs(curvature) < 1e-12
+
+
+def test_rotation_from_the_foundation_includes_strain_penetration():
+    outputs = ("curvature@0", "rotation@0:0.6", "rotation@0.1:0.6", "rotation@0:0.1")
+    column = pushed(0.0, 0.08, outputs=outputs, penetration=0.2, parameters=("Ec", "penetration"))
+    for factor in (1.0, 2.0):
+        base, whole, upper, lower = column.simulate([1.0, factor])[:, 1]
+        above = lower - 0.2 * factor * base  # rotation of the column alone
+        assert whole == pytest.approx(lower + upper, rel=1e-12)
+        assert 0.05 * base < above < 0.1 * base
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 7])
+def test_rotation_over_an_element_is_the_sum_of_the_element(n):
+    points, weights = gauss_lobatto(n)
+    sections = Sections(6.0, 0.5, 2, points)
+    np.testing.assert_allclose(sections.integral(0.0, 3.0)[:n], 3.0 * weights, rtol=1e-12)
+    np.testing.assert_allclose(sections.integral(0.0, 6.0), 3.0 * np.tile(weights, 2), rtol=1e-12)
+    np.testing.assert_array_equal(sections.interpolation(3.0), np.eye(2 * n)[n])  # a node: the upper element
+    np.testing.assert_array_equal(sections.interpolation(6.0), np.eye(2 * n)[-1])
+    halves = sections.integral(0.0, 1.234) + sections.integral(1.234, 6.0)
+    np.testing.assert_allclose(halves, sections.integral(0.0, 6.0), atol=1e-12)
+
+
+def test_sensors_of_any_mesh_agree():
+    values = [pushed(0.0, 0.03, mesh=mesh, outputs=SENSORS).simulate([1.0])[:, 1] for mesh in (40, Patches())]
+    np.testing.assert_allclose(*values, rtol=0.02, atol=1.0)
+
+
+def test_sensors_are_data_and_predictions(shaken, rng):
+    """A likelihood of strains and rotations, and bands of a curvature that was not measured."""
+    thetas = 1.0 + 0.1 * rng.standard_normal((4, 5))
+    measured = replace(shaken, outputs=("displacement", "strain@0.3:-0.55", "rotation@0:0.6"))
+    truth = Measurements(measured.channels, measured.dt, measured.simulate(np.ones(5)))
+    likelihood = FELikelihood(measured, truth)
+    sigmas = truth.values.std(axis=1) * 0.05
+    at_truth, elsewhere = (likelihood(np.append(theta, sigmas)) for theta in (np.ones(5), thetas[0]))
+    assert at_truth > elsewhere + 1.0
+    np.testing.assert_allclose(
+        measured.misfit_batch(thetas, truth.values).misfit,
+        np.square(measured.simulate_batch(thetas).response - truth.values).sum(axis=2),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("moment", "outputs out of"),
+        ("curvature", "outputs out of"),
+        ("curvature@top", "outputs out of"),
+        ("curvature@0.3:0.1", "outputs out of"),
+        ("strain@0.3", "outputs out of"),
+        ("rotation@0.3", "outputs out of"),
+        ("force", "outputs out of"),
+        ("curvature@-0.1", "heights between 0 and 7.3152 m"),
+        ("curvature@nan", "outputs out of"),
+        ("rotation@0:9", "heights between 0 and"),
+        ("rotation@0.6:0.6", "a lower and a higher section"),
+        ("strain@0.3:0.62", "between -0.6096 and 0.6096 m"),
+        (3.0, "outputs out of"),
+    ],
+)
+def test_wrong_names_are_rejected(shaken, name, words):
+    with pytest.raises(ValueError, match=words):
+        replace(shaken, outputs=("displacement", name))
+
+
+def test_the_loading_decides_which_outputs_of_the_top_there_are():
+    with pytest.raises(ValueError, match="outputs out of .'force'"):
+        pushed(0.0, 0.01, outputs=("acceleration",))
+    sections = Sections(7.0, 0.5, 1, gauss_lobatto(3)[0])
+    with pytest.raises(ValueError, match="once"):
+        parse_outputs(("base_moment", "base_moment"), sections, ("force",))
