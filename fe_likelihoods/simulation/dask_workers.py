@@ -12,6 +12,7 @@ __all__ = ["LONGEST_WITHOUT_WORKER", "WorkerWatch"]
 logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN_CHECKS = 5.0
+SECONDS_TO_START = 60.0  # before the same workers are asked for again
 # How long a map waits for a first or another worker of a cluster that has none [s]
 LONGEST_WITHOUT_WORKER = 3600.0
 
@@ -40,6 +41,7 @@ class WorkerWatch:
     def __init__(self, client: Any, futures: Sequence[Any]):
         self._client, self._futures = client, futures
         self._ends, self._gave_up = threading.Event(), False
+        self._asked: tuple[set, float] = (set(), 0.0)
         self._thread = threading.Thread(target=self._watch, name="watch of dask workers", daemon=True)
 
     def __enter__(self) -> "WorkerWatch":
@@ -58,7 +60,7 @@ class WorkerWatch:
         last_seen = time.monotonic()
         while not self._ends.wait(SECONDS_BETWEEN_CHECKS):
             with contextlib.suppress(Exception):  # the cluster or the client is closing
-                restart_lost_workers(getattr(self._client, "cluster", None))
+                self._restart_lost_workers(getattr(self._client, "cluster", None))
                 if self._client.nthreads():
                     last_seen = time.monotonic()
             if time.monotonic() - last_seen > LONGEST_WITHOUT_WORKER:
@@ -67,11 +69,16 @@ class WorkerWatch:
                     self._client.cancel(self._futures, force=True)
                 return
 
-
-def restart_lost_workers(cluster: Any) -> None:
-    """Ask a cluster for the workers that it should have by its own specification, and has given up."""
-    wanted, present = getattr(cluster, "worker_spec", None), getattr(cluster, "workers", None)
-    if wanted is None or present is None or not (lost := set(wanted) - set(present)):
-        return
-    logger.warning("The dask cluster has given up %d of its %d workers: starting them again", len(lost), len(wanted))
-    cluster.scale(len(wanted))
+    def _restart_lost_workers(self, cluster: Any) -> None:
+        """Ask a cluster for the workers that it should have by its own specification, and has given up."""
+        wanted, present = getattr(cluster, "worker_spec", None), getattr(cluster, "workers", None)
+        if wanted is None or present is None:
+            return
+        lost, (asked, when) = set(wanted) - set(present), self._asked
+        if not lost or (lost <= asked and time.monotonic() - when < SECONDS_TO_START):
+            return
+        self._asked = lost, time.monotonic()
+        logger.warning(
+            "The dask cluster has given up %d of its %d workers: starting them again", len(lost), len(wanted)
+        )
+        cluster.scale(len(wanted))

@@ -15,7 +15,7 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.probability.failures import TooManyFailures
-from fe_likelihoods.simulation import processes
+from fe_likelihoods.simulation import dask_workers, executors, processes
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -165,16 +165,87 @@ def _interrupts(item):
     return _Interrupt()
 
 
+class Cluster:
+    """A client of a cluster that has lost its workers, and the cluster: a map ends when it is asked for them."""
+
+    def __init__(self, restarts):
+        self.cluster, self.worker_spec, self.workers = self, {0: {}, 1: {}}, {1: {}}
+        self.restarts, self.asked, self.cancelled, self.ended = restarts, [], [], threading.Event()
+
+    def nthreads(self):
+        return dict.fromkeys(self.workers, 1)
+
+    def scale(self, n):
+        self.asked.append(n)
+        if self.restarts:
+            self.workers = dict.fromkeys(self.worker_spec)
+            self.ended.set()
+
+    def map(self, function, groups, pure):
+        self.workers = {}
+        self.answers = [function(group) for group in groups]
+        return self.answers
+
+    def gather(self, futures):
+        assert self.ended.wait(10.0), "the map waits for ever"
+        if self.cancelled:
+            raise OSError("cancelled")
+        return self.answers
+
+    def cancel(self, futures, force):
+        self.cancelled = futures
+        self.ended.set()
+
+
+@pytest.mark.parametrize("restarts", [True, False])
+def test_a_map_never_waits_for_workers_that_dask_has_given_up(restarts, monkeypatch):
+    monkeypatch.setattr(dask_workers, "SECONDS_BETWEEN_CHECKS", 0.01)
+    monkeypatch.setattr(dask_workers, "LONGEST_WITHOUT_WORKER", 10.0 if restarts else 0.1)
+    monkeypatch.setattr(executors, "wait_for_nanny", lambda: None)
+    client = Cluster(restarts)
+    pool = executors.DaskExecutor(client)
+    if restarts:
+        assert pool.map(lambda item: (item, ""), [1, 2, 3]) == [(1, ""), (2, ""), (3, "")]
+    else:
+        with pytest.raises(RuntimeError, match="the dask cluster has had no worker for 0.1 s: start workers"):
+            pool.map(lambda item: (item, ""), [1, 2, 3])
+        assert len(client.cancelled) == 3
+    assert client.asked == [2]  # once
+
+
+@pytest.mark.slow
 @needs("dask")
 @needs("distributed")
-def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_path):
+def test_dask_gives_up_every_worker_that_dies(tmp_path, monkeypatch):
+    """A cluster that does not wait for the next process of a worker, as a busy machine is too slow for it."""
     import dask
     from dask.distributed import Client, LocalCluster
+
+    monkeypatch.setattr(dask_workers, "LONGEST_WITHOUT_WORKER", 300.0)
+    x = np.column_stack([np.concatenate([theta(bad.FINE, 2), theta(bad.KILLED)]), np.full(3, 0.5)])
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 2, "distributed.deploy.lost-worker-timeout": "0s"}),
+        LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        posterior = posterior_of(DiesOnce(tmp_path), top=20.0, pool=client)
+        assert np.isfinite(posterior(x)).all()
+        values = posterior_of(Treacherous(), top=20.0, pool=client)(x)
+        assert np.isfinite(values[:2]).all() and np.isneginf(values[2])
+
+
+@needs("dask")
+@needs("distributed")
+def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_path, monkeypatch):
+    import dask
+    from dask.distributed import Client, LocalCluster
+
+    monkeypatch.setattr(dask_workers, "LONGEST_WITHOUT_WORKER", 300.0)
 
     thetas = np.concatenate([theta(bad.FINE, 3), theta(bad.KILLED), theta(bad.FINE, 3)])
     x = np.column_stack([thetas, np.full(7, 0.5)])
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 2}),
+        dask.config.set({"distributed.scheduler.allowed-failures": 2, "distributed.deploy.lost-worker-timeout": "60s"}),
         LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
         Client(cluster) as client,
     ):
