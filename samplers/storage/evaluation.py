@@ -3,8 +3,12 @@
 `Evaluator` calls a user's function as emcee does (batch, pool or map; dictionaries for named parameters). Points
 outside the support of the prior are not evaluated. A point for which the function raises an exception or returns NaN
 counts as -inf, and its reason is recorded.
+
+The journal gets a batch when it is finished. Where a function takes one point at a time, it gets finished points about
+once per second, so that a process that is killed loses the last second.
 """
 
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,6 +18,7 @@ from emcee.ensemble import ndarray_to_list_of_dicts
 
 from ..tempering.budget import Budget, BudgetExhausted
 from .checkpoint import Checkpoint
+from .first_evaluations import POINTS
 from .journal import EvaluatedBatch, merge_batches
 from .returned_values import ErrorCapturing, log_densities, log_probabilities, outcomes
 
@@ -21,6 +26,7 @@ __all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit"
 
 KEPT_FAILURES = 1000
 KEPT_REASONS = 100
+SECONDS_BETWEEN_NOTES = 1.0
 
 
 class Failures:
@@ -101,13 +107,24 @@ class CallingConvention(NamedTuple):
     parameter_names: Mapping[str, Any] | None = None
     blobs_dtype: Any = None
 
-    def call(self, function: Callable, coords: np.ndarray, pool: Any = None) -> Any:
-        """Results of a function for points (n, ndim)."""
+    def call(
+        self, function: Callable, coords: np.ndarray, pool: Any = None, note: Callable[[list], None] | None = None
+    ) -> Any:
+        """Results of a function for points (n, ndim); `note` is called with the first of them about once per second.
+
+        A function of a batch has no first results, and neither has a pool whose ``map`` returns a list.
+        """
         named = self.parameter_names
         points = coords if named is None else ndarray_to_list_of_dicts(coords, named)
         if self.vectorize:
             return function(points)
-        return list((map if pool is None else pool.map)(function, points))
+        results, noted = [], time.perf_counter()
+        for result in (map if pool is None else pool.map)(function, points):
+            results.append(result)
+            if note is not None and time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
+                note(results)
+                noted = time.perf_counter()
+        return results
 
 
 class EvaluationRecords:
@@ -313,15 +330,34 @@ class Evaluator:
         return self._records.pack_batch(log_base, inside, merge_batches(batches))
 
     def _compute_and_store(self, coords: np.ndarray) -> EvaluatedBatch:
-        batch = self.compute(coords)
+        stored, storable = 0, self._checkpoint is not None
+
+        def store_first(results: list) -> None:
+            """Store what is known of a long batch: plain numbers, since a failure may yet end the run."""
+            nonlocal stored, storable
+            storable = storable and all(isinstance(r, float | np.floating) and r == r for r in results[stored:])
+            if not storable:
+                return
+            part = self._as_batch(coords[stored : len(results)], results[stored:])
+            if self._check is not None:
+                if np.isfinite(part.log_prob).sum() < POINTS:
+                    return
+                self._check(self, part)
+                self._check = None
+            self._checkpoint.evaluated(part)
+            self.new_evaluations += len(part.coords)
+            stored = len(results)
+
+        results = self._convention.call(self._function, coords, self.pool, store_first)
+        batch = self._as_batch(coords, results)
         if self._limit is not None:
             self._limit.check(batch, self.evaluations, self.failures.count)
         if self._check is not None:
             self._check(self, batch)
             self._check = None
-        if self._checkpoint is not None:
-            self._checkpoint.evaluated(batch)
-        self.new_evaluations += len(batch.coords)
+        if self._checkpoint is not None and stored < len(coords):
+            self._checkpoint.evaluated(batch.after(stored))
+        self.new_evaluations += len(coords) - stored
         return batch
 
     def _first_records(self, log_base: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
@@ -337,7 +373,9 @@ class Evaluator:
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""
-        results = self._convention.call(self._function, coords, self.pool)
+        return self._as_batch(coords, self._convention.call(self._function, coords, self.pool))
+
+    def _as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
         log_prob, blobs, reasons = outcomes(results, len(coords), self._convention.blobs_dtype, self._name)
         if self._name == "log_likelihood_fn":
             log_prob = log_prob + self.log_prior(coords)

@@ -130,6 +130,12 @@ class EvaluatedBatch(NamedTuple):
     blobs: np.ndarray | None
     reasons: dict[int, str]
 
+    def after(self, first: int) -> "EvaluatedBatch":
+        """The points after the `first` ones."""
+        blobs = None if self.blobs is None else self.blobs[first:]
+        reasons = {row - first: reason for row, reason in self.reasons.items() if row >= first}
+        return EvaluatedBatch(self.coords[first:], self.log_prob[first:], blobs, reasons)
+
 
 def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
     """Several batches as one; at least one is needed."""

@@ -2,13 +2,15 @@
 
 import gc
 import logging
+from concurrent.futures import ThreadPoolExecutor
 
+import emcee
 import numpy as np
 import pytest
 
 from samplers import SMCSampler
 from samplers.storage.journal_contents import read_journal
-from tests.contract.targets import WithBlobs
+from tests.contract.targets import Gaussian, WithBlobs
 from tests.faults.interrupted import interrupt_lines, make, state_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
@@ -212,3 +214,44 @@ def test_steps_that_are_not_stored_are_not_made_again(tmp_path, caplog):
         again = script(tmp_path / "run.h5")
     assert state_of(again) == state_of(whole) and again.iteration == 4
     assert again.evaluations == whole.evaluations and again.report()["new_evaluations"] == 0
+
+
+class Counted(Gaussian):
+    """Takes one point, and is interrupted at a chosen one."""
+
+    fingerprint = "counted"
+    interrupted_at = 0
+
+    def __call__(self, x):
+        if self.calls + 1 == self.interrupted_at:
+            raise KeyboardInterrupt
+        return super().__call__(x)
+
+
+@pytest.mark.parametrize("with_pool", [False, True])
+@pytest.mark.parametrize("at", [5, 15, 62])
+def test_finished_points_of_a_batch_are_kept(at, with_pool, tmp_path, monkeypatch):
+    """A function of one point: what was known a second before is not evaluated again, and nothing else changes."""
+    monkeypatch.setattr("samplers.storage.evaluation.SECONDS_BETWEEN_NOTES", 0.0)
+
+    def run(path, interrupted_at, pool):
+        posterior = Counted(2)
+        posterior.interrupted_at = interrupted_at
+        backend = emcee.backends.HDFBackend(str(path))
+        settings = {"seed": 5, "min_moves": 1, "max_moves": 1, "check_draws": 3, "recycle": False}
+        sampler = SMCSampler(20, 2, posterior, pool=pool, backend=backend, **settings)
+        try:
+            sampler.run_mcmc(None, 2)
+        except KeyboardInterrupt:
+            sampler.backend.close()
+            return None, posterior.calls
+        return sampler, posterior.calls
+
+    with ThreadPoolExecutor(1) as executor:
+        pool = executor if with_pool else None
+        whole, calls = run(tmp_path / "whole.h5", 0, pool)
+        _, before = run(tmp_path / "run.h5", at, pool)
+        sampler, after = run(tmp_path / "run.h5", 0, pool)
+    assert before >= at - 1 and after <= calls - (at - 1)
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+    assert (sampler.evaluations, sampler.log_evidence) == (whole.evaluations, whole.log_evidence)
