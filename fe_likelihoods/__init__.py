@@ -143,6 +143,13 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         plot_residuals,
         residual_checks,
     )
+    from .probability.time_shift_noise import (
+        TimeShiftNoise,
+    )
+    from .signals.alignment import (
+        Alignment,
+        align,
+    )
     from .signals.channels import (
         Channel,
         Measurements,
@@ -200,6 +207,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     )
 
 __all__ = [
+    "Alignment",
     "AutoregressiveNoise",
     "AveragedPrediction",
     "Bars",
@@ -254,10 +262,12 @@ __all__ = [
     "StaleCache",
     "Steel",
     "SteelCoupon",
+    "TimeShiftNoise",
     "TooManyFailures",
     "TransientReason",
     "TruncatedNormal",
     "Uniform",
+    "align",
     "average_predictions",
     "effective_samples",
     "exceedance",
@@ -382,6 +392,7 @@ _EXPORTS = {
     ),
     "probability.posterior": ("Posterior",),
     "probability.priors": ("Prior",),
+    "probability.time_shift_noise": ("TimeShiftNoise",),
     "probability.residuals": (
         "ResidualChecks",
         "effective_samples",
@@ -399,6 +410,10 @@ _EXPORTS = {
         "write_dataset",
     ),
     "signals.durations": ("growing_durations",),
+    "signals.alignment": (
+        "Alignment",
+        "align",
+    ),
     "signals.error_measures": ("rrmse",),
     "signals.events": (
         "EventWindow",

@@ -180,7 +180,7 @@ class ResponseTarget:
     Raises
     ------
     ValueError
-        If the statistics of the noise are not quadratic in the residuals.
+        If the statistics of the noise are not quadratic in the residuals, or the noise has time shifts.
     """
 
     def __init__(self, posterior: _Posterior) -> None:
@@ -191,6 +191,11 @@ class ResponseTarget:
         self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)
         self.n_noise = self.ndim - self.n_structural
         self.comparison = self._likelihood.measured
+        if isinstance(self.comparison, Comparison) and self.comparison.lags is not None:
+            raise ValueError(
+                "a guide cannot emulate time shifts of channels: sample without a guide, or estimate the lags with "
+                "align and correct the measurements with Measurements.shift"
+            )
         self.measured = measured_values(self.comparison)
         self.n_steps = self.measured.shape[1]
         self.n_samples = self._likelihood.n_samples

@@ -10,7 +10,7 @@ import hashlib
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -37,7 +37,7 @@ from ..simulation.model import (
 from ..simulation.repeated_points import RepeatedPoints
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
-from .inputs import as_points, check_statistic, match_measurements
+from .inputs import as_rows, check_statistic, match_measurements
 from .requested_simulations import Requested, Simulated
 from .sample_counts import count_samples
 
@@ -57,6 +57,8 @@ class CachedSimulations:
         As for `FELikelihood`.
     statistic : Statistic or None
         Statistic of the residuals; None for the sums of squares.
+    time_shifts : mapping of str to float, optional
+        Largest unknown time shifts of channels [s].
     """
 
     def __init__(
@@ -69,6 +71,7 @@ class CachedSimulations:
         memory_bytes: int,
         cache: SimulationCache | str | os.PathLike | None,
         max_failure_share: float,
+        time_shifts: Mapping[str, float] | None = None,
     ) -> None:
         self._failures = FailureLog(model.parameter_names, max_failure_share)
         self.model = model
@@ -76,8 +79,8 @@ class CachedSimulations:
         self._statistic = statistic
         self._n_structural = len(model.parameter_names)
         # what responses are compared with: the measured values, or a Comparison where samples are missing
-        self.measured = compare_with(self.measurements, model.dt, model.n_steps)
-        self.n_samples = count_samples(self.measurements.values)
+        self.measured = compare_with(self.measurements, model.dt, model.n_steps, time_shifts)
+        self.n_samples = count_samples(getattr(self.measured, "values", self.measured))
         self._response_shape = (len(model.channels), model.n_steps)
         self._width = statistic_width(self.measured, statistic)
         check_statistic(statistic, self.measured)
@@ -140,8 +143,8 @@ class CachedSimulations:
         text = f"{self.model.fingerprint} {self.measurements.fingerprint}"
         if self._statistic is not None:
             text += f" {self._statistic.__module__}.{self._statistic.__qualname__}"
-        if isinstance(self.measured, Comparison) and self.measured.interpolated:
-            text += f" {self.model.dt} {self.model.n_steps} six points"
+        if isinstance(self.measured, Comparison):
+            text += self.measured.description
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
@@ -184,7 +187,7 @@ class CachedSimulations:
         (n, n_numbers) float
             NaN where there is no usable simulation.
         """
-        thetas = _as_rows(thetas, self.model.parameter_names)
+        thetas = as_rows(thetas, self.model.parameter_names)
         if np.isfinite(thetas).all():
             return self._statistics(thetas)
         result = np.full((len(thetas), self._width), np.nan)
@@ -214,7 +217,7 @@ class CachedSimulations:
         TooManyFailures
             As for `statistics`: the finished simulations are cached.
         """
-        thetas = _as_rows(thetas, self.model.parameter_names)
+        thetas = as_rows(thetas, self.model.parameter_names)
         finite = np.flatnonzero(np.isfinite(thetas).all(axis=1))
         keys, distinct = distinct_keys(thetas[finite])
         batch = self._responses(keys, distinct)
@@ -246,7 +249,7 @@ class CachedSimulations:
         ValueError
             If the numbers of rows differ, or the statistics are of another noise.
         """
-        thetas, statistics = _as_rows(thetas, self.model.parameter_names), np.asarray(statistics, dtype=float)
+        thetas, statistics = as_rows(thetas, self.model.parameter_names), np.asarray(statistics, dtype=float)
         if statistics.shape != (len(thetas), self._width) or len(reasons) != len(thetas):
             raise ValueError(
                 f"recall: expected statistics of shape ({len(thetas)}, {self._width}) and {len(thetas)} reasons; got "
@@ -495,9 +498,3 @@ class CachedSimulations:
         if responses:
             batch.response[[bool(reason) for reason in reasons]] = np.nan
         return Simulated(misfit, reasons, batch.response if responses else None)
-
-
-def _as_rows(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Structural parameters in an array (n, n_structural)."""
-    thetas = as_points(thetas, names)
-    return thetas if thetas.ndim == 2 else thetas[None]

@@ -9,10 +9,11 @@ import numpy as np
 
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
+from ..signals.sampling import same_step
 from ..simulation.model import Model, Statistic
-from .noise import Noise, noise_channels
+from .noise import Noise, noise_channels, noise_time_shifts
 
-__all__ = ["as_points", "check_model", "check_noise_channels", "check_statistic", "match_measurements"]
+__all__ = ["as_points", "as_rows", "check_model", "check_noise_channels", "check_statistic", "match_measurements"]
 
 _MODEL_MEMBERS = ("parameter_names", "channels", "dt", "n_steps", "fingerprint", "simulate")
 
@@ -62,6 +63,12 @@ def complete_repr(thing: Any) -> str:
     return text
 
 
+def as_rows(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Points in an array (n, ndim), also for one point; see `as_points`."""
+    thetas = as_points(thetas, names)
+    return thetas if thetas.ndim == 2 else thetas[None]
+
+
 def check_model(model: Model) -> None:
     """Raise ValueError, with the names of the missing members, if an object is not a model."""
     # the class first, so that no property is computed
@@ -74,13 +81,18 @@ def check_model(model: Model) -> None:
 
 
 def check_noise_channels(model: Model, noise: Noise) -> None:
-    """Raise ValueError if the channels of a noise are not those of the model."""
+    """Raise ValueError if the channels of a noise, or its step, are not those of the model."""
     expected = [channel.name for channel in model.channels]
     got = [channel.name for channel in noise_channels(noise, model.channels)]
     if expected != got:
         raise ValueError(
             f"the noise's channels are {', '.join(got)}, the model's are {', '.join(expected)}; make the noise with "
             "model.channels"
+        )
+    if noise_time_shifts(noise) and not same_step(noise.dt, model.dt):
+        raise ValueError(
+            f"the time shifts of the noise are for a response with a step of {noise.dt} s, the model's step is "
+            f"{model.dt} s; make the noise with model.dt"
         )
 
 

@@ -22,7 +22,7 @@ from .cached_simulations import CachedSimulations
 from .distributions import Distribution, RandomState
 from .inputs import as_points, check_model, check_noise_channels, complete_repr
 from .marginal_noise import MarginalNoise
-from .noise import GaussianNoise, Noise, noise_statistic
+from .noise import GaussianNoise, Noise, noise_statistic, noise_time_shifts
 from .report import simulation_report
 
 __all__ = ["FELikelihood"]
@@ -121,7 +121,17 @@ class FELikelihood(CachedSimulations):
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
         self.fast_parameters = tuple(range(len(structural), len(self.parameter_names)))
         statistic = noise_statistic(self.noise)
-        super().__init__(model, measurements, statistic, pool, memory_rows, memory_bytes, cache, max_failure_share)
+        super().__init__(
+            model,
+            measurements,
+            statistic,
+            pool,
+            memory_rows,
+            memory_bytes,
+            cache,
+            max_failure_share,
+            noise_time_shifts(self.noise),
+        )
 
     def __call__(self, x: Any) -> np.ndarray | float:
         """Same as `log_likelihood`."""

@@ -39,6 +39,7 @@ __all__ = [
     "SharedGaussianNoise",
     "noise_channels",
     "noise_statistic",
+    "noise_time_shifts",
     "options_repr",
     "sampled_noise",
     "set_channels",
@@ -59,6 +60,8 @@ class Noise(Protocol):
     * ``statistic``, a function of a module that takes the residuals (n_channels, n_steps) and returns the numbers
       (n_numbers,) which `log_likelihood` needs, the sums of squares (n_channels,) first. Without it these are all.
       Residuals of missing samples are NaN; a statistic without a rule for them is refused with such measurements.
+    * ``time_shifts``, the largest unknown time shifts of channels [s] by name, with the statistics of
+      `fe_likelihoods.probability.time_shift_noise.TimeShiftNoise`.
     * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
       errors (n, n_channels) [SI]; needed for predictions with noise.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
@@ -87,6 +90,11 @@ def noise_channels(noise: Noise, default: Sequence[Channel]) -> tuple[Channel, .
 def noise_statistic(noise: Noise) -> Statistic | None:
     """Statistic of the residuals that a noise needs, None for the sums of squares."""
     return getattr(noise, "statistic", None)
+
+
+def noise_time_shifts(noise: Noise) -> Mapping[str, float] | None:
+    """Largest unknown time shifts of channels [s] of a noise with such parameters, None for others."""
+    return getattr(noise, "time_shifts", None)
 
 
 def sampled_noise(noise: Noise) -> Noise:

@@ -259,6 +259,11 @@ class Measurements:
             starts.append(0.0 if abs(first) <= 1e-9 * dt else first)
         return self._with_rows(range(self.n_channels), rows, starts, self.steps)
 
+    def shift(self, seconds: float) -> "Measurements":
+        """Return the measurements with all times later by `seconds` [s], to correct the clock of a logger."""
+        shift = _check_start(seconds)
+        return replace(self, start=tuple(start + shift for start in self.starts))
+
     def decimate(self, factor: int) -> "Measurements":
         """Return every `factor`-th sample, starting with the first one, without a filter.
 

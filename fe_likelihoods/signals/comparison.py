@@ -10,17 +10,20 @@ and the value of the response at the same instant is what it is compared with. A
 motion that the sensor has measured; the noise of thinned white samples stays white.
 """
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .channels import Measurements
-from .interpolation import Interpolation, interpolate, make_interpolation
+from .interpolation import POINTS, Interpolation, interpolate, make_interpolation
 from .sampling import same_sampling, same_step
 
-__all__ = ["Comparison", "compare_with", "measured_values"]
+__all__ = ["Comparison", "Lags", "compare_with", "measured_values"]
 
 _LATEST = 1e-6  # in steps: how far a sample may be after the end of the response, for round-off
 
@@ -35,15 +38,27 @@ class Comparison:
         Samples [SI], NaN where there is none.
     places : tuple of Interpolation or None, one per channel
         How the response is evaluated at the times of each channel; None where its times are those of the response.
+    lags : Lags or None
+        Lags at which the residuals are also formed, for unknown time shifts.
     """
 
     values: NDArray[np.float64]
     places: tuple[Interpolation | None, ...]
+    lags: "Lags | None" = None
 
     @property
     def interpolated(self) -> bool:
         """Whether the response of a channel is evaluated between its samples."""
         return any(place is not None and place.weights is not None for place in self.places)
+
+    @property
+    def description(self) -> str:
+        """What residuals depend on besides response and measurements: interpolation and lags, for fingerprints."""
+        text = " interpolated by six points" if self.interpolated else ""
+        if self.lags is not None:
+            shifted = [k for k, place in enumerate(self.lags.places) if place is not None]
+            text += f" lags to {self.lags.count} of channels {shifted}"
+        return text
 
     @cached_property
     def missing(self) -> NDArray[np.bool_]:
@@ -73,7 +88,45 @@ class Comparison:
         return residuals
 
 
-def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray[np.float64] | Comparison:
+class Lags(NamedTuple):
+    """Lags of channels whose time shift is unknown.
+
+    Attributes
+    ----------
+    count : int
+        The lags are -count ... count steps of the response.
+    places : tuple of Interpolation or None, one per channel
+        How the response is evaluated at (sample, lag), all samples of one lag after the other; None for channels
+        without a shift.
+    samples : tuple of ndarray of int or None, one per channel
+        The samples of each channel that are compared.
+    """
+
+    count: int
+    places: tuple[Interpolation | None, ...]
+    samples: tuple[NDArray[np.intp] | None, ...]
+
+    def sums(self, response: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return sums of products of residuals at neighbouring lags, shape ((2 count + 1) * POINTS, n_channels).
+
+        The number of row ``POINTS * k + j`` is the sum over the samples of e_k e_(k + j), where e_k is the residual at
+        lag k; zero for channels without a shift, and where k + j is no lag.
+        """
+        n = 2 * self.count + 1
+        sums = np.zeros((n, POINTS, len(values)))
+        for c, (place, samples) in enumerate(zip(self.places, self.samples, strict=True)):
+            if place is None:
+                continue
+            residuals = interpolate(response[c], place).reshape(n, -1) - values[c, samples]
+            products = residuals @ residuals.T
+            for j in range(min(POINTS, n)):
+                sums[: n - j, j, c] = np.diagonal(products, j)
+        return sums.reshape(n * POINTS, len(values))
+
+
+def compare_with(
+    measurements: Measurements, dt: float, n_steps: int, time_shifts: Mapping[str, float] | None = None
+) -> NDArray[np.float64] | Comparison:
     """Return what a response is compared with.
 
     Parameters
@@ -84,6 +137,9 @@ def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray
         Time step of the response [s].
     n_steps : int
         Number of samples of the response.
+    time_shifts : mapping of str to float, optional
+        Largest unknown time shift of channels [s], by their names. Samples within this time of an end of the response,
+        and three further steps, are then left out of their channel.
 
     Returns
     -------
@@ -93,7 +149,8 @@ def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray
     Raises
     ------
     ValueError
-        If the measurements do not end with the response, or a sample is before the first one of the response.
+        If the measurements do not end with the response, a sample is before the first one of the response, or a time
+        shift leaves no sample.
 
     Notes
     -----
@@ -119,9 +176,45 @@ def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray
             )
         # a missing sample may be outside the response: any place within serves
         places.append(make_interpolation(dt, n_steps, np.where(there, times, known[0])))
+    if time_shifts:
+        return _with_lags(measurements, dt, n_steps, time_shifts, places)
     if all(place is None for place in places) and not np.isnan(measurements.values).any():
         return measurements.values
     return Comparison(measurements.values, tuple(places))
+
+
+def _with_lags(
+    measurements: Measurements,
+    dt: float,
+    n_steps: int,
+    time_shifts: Mapping[str, float],
+    places: Sequence[Interpolation | None],
+) -> Comparison:
+    largest = max(time_shifts.values())
+    count = math.ceil(largest / dt - _LATEST) + POINTS // 2
+    values = np.array(measurements.values)
+    lag_places: list[Interpolation | None] = []
+    lag_samples: list[NDArray[np.intp] | None] = []
+    for row, channel in enumerate(measurements.channels):
+        if channel.name not in time_shifts:
+            lag_places.append(None)
+            lag_samples.append(None)
+            continue
+        times = measurements.times(channel.name)
+        first, last = (count - _LATEST) * dt, (n_steps - 1 - count + _LATEST) * dt
+        values[row, (times < first) | (times > last)] = np.nan
+        samples = np.flatnonzero(np.isfinite(values[row]))
+        if not samples.size:
+            raise ValueError(
+                f"no sample of channel {channel.name!r} is farther than {count * dt:g} s from both ends of the "
+                f"response, which lasts {(n_steps - 1) * dt:g} s, so its time shift of up to "
+                f"{time_shifts[channel.name]:g} s is beyond the record; give a smaller one"
+            )
+        lags = dt * np.arange(-count, count + 1)
+        shifted = (times[samples] - lags[:, None]).ravel()
+        lag_places.append(make_interpolation(dt, n_steps, shifted))
+        lag_samples.append(samples)
+    return Comparison(values, tuple(places), Lags(count, tuple(lag_places), tuple(lag_samples)))
 
 
 def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:

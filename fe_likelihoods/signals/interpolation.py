@@ -10,9 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Interpolation", "interpolate", "make_interpolation"]
+__all__ = ["POINTS", "Interpolation", "interpolate", "make_interpolation"]
 
-_POINTS = 6
+POINTS = 6
+"""Number of samples that determine a value between two of them."""
+
 _SAME_TIME = 1e-6  # in steps: times that are nearer to a sample are those of the sample
 
 
@@ -53,7 +55,7 @@ def make_interpolation(dt: float, n_steps: int, times: NDArray[np.float64]) -> I
     if same.all():
         return Interpolation(nearest.astype(np.intp), None)
     position = np.where(same, nearest, position)
-    points = min(_POINTS, n_steps)
+    points = min(POINTS, n_steps)
     first = np.clip(np.floor(position).astype(np.intp) - (points // 2 - 1), 0, n_steps - points)
     local = position - first
     weights = np.ones((points, len(position)))

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
+from ..signals.interpolation import POINTS
 from .changed_model import SentModel
 from .faults import ChangedModel, FailedRun, MisfitReason, is_transient, reason_of
 
@@ -279,6 +280,8 @@ def misfit_of_responses(
 
 def statistic_width(measured: np.ndarray | Comparison, statistic: Statistic | None = None) -> int:
     """Number of numbers that a statistic of the residuals has, by default the sums of squares."""
+    if isinstance(measured, Comparison) and measured.lags is not None:
+        return len(measured.values) * (1 + POINTS * (2 * measured.lags.count + 1))
     values = measured.values if isinstance(measured, Comparison) else measured
     return len((_sums_of_squares if statistic is None else statistic)(values))
 
@@ -291,7 +294,10 @@ def _reduced(response: np.ndarray, measured: np.ndarray | Comparison, reduce: St
     with np.errstate(over="ignore", invalid="ignore"):
         if isinstance(measured, Comparison):
             if not np.isfinite(response).all():  # also where no sample is affected
-                return np.full(len(reduce(measured.values)), np.nan)
+                return np.full(statistic_width(measured, reduce), np.nan)
+            if measured.lags is not None:
+                sums = _sums_of_squares(measured.known_residuals(response))
+                return np.concatenate([sums, measured.lags.sums(response, measured.values).ravel()])
             known = reduce is _sums_of_squares
             return reduce(measured.known_residuals(response) if known else measured.residuals(response))
         # contiguous rows, because the order of summation, and so the last bit, must not depend on the array's layout

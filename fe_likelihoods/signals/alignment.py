@@ -1,0 +1,328 @@
+r"""Lag between measurements and an excitation or a response, from their cross-correlation.
+
+A measured channel is modelled as :math:`y(t) = a\, r(t - \tau) + e(t)` with a reference r, an unknown factor a, the lag
+:math:`\tau` and an error e. With the correlation :math:`c(\tau)` of y and the shifted reference, the log-likelihood,
+maximised over a and the standard deviation of e, is :math:`-\frac n2 \log(1 - c^2(\tau))`. The lag is where the sum
+over the channels, with the effective number of samples in place of n, is largest.
+
+A structure delays and filters its excitation, so a channel of the structure is not a shifted record. Compare like with
+like: the record with the channel at its base, and the channels of the structure with a simulated response.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .channels import Measurements
+from .interpolation import interpolate, make_interpolation
+from .records import Record
+
+__all__ = ["Alignment", "align"]
+
+_FEWEST = 0.5  # share of the energy of a channel, and of its samples, that must overlap with the reference
+_WINDOW = 5.0  # length of the sums over lags of autocorrelations, in correlation times
+_GOOD = 0.7  # correlation below which the reference does not explain the channel
+
+
+class Alignment(NamedTuple):
+    """A lag, and how sure it is.
+
+    Attributes
+    ----------
+    lag : float
+        Time by which the measurements are later than the reference [s]. ``measurements.shift(-lag)`` corrects them.
+    standard_error : float
+        Standard error of the lag [s], if the highest peak is the right one.
+    correlation : dict of str to float
+        Correlation of each channel with the shifted reference [-]; negative for a sensor with the opposite sign.
+    probability : float
+        Probability of the highest peak against the second highest one, a different lag.
+    second_lag : float or None
+        Lag of the second highest peak [s]; None if there is none.
+    """
+
+    lag: float
+    standard_error: float
+    correlation: dict[str, float]
+    probability: float
+    second_lag: float | None
+
+    @property
+    def statement(self) -> str:
+        """How sure the lag is, in words."""
+        text = f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, correlation " + ", ".join(
+            f"{name} {value:.3f}" for name, value in self.correlation.items()
+        )
+        low = [name for name, value in self.correlation.items() if abs(value) < _GOOD]
+        if low:
+            text += f"; NOT SURE: {', '.join(low)} is not a shifted copy of the reference"
+        if self.probability < 0.99:
+            text += (
+                f"; NOT SURE: a lag of {self.second_lag:.5g} s is nearly as good, {self.probability:.0%} for the first"
+            )
+        return text
+
+
+class _Pair(NamedTuple):
+    """A channel and its reference.
+
+    Attributes
+    ----------
+    name : str
+        Name of the channel.
+    start, step : float
+        Time of its first sample and its step [s].
+    places : (n,) int
+        Places of the samples that are there.
+    values : (n,) float
+        These samples, without their mean.
+    dt : float
+        Step of the reference [s], which begins at zero.
+    reference : (n_steps,) float
+        The reference, without its mean.
+    """
+
+    name: str
+    start: float
+    step: float
+    places: NDArray[np.intp]
+    values: NDArray[np.float64]
+    dt: float
+    reference: NDArray[np.float64]
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        return self.start + self.step * self.places
+
+    @property
+    def end(self) -> float:
+        """Time of the last sample of the reference [s]."""
+        return (self.reference.size - 1) * self.dt
+
+
+def align(
+    reference: Record | Measurements,
+    measurements: Measurements,
+    channels: Sequence[str] | None = None,
+    max_lag: float | None = None,
+) -> Alignment:
+    """Estimate the lag of measurements by cross-correlation.
+
+    Parameters
+    ----------
+    reference : Record or Measurements
+        The excitation, or a response simulated with it (``Measurements(model.channels, model.dt, model.simulate(x))``).
+    measurements : Measurements
+        The measurements. Missing samples are left out.
+    channels : sequence of str, optional
+        The channels to use. Default: those that the response has as well; for a record, the only acceleration.
+    max_lag : float, optional
+        Largest lag in both directions [s]. Default: half of the shorter duration.
+
+    Returns
+    -------
+    Alignment
+        The lag, its error, and the statement of how sure it is.
+
+    Raises
+    ------
+    ValueError
+        If channels do not exist or do not fit, a channel or the reference is constant, the largest lag is beyond the
+        record, or the correlation is largest at the end of the range of lags.
+
+    Notes
+    -----
+    The standard error is that of least squares with correlated errors: the information of a channel is a^2 sum r'^2 /
+    (s^2 k), with the variance s^2 of the errors and k = 1 + 2 sum_j q_j p_j for the autocorrelations q of the errors
+    and p of the derivative r' of the reference.
+    """
+    pairs = _pairs(reference, measurements, channels)
+    duration = min(min(p.end, float(np.ptp(p.times))) for p in pairs)
+    if max_lag is None:
+        max_lag = 0.5 * duration
+    if not 0.0 < max_lag < duration:
+        raise ValueError(
+            f"max_lag must be positive and below {duration:g} s, the duration of the shorter of record and "
+            f"measurements, got {max_lag!r}"
+        )
+    step = min(p.step for p in pairs)
+    lags = step * np.arange(-math.floor(max_lag / step), math.floor(max_lag / step) + 1)
+    correlations = np.array([_on_lags(p, lags) for p in pairs])
+    rough = lags[int(np.argmax(-np.log1p(-np.minimum(correlations**2, 1.0 - 1e-12)).sum(axis=0)))]
+    effective = np.array([_effective_samples(p, rough) for p in pairs])
+    score = -0.5 * effective @ np.log1p(-np.minimum(correlations**2, 1.0 - 1e-12))
+    best = int(np.argmax(score))
+    if best in (0, len(lags) - 1):
+        raise ValueError(
+            f"the correlation is largest at a lag of {lags[best]:g} s, the end of the range; give a larger max_lag, or "
+            "other channels"
+        )
+    lag = _refine(pairs, effective, float(lags[best]), step)
+    peaks = 1 + np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:]))
+    others = peaks[np.abs(peaks - best) > 1]
+    second = int(others[np.argmax(score[others])]) if others.size else None
+    advantage = math.inf if second is None else _advantage(pairs, effective, lag, float(lags[second]))
+    probability = 1.0 / (1.0 + math.exp(-max(advantage, 0.0)))
+    found = {p.name: _correlation(p, lag) for p in pairs}
+    information = sum(_information(p, lag) for p in pairs)
+    error = 1.0 / math.sqrt(information) if information > 0.0 else math.inf
+    return Alignment(lag, error, found, probability, None if second is None else float(lags[second]))
+
+
+def _pairs(reference: Record | Measurements, measurements: Measurements, channels: Sequence[str] | None) -> list[_Pair]:
+    names = [channel.name for channel in measurements.channels]
+    if isinstance(channels, str):
+        raise ValueError(f"channels takes a sequence of names, for instance [{channels!r}]")
+    if isinstance(reference, Record):
+        if channels is None:
+            channels = [c.name for c in measurements.channels if c.dimension == "acceleration"]
+            if len(channels) != 1:
+                raise ValueError(
+                    f"expected one channel of acceleration among {', '.join(names)}, found {len(channels)}; name the "
+                    "one at the base with channels=, or give a simulated response instead of the record"
+                )
+        references = dict.fromkeys(channels, (reference.dt, reference.acceleration, "acceleration"))
+    else:
+        if not reference.complete or any(reference.starts):
+            raise ValueError("the reference needs all its samples, from time zero; give a simulated response")
+        simulated = {channel.name: channel for channel in reference.channels}
+        channels = [name for name in names if name in simulated] if channels is None else channels
+        missing = [name for name in channels if name not in simulated]
+        if missing or not channels:
+            raise ValueError(
+                f"the reference has the channels {', '.join(simulated)}; got {', '.join(missing or names)}"
+            )
+        references = {
+            name: (reference.steps[list(simulated).index(name)], reference.channel(name), simulated[name].dimension)
+            for name in channels
+        }
+    pairs = []
+    for name in channels:
+        one = measurements.select([name])
+        values, (channel,) = one.values[0], one.channels
+        dt, history, dimension = references[name]
+        if channel.dimension != dimension:
+            raise ValueError(
+                f"channel {name!r} is {channel.quantity!r}, its reference {dimension!r}; compare like with like"
+            )
+        there = np.isfinite(values)
+        if there.sum() < 10 or not np.ptp(values[there]) > 0.0 or history.size < 10 or not np.ptp(history) > 0.0:
+            raise ValueError(f"channel {name!r} and its reference need ten samples or more that are not constant")
+        known, (start,), (step,) = values[there], one.starts, one.steps
+        centred = history - history.mean()
+        pairs.append(_Pair(name, start, step, np.flatnonzero(there), known - known.mean(), dt, centred))
+    return pairs
+
+
+def _shifted(pair: _Pair, lag: float) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Samples whose times are within the shifted reference, and the reference there."""
+    times = pair.times - lag
+    inside = (times >= -1e-9) & (times <= pair.end + 1e-9)
+    at = make_interpolation(pair.dt, pair.reference.size, np.clip(times[inside], 0.0, pair.end))
+    return inside, interpolate(pair.reference, at)
+
+
+def _correlation(pair: _Pair, lag: float) -> float:
+    """Correlation of a channel and its shifted reference; zero where they do not overlap."""
+    inside, shifted = _shifted(pair, lag)
+    own = pair.values[inside]
+    if own.size < 3 or not np.ptp(own) > 0.0 or not np.ptp(shifted) > 0.0:
+        return 0.0
+    own, shifted = own - own.mean(), shifted - shifted.mean()
+    return float(own @ shifted / math.sqrt((own @ own) * (shifted @ shifted)))
+
+
+def _on_lags(pair: _Pair, lags: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correlations (n_lags,), interpolated between lags at the step of the channel; zero with too little overlap."""
+    steps = int(pair.end / pair.step + 1e-9) + 1
+    at = make_interpolation(pair.dt, pair.reference.size, np.minimum(pair.step * np.arange(steps), pair.end))
+    reference = interpolate(pair.reference, at)
+    there, values = np.zeros(pair.places[-1] + 1), np.zeros(pair.places[-1] + 1)
+    there[pair.places], values[pair.places] = 1.0, pair.values
+
+    def products(own: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sums over i of own_i other_(i - k), for k = 1 - steps, ..., own.size - 1."""
+        size = 2 ** (own.size + steps).bit_length()
+        return np.fft.irfft(np.fft.rfft(own, size) * np.fft.rfft(other[::-1], size), size)[: own.size + steps - 1]
+
+    ones = np.ones(steps)
+    n, own, squares = (products(each, ones) for each in (there, values, values**2))
+    other, other_squares, both = products(there, reference), products(there, reference**2), products(values, reference)
+    n = np.maximum(np.rint(n), 1.0)
+    own_power, other_power = squares - own**2 / n, other_squares - other**2 / n
+    energy = float(pair.values @ pair.values)
+    enough = (n >= max(10, _FEWEST * pair.places.size)) & (own_power >= _FEWEST * energy)
+    enough &= other_power > 1e-9 * float(reference @ reference)
+    found = np.where(enough, both - own * other / n, 0.0)
+    found /= np.sqrt(np.where(enough, own_power * other_power, 1.0))
+    grid = pair.start + pair.step * np.arange(1 - steps, there.size)
+    return np.interp(lags, grid, np.clip(found, -1.0, 1.0), left=0.0, right=0.0)
+
+
+def _advantage(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, other: float) -> float:
+    """Score of a lag minus that of another one, over the samples that both compare."""
+    total = 0.0
+    for pair, n in zip(pairs, effective, strict=True):
+        common = _shifted(pair, lag)[0] & _shifted(pair, other)[0]
+        if common.sum() >= 3:
+            part = pair._replace(places=pair.places[common], values=pair.values[common])
+            first, second = (min(_correlation(part, each) ** 2, 1.0 - 1e-12) for each in (lag, other))
+            total += 0.5 * n * common.mean() * (math.log1p(-second) - math.log1p(-first))
+    return total
+
+
+def _refine(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, step: float) -> float:
+    """The lag of the highest score within a step."""
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    def negative(trial: float) -> float:
+        squares = np.array([_correlation(p, trial) ** 2 for p in pairs])
+        return float(effective @ np.log1p(-np.minimum(squares, 1.0 - 1e-15)))
+
+    found = minimize_scalar(negative, bounds=(lag - step, lag + step), method="bounded", options={"xatol": 1e-6 * step})
+    return float(found.x)
+
+
+def _errors(pair: _Pair, lag: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Errors of the shifted reference that fits best, the shifted reference times its factor, and that factor."""
+    inside, shifted = _shifted(pair, lag)
+    own, shifted = pair.values[inside] - pair.values[inside].mean(), shifted - shifted.mean()
+    factor = float(own @ shifted / (shifted @ shifted))
+    return own - factor * shifted, factor * shifted, factor
+
+
+def _effective_samples(pair: _Pair, lag: float) -> float:
+    errors, _, _ = _errors(pair, lag)
+    correlation = _autocorrelation(errors)
+    return errors.size / max(1.0, 1.0 + 2.0 * _sum_to_window(correlation**2))
+
+
+def _information(pair: _Pair, lag: float) -> float:
+    """Information about the lag [1/s²]."""
+    errors, _, factor = _errors(pair, lag)
+    ahead, behind = (_shifted(pair, lag + sign * 0.05 * pair.dt) for sign in (1.0, -1.0))
+    both = ahead[0] & behind[0]
+    slope = factor * (ahead[1][both[ahead[0]]] - behind[1][both[behind[0]]]) / (0.1 * pair.dt)
+    variance = float(np.square(errors).mean()) + 1e-300
+    n = min(errors.size, slope.size)
+    inflation = 1.0 + 2.0 * _sum_to_window(_autocorrelation(errors)[:n] * _autocorrelation(slope)[:n])
+    return float(slope @ slope) / (variance * max(inflation, 0.1))
+
+
+def _autocorrelation(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Autocorrelation of successive samples, gaps not counted, at lags 0, 1, ..."""
+    size = 2 ** (2 * values.size - 1).bit_length()
+    spectrum = np.fft.rfft(values, size)
+    products = np.fft.irfft(spectrum * spectrum.conj(), size)[: values.size]
+    return products / products[0] if products[0] > 0.0 else np.eye(1, values.size)[0]
+
+
+def _sum_to_window(terms: NDArray[np.float64]) -> float:
+    """Sum of the terms at lags of one and more, up to five correlation times, because later ones are mostly noise."""
+    times = 1.0 + 2.0 * np.cumsum(np.abs(terms[1:]))
+    wide = np.flatnonzero(np.arange(1, terms.size) >= _WINDOW * times)
+    last = int(wide[0]) + 1 if wide.size else terms.size - 1
+    return float(terms[1 : last + 1].sum())

@@ -1,0 +1,200 @@
+"""Lags: estimated by cross-correlation, and as parameters that need no simulation."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    Record,
+    SharedGaussianNoise,
+    SimulationCache,
+    TimeShiftNoise,
+    TruncatedNormal,
+    Uniform,
+    align,
+)
+
+BASE = Channel("base", "acceleration", "g")
+TOP, DRIFT = Channel("top", "acceleration", "g"), Channel("drift", "displacement", "mm")
+DT, N_STEPS = 0.01, 800
+TIME = DT * np.arange(N_STEPS)
+
+
+def motion(time, seed=3):
+    """A smooth transient with many frequencies, zero before time zero."""
+    rng = np.random.default_rng(seed)
+    frequencies, phases = rng.uniform(0.5, 6.0, 25), rng.uniform(0.0, 2.0 * np.pi, 25)
+    waves = np.sin(2.0 * np.pi * frequencies * time[:, None] + phases).sum(axis=1)
+    return np.where(time > 0.0, waves * time**3 * np.exp(-2.0 * np.abs(time)), 0.0)
+
+
+RECORD = Record("motion", DT, motion(TIME))
+
+
+def late(lag, rng, noise=0.0, correlation=0.0, dt=0.0125, missing=0.0):
+    time = dt * np.arange(int(7.5 / dt))
+    errors = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], rng.normal(size=time.size))
+    values = -0.8 * motion(time - lag) + noise * RECORD.acceleration.std() * errors
+    values[rng.random(time.size) < missing] = np.nan
+    return Measurements((BASE,), dt, values[None])
+
+
+# estimates ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag", [-0.2718, 0.0, 0.3137])
+def test_lag_without_noise(rng, lag):
+    found = align(RECORD, late(lag, rng, missing=0.1))
+    assert found.lag == pytest.approx(lag, abs=1e-5)
+    assert found.correlation["base"] == pytest.approx(-1.0, abs=1e-6) and found.probability > 0.999
+    assert found.statement.startswith("lag ") and "NOT SURE" not in found.statement
+    corrected = late(lag, rng).shift(-found.lag)
+    assert align(RECORD, corrected).lag == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_standard_error_is_that_of_repetitions(rng, correlation):
+    found = [align(RECORD, late(0.1, rng, 0.7, correlation, missing=0.1), max_lag=1.0) for _ in range(120)]
+    scores = np.array([(each.lag - 0.1) / each.standard_error for each in found])
+    # the estimated error of one series has itself an error of some ten per cent
+    assert 0.75 < scores.std() < 1.35 and abs(scores.mean()) < 4.0 * scores.std() / np.sqrt(120.0)
+    assert 0.87 <= (np.abs(scores) < 1.96).mean() <= 1.0
+
+
+def test_an_uncertain_lag_says_so(rng):
+    sine = Record("sine", DT, np.sin(2.0 * np.pi * TIME))
+    waves = Measurements((BASE,), DT, (np.sin(2.0 * np.pi * (TIME - 0.2)) + 0.5 * rng.normal(size=N_STEPS))[None])
+    found = align(sine, waves, max_lag=3.0)
+    assert found.probability < 0.99 and "is nearly as good" in found.statement
+    noise = Measurements((BASE,), DT, rng.normal(size=(1, N_STEPS)))
+    assert "NOT SURE: base is not a shifted copy" in align(RECORD, noise, max_lag=1.0).statement
+
+
+def test_channels_of_a_simulated_response(rng):
+    response = Measurements((TOP, DRIFT), DT, [motion(TIME), 0.01 * motion(TIME, 4)])
+    time = 0.02 * np.arange(300)
+    measured = Measurements(
+        (DRIFT, TOP, BASE),
+        (0.02, 0.01, 0.01),
+        [0.01 * motion(time + 0.5 - 0.123, 4), motion(TIME - 0.123), rng.normal(size=N_STEPS)],
+        start=(0.5, 0.0, 0.0),
+    )
+    found = align(response, measured, max_lag=1.0)
+    assert list(found.correlation) == ["drift", "top"] and found.lag == pytest.approx(0.123, abs=1e-5)
+    assert align(RECORD, measured, ["base"], max_lag=1.0).correlation["base"] < 0.5
+
+
+def test_lags_that_cannot_be_estimated_are_refused(rng):
+    good = late(0.1, rng)
+    for arguments, message in (
+        ((RECORD, good, None, 9.0), "max_lag must be positive and below"),
+        ((RECORD, good, None, -1.0), "max_lag must be positive"),
+        ((RECORD, late(0.32, rng), None, 0.3), "end of the range; give a larger max_lag"),
+        ((RECORD, good, ["none"]), "no channel 'none'"),
+        ((RECORD, Measurements((DRIFT,), DT, good.values)), "one channel of acceleration among drift, found 0"),
+        ((RECORD, Measurements((DRIFT,), DT, good.values), ["drift"]), "compare like with like"),
+        ((RECORD, Measurements((BASE,), DT, np.ones((1, 50)))), "that are not constant"),
+        ((good, Measurements((TOP,), DT, good.values)), "the reference has the channels base"),
+        ((good.shift(1.0), good), "from time zero"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            align(*arguments)
+
+
+# as parameters --------------------------------------------------------------------------------------------------------
+
+
+def response(theta):
+    return np.stack([theta[0] * motion(TIME), 0.02 * theta[1] * motion(TIME, 5)])
+
+
+MODEL = FunctionModel(response, ["size", "stretch"], (TOP, DRIFT), DT, N_STEPS)
+
+
+def shifted_data(rng, shift=0.0234, dt=DT):
+    time = dt * np.arange(1 + int(TIME[-1] / dt + 1e-9))
+    values = np.stack([motion(time - shift), 0.02 * motion(time, 5)])
+    values += np.array([[0.02], [0.0004]]) * rng.normal(size=values.shape)
+    values[0, rng.random(time.size) < 0.1] = np.nan
+    return Measurements((TOP, DRIFT), dt, values)
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.0125])
+@pytest.mark.parametrize("inner", [GaussianNoise((TOP, DRIFT)), SharedGaussianNoise((TOP, DRIFT), (1.0, 0.02))])
+def test_shift_is_that_of_the_response(rng, dt, inner):
+    data = shifted_data(rng, dt=dt)
+    noise = TimeShiftNoise(inner, {"top": 0.05}, DT)
+    assert noise.parameter_names[-1] == "time_shift_top"
+    likelihood = FELikelihood(MODEL, data, noise)
+    sigmas = [0.1, 0.002] if isinstance(inner, GaussianNoise) else [0.1]
+    times = data.times("top")
+    inside = np.isfinite(data.channel("top")) & (times > 0.0799) & (times < TIME[-1] - 0.0799)
+    assert likelihood.n_samples.samples.tolist() == [inside.sum(), data.n_steps]
+    for shift in (-0.05, -0.0173, 0.0, 0.01, 0.0234, 0.05):
+        residuals = [
+            (1.1 * motion(times - shift) - data.channel("top"))[inside],
+            0.9 * 0.02 * motion(times, 5) - data.channel("drift"),
+        ]
+        misfit = np.array([[np.square(each).sum() for each in residuals]])
+        expected = inner.log_likelihood(misfit, likelihood.n_samples, np.array([sigmas]))[0]
+        # interpolated between samples with 17 per period of the highest frequency
+        assert likelihood.log_likelihood([1.1, 0.9, *sigmas, shift]) == pytest.approx(expected, abs=5e-2)
+    assert likelihood.log_likelihood([1.1, 0.9, *sigmas, 0.0501]) == -np.inf
+    assert likelihood.simulations == 1 and likelihood.fast_parameters == tuple(range(2, likelihood.ndim))
+
+
+def test_shift_without_interpolation_is_exact(rng):
+    data = shifted_data(rng)
+    likelihood = FELikelihood(MODEL, data, TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT))
+    values, simulated = data.channel("top"), response([1.1, 0.9])[0]
+    kept = np.flatnonzero(np.isfinite(values[8:-8])) + 8
+    for steps in (-5, 0, 3, 5):
+        misfit = np.square(simulated[kept - steps] - values[kept]).sum()
+        statistics = likelihood.statistics([1.1, 0.9])
+        zero, one = (likelihood.log_likelihood([1.1, 0.9, sigma, 0.002, steps * DT]) for sigma in (0.1, 0.2))
+        expected = -0.5 * misfit * (1.0 / 0.01 - 1.0 / 0.04) + len(kept) * np.log(2.0)
+        assert zero - one == pytest.approx(expected, rel=1e-10)
+        assert statistics[0, 0] == pytest.approx(np.square(simulated[kept] - values[kept]).sum(), rel=1e-12)
+
+
+def test_shift_is_found_and_stored(rng, tmp_path):
+    data, noise = shifted_data(rng), TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT)
+    likelihood = FELikelihood(MODEL, data, noise, cache=SimulationCache(tmp_path / "cache.db"))
+    shifts = np.linspace(-0.05, 0.05, 401)
+    values = likelihood.log_likelihood([[1.0, 1.0, 0.02, 0.0004, shift] for shift in shifts])
+    weights = np.exp(values - values.max())
+    mean = weights @ shifts / weights.sum()
+    sd = np.sqrt(weights @ (shifts - mean) ** 2 / weights.sum())
+    assert abs(mean - 0.0234) < 4.0 * sd and sd < 2e-3
+    again = FELikelihood(MODEL, data, noise, cache=SimulationCache(tmp_path / "cache.db"))
+    assert again.log_likelihood([1.0, 1.0, 0.02, 0.0004, 0.01]) == values[240] and again.simulations == 0
+    other = FELikelihood(MODEL, data, TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.07}, DT))
+    assert other.fingerprint != likelihood.fingerprint
+    prior = {"size": TruncatedNormal(1.0, 0.3), "stretch": TruncatedNormal(1.0, 0.3)}
+    prior |= {"sigma_top": HalfNormal(0.1), "sigma_drift": HalfNormal(0.1), "time_shift_top": Uniform(-0.05, 0.05)}
+    with pytest.raises(ValueError, match="cannot emulate time shifts"):
+        Posterior(likelihood, prior).guide()
+
+
+def test_shifts_that_do_not_fit_are_refused(rng):
+    white = GaussianNoise((TOP, DRIFT))
+    for arguments, message in (
+        ((AutoregressiveNoise((TOP, DRIFT)), {"top": 0.1}, DT), "a GaussianNoise or a SharedGaussianNoise"),
+        ((white, {"base": 0.1}, DT), "some of the channels top, drift"),
+        ((white, {}, DT), "some of the channels top, drift"),
+        ((white, {"top": 0.0}, DT), "positive largest shifts"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            TimeShiftNoise(*arguments)
+    with pytest.raises(ValueError, match="beyond the record; give a smaller one"):
+        FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(white, {"top": 4.0}, DT))
+    with pytest.raises(ValueError, match="make the noise with model.dt"):
+        FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(white, {"top": 0.05}, 2.0 * DT))
