@@ -113,6 +113,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         TruncatedNormal,
         Uniform,
     )
+    from .probability.event_noise import (
+        EventNoise,
+    )
     from .probability.failures import (
         TooManyFailures,
     )
@@ -219,6 +222,7 @@ __all__ = [
     "Dataset",
     "DisplacementHistory",
     "Distribution",
+    "EventNoise",
     "EventWindow",
     "Events",
     "Exceedance",
@@ -381,6 +385,7 @@ _EXPORTS = {
         "TruncatedNormal",
         "Uniform",
     ),
+    "probability.event_noise": ("EventNoise",),
     "probability.failures": ("TooManyFailures",),
     "probability.joint": ("JointLikelihood",),
     "probability.likelihood": ("FELikelihood",),

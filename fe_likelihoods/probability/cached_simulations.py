@@ -37,7 +37,7 @@ from ..simulation.model import (
 from ..simulation.repeated_points import RepeatedPoints
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
-from .inputs import as_rows, check_statistic, match_measurements
+from .inputs import as_rows, check_statistic, name_of_statistic
 from .requested_simulations import Requested, Simulated
 from .sample_counts import count_samples
 
@@ -54,7 +54,7 @@ class CachedSimulations:
     Parameters
     ----------
     model, measurements, pool, memory_rows, memory_bytes, cache, max_failure_share
-        As for `FELikelihood`.
+        As for `FELikelihood`; measurements in the order of the model's channels.
     statistic : Statistic or None
         Statistic of the residuals; None for the sums of squares.
     time_shifts : mapping of str to float, optional
@@ -75,7 +75,7 @@ class CachedSimulations:
     ) -> None:
         self._failures = FailureLog(model.parameter_names, max_failure_share)
         self.model = model
-        self.measurements = match_measurements(model, measurements)
+        self.measurements = measurements
         self._statistic = statistic
         self._n_structural = len(model.parameter_names)
         # what responses are compared with: the measured values, or a Comparison where samples are missing
@@ -94,9 +94,7 @@ class CachedSimulations:
         read_attributes_again(model)
         self._key = None if cache is None else self.simulation_key
         self.chunk_size = 1
-        self.simulations = 0
-        self.cache_hits = 0
-        self.disk_hits = 0
+        self.simulations = self.cache_hits = self.disk_hits = 0
         self.seconds = 0.0
         self._outcomes = 0  # simulations of which is known whether they failed: run here, read from disk, or recalled
 
@@ -140,9 +138,7 @@ class CachedSimulations:
 
         The source files of the library are not part of it; they are part of `simulation_key`.
         """
-        text = f"{self.model.fingerprint} {self.measurements.fingerprint}"
-        if self._statistic is not None:
-            text += f" {self._statistic.__module__}.{self._statistic.__qualname__}"
+        text = f"{self.model.fingerprint} {self.measurements.fingerprint}{name_of_statistic(self._statistic)}"
         if isinstance(self.measured, Comparison):
             text += self.measured.description
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

@@ -13,7 +13,16 @@ from ..signals.sampling import same_step
 from ..simulation.model import Model, Statistic
 from .noise import Noise, noise_channels, noise_time_shifts
 
-__all__ = ["as_points", "as_rows", "check_model", "check_noise_channels", "check_statistic", "match_measurements"]
+__all__ = [
+    "as_points",
+    "as_rows",
+    "check_model",
+    "check_noise_channels",
+    "check_statistic",
+    "complete_repr",
+    "match_measurements",
+    "name_of_statistic",
+]
 
 _MODEL_MEMBERS = ("parameter_names", "channels", "dt", "n_steps", "fingerprint", "simulate")
 
@@ -94,6 +103,14 @@ def check_noise_channels(model: Model, noise: Noise) -> None:
             f"the time shifts of the noise are for a response with a step of {noise.dt} s, the model's step is "
             f"{model.dt} s; make the noise with model.dt"
         )
+
+
+def name_of_statistic(statistic: Statistic | None) -> str:
+    """Text that identifies the statistic of a noise in fingerprints; empty for the sums of squares."""
+    if statistic is None:
+        return ""
+    # an object, such as `EventSums`, is represented by its repr
+    return f" {statistic.__module__}.{getattr(statistic, '__qualname__', repr(statistic))}"
 
 
 def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparison) -> None:

@@ -20,9 +20,10 @@ from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
 from .cached_simulations import CachedSimulations
 from .distributions import Distribution, RandomState
-from .inputs import as_points, check_model, check_noise_channels, complete_repr
+from .event_noise import join_measurements, named_noise
+from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
 from .marginal_noise import MarginalNoise
-from .noise import GaussianNoise, Noise, noise_statistic, noise_time_shifts
+from .noise import Noise, noise_of_part, noise_statistic, noise_time_shifts
 from .report import simulation_report
 
 __all__ = ["FELikelihood"]
@@ -37,13 +38,15 @@ class FELikelihood(CachedSimulations):
     ----------
     model : Model
         Computes the response from structural parameters (see `fe_likelihoods.simulation.model`).
-    measurements : Measurements
-        The model's channels (matched by name, in any order), up to the end of the model's response. NaN marks missing
-        samples, which are left out. A channel may have its own step and start: the response is interpolated at the
-        times of its samples, without a filter (`fe_likelihoods.signals.comparison`).
-    noise : Noise, optional
+    measurements : Measurements, or mapping of str to Measurements
+        Those of single events, by their names, for a model whose excitation is `Events`; pauses and events without
+        measurements are not compared (`Events.join`). Otherwise the model's channels (matched by name, in any order),
+        up to the end of the model's response. NaN marks missing samples, which are left out. A channel may have its own
+        step and start: the response is interpolated at the times of its samples, without a filter
+        (`fe_likelihoods.signals.comparison`).
+    noise : Noise or "per event", optional
         A noise of `fe_likelihoods.probability.noise` or any object with that protocol; by default `GaussianNoise` of
-        the model's channels.
+        the model's channels. "per event" is an `EventNoise`, with a level per channel and event.
     pool : int, or object with ``map(function, items)``, optional
         Runs the simulations in parallel: a number of processes of this machine, a client of dask.distributed, an
         executor or a pool (see `fe_likelihoods.simulation.executors`). Without it, simulations run in this process:
@@ -103,8 +106,8 @@ class FELikelihood(CachedSimulations):
     def __init__(
         self,
         model: Model,
-        measurements: Measurements,
-        noise: Noise | None = None,
+        measurements: Measurements | Mapping[str, Measurements],
+        noise: Noise | str | None = None,
         pool: Any = None,
         *,
         memory_rows: int = 100_000,
@@ -113,7 +116,8 @@ class FELikelihood(CachedSimulations):
         max_failure_share: float = 1.0,
     ) -> None:
         check_model(model)
-        self.noise = GaussianNoise(model.channels) if noise is None else noise
+        measurements = match_measurements(model, join_measurements(model, measurements))
+        self.noise = named_noise(model, measurements, noise)
         check_noise_channels(model, self.noise)
         structural, others = tuple(model.parameter_names), tuple(self.noise.parameter_names)
         self.parameter_names = structural + others
@@ -175,7 +179,7 @@ class FELikelihood(CachedSimulations):
             steps = math.ceil(measurements.end / self.model.dt - 1e-6)
             last = min(steps, self.model.n_steps - 1) * self.model.dt
         model = first_part(self.model, last)
-        return self._with(model, measurements, self.noise)
+        return self._with(model, measurements, noise_of_part(self.noise, measurements))
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
         """Measured minus simulated response at one point: one simulation, which is neither counted nor cached.

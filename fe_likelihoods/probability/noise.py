@@ -38,6 +38,7 @@ __all__ = [
     "Noise",
     "SharedGaussianNoise",
     "noise_channels",
+    "noise_of_part",
     "noise_statistic",
     "noise_time_shifts",
     "options_repr",
@@ -64,6 +65,8 @@ class Noise(Protocol):
       `fe_likelihoods.probability.time_shift_noise.TimeShiftNoise`.
     * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
       errors (n, n_channels) [SI]; needed for predictions with noise.
+    * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed where it
+      depends on their number.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
       predictions with autoregressive noise.
     """
@@ -95,6 +98,11 @@ def noise_statistic(noise: Noise) -> Statistic | None:
 def noise_time_shifts(noise: Noise) -> Mapping[str, float] | None:
     """Largest unknown time shifts of channels [s] of a noise with such parameters, None for others."""
     return getattr(noise, "time_shifts", None)
+
+
+def noise_of_part(noise: Noise, measurements: Measurements) -> Noise:
+    """Noise of a part of the measurements: the same, unless it has a method ``with_measurements``."""
+    return noise.with_measurements(measurements) if hasattr(noise, "with_measurements") else noise
 
 
 def sampled_noise(noise: Noise) -> Noise:

@@ -6,6 +6,7 @@ yielded bars and residual displacements of one event are the initial state of th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .channels import Channel, Measurements
 from .records import Record
 from .sampling import rest_samples, same_step
 
@@ -162,6 +164,62 @@ class Events(Record):
             raise ValueError(f"expected histories of {self.n_steps} samples, got shape {values.shape}")
         return {window.name: values[..., window.samples] for window in self.windows}
 
+    def join(self, measurements: Mapping[str, Measurements]) -> Measurements:
+        """Put the measurements of single events at their times in the joined record.
+
+        Parameters
+        ----------
+        measurements : mapping of str to Measurements
+            Measurements by the name of the event, whose time zero is the first sample of the event. All have the same
+            time step. An event may be left out: it then only changes the state of the structure. A channel may be
+            missing in some events.
+
+        Returns
+        -------
+        Measurements
+            All channels over the joined record; NaN in the pauses and wherever nothing was measured.
+
+        Raises
+        ------
+        ValueError
+            If there are no measurements, an event is unknown, the steps differ, samples are outside of their event or
+            between the steps of the joined record, or a channel has another quantity in another event.
+        """
+        if not isinstance(measurements, Mapping) or not measurements:
+            raise ValueError(f"expected Measurements for one or more of {', '.join(self.names)}; got {measurements!r}")
+        windows = {name: self.window(name) for name in measurements}
+        first = next(iter(measurements.values()))
+        channels: dict[str, Channel] = {}
+        for name, each in measurements.items():
+            if not isinstance(each, Measurements) or not each.simultaneous or not same_step(first.dt, each.dt):
+                raise ValueError(
+                    f"measurements of events must have one time step for all channels and events; those of {name!r} "
+                    "differ: use Measurements.decimate, or join channels with steps of their own by NaN in one "
+                    "Measurements"
+                )
+            for channel in each.channels:
+                known = channels.setdefault(channel.name, channel)
+                if known.quantity != channel.quantity:
+                    raise ValueError(
+                        f"channel {channel.name!r} is {known.quantity!r} in one event and {channel.quantity!r} in "
+                        f"{name!r}; rename one of them"
+                    )
+        dt = first.dt
+        values = np.full((len(channels), math.floor(self.duration / dt * (1 + 1e-12)) + 1), np.nan)
+        rows = {name: row for row, name in enumerate(channels)}
+        for name, each in measurements.items():
+            end, duration = each.start + (each.n_steps - 1) * dt, self.records[self.names.index(name)].duration
+            start = _whole_steps(windows[name].start + each.start, dt, name)
+            if end > duration * (1 + 1e-9):
+                raise ValueError(
+                    f"the measurements of {name!r} end at {end:g} s, after the end of the event at {duration:g} s; use "
+                    "Measurements.trim(start, stop)"
+                )
+            for channel, samples in zip(each.channels, each.values, strict=True):
+                values[rows[channel.name], start : start + each.n_steps] = samples
+        described = [f"{name}: {each.description}" for name, each in measurements.items() if each.description]
+        return Measurements(tuple(channels.values()), dt, values, "; ".join(described))
+
     def resample(self, dt: float) -> Events:
         """Return the events with another time step, each resampled by itself as by `Record.resample`."""
         return Events([record.resample(dt) for record in self.records], self.rests, self.names)
@@ -173,6 +231,17 @@ class Events(Record):
     def followed_by(self, other: Record, rest: float = 5.0) -> Events:
         """Return these events, a pause of `rest` [s] and another record or further events; see `Record.followed_by`."""
         return Events([self, other], rest)
+
+
+def _whole_steps(time: float, dt: float, name: str) -> int:
+    """Number of steps `dt` in `time` [s]; raise ValueError if it is not whole."""
+    steps = round(time / dt)
+    if abs(time - steps * dt) > 1e-6 * dt:
+        raise ValueError(
+            f"the first measured sample of {name!r} is at {time:g} s of the joined record, which is no multiple of the "
+            f"step {dt:g} s of the measurements; choose pauses after which every event begins at such a multiple"
+        )
+    return steps
 
 
 def _pauses(rest: float | Sequence[float], n: int) -> list[float]:

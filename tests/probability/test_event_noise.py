@@ -1,0 +1,167 @@
+"""Measurements of single events, pauses that are not compared, and a level of noise for every event."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    EventNoise,
+    Events,
+    FELikelihood,
+    GaussianNoise,
+    HalfNormal,
+    LinearOscillator,
+    Measurements,
+    Posterior,
+    Record,
+    SharedGaussianNoise,
+    SimulationCache,
+    TruncatedNormal,
+    propagate,
+)
+
+NAMES = ("stiffness", "damping")
+
+
+@pytest.fixture
+def events(rng):
+    return Events([Record(name, 0.02, rng.normal(size=n)) for name, n in (("EQ1", 60), ("EQ2", 50))], rest=1.0)
+
+
+@pytest.fixture
+def model(events):
+    return LinearOscillator(events, period=0.5)
+
+
+@pytest.fixture
+def measured(model, events, rng):
+    """Measurements of each event, with five times more noise in the second one."""
+    response = events.split(model.simulate([1.1, 0.9]))
+    levels = {"EQ1": 0.1, "EQ2": 0.5}
+    scale = {name: level * np.std(response["EQ1"], axis=1, keepdims=True) for name, level in levels.items()}
+    return {
+        name: Measurements(model.channels, 0.02, part + scale[name] * rng.normal(size=part.shape))
+        for name, part in response.items()
+    }
+
+
+def residuals(model, events, measured, theta):
+    response = events.split(model.simulate(theta))
+    return {name: measured[name].values - response[name] for name in measured}
+
+
+def gaussian(errors, sigma):
+    return np.sum(-0.5 * np.log(2.0 * np.pi * sigma**2) - 0.5 * (errors / sigma) ** 2)
+
+
+def test_pauses_are_not_compared(model, events, measured):
+    likelihood = FELikelihood(model, measured)
+    assert likelihood.parameter_names == (*NAMES, "sigma_acceleration", "sigma_displacement")
+    for theta in ([1.0, 1.0], [1.2, 0.7]):
+        errors = residuals(model, events, measured, theta)
+        for sigma in ([1.0, 0.01], [0.5, 0.02]):
+            expected = sum(gaussian(part[row], sigma[row]) for part in errors.values() for row in range(2))
+            assert likelihood([*theta, *sigma]) == pytest.approx(expected, rel=1e-12)
+    joined = events.join(measured)
+    assert (
+        np.isnan(joined.values).sum() == 2 * 50
+        and likelihood.data_fingerprint == joined.select(["acceleration", "displacement"]).fingerprint
+    )
+
+
+def test_an_event_without_measurement_changes_the_state_only(model, events, measured):
+    only = FELikelihood(model, {"EQ2": measured["EQ2"]})
+    errors = residuals(model, events, measured, [1.0, 1.0])["EQ2"]
+    expected = gaussian(errors[0], 1.0) + gaussian(errors[1], 0.01)
+    assert only([1.0, 1.0, 1.0, 0.01]) == pytest.approx(expected, rel=1e-12)
+    alone = FELikelihood(model.with_record(events.records[1]), measured["EQ2"])
+    assert abs(only([1.0, 0.1, 1.0, 0.01]) - alone([1.0, 0.1, 1.0, 0.01])) > 0.1  # free vibration of the first event
+
+
+def test_a_level_per_event(model, events, measured):
+    likelihood = FELikelihood(model, measured, noise="per event")
+    sigmas = ("acceleration_EQ1", "displacement_EQ1", "acceleration_EQ2", "displacement_EQ2")
+    assert likelihood.parameter_names == (*NAMES, *(f"sigma_{name}" for name in sigmas))
+    assert likelihood.fast_parameters == (2, 3, 4, 5)
+    errors, levels = residuals(model, events, measured, [1.1, 0.9]), {"EQ1": (0.2, 0.002), "EQ2": (0.9, 0.01)}
+    expected = sum(gaussian(errors[name][row], levels[name][row]) for name in levels for row in range(2))
+    point = [1.1, 0.9, *levels["EQ1"], *levels["EQ2"]]
+    assert likelihood(point) == pytest.approx(expected, rel=1e-12)
+    equal = FELikelihood(model, measured)  # one level: the same value where the levels are equal
+    assert likelihood([1.1, 0.9, 0.3, 0.01, 0.3, 0.01]) == pytest.approx(equal([1.1, 0.9, 0.3, 0.01]), rel=1e-12)
+    assert likelihood([1.1, 0.9, 0.3, 0.01, 0.3, 0.0]) == -np.inf and likelihood.simulations == 1
+    best = {name: part.std(axis=1) for name, part in errors.items()}
+    assert (best["EQ2"] > 3.0 * best["EQ1"]).all()
+
+
+def test_only_measured_channels_have_levels(model, measured):
+    partial = {"EQ1": measured["EQ1"].select(["displacement"]), "EQ2": measured["EQ2"]}
+    likelihood = FELikelihood(model, partial, noise="per event")
+    assert "sigma_acceleration_EQ1" not in likelihood.parameter_names and likelihood.ndim == 2 + 3
+    assert np.isfinite(likelihood([1.0, 1.0, 0.01, 1.0, 0.01]))
+
+
+def test_other_noises_work_with_events(model, events, measured):
+    joined = events.join(measured).select(["acceleration", "displacement"])
+    for noise in (SharedGaussianNoise.of(joined), AutoregressiveNoise(model.channels)):
+        likelihood = FELikelihood(model, measured, noise)
+        values = [1.0, 1.0, *(0.3 if "rho" not in name else 0.2 for name in noise.parameter_names)]
+        assert np.isfinite(likelihood(values))
+
+
+def test_first_part_cache_and_guide(model, measured, tmp_path):
+    cache = SimulationCache(tmp_path / "cache.db")
+    likelihood = FELikelihood(model, measured, noise="per event", cache=cache)
+    point = [1.0, 1.0, 0.3, 0.01, 0.5, 0.02]
+    value = likelihood(point)
+    again = FELikelihood(model, measured, noise="per event", cache=cache)
+    assert again(point) == value and again.disk_hits == 1
+    assert FELikelihood(model, measured, cache=cache).fingerprint != again.fingerprint
+    part = likelihood.first(0.5)  # within the first event
+    only = FELikelihood(model.first(0.5), measured["EQ1"].trim(0.0, 0.5), GaussianNoise(model.channels))
+    assert part(point) == pytest.approx(only(point[:4]), rel=1e-12)
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in NAMES}
+    prior |= {name: HalfNormal(1.0) for name in likelihood.parameter_names[2:]}
+    posterior = Posterior(likelihood, prior)
+    assert Posterior(again, prior).fingerprint == posterior.fingerprint
+    assert posterior.guide() is not None
+
+
+def test_steps_of_the_measurements_may_be_longer(events, model):
+    assert [window.first for window in events.windows] == [0, 110]
+    channel = (Channel("displacement", "relative displacement", "cm"),)
+    first, second = (Measurements(channel, 0.04, values) for values in (np.ones((1, 30)), np.zeros((1, 5))))
+    joined = events.join({"EQ1": first, "EQ2": second})
+    assert joined.dt == 0.04 and joined.n_steps == 80
+    assert np.flatnonzero(joined.values[0] == 0.0).tolist() == [55, 56, 57, 58, 59]
+    noise = EventNoise.of(events, joined)
+    assert noise.samples == ((30,), (5,)) and noise.windows == ((0, 30), (55, 80))
+    late = events.join({"EQ2": Measurements(channel, 0.02, np.zeros((1, 5)), start=0.1)})
+    assert np.flatnonzero(~np.isnan(late.values[0])).tolist() == [115, 116, 117, 118, 119]
+
+
+def test_bad_input_is_refused_before_anything_is_simulated(model, events, measured):
+    channel = (Channel("displacement", "acceleration", "g"),)
+    cases = {
+        "no event 'EQ3'; the events are EQ1, EQ2": {"EQ3": measured["EQ1"]},
+        "expected Measurements for one or more of EQ1, EQ2": {},
+        "those of 'EQ2' differ": measured | {"EQ2": measured["EQ2"].decimate(2)},
+        "end at 1.18 s, after the end of the event at 0.98 s": {"EQ2": measured["EQ1"]},
+        "is no multiple": {"EQ2": Measurements(channel, 0.04 * 1.5, np.ones((1, 3)))},
+        "rename one of them": measured | {"EQ2": Measurements(channel, 0.02, np.ones((1, 5)))},
+    }
+    for message, wrong in cases.items():
+        with pytest.raises(ValueError, match=message):
+            FELikelihood(model, wrong)
+    whole = Measurements(model.channels, 0.02, model.simulate([1.0, 1.0]))
+    with pytest.raises(ValueError, match="100 measured samples are outside of every event, the first at 1.2 s"):
+        FELikelihood(model, whole, noise="per event")
+    with pytest.raises(ValueError, match="or \"per event\"; got 'per channel'"):
+        FELikelihood(model, whole, noise="per channel")
+    plain = LinearOscillator(events.trim(0.0, 1.0))
+    for arguments in ((measured,), (whole, "per event")):
+        with pytest.raises(ValueError, match="need a model whose excitation is Events"):
+            FELikelihood(plain, *arguments)
+    with pytest.raises(ValueError, match="EventNoise cannot be drawn from"):
+        propagate(FELikelihood(model, measured, "per event"), np.ones((2, 6)), noise=True, progress=False)
