@@ -283,10 +283,11 @@ class JournaledBackend(Recovery):
             self._journal.call(index, steps, begin, request.options)
 
     def go_on(self) -> None:
-        """Enter that the present call goes on, although others were made after it."""
-        self.script.go_on()
+        """Enter that the present call goes on, although others were made after it, or after a limit was raised."""
+        again = self.script.count_again()
+        self.script.go_on(again)
         if self._journal is not None:
-            self._journal.more(self.script.position)
+            self._journal.more(self.script.position, again)
 
     def passed(self, request: Request, last: Step) -> None:
         """Enter a complete call that stores no steps."""
@@ -313,6 +314,7 @@ class JournaledBackend(Recovery):
     def halt(self, shows: bool) -> None:
         """Enter in the journal that the limit of simulations ended the call, and whether the next step shows it."""
         self._shows = shows
+        self.script.halt()
         if self._journal is not None:
             self._journal.halt(shows)
 

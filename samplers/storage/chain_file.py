@@ -130,7 +130,7 @@ def write_marks(group: h5py.Group, run: str, journal_size: int, script: Script) 
         count, crc = 0, 0
     group.attrs[CHECKSUM] = np.array([iteration, checksum(group, count, iteration, crc)], dtype=np.int64)
     group.attrs[RUN], group.attrs[JOURNAL] = run, journal_size
-    group.attrs[SCRIPT] = json.dumps([call[:6] for call in script.calls])
+    group.attrs[SCRIPT] = json.dumps([call[:7] for call in script.calls])
 
 
 def compare(stored: StoredRun, contents: Contents) -> str:

@@ -251,10 +251,12 @@ class Checkpoint:
 
     def go_on_with_call(self) -> bool:
         """Enter that the present call, which is incomplete, goes on; returns whether others were made after it."""
-        if self._journal is None or self._journal.script.is_last:
+        if self._journal is None:
             return False
-        self._journal.go_on()
-        return True
+        is_last = self._journal.script.is_last
+        if not is_last or self._journal.script.was_halted:
+            self._journal.go_on()
+        return not is_last
 
     @property
     def lost_journal(self) -> bool:

@@ -14,7 +14,8 @@ pickled::
     VERD  the verdict (JSON)
     CALL  a call of the sampler: its place in the script, the steps at beta = 1 that it asks for, what it starts from,
           options (JSON)
-    MORE  the call at this place of the script (JSON) goes on, although others were made after it
+    MORE  the call at this place of the script (JSON) goes on, although others were made after it, or by another call of
+          the script, the number of which follows
     PASS  a complete call that stores no steps: as CALL, and its last state in the form of STEP
     STEP  a stored step: points, log-probabilities, acceptance, blobs, state of the random generator
     DONE  the call is complete
@@ -312,9 +313,9 @@ class Journal:
         """Enter a call: its place in the script, the steps that it asks for, the digest of where it starts, options."""
         self._append_text(b"CALL", [index, nsteps, begin, options])
 
-    def more(self, index: int) -> None:
-        """Enter that the call at a place of the script goes on."""
-        self._append_text(b"MORE", index)
+    def more(self, index: int, again: int) -> None:
+        """Enter that the call at a place of the script goes on, and how many calls of a process went on with it."""
+        self._append_text(b"MORE", [index, again])
 
     def passed(self, index: int, nsteps: int, begin: str, options: str, last: Step) -> None:
         """Enter a call that stores no steps, and its last state."""

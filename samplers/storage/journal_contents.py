@@ -201,8 +201,8 @@ class _Reader:
         self.shows = False
 
     def enter_more(self, content: bytes) -> None:
-        self.script.position = json.loads(content)
-        self.script.go_on()
+        self.script.position, again = json.loads(content)
+        self.script.go_on(again)
 
     def enter_pass(self, content: bytes) -> None:
         call, *arrays = unpack_arrays(content)

@@ -93,7 +93,7 @@ class MemoryRecord:
 
     def go_on(self) -> None:
         """Enter that the present call goes on, although others were made after it."""
-        self.script.go_on()
+        self.script.go_on(0)
 
     def stepped(self, state: State) -> None:
         """Enter a stored step of the chain."""

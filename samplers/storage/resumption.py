@@ -328,6 +328,7 @@ class PresentCall:
         """Look up the stored call that this one repeats; a loop that stores nothing is in no script."""
         if self._store or self.runs_to_end:
             self.call = self._sampler._checkpoint.find_call(request)
+            self.position = self._sampler._checkpoint.position
             self.repeats = self.call is not None
 
     def check_is_present(self) -> None:

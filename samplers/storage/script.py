@@ -8,9 +8,13 @@ added to the chain. Calls are equal where the number of steps, the initial state
 A loop over ``sample`` that the user leaves early and one that an error ends look the same from inside: the generator
 is closed. Such a call stays incomplete, and the next call takes the next place. Started again, the loop gets the stored
 states once more; if it does not leave with them, the call goes on.
+
+A call that the limit of simulations has ended is completed by the next equal call, once the limit is raised. Such calls
+are counted, so that the same script repeats them as well.
 """
 
 import zlib
+from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +41,8 @@ class Call(NamedTuple):
         Whether nothing remains to be done.
     annealing : int
         How many annealings the file has had when the call began.
+    again : int
+        How many further calls of the script went on with it, after its limit of simulations was raised.
     last : Step, or None
         Its last stored step, or the last state of a complete call with ``store=False``; None where there is none or it
         is not known.
@@ -48,6 +54,7 @@ class Call(NamedTuple):
     made: int = 0
     complete: bool = False
     annealing: int = 1
+    again: int = 0
     last: Step | None = None
 
 
@@ -101,6 +108,9 @@ class Script:
     def __init__(self, calls: list[Call] | None = None):
         self.calls = list(calls or [])
         self.position = 0
+        self._halted: int | None = None
+        self._went_on: Counter[int] = Counter()  # with calls that a limit of simulations had ended, by place
+        self._expected = 0  # calls that went on with the one that has just been repeated
 
     def find(self, request: Request, resumable: bool) -> Call | None:
         """The stored call that a new one repeats; None if there is none.
@@ -112,9 +122,15 @@ class Script:
         resumable : bool
             Whether the coordinates of an incomplete call are compared elsewhere.
         """
+        expected, self._expected = self._expected, 0
+        if expected > 0 and self._matches(self.position - 1, request):
+            self.position, self._expected = self.position - 1, expected - 1
+            return self.calls[self.position]
         if self.position >= len(self.calls):
             return None
         call, coords = self.calls[self.position], request.coords
+        if call.complete and self._matches(self.position, request):
+            self._expected = call.again
         if (call.steps, call.options) != (request.steps, request.options):
             return None
         if coords is None or digest(coords) == call.begin or (resumable and not call.complete):
@@ -122,18 +138,40 @@ class Script:
         goes_on = not call.complete and call.last is not None and np.array_equal(coords, call.last.coords)
         return call if goes_on else None
 
+    def _matches(self, place: int, request: Request) -> bool:
+        call = self.calls[place]
+        same_start = request.coords is None or digest(request.coords) == call.begin
+        return (call.steps, call.options) == (request.steps, request.options) and same_start
+
     @property
     def is_last(self) -> bool:
         """Whether no stored call follows the present one."""
         return self.position >= len(self.calls) - 1
 
-    def go_on(self) -> None:
-        """Enter that the present call goes on, although others were made after it: they do not count any more."""
+    @property
+    def was_halted(self) -> bool:
+        """Whether the limit of simulations has ended the present call in this process."""
+        return self._halted == self.position
+
+    def halt(self) -> None:
+        """Enter that the limit of simulations has ended the present call."""
+        self._halted = self.position
+
+    def count_again(self) -> int:
+        """How many calls of this process have gone on with the present one after a limit, with this one."""
+        self._went_on[self.position] += self.was_halted
+        self._halted = None
+        return self._went_on[self.position]
+
+    def go_on(self, again: int) -> None:
+        """Enter that the present call goes on. Others that were made after it do not count any more."""
         del self.calls[self.position + 1 :]
+        self.calls[self.position] = self.calls[self.position]._replace(again=again)
 
     def begin(self, steps: int | None, begin: str = "", annealing: int = 1, options: str = "") -> int:
         """Enter a new call at the present place, and return the place; a reset is complete at once."""
         del self.calls[self.position :]
+        self._halted = None
         self.calls.append(Call(steps, begin, options, annealing=annealing, complete=steps is None))
         self.position += steps is None
         return len(self.calls) - 1

@@ -2,6 +2,8 @@
 
 import gc
 import logging
+import os
+import signal
 from concurrent.futures import ThreadPoolExecutor
 
 import emcee
@@ -10,6 +12,7 @@ import pytest
 
 from samplers import SMCSampler
 from samplers.storage.journal_contents import read_journal
+from samplers.storage.lenient_file import LenientFile
 from tests.contract.targets import Gaussian, WithBlobs
 from tests.faults.interrupted import interrupt_lines, make, state_of
 
@@ -158,6 +161,32 @@ def test_ctrl_c_at_some_lines(tmp_path):
     assert count >= 5 and not wrong
 
 
+def test_ctrl_c_waits_while_hdf5_writes(tmp_path, monkeypatch):
+    """It would be raised in a function that HDF5 calls, and leave the file in an unknown state."""
+    path = tmp_path / "run.h5"
+    sampler = make(path)
+    sampler.run_mcmc(None, 2)
+    write, left = LenientFile.write, [1]
+
+    def interrupted(self, data):
+        if left:
+            left.pop()
+            os.kill(os.getpid(), signal.SIGINT)
+        return write(self, data)
+
+    monkeypatch.setattr(LenientFile, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="steps are kept in"):
+        sampler.run_mcmc(None, 3)
+    assert not left
+    sampler.run_mcmc(None, 3)
+    assert sampler.iteration == 5
+    sampler.backend.close()
+    again = make(path)
+    again.run_mcmc(None, 2)
+    again.run_mcmc(None, 3)
+    assert state_of(again) == state_of(sampler)
+
+
 @pytest.mark.slow
 def test_ctrl_c_at_every_line(tmp_path):
     """Of the second call of a small script: the same call, and the same script, go on and add nothing twice."""
@@ -195,6 +224,26 @@ def test_steps_of_a_script_that_is_edited(tmp_path):
         lengths.append(sampler.iteration)
         sampler.backend.close()
     assert lengths == [6, 6, 18, 18, 18]
+
+
+@pytest.mark.parametrize("limits", [(20, 10_000), (20, 34, 10_000)])
+def test_a_limit_that_is_raised_in_a_script(tmp_path, limits):
+    """The calls that go on with the first one are repeated as well; a further one adds its steps, once."""
+
+    def script(further=0):
+        sampler = make(tmp_path / "run.h5", max_simulations=limits[0])
+        for limit in limits:
+            sampler.max_simulations = limit
+            sampler.run_mcmc(None, 6)
+        for _ in range(further):
+            sampler.run_mcmc(None, 6)
+        sampler.backend.close()
+        return sampler
+
+    first = script()
+    again = script()
+    assert state_of(first) == state_of(again) and again.report()["new_evaluations"] == 0
+    assert [script(further).iteration for further in (0, 1, 1, 2, 0)] == [6, 12, 12, 18, 18]
 
 
 def test_steps_that_are_not_stored_are_not_made_again(tmp_path, caplog):
