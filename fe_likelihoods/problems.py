@@ -267,7 +267,9 @@ def bridge_column(
     coarse = None
     intensity = np.cumsum(record.acceleration**2)
     end = int(np.searchsorted(intensity, _COARSE_SHARE * intensity[-1])) * record.dt
-    if end > record.dt:
+    # a channel that was not measured in the first part leaves no coarse posterior
+    early = measurements.complete or (measurements.times_of_first_samples < end).all()
+    if end > record.dt and early:
         cheap = replace(model, loading=record.trim(0.0, end), **_COARSE_TOLERANCES)
         coarse = Posterior(FELikelihood(cheap, measurements.trim(0.0, end), law, cache=likelihood.cache), prior)
     posterior = Posterior(likelihood, prior, coarse)

@@ -20,7 +20,7 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fe_likelihoods import from_si, rrmse
+from fe_likelihoods import RCColumn, from_si, problems, rrmse
 
 ROOT = Path(__file__).parents[1]
 TUTORIALS = sorted((ROOT / "tutorials").glob("[0-9]*.py"))
@@ -261,6 +261,7 @@ def test_bridge_column_draws_the_tempering_stages(column):
     assert len(stages) == json.loads((column / "summary.json").read_text())["stages"]
 
 
+@pytest.mark.slow
 def test_bridge_column_on_another_record(shared, tmp_path):
     """The first part of a recorded motion; no number is checked, so few walkers are enough."""
     whole = shared / "records" / "loma_prieta_1989_apeel2_redwood_city_133.csv"
@@ -271,6 +272,87 @@ def test_bridge_column_on_another_record(shared, tmp_path):
     output = run_tutorial("02_bridge_column.py", *options, "--out", str(tmp_path))
     assert "x 0.85" in output and "SYNTHETIC" in output
     assert json.loads((tmp_path / "summary.json").read_text())["rrmse"]["Before updating (reported values)"]
+
+
+def own_test(folder: Path) -> tuple[str, ...]:
+    """Options for a test of one's own: synthetic files of a slender column, the displacement with gaps and late."""
+    data = problems.bridge_column_data()
+    record = data.record.resample(1 / 64).trim(4.0, 6.5)
+    column = RCColumn.lhpost(record.scale(1.1), height=5.0, outputs=("displacement",))
+    rows = np.column_stack([record.time, from_si(record.acceleration, "g")])
+    lines = [f"{time:.6f};{value:.6e}".replace(".", ",") for time, value in rows]
+    (folder / "base.csv").write_text("\n".join(["Zeit [s];Boden [g]", *lines]), encoding="utf-8")
+    (drift,) = from_si(column.simulate([0.8, 1.0, 1.0, 1.0, 1.0]), "mm")
+    drift += 0.2 * np.random.default_rng(0).standard_normal(drift.size)
+    cells = ["" if k % 9 == 0 else f"{value:.4f}" for k, value in enumerate(drift)]
+    table = ["Logger 7", "Time,Top", "s,mm", *(f"{k / 64:.6f},{cells[k]}" for k in range(8, drift.size, 2))]
+    (folder / "top.csv").write_text("\n".join(table))
+    (folder / "own.toml").write_text(
+        '[column]\nheight = "5000 mm"\n[column.concrete]\nec = "3320 ksi"\n'
+        '[measurements]\ncolumns = {displacement = "Top"}\n[prior]\nEc = 0.2\nsigma_displacement = "5 mm"\n'
+    )
+    names = {"--record": "base.csv", "--measurements": "top.csv", "--column": "own.toml"}
+    return tuple(word for option, name in names.items() for word in (option, str(folder / name)))
+
+
+def test_own_column(tmp_path):
+    options = ("--scale", "1.1", "--walkers", "16", "--every", "1", "--out", str(tmp_path / "results"))
+    output = run_tutorial("02_bridge_column.py", *own_test(tmp_path), *options)
+    assert "base motion: base x 1.1; measurements: measurements of top.csv" in output and "SYNTHETIC" not in output
+    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert summary["truth"] is None
+    assert list(summary["posterior_mean"]) == ["Ec", "Es", "a0", "a1", "ft", "sigma_displacement"]
+    before, after = summary["rrmse"].values()
+    assert after["displacement"] < before["displacement"]
+    with (tmp_path / "results" / "table2.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert "Truth (synthetic)" not in rows[0] and rows[0]["Prior"] == "normal(1, 0.20), > 0"
+    assert rows[5]["Prior"] == "half-normal(0.1969 in)"
+    assert len(read_figure(tmp_path / "results", "fig3_data").axes) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[colum]\n", "unknown colum; known are column, measurements, prior, noise"),
+        ("[column]\nwidth = 1\n", r"\[column\]: unknown width; known are diameter"),
+        ('[column]\nheight = "5 kg"\n', "height: expected a number with its unit such as '48 in', got '5 kg'"),
+        ('[column]\nmass = "5 t"\n', "mass: expected .* got '5 t': this setting is a number in SI units"),
+        ("[column]\nheight = [1]\n", "expected a number, got"),
+        ("[column.concrete]\nfck = 1\n", r"\[column.concrete\]: unknown fck"),
+        ("[column]\nconcrete = 1\n", r"expected a table \[concrete\]"),
+        ('[noise]\nkind = "pink"\n', "expected a kind of 'per channel'"),
+        ("[column\n", "cannot read .*own.toml"),
+    ],
+)
+def test_settings_of_an_own_column_are_checked(tmp_path, monkeypatch, text, message):
+    monkeypatch.syspath_prepend(ROOT / "tutorials")
+    own_column = importlib.import_module("own_column")
+    (tmp_path / "own.toml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        own_column.read_settings(tmp_path / "own.toml")
+
+
+def test_settings_in_the_documentation_are_those_of_the_tutorial(tmp_path, monkeypatch):
+    """The example of docs/own_column.rst describes the column of the tutorial."""
+    monkeypatch.syspath_prepend(ROOT / "tutorials")
+    own_column = importlib.import_module("own_column")
+    page = (ROOT / "docs" / "own_column.rst").read_text()
+    block = page.split(".. code-block:: toml\n\n")[1].split("\n\n``[meas")[0]
+    (tmp_path / "own.toml").write_text("\n".join(line[3:] for line in block.splitlines()))
+    settings = own_column.read_settings(tmp_path / "own.toml")
+    record = problems.bridge_column_data().record
+    own, usual = RCColumn.lhpost(record, **settings.column), RCColumn.lhpost(record)
+    for name in ("diameter", "height", "cover", "a0", "a1", "concrete", "steel"):
+        assert getattr(own, name) == getattr(usual, name), name
+    assert own.mass == pytest.approx(usual.mass, rel=1e-3) and own.bars.number == usual.bars.number
+    assert own.bars.area_each == pytest.approx(usual.bars.area_each, rel=1e-2)
+    posterior = own_column.make_posterior(
+        record, problems.bridge_column_data().measurements, settings, every=64, mesh=10
+    )
+    assert np.isfinite(posterior.log_prob([1.0] * 5 + [0.5, 0.01, 0.3, 0.3]))
+    assert posterior.prior.distributions["sigma_acceleration"].sd == pytest.approx(0.980665)
+    assert settings.noise == "autoregressive" and settings.prior["sigma_acceleration"] == pytest.approx(0.980665)
 
 
 @pytest.mark.slow

@@ -17,6 +17,10 @@ synthetic motion or any record that you name::
     python tutorials/02_bridge_column.py --preset ramancha2022                 # the algorithm of the paper; hours
     python tutorials/02_bridge_column.py --record motion.AT2 --scale 0.85      # another base motion (AT2, V2, CSV)
     python tutorials/02_bridge_column.py --preset reduced --classes            # compare model classes by evidence
+    python tutorials/02_bridge_column.py --record base.csv --measurements top.csv --column own.toml    # your own test
+
+The last line is for a test of your own: measured acceleration and displacement of the top of a column
+(:doc:`/own_column` describes the files).
 
 With ``FAST=1`` the script keeps one sample in 16 and uses 40 walkers. It then shows how the tutorial works; its numbers
 are not results.
@@ -37,6 +41,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import own_column
 
 from fe_likelihoods import (
     Record,
@@ -72,6 +77,10 @@ PRESETS = {
 
 parser = argparse.ArgumentParser(description="Update the bridge column with SMC; write tables and figures to a folder.")
 parser.add_argument("--record", type=Path, help="base motion: .csv, .at2, .v2 or .zip (default: bundled, synthetic)")
+parser.add_argument(
+    "--measurements", type=Path, help="measured response of the top: .csv or .xlsx (default: synthetic)"
+)
+parser.add_argument("--column", type=Path, help="geometry, materials, prior and columns of the measurements: .toml")
 parser.add_argument("--units", help="unit of the acceleration, if the file of the record does not state it")
 parser.add_argument("--scale", type=float, default=1.0, help="factor by which the record is multiplied")
 parser.add_argument("--preset", choices=PRESETS, default="fast" if os.environ.get("FAST") else "default")
@@ -83,6 +92,10 @@ parser.add_argument("--classes", action="store_true", help="also compare model c
 parser.add_argument("--resume", action="store_true", help="continue an interrupted run in OUT, with the same options")
 parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the results")
 args = parser.parse_args()
+if args.measurements and not args.record:
+    parser.error("--measurements need the base motion under which they were measured: give --record too")
+if args.column and not args.measurements:
+    parser.error("--column describes a test of your own: give --measurements too")
 
 walkers, every, sweeps, guided, settings = PRESETS[args.preset]
 walkers, every = args.walkers or walkers, args.every or every
@@ -108,7 +121,11 @@ def read_record(path: Path) -> Record:
     return read_csv(path, units=args.units)
 
 
-if args.record is None:
+own = own_column.read_settings(args.column) if args.measurements else None
+if own is not None:
+    record = read_record(args.record).scale(args.scale)
+    measurements = own_column.read_measurements(args.measurements, own, record)
+elif args.record is None:
     data = problems.bridge_column_data()
     record, measurements = data.record.scale(args.scale), data.measurements
     if args.scale != 1.0:
@@ -116,9 +133,18 @@ if args.record is None:
 else:
     record = read_record(args.record).scale(args.scale)
     measurements = problems.bridge_column_measurements(record, seed=args.seed)
-posterior = problems.bridge_column(record=record, measurements=measurements, every=every)
+
+
+def make_posterior(**changes):
+    """The posterior of the data, of the tutorial's column or of one's own, for a model with changes."""
+    if own is not None:
+        return own_column.make_posterior(record, measurements, own, every, **changes)
+    return problems.bridge_column(record=record, measurements=measurements, every=every, **changes)
+
+
+posterior = make_posterior()
 model, measured = posterior.likelihood.model, posterior.likelihood.measurements
-truth = np.array([*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_NOISE.values()])
+truth = None if own else np.array([*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_NOISE.values()])
 
 print(f"base motion: {record.name} x {args.scale:g}; measurements: {measurements.description}")
 print(f"{measured.n_steps} samples at {measured.dt:g} s of {', '.join(c.name for c in measured.channels)}")
@@ -132,23 +158,21 @@ if every > 1:
 # Do not expect the damping coefficients ``a0`` and ``a1`` at their true values: the true ``a1`` is 6.3 prior standard
 # deviations away from the mean of the prior.
 
-figure, axes = plt.subplots(3, 1, figsize=(9, 6.5), sharex=True, layout="constrained")
+figure, axes = plt.subplots(1 + measured.n_channels, 1, figsize=(9, 6.5), sharex=True, layout="constrained")
 rows = [
     (record.time, from_si(record.acceleration, "g"), "Input: acceleration of the base", "acceleration [g]"),
     *(
-        (measured.time, from_si(measured.channel(name), unit), f"Output: {quantity} of the top", f"{name} [{unit}]")
-        for name, unit, quantity in (
-            ("displacement", "in", "relative displacement"),
-            ("acceleration", "g", "absolute acceleration"),
-        )
+        (measured.time, from_si(measured.channel(c.name), c.unit), f"Output: {c.quantity} of the top", c)
+        for c in sorted(measured.channels, key=lambda channel: channel.name, reverse=True)
     ),
 ]
+rows[1:] = [(*row[:3], f"{row[3].name} [{row[3].unit}]") for row in rows[1:]]
 for axis, (instants, values, title, label) in zip(axes, rows, strict=True):
     axis.plot(instants, values, color="#1f5a8c", linewidth=0.7)
     axis.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
-    axis.set(title=title, ylabel=label, ylim=np.array([-1.1, 1.1]) * np.abs(values).max())
+    axis.set(title=title, ylabel=label, ylim=np.array([-1.1, 1.1]) * np.nanmax(np.abs(values)))
 axes[-1].set(xlabel="time [s]", xlim=(0.0, record.duration))
-figure.suptitle("Figure 3: measurement data for model updating (synthetic)")
+figure.suptitle("Figure 3: measurement data for model updating" + ("" if own else " (synthetic)"))
 figure.savefig(args.out / "fig3_data.png", dpi=150)
 
 # %%
@@ -204,7 +228,8 @@ def table2() -> list[dict[str, str]]:
     rows = []
     moments = summary(samples, posterior.parameter_names)
     for i, name in enumerate(posterior.parameter_names):
-        unit, mean, true, cv = DISPLAY[name], moments.mean[i], truth[i], moments.cv[i]
+        unit, mean, cv = DISPLAY.get(name, "-"), moments.mean[i], moments.cv[i]
+        true = np.nan if truth is None else truth[i]
         distance = (mean - true) / moments.sd[i]
         if name in model.parameter_names:
             nominal = model.nominal[name]
@@ -216,6 +241,8 @@ def table2() -> list[dict[str, str]]:
                 f"{mean:.5g} x {shown}",
                 f"{true:.5g}",
             )
+        elif unit == "-":  # a correlation of the noise
+            row = ("uniform(-1, 1)", "-", f"{mean:.4g}", f"{true:.4g}")
         else:
             percent = f" ({100 * from_si(mean, 'g').item():.3g} % g)" if unit == "in/s2" else ""
             mean, true = (from_si(v, unit).item() for v in (mean, true))
@@ -225,6 +252,8 @@ def table2() -> list[dict[str, str]]:
         rows.append(
             dict(zip(keys, (name, *row), strict=True)) | {"CV": f"{cv:.2e}", "(mean-truth)/sd": f"{distance:+.2f}"}
         )
+    if truth is None:
+        return [{key: value for key, value in row.items() if "ruth" not in key} for row in rows]
     return rows
 
 
@@ -246,17 +275,25 @@ print("\n".join(lines))
 # First in the form of the paper, then as a usual corner plot. The lines mark the true values of the synthetic data.
 
 LABELS = ["$E_c$ [x nominal]", "$E_s$ [x nominal]", "$a_0$ [x nominal]", "$a_1$ [x nominal]", "$f_t$ [x nominal]"]
-LABELS += [r"$\sigma_a$ [g]", r"$\sigma_d$ [in]"]
+UNITS = dict.fromkeys(posterior.parameter_names[5:], None)
+for name in UNITS:
+    kind, _, channel = name.partition("_")
+    UNITS[name] = {"sigma_acceleration": "g", "sigma_displacement": "in"}.get(name)
+    symbol = "\\" + kind + (f"_{channel[0]}" if channel else "")
+    LABELS.append(f"${symbol}$ [{UNITS[name] or '-'}]")
 
 
 def to_display(x: np.ndarray) -> np.ndarray:
-    """Convert the noise levels of parameters (..., 7) to g and in."""
-    return np.concatenate([x[..., :5], from_si(x[..., 5:6], "g"), from_si(x[..., 6:], "in")], axis=-1)
+    """Convert the noise levels of parameters (..., ndim) to g and in."""
+    columns = [x[..., 5 + k] if unit is None else from_si(x[..., 5 + k], unit) for k, unit in enumerate(UNITS.values())]
+    return np.concatenate([x[..., :5], np.stack(columns, axis=-1)], axis=-1)
 
 
-shown, true_shown = to_display(samples), to_display(truth)
+shown, true_shown = to_display(samples), None if truth is None else to_display(truth)
 pair_plot(shown, LABELS, truth=true_shown).savefig(args.out / "fig4_pair.png", dpi=130)
-lowest, highest = np.minimum(shown.min(axis=0), true_shown), np.maximum(shown.max(axis=0), true_shown)
+lowest, highest = shown.min(axis=0), shown.max(axis=0)
+if true_shown is not None:
+    lowest, highest = np.minimum(lowest, true_shown), np.maximum(highest, true_shown)
 margin = 0.05 * (highest - lowest)
 figure = corner.corner(
     shown,
@@ -287,13 +324,16 @@ def error_line(title: str, error: np.ndarray) -> str:
 
 
 n_structural = len(model.parameter_names)
-predictions = {
-    "Before updating (reported values)": model.simulate(np.ones(n_structural)),
-    "After updating (posterior mean)": model.simulate(samples.mean(axis=0)[:n_structural]),
+points = {
+    "Before updating (reported values)": np.ones(n_structural),
+    "After updating (posterior mean)": samples.mean(axis=0)[:n_structural],
 }
+# at the samples that were measured: with measurements of your own, some may be missing or have a step of their own
+predictions = {title: measured.values - posterior.likelihood.residuals(point) for title, point in points.items()}
 errors = {title: rrmse(response, measured.values) for title, response in predictions.items()}
 
-figure, axes = plt.subplots(2, 2, figsize=(12, 6), sharex=True, sharey="row", layout="constrained")
+shape = {"nrows": measured.n_channels, "ncols": 2, "squeeze": False}
+figure, axes = plt.subplots(**shape, figsize=(12, 6), sharex=True, sharey="row", layout="constrained")
 for column, (title, response) in enumerate(predictions.items()):
     for i, channel in enumerate(measured.channels):
         axis = axes[i, column]
@@ -327,7 +367,7 @@ if args.classes:
     }
     runs, posteriors = {"as updated": sampler}, {"as updated": posterior}
     for name, change in variants.items():
-        posteriors[name] = problems.bridge_column(record=record, measurements=measurements, every=every, **change)
+        posteriors[name] = make_posterior(**change)
         guide = posteriors[name].guide() if guided else None
         runs[name] = SMCSampler(
             walkers, posterior.ndim, posteriors[name], vectorize=True, seed=args.seed, guide=guide, **dict(settings)
@@ -341,8 +381,9 @@ if args.classes:
         for name, run in runs.items()
     }
     averaged = average_predictions(predictions_of, comparison.probabilities)
-    for name, predicted in (*predictions_of.items(), ("averaged", averaged)):
-        print(error_line(name, rrmse(predicted.mean, measured.values)))
+    predictions_of["averaged"] = replace(predictions_of["as updated"], mean=averaged.mean)
+    for name, predicted in predictions_of.items():
+        print(error_line(name, predicted.rrmse(measured)))
     classes = {name: [float(run.log_evidence), float(run.log_evidence_error)] for name, run in runs.items()}
 
 # %%
@@ -364,7 +405,7 @@ result = {
     "log_evidence_error": float(sampler.log_evidence_error),
     "posterior_mean": dict(zip(posterior.parameter_names, samples.mean(axis=0).tolist(), strict=True)),
     "posterior_sd": dict(zip(posterior.parameter_names, samples.std(axis=0, ddof=1).tolist(), strict=True)),
-    "truth": dict(zip(posterior.parameter_names, truth.tolist(), strict=True)),
+    "truth": None if truth is None else dict(zip(posterior.parameter_names, truth.tolist(), strict=True)),
     "rrmse": {k: dict(zip([c.name for c in measured.channels], v.tolist(), strict=True)) for k, v in errors.items()},
     "verdict": sampler.verdict.status,
     "reasons": sampler.verdict.reasons,

@@ -447,7 +447,7 @@ class CachedSimulations:
 
     def _check_model(self, check: Callable, *arguments: Any) -> None:
         """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
-        run = VerifyingRun(self.model, self.pool, self.measurements.values, self._statistic, self._width)
+        run = VerifyingRun(self.model, self.pool, self.measured, self._statistic, self._width)
         try:
             check(self.model, partial(self._repeated_points.agree, run, self.cache), *arguments)
         except ChangedModel:

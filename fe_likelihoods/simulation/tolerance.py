@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..signals.comparison import Comparison, measured_values
 from .model import Model
 from .source_digest import inherits_fingerprint
 
@@ -23,7 +24,7 @@ def response_tolerance(model: Model) -> float:
 
 
 def largest_difference(
-    stored: np.ndarray, new: np.ndarray, measured: np.ndarray, tolerance: float
+    stored: np.ndarray, new: np.ndarray, measured: np.ndarray | Comparison, tolerance: float
 ) -> tuple[int, float] | None:
     """The statistic that differs most between two simulations with the same parameters, if one differs too much.
 
@@ -32,7 +33,7 @@ def largest_difference(
     stored, new : (n_numbers,) float
         Statistics of the residuals, the sums of squares (n_channels,) first; further numbers have the order and the
         scale of the sums.
-    measured : (n_channels, n_steps) float
+    measured : (n_channels, n_steps) float, or Comparison
         Measured response [SI].
     tolerance : float
         Accepted change of the response in a channel, relative to the norm of the response.
@@ -51,6 +52,7 @@ def largest_difference(
     """
     if np.array_equal(stored, new):
         return None
+    measured = measured_values(measured)
     channels = np.arange(len(stored)) % len(measured)
     sums = np.sort([stored[: len(measured)], new[: len(measured)]], axis=0)
     s = np.sqrt(sums[0])[channels]

@@ -347,7 +347,7 @@ class VerifiedCache:
                 advice = ". If failures depend on anything but the parameters, set retry_failures=True"
         else:
             tolerance = self._tolerance(run)
-            found = largest_difference(row.misfit, new, measured_values(run.measured), tolerance)
+            found = largest_difference(row.misfit, new, run.measured, tolerance)
             if found is None:
                 return
             index, change = found
@@ -387,7 +387,7 @@ class VerifiedCache:
         if reason or new_reason:
             outcome = f"failed ({new_reason})" if new_reason else "succeeded"
             return f"{text}{outcome}. Make it depend on its parameters alone, for example with a fixed seed"
-        found = largest_difference(earlier, new, measured_values(run.measured), self._tolerance(run))
+        found = largest_difference(earlier, new, run.measured, self._tolerance(run))
         if found is None:
             return ""
         index, change = found

@@ -19,6 +19,7 @@ from fe_likelihoods import (
     SharedGaussianNoise,
     SimulationCache,
     SimulationFailed,
+    StaleCache,
     TruncatedNormal,
     Uniform,
     effective_samples,
@@ -220,6 +221,28 @@ def test_likelihood_with_gaps(rng, tmp_path, noise, own):
     assert again.simulations == 0
     shifted = FELikelihood(model, measured(rng, there), noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
     assert shifted.fingerprint != likelihood.fingerprint
+
+
+@pytest.mark.parametrize("noise", [GaussianNoise, AutoregressiveNoise])
+@pytest.mark.parametrize(("jitter", "stale"), [(1e-13, False), (1e-3, True)])
+def test_cached_rows_are_compared_with_gaps(rng, tmp_path, noise, jitter, stale):
+    """Simulations that differ in their last digits agree with the stored rows, others do not."""
+    data, runs = measured(rng, with_gaps(rng)), []
+
+    def unsteady(theta):
+        runs.append(theta)
+        return wave(theta) * (1.0 + jitter * len(runs))
+
+    model = FunctionModel(unsteady, ["size", "speed"], CHANNELS, 0.02, 60, version="1")
+    thetas = rng.uniform(0.5, 1.5, (4, 2))
+    FELikelihood(model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db")).statistics(thetas)
+    again = FELikelihood(model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
+    if stale:
+        with pytest.raises(StaleCache):
+            again.statistics(thetas)
+    else:
+        again.statistics(thetas)
+        assert again.disk_hits == 4 and again.verifications > 0
 
 
 class Unaware:
