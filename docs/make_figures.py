@@ -14,10 +14,18 @@ from pathlib import Path
 import matplotlib
 
 matplotlib.use("Agg")
+import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from fe_likelihoods import problems
+from fe_likelihoods import (
+    material_curves,
+    moment_curvature,
+    plot_material,
+    plot_moment_curvature,
+    plot_sensors,
+    problems,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
@@ -45,7 +53,30 @@ def model_figures() -> dict:
     loops.suptitle("bridge column under 2.5 times the synthetic motion", fontsize="medium")
     bearings = problems.isolated_bridge().likelihood.model.plot_hysteresis(np.ones(10))
     bearings.suptitle("isolated bridge, nominal values (assumed), synthetic motion", fontsize="medium")
+    means = [problems.BRIDGE_COLUMN_MEANS[name] for name in column.parameter_names]
+    bar = round(column.bar_circle_radius, 3)
+    places = (*(f"strain@0.3:{x}" for x in (bar, -bar)), f"strain@0.6:{bar}", "curvature@0", "curvature@1.8288")
+    outputs = (
+        "acceleration",
+        "displacement",
+        "base_moment",
+        "base_shear",
+        *places,
+        "rotation@0:0.6",
+        "rotation@0.6:1.2",
+    )
+    sensors = plot_sensors(replace(column, outputs=outputs)).figure
+    materials, (left, middle, right) = plt.subplots(1, 3, figsize=(12.8, 4.0), layout="constrained")
+    core, cover, steel = material_curves(column, np.ones(5))
+    plot_material(core, cover, axes=left)
+    plot_material(steel, axes=middle)
+    curvature = np.linspace(0.0, 0.05, 300)
+    cases = {"nominal": np.ones(5), "posterior means": means}
+    curves = {name: moment_curvature(column, theta, curvature) for name, theta in cases.items()}
+    plot_moment_curvature(curves, right)
     return {
+        "column_sensors": sensors,
+        "column_materials": materials,
         "column_section": column.plot_section().figure,
         "column_hysteresis": loops,
         "bridge_hysteresis": bearings,

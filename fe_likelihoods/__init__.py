@@ -61,6 +61,12 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .models.rc_column import (
         RCColumn,
     )
+    from .models.rc_column_curves import (
+        MaterialCurve,
+        MomentCurvature,
+        material_curves,
+        moment_curvature,
+    )
     from .models.rc_column_parts import (
         Bars,
         Concrete,
@@ -75,9 +81,16 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         plot_histories,
         plot_loop,
     )
+    from .plots.materials import (
+        plot_material,
+        plot_moment_curvature,
+    )
     from .plots.predictions import (
         plot_bands,
         plot_fragility,
+    )
+    from .plots.structures import (
+        plot_sensors,
     )
     from .prediction.averaging import (
         AveragedPrediction,
@@ -241,10 +254,12 @@ __all__ = [
     "LocalPool",
     "LogNormal",
     "MarginalNoise",
+    "MaterialCurve",
     "Measurements",
     "Mode",
     "ModeSearch",
     "Model",
+    "MomentCurvature",
     "Noise",
     "OpenSeesModel",
     "Patches",
@@ -282,6 +297,8 @@ __all__ = [
     "from_si",
     "growing_durations",
     "innovations",
+    "material_curves",
+    "moment_curvature",
     "nautilus_prior",
     "peak",
     "peak_ground_acceleration",
@@ -289,7 +306,10 @@ __all__ = [
     "plot_fragility",
     "plot_histories",
     "plot_loop",
+    "plot_material",
+    "plot_moment_curvature",
     "plot_residuals",
+    "plot_sensors",
     "problems",
     "propagate",
     "read_at2",
@@ -341,6 +361,12 @@ _EXPORTS = {
     ),
     "models.opensees": ("OpenSeesModel",),
     "models.rc_column": ("RCColumn",),
+    "models.rc_column_curves": (
+        "MaterialCurve",
+        "MomentCurvature",
+        "material_curves",
+        "moment_curvature",
+    ),
     "models.rc_column_parts": (
         "Bars",
         "Concrete",
@@ -353,10 +379,15 @@ _EXPORTS = {
         "plot_histories",
         "plot_loop",
     ),
+    "plots.materials": (
+        "plot_material",
+        "plot_moment_curvature",
+    ),
     "plots.predictions": (
         "plot_bands",
         "plot_fragility",
     ),
+    "plots.structures": ("plot_sensors",),
     "prediction.averaging": (
         "AveragedPrediction",
         "average_predictions",

@@ -30,7 +30,16 @@ import math
 
 from .jit import kernel
 
-__all__ = ["N_CONSTANTS", "constants", "unloading", "envelope", "stress_tangent", "commit"]
+__all__ = [
+    "N_CONSTANTS",
+    "constants",
+    "unloading",
+    "envelope",
+    "stress_tangent",
+    "commit",
+    "stress_history",
+    "fiber_stresses",
+]
 
 # Layout of the constants of one concrete.
 FC, E0, ECU, EC, FT, ETU, BETA, ESEC, R, ECT, DECAY = range(11)
@@ -138,3 +147,23 @@ def stress_tangent(eps, eps_min, eps_max, eps_end, slope, tension_slope, c):
 def commit(eps, eps_min, eps_max):
     """Return the memory after the strain `eps` has been committed."""
     return min(eps_min, eps), max(eps_max, eps)
+
+
+@kernel
+def stress_history(strain, c, stress):
+    """Take one virgin fiber through `strain` (n,) and write its `stress` (n,)."""
+    eps_min, eps_max = 0.0, 0.0
+    eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)
+    for i in range(strain.shape[0]):
+        stress[i], _ = stress_tangent(strain[i], eps_min, eps_max, eps_end, slope, tension_slope, c)
+        eps_min, eps_max = commit(strain[i], eps_min, eps_max)
+        eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)
+
+
+@kernel
+def fiber_stresses(strain, memory, c, stress):
+    """Write the `stress` (n,) of fibers at the trial `strain` (n,); `memory` (n, 2) has their extreme strains."""
+    for i in range(strain.shape[0]):
+        eps_min, eps_max = memory[i, 0], memory[i, 1]
+        eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)
+        stress[i], _ = stress_tangent(strain[i], eps_min, eps_max, eps_end, slope, tension_slope, c)

@@ -397,7 +397,7 @@ class RCColumn(ThreadedModel):
             **prepared.fibers,
             penetration=values["penetration"],
         )
-        set_materials(column, values, self.concrete, self.steel, prepared.section.confinement(values["fc"]))
+        set_materials(column.sections, values, self.concrete, self.steel, prepared.section.confinement(values["fc"]))
         iteration = Iteration(float(self.tolerance), int(self.max_iterations), int(self.halvings))
         record = any(output.row is None for output in prepared.outputs)
         gravity = np.zeros(3 * self.n_elements)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..kernels import concrete04, reinforcing_steel
+from ..kernels.fiber_section import Sections
 from ..kernels.frame import Column
 from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from ..kernels.static import Iteration, impose_displacement
@@ -228,16 +229,16 @@ def checked_history(model: RCColumn, analysis: Analysis, theta: np.ndarray) -> C
 
 
 def set_materials(
-    column: Column, values: dict[str, float], concrete: Concrete, steel: Steel, confinement: Confinement
+    sections: Sections, values: dict[str, float], concrete: Concrete, steel: Steel, confinement: Confinement
 ) -> None:
-    """Write the constants of core, cover and bars at the physical parameter `values` [SI] into `column`."""
+    """Write the constants of core, cover and bars at the physical parameter `values` [SI] into `sections`."""
     fc, ec, ft = values["fc"], values["Ec"], values["ft"]
     peak = concrete.peak_strain if concrete.peak_strain is not None else 2.0 * fc / ec
     core_peak = peak * confinement.strain_ratio
     core_ultimate = max(confinement.ultimate_strain, 1.05 * core_peak)
     cover_ultimate = max(concrete.ultimate_strain, 1.5 * peak)
     tension = (ec, ft, ft / ec + concrete.softening_strain, concrete.softening_ratio)
-    core, cover = column.sections.concrete
+    core, cover = sections.concrete
     concrete04.constants(-fc * confinement.strength_ratio, -core_peak, -core_ultimate, *tension, core)
     concrete04.constants(-fc, -peak, -cover_ultimate, *tension, cover)
     reinforcing_steel.constants(
@@ -247,7 +248,7 @@ def set_materials(
         values["Esh"],
         steel.hardening_strain,
         steel.ultimate_strain,
-        column.sections.steel,
+        sections.steel,
     )
 
 

@@ -20,6 +20,8 @@ __all__ = [
     "FragilityLike",
     "HistoryLike",
     "HoopsLike",
+    "MaterialCurveLike",
+    "MomentCurvatureLike",
     "NamedLike",
     "PatchesLike",
     "PredictionLike",
@@ -136,6 +138,21 @@ class HistoryLike(Protocol):
         """History of one quantity, shape (n_steps,)."""
 
 
+class MaterialCurveLike(NamedLike, Protocol):
+    """Stress of a material under a history of strain, such as `fe_likelihoods.MaterialCurve`."""
+
+    strain: np.ndarray
+    stress: np.ndarray
+
+
+class MomentCurvatureLike(Protocol):
+    """Moment of a section under a history of curvature, such as `fe_likelihoods.MomentCurvature`."""
+
+    curvature: np.ndarray
+    moment: np.ndarray
+    axial_force: float
+
+
 class BarsLike(Protocol):
     """Longitudinal bars on a circle."""
 
@@ -163,12 +180,21 @@ class ColumnLike(Protocol):
     """A circular reinforced-concrete column, such as `fe_likelihoods.RCColumn`; lengths in metres."""
 
     diameter: float
+    height: float
     cover: float
     bars: BarsLike
     hoops: HoopsLike
     mesh: int | PatchesLike
     units: Mapping[str, str] | Sequence[tuple[str, str]]
     loading: NamedLike
+
+    @property
+    def channels(self) -> Sequence[ChannelLike]:
+        """Channels of the response."""
+
+    @property
+    def section_heights(self) -> np.ndarray:
+        """Heights of the sections above the base [m]."""
 
     @property
     def core_diameter(self) -> float:

@@ -1,4 +1,4 @@
-"""Figures of structures: the section of a column, and hysteresis loops.
+"""Figures of structures: the section of a column, its sensors, and hysteresis loops.
 
 The functions draw what a model or the history of one simulation holds. The models have methods that call them. Values
 are drawn in the display units of the model. Moments have units of force times length, curvatures one over length.
@@ -14,13 +14,13 @@ import numpy as np
 from ..units import from_si
 from .histories import plot_loop
 from .protocols import ColumnLike, HistoryLike, PatchesLike
-from .style import BLUE, ORANGE, new_axes
+from .style import BLUE, GREY, ORANGE, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_bearing_loops", "plot_column_loops", "plot_section"]
+__all__ = ["plot_bearing_loops", "plot_column_loops", "plot_section", "plot_sensors"]
 
 _CORE = "#b9cfe4"
 
@@ -75,6 +75,67 @@ def plot_section(column: ColumnLike, axes: Axes | None = None) -> Axes:
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, fontsize="small", ncols=2
     )
     return axes
+
+
+def plot_sensors(column: ColumnLike, axes: Axes | None = None) -> Axes:
+    """Plot where the sensors of a column are: its elevation with every channel at its place.
+
+    Parameters
+    ----------
+    column : ColumnLike
+        The column, such as `fe_likelihoods.RCColumn`; its channels have the names of its outputs.
+    axes : matplotlib Axes, optional
+        Where to draw. Default: a new figure.
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes with the figure; lengths in metres.
+    """
+    from matplotlib.patches import Rectangle
+
+    axes = new_axes(axes, (6.8, 6.4))
+    radius, height = 0.5 * column.diameter, column.height
+    axes.add_patch(Rectangle((-radius, 0.0), 2.0 * radius, height, facecolor="#e9ebee", edgecolor="0.5"))
+    axes.add_patch(Rectangle((-2.2 * radius, -0.05 * height), 4.4 * radius, 0.05 * height, facecolor="0.6"))
+    axes.add_patch(Rectangle((-1.4 * radius, height), 2.8 * radius, 0.06 * height, facecolor="0.8", edgecolor="0.5"))
+    axes.hlines(np.unique(column.section_heights), -radius, radius, color="0.65", linestyle=":", linewidth=1.0)
+    places = sorted((_draw_sensor(name, axes, radius, height) for name in (c.name for c in column.channels)), key=_rank)
+    ends = np.linspace(0.0, height, len(places)) if len(places) > 1 else [0.5 * height]
+    for (x, z, name), end in zip(places, ends, strict=True):
+        axes.plot([x, 2.4 * radius, 2.8 * radius], [z, end, end], color=GREY, linewidth=0.6, zorder=1)
+        axes.text(2.85 * radius, end, name, va="center", fontsize="small")
+    axes.set(xlim=(-2.4 * radius, 6.5 * radius), ylim=(-0.07 * height, 1.1 * height))
+    axes.set(xlabel="position in the direction of loading [m]", ylabel="height above the base [m]")
+    axes.set_xticks([-radius, 0.0, radius], [f"{x:.3g}" for x in (-radius, 0.0, radius)])
+    axes.set_title("dotted: sections of the elements", fontsize="small")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    return axes
+
+
+def _draw_sensor(name: str, axes: Axes, radius: float, height: float) -> tuple[float, float, str]:
+    """Draw one sensor by its name, such as "strain@0.3:0.5"; return the place at which its label points, and it."""
+    kind, _, place = name.partition("@")
+    values = [float(number) for number in place.split(":")] if place else []
+    if kind == "strain":
+        axes.plot(values[1], values[0], "o", color=ORANGE, markersize=5, zorder=3)
+        return values[1], values[0], name
+    if kind == "curvature":
+        axes.plot([-radius, radius], [values[0]] * 2, color=BLUE, linewidth=2.0, zorder=2)
+        return radius, values[0], name
+    if kind == "rotation":
+        axes.plot([1.2 * radius] * 2, values, color=ORANGE, marker="_", markersize=9, linewidth=1.6, zorder=2)
+        return 1.2 * radius, 0.5 * (values[0] + values[1]), name
+    z = height if kind in ("acceleration", "displacement", "force") else 0.0
+    axes.plot(0.0, z, "s", color="0.25", markersize=5, zorder=3)
+    return 0.0, z, name
+
+
+def _rank(place: tuple[float, float, str]) -> tuple[float, float]:
+    """Order of labels from the base up; of those at the same height, the one nearest to the labels is the highest."""
+    x, z, _ = place
+    return z, x
 
 
 def plot_column_loops(column: ColumnLike, history: HistoryLike) -> Figure:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fe_likelihoods import plot_sensors
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
 from fe_likelihoods.models.rc_column import Patches, RCColumn
 from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
@@ -76,3 +77,18 @@ def test_section(record, mesh):
         assert low < -cover.radius < cover.radius < high
     assert axes.get_xlabel() == "position in the direction of loading [in]"
     assert axes.get_aspect() == 1.0 and "18 bars, diameter 1.41 in" in texts(axes)
+
+
+def test_sensors_are_drawn_at_their_places(record):
+    outputs = ("acceleration", "base_moment", "strain@0.3:-0.5", "curvature@2", "rotation@0.1:0.7")
+    axes = plot_sensors(RCColumn.lhpost(record, outputs=outputs))
+    assert sorted(text.get_text() for text in axes.texts) == sorted(outputs)
+    assert len({text.get_position() for text in axes.texts}) == 5, "no label covers another"
+    drawn = [np.round(np.column_stack(line.get_data()), 9).tolist() for line in axes.lines]
+    assert [[-0.5, 0.3]] in drawn and [[-0.6096, 2.0], [0.6096, 2.0]] in drawn
+    assert [[0.73152, 0.1], [0.73152, 0.7]] in drawn
+    assert [[0.0, 7.3152]] in drawn and [[0.0, 0.0]] in drawn
+    (sections,) = axes.collections
+    np.testing.assert_allclose([s[0, 1] for s in sections.get_segments()], [0.0, 1.8288, 3.6576, 5.4864, 7.3152])
+    low, high = axes.get_ylim()
+    assert low < 0.0 and high > 7.3152

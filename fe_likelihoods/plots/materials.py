@@ -1,0 +1,96 @@
+"""Figures of materials and sections: stress against strain, moment against curvature."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from ..units import find_unit, from_si
+from .protocols import MaterialCurveLike, MomentCurvatureLike
+from .style import BLUE, GREY, ORANGE, new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_material", "plot_moment_curvature"]
+
+_COLOURS = (BLUE, ORANGE, GREY, "#4c8c4a", "#8c4a6e")
+
+
+def plot_material(
+    *curves: MaterialCurveLike,
+    axes: Axes | None = None,
+    strain_unit: str = "%",
+    stress_unit: str = "MPa",
+) -> Axes:
+    """Plot stress against strain of one or more materials.
+
+    Parameters
+    ----------
+    *curves : MaterialCurveLike
+        The curves, such as the results of `fe_likelihoods.material_curves`.
+    axes : matplotlib Axes, optional
+        Where to draw. Default: a new figure.
+    strain_unit, stress_unit : str
+        Units of the axes.
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes with the figure.
+    """
+    axes = _with_origin(new_axes(axes, (5.4, 4.0)))
+    for curve, colour in zip(curves, _cycle(len(curves)), strict=True):
+        strain = from_si(curve.strain, strain_unit, "strain")
+        axes.plot(strain, from_si(curve.stress, stress_unit, "stress"), color=colour, linewidth=1.1, label=curve.name)
+    label = "strain" if strain_unit == "1" else f"strain [{strain_unit}]"
+    axes.set(xlabel=label, ylabel=f"stress [{stress_unit}]")
+    axes.legend(frameon=False, fontsize="small")
+    return axes
+
+
+def plot_moment_curvature(
+    curves: MomentCurvatureLike | Mapping[str, MomentCurvatureLike],
+    axes: Axes | None = None,
+    *,
+    curvature_unit: str = "1/m",
+    moment_unit: str = "kN m",
+) -> Axes:
+    """Plot moment against curvature of one or more sections.
+
+    Parameters
+    ----------
+    curves : MomentCurvatureLike, or a mapping from labels to them
+        The curves, such as the result of `fe_likelihoods.moment_curvature`.
+    axes : matplotlib Axes, optional
+        Where to draw. Default: a new figure.
+    curvature_unit, moment_unit : str
+        Units of the axes.
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes with the figure. The labels have the axial force, positive in tension.
+    """
+    many = dict(curves) if isinstance(curves, Mapping) else {"": curves}
+    axes = _with_origin(new_axes(axes, (5.4, 4.0)))
+    force_unit = find_unit(moment_unit, "moment").name.split()[0]
+    for (name, curve), colour in zip(many.items(), _cycle(len(many)), strict=True):
+        force = f"axial force {from_si(curve.axial_force, force_unit):.5g} {force_unit}"
+        x = from_si(curve.curvature, curvature_unit, "curvature")
+        y = from_si(curve.moment, moment_unit, "moment")
+        axes.plot(x, y, color=colour, linewidth=1.3, label=f"{name}, {force}" if name else force)
+    axes.set(xlabel=f"curvature [{curvature_unit}]", ylabel=f"moment [{moment_unit}]")
+    axes.legend(frameon=False, fontsize="small", loc="best")
+    return axes
+
+
+def _with_origin(axes: Axes) -> Axes:
+    for line in (axes.axhline, axes.axvline):
+        line(0.0, color="0.75", linewidth=0.7, zorder=0)
+    axes.grid(alpha=0.25)
+    return axes
+
+
+def _cycle(n: int) -> list[str]:
+    return [_COLOURS[i % len(_COLOURS)] for i in range(n)]
