@@ -1,10 +1,21 @@
-"""Shared fixtures: the folder of reference material beside the project, and the seed of the statistical tests."""
+"""Shared fixtures: the folder of reference material beside the project, and the seed of the statistical tests.
+
+Linear algebra uses one thread per process, also in the scripts that tests start. The workers of pytest-xdist occupy all
+cores, and threads of OpenBLAS that wait for each other on small matrices take three times the processor time.
+
+The longest tests come first, so that no worker waits for another one at the end.
+"""
 
 import os
 from pathlib import Path
 
-import numpy as np
-import pytest
+for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")  # read when numpy is imported
+
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+
+LONG = ("test_tutorials.py", "test_readme.py")
 
 SHARED = Path(os.environ.get("FE_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
@@ -29,3 +40,9 @@ def seed() -> int:
 def rng(seed) -> np.random.Generator:
     """Generator seeded with `seed`."""
     return np.random.default_rng(seed)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Begin with the files whose tests take up to a minute; the order within a file stays."""
+    items.sort(key=lambda item: item.path.name not in LONG)
