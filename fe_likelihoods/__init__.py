@@ -16,51 +16,31 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         to_pints,
         to_pymc,
     )
-    from .data.make_isolated_bridge import (
-        table_motion,
-    )
-    from .emulation.emulator import (
-        ResponseEmulator,
-    )
-    from .emulation.guide import (
-        ResponseGuide,
-    )
+    from .data.make_isolated_bridge import table_motion
+    from .emulation.emulator import ResponseEmulator
+    from .emulation.guide import ResponseGuide
     from .emulation.modes import (
         Mode,
         ModeSearch,
         find_modes,
     )
-    from .models.executable import (
-        ExecutableModel,
-    )
-    from .models.function import (
-        FunctionModel,
-    )
-    from .models.isolated_bridge import (
-        IsolatedBridge,
-    )
+    from .models.executable import ExecutableModel
+    from .models.function import FunctionModel
+    from .models.isolated_bridge import IsolatedBridge
     from .models.isolated_bridge_parts import (
         Bearing,
         Damper,
         Pier,
         Rubber,
     )
-    from .models.linear_oscillator import (
-        LinearOscillator,
-    )
-    from .models.linear_structure import (
-        LinearStructure,
-    )
+    from .models.linear_oscillator import LinearOscillator
+    from .models.linear_structure import LinearStructure
     from .models.linear_structure_parts import (
         BridgeDeck,
         ShearFrame,
     )
-    from .models.opensees import (
-        OpenSeesModel,
-    )
-    from .models.rc_column import (
-        RCColumn,
-    )
+    from .models.opensees import OpenSeesModel
+    from .models.rc_column import RCColumn
     from .models.rc_column_curves import (
         MaterialCurve,
         MomentCurvature,
@@ -74,9 +54,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         Patches,
         Steel,
     )
-    from .models.steel_coupon import (
-        SteelCoupon,
-    )
+    from .models.steel_coupon import SteelCoupon
     from .plots.histories import (
         plot_histories,
         plot_loop,
@@ -89,9 +67,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         plot_bands,
         plot_fragility,
     )
-    from .plots.structures import (
-        plot_sensors,
-    )
+    from .plots.structures import plot_sensors
     from .prediction.averaging import (
         AveragedPrediction,
         average_predictions,
@@ -102,23 +78,17 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         fragility,
         peak_ground_acceleration,
     )
-    from .prediction.prediction import (
-        Prediction,
-    )
+    from .prediction.prediction import Prediction
     from .prediction.propagation import (
         fit_measures,
         propagate,
     )
-    from .prediction.quantities import (
-        peak,
-    )
+    from .prediction.quantities import peak
     from .prediction.reliability import (
         Exceedance,
         exceedance,
     )
-    from .probability.autoregressive_noise import (
-        AutoregressiveNoise,
-    )
+    from .probability.autoregressive_noise import AutoregressiveNoise
     from .probability.distributions import (
         Distribution,
         HalfNormal,
@@ -126,32 +96,18 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         TruncatedNormal,
         Uniform,
     )
-    from .probability.event_noise import (
-        EventNoise,
-    )
-    from .probability.failures import (
-        TooManyFailures,
-    )
-    from .probability.joint import (
-        JointLikelihood,
-    )
-    from .probability.likelihood import (
-        FELikelihood,
-    )
-    from .probability.marginal_noise import (
-        MarginalNoise,
-    )
+    from .probability.event_noise import EventNoise
+    from .probability.failures import TooManyFailures
+    from .probability.joint import JointLikelihood
+    from .probability.likelihood import FELikelihood
+    from .probability.marginal_noise import MarginalNoise
     from .probability.noise import (
         GaussianNoise,
         Noise,
         SharedGaussianNoise,
     )
-    from .probability.posterior import (
-        Posterior,
-    )
-    from .probability.priors import (
-        Prior,
-    )
+    from .probability.posterior import Posterior
+    from .probability.priors import Prior
     from .probability.residuals import (
         ResidualChecks,
         effective_samples,
@@ -159,9 +115,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         plot_residuals,
         residual_checks,
     )
-    from .probability.time_shift_noise import (
-        TimeShiftNoise,
-    )
+    from .probability.time_shift_noise import TimeShiftNoise
     from .signals.alignment import (
         Alignment,
         align,
@@ -175,12 +129,8 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         read_dataset,
         write_dataset,
     )
-    from .signals.durations import (
-        growing_durations,
-    )
-    from .signals.error_measures import (
-        rrmse,
-    )
+    from .signals.durations import growing_durations
+    from .signals.error_measures import rrmse
     from .signals.events import (
         Events,
         EventWindow,
@@ -201,22 +151,14 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         ResponseSpectrum,
         response_spectrum,
     )
-    from .simulation.disk_cache import (
-        SimulationCache,
-    )
-    from .simulation.faults import (
-        TransientReason,
-    )
-    from .simulation.local_pool import (
-        LocalPool,
-    )
+    from .simulation.disk_cache import SimulationCache
+    from .simulation.faults import TransientReason
+    from .simulation.local_pool import LocalPool
     from .simulation.model import (
         Model,
         SimulationFailed,
     )
-    from .simulation.verification import (
-        StaleCache,
-    )
+    from .simulation.verification import StaleCache
     from .units import (
         from_si,
         to_si,

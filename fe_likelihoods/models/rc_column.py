@@ -411,7 +411,7 @@ class RCColumn(ThreadedModel):
             analysis = prepared.motion.run(column, dynamics, iteration, record)
         rows = dict(zip(analysis.names, analysis.values, strict=True))
         outputs = {o.name: o.evaluate(rows, analysis.sections, values["penetration"]) for o in prepared.outputs}
-        return checked_history(self, analysis, theta), outputs
+        return checked_history(self, self.steel, self.bar_circle_radius, analysis, theta), outputs
 
     @property
     def _time_label(self) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,13 +20,10 @@ from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from ..kernels.static import Iteration, impose_displacement
 from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
-from .base import History
+from .base import BuiltInModel, History
 from .circular_section import Confinement
 from .rc_column_parts import Concrete, Steel
 from .validation import check_values
-
-if TYPE_CHECKING:
-    from .rc_column import RCColumn
 
 __all__ = [
     "Analysis",
@@ -40,7 +37,7 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-_WARNED: weakref.WeakSet[RCColumn] = weakref.WeakSet()
+_WARNED: weakref.WeakSet[BuiltInModel] = weakref.WeakSet()
 _MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 
 IMPOSED_ROWS = (
@@ -210,11 +207,13 @@ def check_physical_values(values: dict[str, float], steel: Steel) -> None:
         )
 
 
-def checked_history(model: RCColumn, analysis: Analysis, theta: np.ndarray) -> ColumnHistory:
+def checked_history(
+    model: BuiltInModel, steel: Steel, bar_radius: float, analysis: Analysis, theta: np.ndarray
+) -> ColumnHistory:
     """History of a simulation; warns once per model where bars exceed the strain at which they fracture."""
     strain, curvature = (analysis.values[analysis.names.index(f"base {row}")] for row in ("axial strain", "curvature"))
-    limit = model.steel.ultimate_strain
-    beyond = float((np.abs(strain) + model.bar_circle_radius * np.abs(curvature)).max()) / limit
+    limit = steel.ultimate_strain
+    beyond = float((np.abs(strain) + bar_radius * np.abs(curvature)).max()) / limit
     if beyond > 1.0 and model not in _WARNED:
         _WARNED.add(model)
         logger.warning(
