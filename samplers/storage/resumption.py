@@ -260,9 +260,13 @@ class Resumption:
             self._runs_to_end = False
 
     def _describe_what_is_kept(self) -> str:
+        try:
+            steps = f"{self.iteration} steps"
+        except OSError:  # a disk that is full: the journal has them
+            steps = "all steps"
         return (
-            f"{self.evaluations} evaluations and {self.iteration} steps are kept in {self._checkpoint.place}: run the "
-            "same script again, or make the same call, to go on"
+            f"{self.evaluations} evaluations and {steps} are kept in {self._checkpoint.place}: run the same script "
+            "again, or make the same call, to go on"
         )
 
     def _compare_last_state(self) -> None:

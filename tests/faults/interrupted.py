@@ -6,6 +6,7 @@ executes, one after another, makes the same call again, and then starts the same
 
 import argparse
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -20,7 +21,6 @@ from samplers import SMCSampler
 from tests.contract.targets import WithBlobs
 
 FOLDER = str(Path(samplers.__file__).parent)
-DEFERS = "lenient_file.py"  # Ctrl-C waits for its end
 CALLS = (2, 3)
 
 
@@ -41,6 +41,7 @@ class Interrupt:
 
     def __init__(self, line=None):
         self.line, self.count, self.place = line, 0, ""
+        self.handler = signal.getsignal(signal.SIGINT)
 
     def __enter__(self):
         sys.settrace(self._enter)
@@ -50,11 +51,10 @@ class Interrupt:
         sys.settrace(None)
 
     def _enter(self, frame, event, value):
-        name = frame.f_code.co_filename
-        return self._trace if name.startswith(FOLDER) and not name.endswith(DEFERS) else None
+        return self._trace if frame.f_code.co_filename.startswith(FOLDER) else None
 
     def _trace(self, frame, event, value):
-        if event == "line":
+        if event == "line" and signal.getsignal(signal.SIGINT) is self.handler:  # otherwise Ctrl-C is deferred
             self.count += 1
             if self.count == self.line:
                 self.place = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
