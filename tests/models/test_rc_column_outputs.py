@@ -14,6 +14,7 @@ from fe_likelihoods import (
     Measurements,
     Patches,
     RCColumn,
+    read_columns,
 )
 from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column_outputs import Sections, parse_outputs
@@ -130,6 +131,20 @@ def test_sensors_are_data_and_predictions(shaken, rng):
         measured.misfit_batch(thetas, truth.values).misfit,
         np.square(measured.simulate_batch(thetas).response - truth.values).sum(axis=2),
     )
+
+
+def test_sensors_are_read_from_a_table_with_their_units(shaken, tmp_path):
+    names = ("base_moment", "strain@0.3:-0.55", "curvature@0.3", "rotation@0:0.6")
+    units, factors = ("kN m", "microstrain", "1/km", "mrad"), (1e3, 1e-6, 1e-3, 1e-3)
+    column = replace(shaken, outputs=names)
+    response = column.simulate(np.ones(5))
+    table = np.vstack([shaken.dt * np.arange(shaken.n_steps), response / np.array(factors)[:, None]])
+    headers = [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
+    file = tmp_path / "sensors.csv"
+    np.savetxt(file, table.T, delimiter=",", header=",".join(["time [s]", *headers]), comments="", fmt="%.17g")
+    measured = read_columns(file, column.channels, headers, units)
+    np.testing.assert_allclose(measured.values, response, rtol=1e-12, atol=1e-18)
+    assert FELikelihood(column, measured).parameter_names[-1] == "sigma_rotation@0:0.6"
 
 
 @pytest.mark.parametrize(
