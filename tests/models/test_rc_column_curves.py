@@ -53,7 +53,7 @@ def test_moment_curvature_is_that_of_the_simulated_base(column):
 
 
 def test_large_curvature_steps_are_divided(column):
-    fine = moment_curvature(column, np.ones(3), np.linspace(0.0, 0.04, 400))
+    fine = moment_curvature(column, np.ones(3), np.linspace(0.0, 0.04, 100))
     (moment,) = moment_curvature(column, np.ones(3), [0.04]).moment
     assert moment == pytest.approx(fine.moment[-1], rel=0.02)
 
