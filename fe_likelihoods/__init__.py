@@ -10,159 +10,62 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
     from . import problems
-    from .adapters import (
-        nautilus_prior,
-        to_bilby,
-        to_pints,
-        to_pymc,
-    )
+    from .adapters import nautilus_prior, to_bilby, to_pints, to_pymc
     from .data.make_isolated_bridge import table_motion
     from .emulation.emulator import ResponseEmulator
     from .emulation.guide import ResponseGuide
-    from .emulation.modes import (
-        Mode,
-        ModeSearch,
-        find_modes,
-    )
+    from .emulation.modes import Mode, ModeSearch, find_modes
     from .models.executable import ExecutableModel
     from .models.function import FunctionModel
     from .models.isolated_bridge import IsolatedBridge
-    from .models.isolated_bridge_parts import (
-        Bearing,
-        Damper,
-        Pier,
-        Rubber,
-    )
+    from .models.isolated_bridge_parts import Bearing, Damper, Pier, Rubber
     from .models.linear_oscillator import LinearOscillator
     from .models.linear_structure import LinearStructure
-    from .models.linear_structure_parts import (
-        BridgeDeck,
-        ShearFrame,
-    )
+    from .models.linear_structure_parts import BridgeDeck, ShearFrame
     from .models.opensees import OpenSeesModel
     from .models.rc_column import RCColumn
-    from .models.rc_column_curves import (
-        MaterialCurve,
-        MomentCurvature,
-        material_curves,
-        moment_curvature,
-    )
-    from .models.rc_column_parts import (
-        Bars,
-        Concrete,
-        Hoops,
-        Patches,
-        Steel,
-    )
+    from .models.rc_column_curves import MaterialCurve, MomentCurvature, material_curves, moment_curvature
+    from .models.rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
     from .models.steel_coupon import SteelCoupon
-    from .plots.histories import (
-        plot_histories,
-        plot_loop,
-    )
-    from .plots.materials import (
-        plot_material,
-        plot_moment_curvature,
-    )
-    from .plots.predictions import (
-        plot_bands,
-        plot_fragility,
-    )
+    from .plots.histories import plot_histories, plot_loop
+    from .plots.materials import plot_material, plot_moment_curvature
+    from .plots.predictions import plot_bands, plot_fragility
     from .plots.structures import plot_sensors
-    from .prediction.averaging import (
-        AveragedPrediction,
-        average_predictions,
-    )
-    from .prediction.fragility import (
-        Fragility,
-        fit_fragility,
-        fragility,
-        peak_ground_acceleration,
-    )
+    from .prediction.averaging import AveragedPrediction, average_predictions
+    from .prediction.fragility import Fragility, fit_fragility, fragility, peak_ground_acceleration
     from .prediction.prediction import Prediction
-    from .prediction.propagation import (
-        fit_measures,
-        propagate,
-    )
+    from .prediction.propagation import fit_measures, propagate
     from .prediction.quantities import peak
-    from .prediction.reliability import (
-        Exceedance,
-        exceedance,
-    )
+    from .prediction.reliability import Exceedance, exceedance
     from .probability.autoregressive_noise import AutoregressiveNoise
-    from .probability.distributions import (
-        Distribution,
-        HalfNormal,
-        LogNormal,
-        TruncatedNormal,
-        Uniform,
-    )
+    from .probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
     from .probability.event_noise import EventNoise
     from .probability.failures import TooManyFailures
     from .probability.joint import JointLikelihood
     from .probability.likelihood import FELikelihood
     from .probability.marginal_noise import MarginalNoise
-    from .probability.noise import (
-        GaussianNoise,
-        Noise,
-        SharedGaussianNoise,
-    )
+    from .probability.mixture_prior import MixtureDistribution, fit_mixture
+    from .probability.multivariate import MultivariateDistribution, MultivariateNormal, TruncatedMultivariateNormal
+    from .probability.noise import GaussianNoise, Noise, SharedGaussianNoise
     from .probability.posterior import Posterior
     from .probability.priors import Prior
-    from .probability.residuals import (
-        ResidualChecks,
-        effective_samples,
-        innovations,
-        plot_residuals,
-        residual_checks,
-    )
+    from .probability.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
     from .probability.time_shift_noise import TimeShiftNoise
-    from .signals.alignment import (
-        Alignment,
-        align,
-    )
-    from .signals.channels import (
-        Channel,
-        Measurements,
-    )
-    from .signals.datasets import (
-        Dataset,
-        read_dataset,
-        write_dataset,
-    )
+    from .signals.alignment import Alignment, align
+    from .signals.channels import Channel, Measurements
+    from .signals.datasets import Dataset, read_dataset, write_dataset
     from .signals.durations import growing_durations
     from .signals.error_measures import rrmse
-    from .signals.events import (
-        Events,
-        EventWindow,
-    )
-    from .signals.readers import (
-        ImposedTest,
-        read_at2,
-        read_columns,
-        read_csv,
-        read_imposed_test,
-        read_v2,
-    )
-    from .signals.records import (
-        DisplacementHistory,
-        Record,
-    )
-    from .signals.response_spectrum import (
-        ResponseSpectrum,
-        response_spectrum,
-    )
+    from .signals.events import Events, EventWindow
+    from .signals.readers import ImposedTest, read_at2, read_columns, read_csv, read_imposed_test, read_v2
+    from .signals.records import DisplacementHistory, Record
+    from .signals.response_spectrum import ResponseSpectrum, response_spectrum
     from .simulation.disk_cache import SimulationCache
     from .simulation.faults import TransientReason
     from .simulation.local_pool import LocalPool
-    from .simulation.model import (
-        Model,
-        SimulationFailed,
-    )
+    from .simulation.model import Model, SimulationFailed
     from .simulation.verification import StaleCache
-    from .units import (
-        from_si,
-        to_si,
-    )
+    from .units import from_si, to_si
 
 __all__ = [
     "Alignment",
@@ -198,10 +101,13 @@ __all__ = [
     "MarginalNoise",
     "MaterialCurve",
     "Measurements",
+    "MixtureDistribution",
     "Mode",
     "ModeSearch",
     "Model",
     "MomentCurvature",
+    "MultivariateDistribution",
+    "MultivariateNormal",
     "Noise",
     "OpenSeesModel",
     "Patches",
@@ -226,6 +132,7 @@ __all__ = [
     "TimeShiftNoise",
     "TooManyFailures",
     "TransientReason",
+    "TruncatedMultivariateNormal",
     "TruncatedNormal",
     "Uniform",
     "align",
@@ -235,6 +142,7 @@ __all__ = [
     "find_modes",
     "fit_fragility",
     "fit_measures",
+    "fit_mixture",
     "fragility",
     "from_si",
     "growing_durations",
@@ -363,6 +271,15 @@ _EXPORTS = {
     "probability.joint": ("JointLikelihood",),
     "probability.likelihood": ("FELikelihood",),
     "probability.marginal_noise": ("MarginalNoise",),
+    "probability.mixture_prior": (
+        "MixtureDistribution",
+        "fit_mixture",
+    ),
+    "probability.multivariate": (
+        "MultivariateDistribution",
+        "MultivariateNormal",
+        "TruncatedMultivariateNormal",
+    ),
     "probability.noise": (
         "GaussianNoise",
         "Noise",
@@ -370,13 +287,17 @@ _EXPORTS = {
     ),
     "probability.posterior": ("Posterior",),
     "probability.priors": ("Prior",),
-    "probability.time_shift_noise": ("TimeShiftNoise",),
     "probability.residuals": (
         "ResidualChecks",
         "effective_samples",
         "innovations",
         "plot_residuals",
         "residual_checks",
+    ),
+    "probability.time_shift_noise": ("TimeShiftNoise",),
+    "signals.alignment": (
+        "Alignment",
+        "align",
     ),
     "signals.channels": (
         "Channel",
@@ -388,10 +309,6 @@ _EXPORTS = {
         "write_dataset",
     ),
     "signals.durations": ("growing_durations",),
-    "signals.alignment": (
-        "Alignment",
-        "align",
-    ),
     "signals.error_measures": ("rrmse",),
     "signals.events": (
         "EventWindow",

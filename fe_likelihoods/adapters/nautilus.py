@@ -28,6 +28,11 @@ def nautilus_prior(posterior: Posterior) -> nautilus.Prior:
     -------
     nautilus.Prior
 
+    Raises
+    ------
+    ValueError
+        If parameters have a joint prior distribution.
+
     Examples
     --------
     >>> sampler = nautilus.Sampler(nautilus_prior(posterior), posterior.log_likelihood, vectorized=True)
@@ -37,5 +42,10 @@ def nautilus_prior(posterior: Posterior) -> nautilus.Prior:
 
     prior = nautilus.Prior()
     for name, distribution in posterior.prior.distributions.items():
+        if isinstance(name, tuple):
+            raise ValueError(
+                f"nautilus_prior needs independent parameters; {', '.join(name)} have a {type(distribution).__name__}: "
+                "use nautilus.Sampler(posterior.prior_transform, posterior.log_likelihood, n_dim=posterior.ndim)"
+            )
         prior.add_parameter(name, distribution)
     return prior

@@ -80,7 +80,7 @@ def _classes() -> dict[str, type]:
             return self.posterior.prior_transform(p)
 
         def mean(self) -> np.ndarray:
-            return np.array([d.moments[0] for d in self.posterior.prior.distributions.values()])
+            return self.posterior.prior.mean()
 
         def sample(self, n: int = 1) -> np.ndarray:
             return self.posterior.sample_prior(n)

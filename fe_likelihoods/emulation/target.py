@@ -203,7 +203,7 @@ class ResponseTarget:
         if isinstance(self.comparison, Comparison) and self.statistic is not sums_of_squares:
             self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)
         check_quadratic(self.statistic, self.measured)
-        self._logarithmic = [d.logarithmic for d in list(self._prior.distributions.values())[: self.n_structural]]
+        self._logarithmic = list(self._prior.logarithmic[: self.n_structural])
         self._median = self._prior.from_normal(np.zeros(self.ndim))
         self.archive = Archive()
 

@@ -283,7 +283,13 @@ class JointLikelihood:
             )
         # a name is shared by all likelihoods or by none, so each part needs its own priors only
         parts = {
-            key: likelihood.marginal({name: priors[self._joint_name(key, name)] for name in _noise_names(likelihood)})
+            key: likelihood.marginal(
+                {
+                    name: priors[self._joint_name(key, name)]
+                    for name in _noise_names(likelihood)
+                    if self._joint_name(key, name) in priors
+                }
+            )
             for key, likelihood in self.likelihoods.items()
         }
         structural = {name for likelihood in parts.values() for name in likelihood.parameter_names}

@@ -287,6 +287,11 @@ class FELikelihood(CachedSimulations):
             If the noise is not white, has sensor noise, or is integrated out already.
         """
         names = self.parameter_names[self._n_structural :]
+        if joint := [name for name in names if name not in priors]:
+            raise ValueError(
+                f"{', '.join(joint)} have a joint prior distribution and cannot be integrated out; give them "
+                "independent priors"
+            )
         return self.with_noise(MarginalNoise(self.noise, {name: priors[name] for name in names}))
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:

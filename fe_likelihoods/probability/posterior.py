@@ -98,7 +98,11 @@ class Posterior:
         """
         parts = self.likelihood.density_parts()
         for name, distribution in self.prior.distributions.items():
-            parts += [name, type(distribution).__qualname__, complete_repr(distribution)]
+            parts += [
+                *([name] if isinstance(name, str) else name),
+                type(distribution).__qualname__,
+                complete_repr(distribution),
+            ]
         return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()
 
     @property
@@ -203,7 +207,7 @@ class Posterior:
             If the noise is not white, has sensor noise, or is integrated out already.
         """
         likelihood = self.likelihood.marginal(self.prior.distributions)
-        structural = {name: self.prior.distributions[name] for name in likelihood.parameter_names}
+        structural = self.prior.subset(likelihood.parameter_names)
         return Posterior(likelihood, structural, None if self.coarse is None else self.coarse.marginal())
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Prior of all parameters: independent distributions under the names of the parameters.
+"""Prior of all parameters: independent distributions of single parameters or of several correlated ones.
 
 `Prior` has the attributes that clients expect of a prior (``logpdf``, ``rvs``, ``bounds``, ``dim``), ``transform`` from
 the unit cube, and ``to_normal`` and ``from_normal``, the map between the parameters and standard normal variables.
@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from .distributions import Distribution, RandomState, uniform_numbers
+from .multivariate import MultivariateDistribution, as_distribution, as_multivariate
 
 __all__ = ["Prior"]
 
@@ -18,8 +19,10 @@ class Prior:
 
     Parameters
     ----------
-    distributions : mapping of str to Distribution
-        Parameter names and their distributions, in the order of the parameters.
+    distributions : mapping of str to Distribution, and of tuples of str to MultivariateDistribution
+        Parameter names and their distributions, in the order of the parameters. A tuple of names has a distribution of
+        these parameters together, such as `MultivariateNormal` or the result of `fit_mixture`. Frozen continuous
+        distributions of `scipy.stats` are accepted as well.
 
     Attributes
     ----------
@@ -29,34 +32,56 @@ class Prior:
         Number of parameters.
     bounds : ndarray[dim, 2]
         Lower and upper bound of every parameter.
-    distributions : dict of str to Distribution
-        As given.
+    distributions : dict
+        As given; those of scipy as objects of this package.
+    logarithmic : tuple of bool
+        `Distribution.logarithmic` of every parameter; False for parameters with a joint distribution.
 
     Raises
     ------
     ValueError
-        If `distributions` is not such a mapping, or empty.
+        If `distributions` is not such a mapping, or empty, if names repeat, or a joint distribution has another number
+        of parameters than names.
 
     Examples
     --------
     >>> prior = Prior({"stiffness": TruncatedNormal(1.0, 0.3), "sigma_displacement": HalfNormal(0.03)})
     >>> prior.rvs(1000, 42).shape
     (1000, 2)
+
+    Two correlated parameters:
+
+    >>> correlated = MultivariateNormal([1.0, 1.0], [[0.04, 0.01], [0.01, 0.09]])
+    >>> prior = Prior({("stiffness", "damping"): correlated, "sigma_displacement": HalfNormal(0.03)})
     """
 
-    def __init__(self, distributions: Mapping[str, Distribution]) -> None:
+    def __init__(self, distributions: Mapping[str | tuple[str, ...], Distribution | MultivariateDistribution]) -> None:
         if not isinstance(distributions, Mapping) or not distributions:
             raise ValueError(
                 "Prior expects a non-empty mapping of parameter names to distributions, such as "
                 f'{{"stiffness": TruncatedNormal(1.0, 0.3)}}; got {distributions!r}'
             )
-        for name, distribution in distributions.items():
-            if not isinstance(distribution, Distribution):
-                raise ValueError(f"Prior: {name!r} must be a Distribution of fe_likelihoods; got {distribution!r}")
-        self.distributions = dict(distributions)
-        self.names = tuple(distributions)
-        self.dim = len(self.names)
-        self.bounds = np.array([distribution.bounds for distribution in distributions.values()])
+        self.distributions = {
+            key: as_multivariate(key, distribution) if isinstance(key, tuple) else as_distribution(key, distribution)
+            for key, distribution in distributions.items()
+        }
+        names = [name for key in self.distributions for name in (key if isinstance(key, tuple) else (key,))]
+        if len(set(names)) != len(names):
+            raise ValueError(f"Prior: the names of the parameters must differ; got {', '.join(names)}")
+        self._set_order(tuple(names))
+
+    def _set_order(self, names: tuple[str, ...]) -> None:
+        """Set the order of the parameters."""
+        self.names, self.dim = names, len(names)
+        single = {key: d for key, d in self.distributions.items() if not isinstance(key, tuple)}
+        self._single = [(names.index(name), d) for name, d in single.items()]
+        self._joint = [
+            ([names.index(name) for name in key], d) for key, d in self.distributions.items() if isinstance(key, tuple)
+        ]
+        self.bounds = np.empty((self.dim, 2))
+        for column, distribution in [*self._single, *self._joint]:
+            self.bounds[column] = distribution.bounds
+        self.logarithmic = tuple(name in single and single[name].logarithmic for name in names)
 
     def __repr__(self) -> str:
         return f"Prior({self.distributions!r})"
@@ -85,7 +110,8 @@ class Prior:
         x = self._checked(x, "x")
         inside = ((x >= self.bounds[:, 0]) & (x <= self.bounds[:, 1])).all(axis=-1)
         with np.errstate(all="ignore"):
-            total = sum(d._log_density(column) for d, column in zip(self.distributions.values(), x.T, strict=True))
+            total = sum(d._log_density(x[..., column]) for column, d in self._single)
+            total = total + sum(d.logpdf(x[..., columns]) for columns, d in self._joint) if self._joint else total
         log_density = np.where(inside, total, -np.inf)
         return log_density if x.ndim == 2 else float(log_density)
 
@@ -100,10 +126,19 @@ class Prior:
         Returns
         -------
         ndarray of the same shape
+
+        Raises
+        ------
+        ValueError
+            If a joint distribution has no such map (`MultivariateDistribution.from_normal`).
         """
         u = self._checked(u, "u")
-        columns = [d.ppf(column) for d, column in zip(self.distributions.values(), u.T, strict=True)]
-        return np.stack(columns, axis=-1)
+        x = np.empty(u.shape)
+        for column, distribution in self._single:
+            x[..., column] = distribution.ppf(u[..., column])
+        for columns, distribution in self._joint:
+            x[..., columns] = distribution.from_normal(_scores(u[..., columns]))
+        return x
 
     def from_normal(self, z: np.ndarray) -> np.ndarray:
         """Map from independent standard normal variables to the parameters, by which the prior is standard normal.
@@ -125,8 +160,10 @@ class Prior:
         standard normal density phi.
         """
         z = self._checked(z, "z")
-        columns = [d.from_normal(column) for d, column in zip(self.distributions.values(), z.T, strict=True)]
-        return np.stack(columns, axis=-1)
+        x = np.empty(z.shape)
+        for column, distribution in [*self._single, *self._joint]:
+            x[..., column] = distribution.from_normal(z[..., column])
+        return x
 
     def to_normal(self, x: np.ndarray) -> np.ndarray:
         """Map from the parameters to independent standard normal variables, the inverse of `from_normal`.
@@ -141,8 +178,10 @@ class Prior:
             -inf at and below the lower bound, inf at and above the upper bound; NaN where x is NaN.
         """
         x = self._checked(x, "x")
-        columns = [d.to_normal(column) for d, column in zip(self.distributions.values(), x.T, strict=True)]
-        return np.stack(columns, axis=-1)
+        z = np.empty(x.shape)
+        for column, distribution in [*self._single, *self._joint]:
+            z[..., column] = distribution.to_normal(x[..., column])
+        return z
 
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
         """Independent draws.
@@ -158,7 +197,24 @@ class Prior:
         -------
         ndarray[size, dim]
         """
-        return self.transform(uniform_numbers((size, self.dim), random_state))
+        if isinstance(random_state, int | np.integer):
+            random_state = np.random.default_rng(random_state)
+        u = uniform_numbers((size, self.dim), random_state)
+        x = np.empty(u.shape)
+        for column, distribution in self._single:
+            x[:, column] = distribution.ppf(u[:, column])
+        for columns, distribution in self._joint:
+            x[:, columns] = distribution.rvs(size, random_state)
+        return x
+
+    def mean(self) -> np.ndarray:
+        """Mean of every parameter, shape (dim,); of joint distributions by 10 000 draws with a fixed seed."""
+        mean = np.empty(self.dim)
+        for column, distribution in self._single:
+            mean[column] = distribution.moments[0]
+        for columns, distribution in self._joint:
+            mean[columns] = distribution.rvs(10_000, 0).mean(axis=0)
+        return mean
 
     def reorder(self, names: Iterable[str]) -> "Prior":
         """The same prior with its parameters in the order of `names`; ValueError if the names are not the same."""
@@ -169,4 +225,51 @@ class Prior:
                 f"the parameters are {list(names)}; without a prior: {sorted(set(names) - set(self.names))}; "
                 f"unknown: {sorted(set(self.names) - set(names))}"
             )
-        return Prior({name: self.distributions[name] for name in names})
+        if not self._joint:
+            return Prior({name: self.distributions[name] for name in names})
+        prior = Prior(self.distributions)
+        prior._set_order(names)
+        return prior
+
+    def subset(self, names: Iterable[str]) -> "Prior":
+        """The prior of some of the parameters, in the order of `names`.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Names of parameters; all or none of those with a joint distribution.
+
+        Returns
+        -------
+        Prior
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, or a joint distribution would be split.
+        """
+        names = tuple(names)
+        if unknown := [name for name in names if name not in self.names]:
+            raise ValueError(f"the prior has no parameters {', '.join(unknown)}; it has {', '.join(self.names)}")
+        kept = {}
+        for key, distribution in self.distributions.items():
+            members = key if isinstance(key, tuple) else (key,)
+            inside = [name for name in members if name in names]
+            if 0 < len(inside) < len(members):
+                raise ValueError(
+                    f"the parameters {', '.join(members)} have a joint distribution and cannot be separated; got "
+                    f"{', '.join(inside)} only"
+                )
+            if inside:
+                kept[key] = distribution
+        return Prior(kept).reorder(names)
+
+
+def _scores(u: np.ndarray) -> np.ndarray:
+    """Standard normal scores of uniform numbers."""
+    from scipy.special import ndtri  # slow to import, and not needed for densities
+
+    if not ((u >= 0.0) & (u <= 1.0)).all():
+        raise ValueError(f"quantiles are defined for probabilities in [0, 1]; got values from {u.min()} to {u.max()}")
+    # a score of infinity has no place in a sum of correlated ones
+    return ndtri(np.clip(u, 1e-300, 1.0 - 1e-16))

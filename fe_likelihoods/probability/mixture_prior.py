@@ -1,0 +1,321 @@
+"""A posterior as the prior of the next step: a mixture of normal distributions fitted to posterior samples.
+
+The samples are mapped to the coordinates in which the first prior is standard normal (`Prior.to_normal`), and a mixture
+is fitted there by expectation maximisation. Bounds of the prior are therefore kept, and correlations are described. The
+number of components is that with the smallest Bayesian information criterion. See ``docs/events.rst``.
+
+References
+----------
+G. Schwarz (1978), Estimating the dimension of a model, Annals of Statistics 6, 461-464, doi:10.1214/aos/1176344136.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .distributions import RandomState
+from .inputs import as_points
+from .multivariate import MultivariateDistribution, as_generator
+
+if TYPE_CHECKING:
+    from .priors import Prior
+
+__all__ = ["MixtureDistribution", "fit_mixture"]
+
+_LOG_TWO_PI = np.log(2.0 * np.pi)
+_LARGEST_SCORE = 12.0  # samples at a bound of the prior have infinite scores
+_ITERATIONS = 100
+_STARTS = 2
+_GAIN = 1e-6  # of the log-likelihood per sample and iteration, below which the maximisation ends
+_REFITS = 16
+
+
+class MixtureDistribution(MultivariateDistribution):
+    """Mixture of normal distributions in the coordinates of a prior; made by `fit_mixture`.
+
+    Parameters
+    ----------
+    prior : Prior
+        Prior whose map to standard normal variables defines the coordinates, with the parameters of the mixture.
+    weights : (n_components,) array_like
+        Shares of the components, which sum to one.
+    means : (n_components, dim) array_like
+        Means in the coordinates.
+    covariances : (n_components, dim, dim) array_like
+        Covariances in the coordinates.
+    fit_error : float
+        Standard error of the logarithm of the density [-], root mean square over the samples, from fits to resampled
+        samples. An evidence with this prior has this error in addition to that of the sampler.
+    misfit : float or None
+        Standard deviation over the samples of the logarithm of the ratio of the posterior to the mixture [-], which is
+        zero for a perfect fit. None if the posterior density was not given.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the parameters.
+    """
+
+    def __init__(
+        self,
+        prior: "Prior",
+        weights: np.ndarray,
+        means: np.ndarray,
+        covariances: np.ndarray,
+        fit_error: float = 0.0,
+        misfit: float | None = None,
+    ) -> None:
+        self.prior, self.names = prior, prior.names
+        self.weights, self.means, self.covariances = (
+            np.array(each, dtype=float) for each in (weights, means, covariances)
+        )
+        n, dim = len(self.weights), prior.dim
+        if self.means.shape != (n, dim) or self.covariances.shape != (n, dim, dim):
+            raise ValueError(
+                f"expected {n} means ({n}, {dim}) and covariances ({n}, {dim}, {dim}) for the parameters "
+                f"{', '.join(self.names)}; got shapes {self.means.shape} and {self.covariances.shape}"
+            )
+        if not (self.weights > 0.0).all() or abs(self.weights.sum() - 1.0) > 1e-9:
+            raise ValueError(f"expected positive weights that sum to one; got {self.weights}")
+        self.fit_error, self.misfit = float(fit_error), misfit
+        self._factors = np.linalg.cholesky(self.covariances)
+
+    def __repr__(self) -> str:
+        return f"MixtureDistribution({self.prior!r}, {self.weights!r}, {self.means!r}, {self.covariances!r})"
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return len(self.names)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Bounds of the first prior, shape (dim, 2)."""
+        return self.prior.bounds
+
+    def logpdf(self, x: np.ndarray) -> np.ndarray:
+        """Logarithm of the density (...) at x (..., dim); -inf outside the bounds."""
+        x = np.asarray(x, dtype=float)
+        rows = x.reshape(-1, self.dim)
+        value = np.full(len(rows), -np.inf)
+        base = np.atleast_1d(self.prior.logpdf(rows))
+        inside = np.isfinite(base)
+        if inside.any():
+            z = self.prior.to_normal(rows[inside])
+            finite = np.isfinite(z).all(axis=1)
+            z = np.where(finite[:, None], z, 0.0)
+            # the density of z, times dz / dx = p(x) / phi(z) of every parameter
+            slope = base[inside] + 0.5 * np.square(z).sum(axis=1) + 0.5 * self.dim * _LOG_TWO_PI
+            value[inside] = np.where(finite, _log_mixture(z, self.weights, self.means, self._factors) + slope, -np.inf)
+        return value.reshape(x.shape[:-1])
+
+    def from_normal(self, z: np.ndarray) -> np.ndarray:
+        """Map from independent standard normal variables (..., dim), by conditional quantiles (Rosenblatt)."""
+        z = np.asarray(z, dtype=float)
+        rows, out = z.reshape(-1, self.dim), np.zeros((z.size // self.dim, self.dim))
+        for i in range(self.dim):
+            shares, means, deviations = self._conditional(out, i)
+            low, high = (means + side * 40.0 * deviations for side in (-1.0, 1.0))
+            low, high = low.min(axis=1), high.max(axis=1)
+            for _ in range(70):
+                middle = 0.5 * (low + high)
+                below = _mixture_score(middle, shares, means, deviations) < rows[:, i]
+                low, high = np.where(below, middle, low), np.where(below, high, middle)
+            out[:, i] = 0.5 * (low + high)
+        return self.prior.from_normal(out).reshape(z.shape)
+
+    def to_normal(self, x: np.ndarray) -> np.ndarray:
+        """Map to independent standard normal variables (..., dim)."""
+        x = np.asarray(x, dtype=float)
+        z = self.prior.to_normal(x.reshape(-1, self.dim))
+        scores = np.empty_like(z)
+        for i in range(self.dim):
+            scores[:, i] = _mixture_score(z[:, i], *self._conditional(z, i))
+        return scores.reshape(x.shape)
+
+    def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
+        """Independent draws, shape (size, dim); arguments as of `Prior.rvs`."""
+        rng = as_generator(random_state)
+        rows = np.searchsorted(np.cumsum(self.weights)[:-1], rng.random(size))
+        z = self.means[rows] + np.einsum("nij,nj->ni", self._factors[rows], rng.standard_normal((size, self.dim)))
+        return self.prior.from_normal(z)
+
+    def _conditional(self, z: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Shares, means and standard deviations (n, n_components) of coordinate i, given the earlier ones in z."""
+        log_shares = np.tile(np.log(self.weights), (len(z), 1))
+        means = np.tile(self.means[:, i], (len(z), 1))
+        deviations = np.tile(self._factors[:, i, i], (len(z), 1))
+        for k, factor in enumerate(self._factors if i else ()):
+            # the inverse of the leading part of a Cholesky factor is that of the leading block
+            y = np.linalg.solve(factor[:i, :i], (z[:, :i] - self.means[k, :i]).T)
+            log_shares[:, k] -= 0.5 * np.square(y).sum(axis=0) + np.log(np.diag(factor)[:i]).sum()
+            means[:, k] += factor[i, :i] @ y
+        shares = np.exp(log_shares - log_shares.max(axis=1, keepdims=True))
+        return shares / shares.sum(axis=1, keepdims=True), means, deviations
+
+
+def fit_mixture(
+    samples: Any,
+    prior: "Prior",
+    names: Sequence[str] | None = None,
+    *,
+    log_prob: np.ndarray | None = None,
+    effective_sample_size: float | None = None,
+    max_components: int = 6,
+    seed: int = 0,
+) -> MixtureDistribution:
+    """Fit a mixture of normal distributions to posterior samples, as a prior of the next step.
+
+    Parameters
+    ----------
+    samples : (n, dim) array_like, or named values of shape (n,)
+        Posterior samples of equal weight: of all parameters of `prior`.
+    prior : Prior
+        Prior of these samples. Its parameters are independent.
+    names : sequence of str, optional
+        The parameters that the mixture describes, such as the structural ones. Default: all.
+    log_prob : (n,) array_like, optional
+        Logarithm of the posterior density of the samples, up to a constant (``sampler.get_log_prob(flat=True)``), for
+        `MixtureDistribution.misfit`; only with all parameters.
+    effective_sample_size : float, optional
+        Effective number of independent samples, for `MixtureDistribution.fit_error`. Default: the number of distinct
+        samples.
+    max_components : int
+        Largest number of components.
+    seed : int
+        Seed of the starts and of the resampling.
+
+    Returns
+    -------
+    MixtureDistribution
+        Its `fit_error` and `misfit` say how good the fit is.
+
+    Raises
+    ------
+    ValueError
+        If the samples have another dimension or are too few, a sample is impossible under the prior, a name is unknown,
+        or an argument is out of range.
+
+    Examples
+    --------
+    >>> mixture = fit_mixture(sampler.get_chain(flat=True), posterior.prior, model.parameter_names)
+    >>> prior = Prior({mixture.names: mixture, "sigma_displacement": HalfNormal(0.01)})
+    """
+    points = as_points(samples, prior.names)
+    names = prior.names if names is None else tuple(names)
+    if unknown := sorted(set(names) - set(prior.names)):
+        raise ValueError(f"the prior has no parameters {', '.join(unknown)}; it has {', '.join(prior.names)}")
+    dim = len(names)
+    if points.ndim != 2 or len(np.unique(points, axis=0)) < 20 * dim:
+        raise ValueError(
+            f"a fit of {dim} parameters needs {20 * dim} different samples or more, in an array (n, {prior.dim}); got "
+            f"shape {points.shape}"
+        )
+    if not np.isfinite(np.atleast_1d(prior.logpdf(points))).all():
+        raise ValueError("some samples are impossible under the prior; give the prior with which they were drawn")
+    if max_components < 1:
+        raise ValueError(f"max_components must be 1 or more; got {max_components}")
+    chosen = points[:, [prior.names.index(name) for name in names]]
+    part = prior.subset(names)
+    z = np.clip(part.to_normal(chosen), -_LARGEST_SCORE, _LARGEST_SCORE)
+    rng = np.random.default_rng(seed)
+    distinct = len(np.unique(z, axis=0))
+    effective = float(distinct if effective_sample_size is None else effective_sample_size)
+    if not 1.0 <= effective:
+        raise ValueError(f"effective_sample_size must be 1 or more; got {effective_sample_size!r}")
+    best = None
+    for n_components in range(1, max_components + 1):
+        n_parameters = n_components * (1 + dim + dim * (dim + 1) // 2) - 1
+        if effective < 10 * n_parameters and n_components > 1:
+            break
+        before = best
+        for _ in range(1 if n_components == 1 else _STARTS):
+            fit, log_likelihood = _maximise(z, _start(z, n_components, rng))
+            criterion = -2.0 * log_likelihood * effective / len(z) + n_parameters * np.log(effective)
+            if best is None or criterion < best[0]:
+                best = criterion, fit
+        if best is before:  # more components describe the samples no better
+            break
+    weights, means, covariances = best[1]
+    density = _log_mixture(z, weights, means, np.linalg.cholesky(covariances))
+    refits = []
+    for _ in range(_REFITS):
+        rows = rng.integers(len(z), size=max(round(effective), 2 * dim))
+        again, _ = _maximise(z[rows], best[1], 20)
+        refits.append(_log_mixture(z, again[0], again[1], np.linalg.cholesky(again[2])))
+    fit_error = np.sqrt(np.mean(np.var(refits, axis=0, ddof=1)))
+    misfit = None
+    if log_prob is not None:
+        log_prob = np.asarray(log_prob, dtype=float)
+        if log_prob.shape != (len(z),) or set(names) != set(prior.names):
+            raise ValueError(
+                f"log_prob must have one value for each of the {len(z)} samples, and the mixture all parameters; got "
+                f"shape {log_prob.shape} and the parameters {', '.join(names)}"
+            )
+        slope = np.atleast_1d(part.logpdf(chosen)) + 0.5 * np.square(z).sum(axis=1)
+        misfit = float(np.std(log_prob - density - slope))
+    return MixtureDistribution(part, weights, means, covariances, fit_error, misfit)
+
+
+def _log_mixture(z: np.ndarray, weights: np.ndarray, means: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Logarithm of the density (n,) of a mixture at z (n, dim)."""
+    return np.logaddexp.reduce(_log_terms(z, weights, means, factors), axis=1)
+
+
+def _log_terms(z: np.ndarray, weights: np.ndarray, means: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Logarithms of the weighted densities of the components, (n, n_components)."""
+    inverses = np.linalg.inv(factors)
+    squares = [np.square((z - mean) @ inverse.T).sum(axis=1) for mean, inverse in zip(means, inverses, strict=True)]
+    diagonals = np.diagonal(factors, axis1=1, axis2=2)
+    constants = np.log(weights) - np.log(diagonals).sum(axis=1) - 0.5 * z.shape[1] * _LOG_TWO_PI
+    return constants - 0.5 * np.stack(squares, axis=1)
+
+
+def _mixture_score(t: np.ndarray, shares: np.ndarray, means: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Standard normal score of t (n,) under mixtures of one coordinate, accurate in both tails."""
+    from scipy.special import ndtr, ndtri  # slow to import, and not needed for densities
+
+    scores = (t[:, None] - means) / deviations
+    below, above = (shares * ndtr(scores)).sum(axis=1), (shares * ndtr(-scores)).sum(axis=1)
+    return np.where(below < above, ndtri(below), -ndtri(above))
+
+
+def _start(z: np.ndarray, n_components: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Start of the maximisation: samples as means, each chosen far from the earlier ones (k-means++)."""
+    covariance = np.atleast_2d(np.cov(z.T))
+    if n_components == 1:
+        return np.ones(1), z.mean(axis=0)[None], covariance[None]
+    scaled = z @ np.linalg.inv(np.linalg.cholesky(covariance)).T
+    rows = [int(rng.integers(len(z)))]
+    while len(rows) < n_components:
+        distance = np.min([np.square(scaled - scaled[row]).sum(axis=1) for row in rows], axis=0)
+        rows.append(int(rng.choice(len(z), p=distance / distance.sum())))
+    return np.full(n_components, 1.0 / n_components), z[rows], np.tile(covariance, (n_components, 1, 1))
+
+
+def _maximise(
+    z: np.ndarray, start: tuple[np.ndarray, np.ndarray, np.ndarray], iterations: int = _ITERATIONS
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float]:
+    """Expectation maximisation; returns weights, means and covariances, and the log-likelihood of the samples."""
+    weights, means, covariances = start
+    floor = 1e-6 * np.diag(np.var(z, axis=0) + 1e-12)  # keeps a component from shrinking to one sample
+    previous = -np.inf
+    for _ in range(iterations):
+        terms = _log_terms(z, weights, means, np.linalg.cholesky(covariances))
+        total = np.logaddexp.reduce(terms, axis=1)
+        log_likelihood = float(total.sum())
+        if log_likelihood - previous < _GAIN * len(z):
+            break
+        previous = log_likelihood
+        shares = np.exp(terms - total[:, None])
+        counts = shares.sum(axis=0) + 1e-10
+        weights = counts / counts.sum()
+        means = shares.T @ z / counts[:, None]
+        covariances = np.stack(
+            [
+                (share[:, None] * (z - mean)).T @ (z - mean) / n + floor
+                for share, mean, n in zip(shares.T, means, counts, strict=True)
+            ]
+        )
+    return (weights, means, covariances), log_likelihood

@@ -1,0 +1,381 @@
+"""Distributions of several correlated parameters, for `Prior`: normal, truncated normal, and those of scipy.
+
+A distribution has a normalised density and draws. Nested samplers and guides also need a map between the parameters and
+independent standard normal variables. `MultivariateNormal` and `MixtureDistribution` have one; a distribution without
+one serves all samplers that use density and draws only.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .distributions import Distribution, RandomState
+
+__all__ = [
+    "FrozenDistribution",
+    "FrozenMultivariate",
+    "MultivariateDistribution",
+    "MultivariateNormal",
+    "TruncatedMultivariateNormal",
+    "as_distribution",
+    "as_generator",
+    "as_multivariate",
+]
+
+_LOG_TWO_PI = math.log(2.0 * math.pi)
+_FEWEST_INSIDE = 1e-3  # probability of a box below which draws by rejection take too long
+_LATTICE_POINTS = 2**14
+_SHIFTS = 8
+
+
+class MultivariateDistribution(ABC):
+    """Distribution of several parameters together.
+
+    A subclass has `dim`, `logpdf` and either `from_normal` and `to_normal` or `rvs`. If it is not defined for all real
+    numbers it also has `bounds`. Its ``repr`` must show all values, because it is part of fingerprints.
+    """
+
+    @property
+    @abstractmethod
+    def dim(self) -> int:
+        """Number of parameters."""
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lower and upper bound of every parameter, shape (dim, 2), outside which the density is zero."""
+        return np.tile([-np.inf, np.inf], (self.dim, 1))
+
+    @abstractmethod
+    def logpdf(self, x: np.ndarray) -> np.ndarray:
+        """Logarithm of the normalised density (...) at parameters x (..., dim); -inf where it is zero."""
+
+    def from_normal(self, z: np.ndarray) -> np.ndarray:
+        """Map from independent standard normal variables (..., dim) to the parameters; ValueError if there is none."""
+        raise ValueError(
+            f"{type(self).__name__} has no map from the unit cube, which nested samplers and guides need; use "
+            "MultivariateNormal or MixtureDistribution, or a sampler that draws from the prior"
+        )
+
+    def to_normal(self, x: np.ndarray) -> np.ndarray:
+        """Map from the parameters (..., dim) to standard normal variables, the inverse of `from_normal`."""
+        return self.from_normal(x)  # raises
+
+    def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
+        """Independent draws, shape (size, dim); arguments as of `Prior.rvs`."""
+        return self.from_normal(as_generator(random_state).standard_normal((size, self.dim)))
+
+
+def as_generator(random_state: RandomState) -> Any:
+    """An object with ``standard_normal`` and ``random``: from a seed, a generator, or NumPy's global stream."""
+    if random_state is None:
+        return np.random  # the stream of np.random.seed, as in scipy.stats
+    return np.random.default_rng(random_state) if isinstance(random_state, int | np.integer) else random_state
+
+
+class MultivariateNormal(MultivariateDistribution):
+    """Multivariate normal distribution.
+
+    Parameters
+    ----------
+    mean : (dim,) array_like
+        Mean.
+    covariance : (dim, dim) array_like
+        Covariance, symmetric and positive definite.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match, a value is not finite, or the covariance is not symmetric and positive definite.
+
+    Examples
+    --------
+    >>> Prior({("stiffness", "damping"): MultivariateNormal([1.0, 1.0], [[0.04, 0.01], [0.01, 0.09]])})
+    """
+
+    def __init__(self, mean: ArrayLike, covariance: ArrayLike) -> None:
+        self.mean = np.array(mean, dtype=float)
+        self.covariance = np.array(covariance, dtype=float)
+        kind, n = type(self).__name__, self.mean.size
+        if self.mean.ndim != 1 or not n or self.covariance.shape != (n, n):
+            raise ValueError(
+                f"{kind} expects a mean (dim,) and a covariance (dim, dim); got shapes {self.mean.shape} and "
+                f"{self.covariance.shape}"
+            )
+        if not (np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()):
+            raise ValueError(f"{kind} expects finite numbers; got mean {self.mean} and covariance {self.covariance}")
+        if not np.allclose(self.covariance, self.covariance.T, rtol=1e-10, atol=0.0):
+            raise ValueError(f"{kind} expects a symmetric covariance; got {self.covariance}")
+        try:
+            self._factor = np.linalg.cholesky(self.covariance)
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                f"{kind} expects a positive definite covariance; got eigenvalues {np.linalg.eigvalsh(self.covariance)}"
+            ) from None
+        self._inverse = np.linalg.inv(self._factor)
+        self._constant = -0.5 * n * _LOG_TWO_PI - np.log(np.diag(self._factor)).sum()
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.mean!r}, {self.covariance!r})"
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return self.mean.size
+
+    def logpdf(self, x: np.ndarray) -> np.ndarray:
+        """Logarithm of the density (...) at x (..., dim); -inf where a value is not finite."""
+        with np.errstate(all="ignore"):
+            value = self._constant - 0.5 * np.square((np.asarray(x) - self.mean) @ self._inverse.T).sum(axis=-1)
+        return np.where(np.isfinite(value), value, -np.inf)
+
+    def from_normal(self, z: np.ndarray) -> np.ndarray:
+        """Map from independent standard normal variables (..., dim): mean + L z, with the Cholesky factor L."""
+        return self.mean + np.asarray(z) @ self._factor.T
+
+    def to_normal(self, x: np.ndarray) -> np.ndarray:
+        """Map to independent standard normal variables (..., dim)."""
+        return (np.asarray(x) - self.mean) @ self._inverse.T
+
+
+class TruncatedMultivariateNormal(MultivariateNormal):
+    """Multivariate normal distribution restricted to a box and normalised there.
+
+    It has no map from the unit cube. Draws are made by rejection, so the box must contain at least 0.1 % of the normal
+    distribution.
+
+    Parameters
+    ----------
+    mean : (dim,) array_like
+        Mean before truncation.
+    covariance : (dim, dim) array_like
+        Covariance before truncation.
+    lower, upper : float or (dim,) array_like
+        Bounds; infinite where there is none. By default the parameters are positive.
+
+    Attributes
+    ----------
+    log_probability : float
+        Logarithm of the probability of the box before truncation, which normalises the density.
+    log_probability_error : float
+        Its standard error, by which the logarithm of every density and every evidence may be shifted. Zero for
+        independent parameters.
+
+    Raises
+    ------
+    ValueError
+        As `MultivariateNormal`, if a lower bound is not below the upper one, or if the box contains too little
+        probability.
+
+    Notes
+    -----
+    The probability of the box is a quasi-Monte Carlo integral over a lattice of 2^14 points with 8 fixed random shifts,
+    after the transformation of Genz (1992), "Numerical computation of multivariate normal probabilities", Journal of
+    Computational and Graphical Statistics 1, 141-149. It is the same in every process.
+    """
+
+    def __init__(
+        self, mean: ArrayLike, covariance: ArrayLike, lower: ArrayLike = 0.0, upper: ArrayLike = np.inf
+    ) -> None:
+        super().__init__(mean, covariance)
+        try:
+            self.lower = np.broadcast_to(np.asarray(lower, dtype=float), self.mean.shape).copy()
+            self.upper = np.broadcast_to(np.asarray(upper, dtype=float), self.mean.shape).copy()
+        except ValueError:
+            raise ValueError(
+                f"TruncatedMultivariateNormal expects one bound or {self.dim}; got {lower!r} and {upper!r}"
+            ) from None
+        if not (self.lower < self.upper).all():
+            raise ValueError(
+                f"TruncatedMultivariateNormal expects lower < upper; got {self.lower.tolist()} and "
+                f"{self.upper.tolist()}"
+            )
+        probability, error = _box_probability(self._factor, self.lower - self.mean, self.upper - self.mean)
+        if not probability >= _FEWEST_INSIDE:
+            raise ValueError(
+                f"the box of a TruncatedMultivariateNormal must contain {_FEWEST_INSIDE:g} of the normal distribution "
+                f"or more; it contains {probability:.2g}: choose a mean and a covariance that describe the box"
+            )
+        self.log_probability, self.log_probability_error = math.log(probability), error / probability
+
+    def __repr__(self) -> str:
+        return f"{super().__repr__()[:-1]}, {self.lower!r}, {self.upper!r})"
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lower and upper bound of every parameter, shape (dim, 2)."""
+        return np.stack([self.lower, self.upper], axis=1)
+
+    def logpdf(self, x: np.ndarray) -> np.ndarray:
+        """Logarithm of the density (...) at x (..., dim); -inf outside the box."""
+        x = np.asarray(x)
+        inside = ((x >= self.lower) & (x <= self.upper)).all(axis=-1)
+        return np.where(inside, super().logpdf(x) - self.log_probability, -np.inf)
+
+    def from_normal(self, z: np.ndarray) -> np.ndarray:
+        """ValueError: there is no map."""
+        return MultivariateDistribution.from_normal(self, z)
+
+    def to_normal(self, x: np.ndarray) -> np.ndarray:
+        """ValueError: there is no map."""
+        return MultivariateDistribution.from_normal(self, x)
+
+    def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
+        """Independent draws, shape (size, dim), by rejection."""
+        rng, found = as_generator(random_state), np.empty((0, self.dim))
+        while len(found) < size:
+            n = int(1.2 * (size - len(found)) / math.exp(self.log_probability)) + 10
+            draws = self.mean + rng.standard_normal((n, self.dim)) @ self._factor.T
+            inside = ((draws >= self.lower) & (draws <= self.upper)).all(axis=1)
+            found = np.concatenate([found, draws[inside]])
+        return found[:size]
+
+
+def _box_probability(factor: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
+    """Probability that ``factor @ z`` is between `low` and `high` for standard normal z, and its standard error."""
+    from scipy.special import ndtr, ndtri  # slow to import, and not needed for densities
+
+    dim = len(factor)
+    if not np.any(np.tril(factor, -1)):
+        scale = np.diag(factor)
+        return float(np.prod(ndtr(high / scale) - ndtr(low / scale))), 0.0
+    # a Richtmyer lattice; the roots of primes are irrational and independent
+    primes = [p for p in range(2, 8 * dim + 20) if all(p % q for q in range(2, int(p**0.5) + 1))][:dim]
+    lattice = np.arange(1, _LATTICE_POINTS + 1)[:, None] * np.sqrt(primes)
+    estimates = []
+    for shift in np.random.default_rng(1992).random((_SHIFTS, dim)):
+        u = np.abs(2.0 * ((lattice + shift) % 1.0) - 1.0)  # periodic, which speeds up the convergence
+        z, weight = np.zeros((_LATTICE_POINTS, dim)), np.ones(_LATTICE_POINTS)
+        for i in range(dim):
+            known = z[:, :i] @ factor[i, :i]
+            below, above = ndtr((low[i] - known) / factor[i, i]), ndtr((high[i] - known) / factor[i, i])
+            weight *= above - below
+            z[:, i] = ndtri(np.clip(below + u[:, i] * (above - below), 1e-300, 1.0 - 1e-16))
+        estimates.append(weight.mean())
+    return float(np.mean(estimates)), float(np.std(estimates, ddof=1) / math.sqrt(_SHIFTS))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrozenDistribution(Distribution):
+    """A frozen continuous distribution of `scipy.stats`, such as ``scipy.stats.gamma(2.0)``.
+
+    `Prior` accepts the scipy object itself. The distributions of this package are faster.
+
+    Parameters
+    ----------
+    frozen : scipy.stats.rv_frozen
+        The distribution.
+    """
+
+    frozen: Any
+
+    def __repr__(self) -> str:
+        values = [repr(value) for value in self.frozen.args]
+        values += [f"{name}={value!r}" for name, value in sorted(self.frozen.kwds.items())]
+        return f"FrozenDistribution({self.frozen.dist.name}({', '.join(values)}))"
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Support of the distribution."""
+        low, high = self.frozen.support()
+        return float(low), float(high)
+
+    @property
+    def moments(self) -> tuple[float, float]:
+        """Mean and standard deviation."""
+        return float(self.frozen.mean()), float(self.frozen.std())
+
+    def _log_density(self, x: np.ndarray) -> np.ndarray:
+        return self.frozen.logpdf(x)
+
+    def _quantile(self, u: np.ndarray) -> np.ndarray:
+        return self.frozen.ppf(u)
+
+    def _upper_quantile(self, q: np.ndarray) -> np.ndarray:
+        return self.frozen.isf(q)
+
+
+class FrozenMultivariate(MultivariateDistribution):
+    """A frozen multivariate distribution of `scipy.stats` with ``logpdf`` and ``rvs``, such as ``multivariate_t``.
+
+    Parameters
+    ----------
+    frozen : frozen distribution of scipy.stats
+        The distribution, whose density is defined for all real numbers.
+    dim : int
+        Number of parameters.
+
+    Raises
+    ------
+    ValueError
+        If its draws have another dimension.
+    """
+
+    def __init__(self, frozen: Any, dim: int) -> None:
+        shape = np.shape(frozen.rvs(size=2, random_state=0))
+        if shape != (2, dim) and (shape, dim) != ((2,), 1):
+            raise ValueError(
+                f"Prior: expected a distribution of {dim} parameters; {type(frozen).__name__} draws arrays of shape "
+                f"{shape[1:]}"
+            )
+        self.frozen, self._dim = frozen, dim
+        points = np.reshape(frozen.rvs(size=8, random_state=0), (8, dim))
+        # scipy's frozen objects do not show their values, but draws and densities do
+        self._values = np.concatenate([points.ravel(), np.ravel(frozen.logpdf(points))])
+
+    def __repr__(self) -> str:
+        return f"FrozenMultivariate({type(self.frozen).__name__}, {self._values!r})"
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return self._dim
+
+    def logpdf(self, x: np.ndarray) -> np.ndarray:
+        """Logarithm of the density (...) at x (..., dim); -inf where a value is not finite."""
+        x = np.asarray(x, dtype=float)
+        value = np.full(x.shape[:-1], -np.inf)
+        finite = np.isfinite(x).all(axis=-1)
+        if finite.any():
+            value[finite] = self.frozen.logpdf(x[finite])
+        return np.where(np.isnan(value), -np.inf, value)
+
+    def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
+        """Independent draws, shape (size, dim)."""
+        return np.reshape(self.frozen.rvs(size=size, random_state=random_state), (size, self._dim))
+
+
+def as_distribution(name: str, distribution: Any) -> Distribution:
+    """The distribution of one parameter; a frozen one of scipy is wrapped, anything else is a ValueError."""
+    if isinstance(distribution, Distribution):
+        return distribution
+    # a foreign object: frozen distributions of scipy have no public base class
+    if all(hasattr(distribution, member) for member in ("logpdf", "ppf", "support", "dist")):
+        return FrozenDistribution(distribution)
+    raise ValueError(
+        f"Prior: {name!r} must be a Distribution of fe_likelihoods or a frozen continuous distribution of scipy.stats; "
+        f"got {distribution!r}"
+    )
+
+
+def as_multivariate(names: tuple[str, ...], distribution: Any) -> MultivariateDistribution:
+    """The distribution of several parameters; ValueError if it is none, or one of another number of parameters."""
+    if not isinstance(distribution, MultivariateDistribution):
+        if not all(hasattr(distribution, member) for member in ("logpdf", "rvs")) or hasattr(distribution, "ppf"):
+            raise ValueError(
+                f"Prior: the parameters {', '.join(names)} need a distribution of {len(names)} parameters, such as "
+                f"MultivariateNormal(mean, covariance); got {distribution!r}"
+            )
+        if hasattr(distribution, "cov") and type(distribution).__name__ == "multivariate_normal_frozen":
+            distribution = MultivariateNormal(distribution.mean, distribution.cov)
+        else:
+            distribution = FrozenMultivariate(distribution, len(names))
+    if distribution.dim != len(names):
+        raise ValueError(
+            f"Prior: {len(names)} names, {', '.join(names)}, for a distribution of {distribution.dim} parameters; give "
+            "one name for each"
+        )
+    return distribution
