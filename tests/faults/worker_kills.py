@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.simulation.executors import LocalPool
+from fe_likelihoods.simulation.model import simulate_batch
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, descendants, line, posterior_of
 
 __all__ = ["main"]
@@ -39,10 +41,10 @@ def slow(theta: np.ndarray) -> np.ndarray:
     return line(theta)
 
 
-def _kill(done: threading.Event, seed: int, kills: list[int]) -> None:
-    """Kill a worker about once per second, at random."""
+def _kill(done: threading.Event, seed: int, kills: list[int], pause: float) -> None:
+    """Kill a worker at random, about once in a time [s]."""
     random = np.random.default_rng(seed)
-    while not done.wait(random.uniform(0.8, 1.6)):
+    while not done.wait(pause * random.uniform(0.8, 1.6)):
         workers = []
         for pid in descendants(os.getpid()):
             try:
@@ -74,7 +76,12 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             done, kills = threading.Event(), []
             posterior = posterior_of(model, pool=2, cache=Path(folder) / "cache.sqlite")
-            killer = threading.Thread(target=_kill, args=(done, options.seed, kills))
+            start = time.monotonic()
+            with LocalPool(2) as pool:
+                simulate_batch(model, x[:2, :2], pool)
+            # three workers in succession that die while they start end a run
+            pause = max(1.0, 1.5 * (time.monotonic() - start))
+            killer = threading.Thread(target=_kill, args=(done, options.seed, kills, pause))
             killer.start()
             try:
                 values = posterior(x)
