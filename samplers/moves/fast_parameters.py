@@ -112,6 +112,11 @@ class WithFastSweeps(Move):
         calibrate_move(self.move, coords, weights, inside)
         self._walk.calibrate(coords, weights, inside)
 
+    def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
+        """Pass points (n, ndim) and the logarithm of the target (n,) on to the move if it is a mixture move."""
+        if isinstance(self.move, MixtureMove):
+            self.move.cover_basins(coords, log_target)
+
     def expect_independence(self) -> None:
         """See `samplers.moves.kernels.MixtureMove.expect_independence`; without effect on other moves."""
         if isinstance(self.move, MixtureMove):

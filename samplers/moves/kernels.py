@@ -19,6 +19,7 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import MHMove, Move
 
+from ..proposals.basins import cover_basins
 from ..proposals.covariance import invert_roots, location_and_root
 from ..proposals.mixture import (
     Mixture,
@@ -267,6 +268,18 @@ class MixtureMove(MHMove):
         self._archive = to_component_space(self._mixture, coords)
         self._cumulated = np.cumsum(weights)
         self._current, self._independence_accepted = None, False
+
+    def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
+        """Add components for parts of the target that the fitted mixture does not cover.
+
+        Parameters
+        ----------
+        coords : ndarray, shape (n, ndim)
+            Points, also those of earlier stages.
+        log_target : ndarray, shape (n,)
+            Logarithm of the target of the stage, scaled so that its integral is about 1.
+        """
+        self._mixture = cover_basins(self._mixture, coords, log_target)
 
     def expect_independence(self) -> None:
         """Prefer the independence kernel, without a first sweep that shows its acceptance.

@@ -20,20 +20,20 @@ from collections.abc import Generator, Iterator
 
 import numpy as np
 
-from ..proposals.mixture import fit_mixture, log_density
-from ..proposals.support_bounds import find_support_bounds
 from .adaptive_importance import Recycled, StartingDensity, recycle
 from .budget import BudgetExhausted
 from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, fits_poorly, warn
-from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights, pareto_shape
+from .evidence_check import pareto_shape
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, draw_rounds, start_from_guide
 from .multilevel import draw_start
 from .mutation import MoveSchedule, Mutated, grow_chains, move_together
 from .population import Density, Doubt, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
+from .population_check import check_population
 from .resampling import systematic
 from .settings import Settings
 from .stopping import NothingToReport, StoppedEarly, stop_at, usable
+from .watched_density import WatchedDensity
 from .weights import (
     WHERE_TO_LOOK,
     EvidenceError,
@@ -296,7 +296,10 @@ def _by_moves(
 ) -> Steps:
     """Sequential Monte Carlo. Its evidence is compared with that of `recycled`, which could not be trusted."""
     n, ndim = population.coords.shape
-    target, stages = float(n), []
+    target, stages, density = float(n), [], WatchedDensity(density)
+    density.add(population.coords, population.records)
+    if recycled is not None:
+        density.add(recycled.coords, recycled.records)
     error = EvidenceError(n)
     while population.beta < 1.0:
         coords, records = population.coords, population.records
@@ -307,6 +310,10 @@ def _by_moves(
         weights = normalised_weights(log_weights)
         standard_error = error.weigh(weights)
         schedule.calibrate(coords, coarse_weights(log_weights), density.inside)
+        increment = log_mean_weight(log_weights)
+        log_evidence = sum(stage.log_evidence_increment for stage in stages) + increment
+        visited, log_target = density.visited(beta)
+        schedule.cover_basins(visited, log_target - log_evidence)
 
         ancestors = settings.resample(weights, random)
         error.resample(ancestors)
@@ -317,8 +324,7 @@ def _by_moves(
         mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
         population = mutated.population
         if mutated.stopped:
-            finished = sum(stage.log_evidence_increment for stage in stages)
-            raise stop_at(population, finished + log_mean_weight(log_weights), standard_error, finished)
+            raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
         stages.append(
             Stage(
                 beta=beta,
@@ -326,7 +332,7 @@ def _by_moves(
                 acceptance=mutated.acceptance,
                 moves=mutated.moves,
                 distinct_ancestors=distinct,
-                log_evidence_increment=log_mean_weight(log_weights),
+                log_evidence_increment=increment,
                 log_evidence_error=standard_error,
             )
         )
@@ -338,10 +344,12 @@ def _by_moves(
     check = None
     if settings.check_draws != 0:
         try:
-            check = _check_evidence(population.coords, density, random, settings.check_draws)
+            check, doubts = check_population(population, density, log_evidence, random, settings.check_draws)
         except BudgetExhausted:
             raise StoppedEarly(population, 0.0, 0.0, 1.0, complete=True) from None
         yield population, check
+        for doubt in doubts:
+            yield population, doubt
     if recycled is not None and recycled.check is not None:
         for doubt in check_fallback(stages, check, recycled.log_evidence, recycled.log_evidence_error, recycled.check):
             yield population, doubt
@@ -462,16 +470,6 @@ def _only_sweeps(
             return end.value
         if isinstance(report, Sweep):
             yield population, report
-
-
-def _check_evidence(
-    coords: np.ndarray, density: Density, random: np.random.RandomState, draws: int | None
-) -> EvidenceCheck:
-    """The evidence from fresh draws of a mixture fitted to the final points; by default as many draws as points."""
-    n = len(coords)
-    mixture = fit_mixture(coords, np.full(n, 1.0 / n), bounds=find_support_bounds(density.inside, coords))
-    drawn, made = draw_inside(mixture, n if draws is None else draws, random, density.inside)
-    return evidence_from_weights(density.evaluate(drawn)["log_prob"] - log_density(mixture, drawn), made)
 
 
 def _mutate(

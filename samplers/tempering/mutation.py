@@ -67,6 +67,20 @@ class MoveSchedule(NamedTuple):
         for move in self.moves:
             calibrate_move(move, coords, weights, inside)
 
+    def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
+        """Let the moves that can use it propose points in parts of the target that their fits do not cover.
+
+        Parameters
+        ----------
+        coords : (n, ndim) float
+            Points, also those of earlier stages.
+        log_target : (n,) float
+            Logarithm of the target of the stage, scaled so that its integral is about 1.
+        """
+        for move in self.moves:
+            if isinstance(move, MixtureMove | WithFastSweeps):
+                move.cover_basins(coords, log_target)
+
     def expect_independence(self) -> None:
         """Tell the moves that can use it that the points are independent draws of the target already."""
         for move in self.moves:

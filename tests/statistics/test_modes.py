@@ -4,9 +4,11 @@ import warnings
 
 import numpy as np
 import pytest
+from emcee.moves import StretchMove
 from scipy.stats import multivariate_normal
 
-from samplers import RecyclingSettings, SMCSampler
+from samplers import RecyclingSettings, SMCSampler, TMCMCSampler
+from samplers.moves.kernels import MixtureMove
 
 NDIM = 10
 WIDTHS = np.array([0.01, 0.0125])  # a ratio of volumes of 9
@@ -45,9 +47,16 @@ class OneMode(TwoModes):
         return self.parts(x)[1] + np.log(2.0)
 
 
-def run(seed, target=TwoModes, **settings):
+def run(seed, target=TwoModes, moves=None, **settings):
     posterior = target(seed)
-    sampler = SMCSampler(500, NDIM, posterior, vectorize=True, seed=seed, recycling=RecyclingSettings(**settings))
+    recycling = RecyclingSettings(**settings)
+    sampler = SMCSampler(
+        500, NDIM, posterior, vectorize=True, seed=seed, moves=moves, recycle=True, recycling=recycling
+    )
+    return finish(sampler, posterior)
+
+
+def finish(sampler, posterior):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         sampler.run_mcmc(None, 1)
@@ -70,9 +79,24 @@ def test_without_components_for_basins_it_is_lost():
 
 @pytest.mark.parametrize(("target", "lost"), [(TwoModes, True), (OneMode, False)])
 def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, lost):
-    """Recycling finds both modes, is not trusted, and the moves after it find one."""
-    sampler, share = run(2, target, trusted_yield=1.0)
+    """Recycling finds both modes, is not trusted, and the stretch moves after it find one."""
+    sampler, share = run(2, target, moves=StretchMove(), trusted_yield=1.0, closing_sweeps=True)
     assert share < 0.05
-    reported = any("may have lost a mode" in reason for reason in sampler.verdict.reasons)
+    reported = any("a mode has been lost" in reason for reason in sampler.verdict.reasons)
     assert reported == lost
     assert not lost or sampler.verdict.status == "not usable"
+
+
+def test_moves_keep_the_narrow_mode():
+    posterior = TwoModes(2)
+    sampler, share = finish(TMCMCSampler(500, NDIM, posterior, vectorize=True, seed=2), posterior)
+    assert abs(sampler.log_evidence) < 4.0 * sampler.log_evidence_error + 0.1
+    assert share == pytest.approx(0.5, abs=0.15)
+
+
+def test_moves_without_components_for_basins_lose_it(monkeypatch):
+    """Negative control."""
+    monkeypatch.setattr(MixtureMove, "cover_basins", lambda self, coords, log_target: None)
+    posterior = TwoModes(2)
+    _, share = finish(TMCMCSampler(500, NDIM, posterior, vectorize=True, seed=2), posterior)
+    assert share < 0.05
