@@ -8,8 +8,9 @@ from scipy import stats
 
 from samplers import EvidenceCheck, SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.proposals.mixture import fit_mixture, log_density
-from samplers.tempering.diagnostics import check_evidence
+from samplers.tempering.diagnostics import check_evidence, check_fallback
 from samplers.tempering.evidence_check import expected_yield
+from samplers.tempering.population import Stage
 from tests.benchmarks import truth_targets
 
 
@@ -38,6 +39,18 @@ def test_unreliable_check_that_differs_by_more_than_one_is_grave(value):
 def test_check_without_information_is_reported():
     (doubt,) = check_evidence(-10.0, 0.1, _check(-10.4, error=0.5, effective=3.0, shape=1.1))
     assert "no mixture fits the final points" in doubt.message
+
+
+@pytest.mark.parametrize(
+    ("recycled", "check_of_it", "lost"), [(-9.3, -9.2, True), (-10.05, -10.0, False), (-9.3, -10.0, False)]
+)
+@pytest.mark.parametrize("reliable", [True, False])
+def test_evidence_that_moves_lose_after_recycling_is_reported(recycled, check_of_it, lost, reliable):
+    """Both estimates of recycling must exceed that of the moves: that of the check, or else that of the stages."""
+    stages = [Stage(1.0, 250.0, 0.3, 5, 300, -10.0 if not reliable else -9.3, 0.05)]
+    check = _check(-10.0) if reliable else _check(-9.3, shape=1.2)
+    doubts = check_fallback(stages, check, recycled, 0.05, _check(check_of_it))
+    assert [doubt.grave for doubt in doubts] == [True] * lost
 
 
 @pytest.mark.parametrize(("Sampler", "walkers", "seed"), [(TMCMCSampler, 500, 1), (SMCSampler, 250, 82)])
