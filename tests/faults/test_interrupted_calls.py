@@ -93,7 +93,7 @@ def test_a_loop_whose_body_ends_with_an_error_goes_on(script, error, tmp_path):
     """And sees the same states and the same chain; a script that is done adds nothing and evaluates nothing."""
     whole, expected = run(tmp_path / "whole.h5", script)
     path = tmp_path / "run.h5"
-    for dies_at in (3, 3, len(expected)):  # twice at the same place, then in the last body
+    for dies_at in (3, len(expected)):
         with pytest.raises(error):
             run(path, script, dies_at, error)
     for _ in range(2):
@@ -277,8 +277,7 @@ class Counted(Gaussian):
         return super().__call__(x)
 
 
-@pytest.mark.parametrize("with_pool", [False, True])
-@pytest.mark.parametrize("at", [5, 15, 62])
+@pytest.mark.parametrize(("at", "with_pool"), [(15, False), (62, True)])
 def test_finished_points_of_a_batch_are_kept(at, with_pool, tmp_path, monkeypatch):
     """A function of one point: what was known a second before is not evaluated again, and nothing else changes."""
     monkeypatch.setattr("samplers.storage.evaluation.SECONDS_BETWEEN_NOTES", 0.0)
