@@ -478,8 +478,7 @@ class CachedSimulations:
             if reason:
                 self._failures.add(theta, reason)
         self._check_model(self._guard.after, thetas, self.pool is None, seconds)
-        if not self._guard.unchecked:
-            self._repeated_points.add(thetas, misfit, reasons)
+        self._repeated_points.add(thetas, misfit, reasons, unchanged=not self._guard.unchecked)
         self.memory_cache.store(keys, misfit)
         if responses:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]

@@ -73,14 +73,14 @@ class ModelGuard:
     def __getstate__(self) -> dict:
         return self.__dict__ | {"unchecked": [], "_not_before": -np.inf}
 
-    def before(self, model: Any, repeats: Callable[[], bool]) -> None:
+    def before(self, model: Any, repeats: Callable[[], bool | None]) -> None:
         """Compare before simulations, unless the last comparison was too short ago.
 
         Parameters
         ----------
         model : Model
         repeats : callable
-            Simulates earlier points again; returns whether their results are the same.
+            Simulates earlier points again; returns whether their results are the same, None if there are none.
 
         Raises
         ------
@@ -96,7 +96,7 @@ class ModelGuard:
             self._not_before = now + max(0.0, 2.0 * self._seconds - _NO_TIME) / _SHARE_OF_TIME
 
     def after(
-        self, model: Any, repeats: Callable[[], bool], thetas: np.ndarray, in_process: bool, seconds: float
+        self, model: Any, repeats: Callable[[], bool | None], thetas: np.ndarray, in_process: bool, seconds: float
     ) -> None:
         """Compare after simulations at `thetas` (n, n_structural), if they were compared before them or took long.
 
@@ -128,7 +128,7 @@ class ModelGuard:
                 model.accept_own_changes()
         self._require_same(model, repeats)
 
-    def _require_same(self, model: Any, repeats: Callable[[], bool]) -> None:
+    def _require_same(self, model: Any, repeats: Callable[[], bool | None]) -> None:
         """Raise `ChangedModel` if the model differs in more than values that it may change itself."""
         why = self._difference(model)
         if why is None:
@@ -137,7 +137,10 @@ class ModelGuard:
         if self._state == state_of_user(model) and hasattr(model, "only_own_changes") and model.only_own_changes():
             if self._has_repeated and sum(map(len, self.unchecked)) < _ROWS_PER_REPETITION:
                 return
-            if repeats():
+            same = repeats()
+            if same is None:  # there is no earlier point
+                return
+            if same:
                 self._has_repeated = True
                 self.unchecked.clear()
                 return

@@ -36,8 +36,8 @@ class RepeatedPoints:
     def __getstate__(self) -> dict:
         return self.__dict__ | {"_points": []}
 
-    def add(self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str]) -> None:
-        """Keep the first and the last success of a batch that was simulated by the unchanged model.
+    def add(self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], unchanged: bool) -> None:
+        """Keep the first and the last success of a batch, the last one only if the model is known to be unchanged.
 
         Parameters
         ----------
@@ -47,13 +47,15 @@ class RepeatedPoints:
             Statistics.
         reasons : list of n str
             Reasons of failures; empty where the simulation succeeded.
+        unchanged : bool
+            Whether the model did not differ at the last comparison.
         """
         succeeded = [row for row, reason in enumerate(reasons) if not reason]
-        for row in succeeded[:1] + succeeded[-1:]:
+        for row in succeeded[:1] + succeeded[-1:] if unchanged or not self._points else []:
             self._points[1:] = [StoredSimulation(thetas[row].copy(), misfit[row].copy(), "")]
 
-    def agree(self, run: VerifyingRun, cache: SimulationCache | None) -> bool:
-        """Whether new simulations at these points give the earlier results; also if there are none.
+    def agree(self, run: VerifyingRun, cache: SimulationCache | None) -> bool | None:
+        """Whether new simulations at these points give the earlier results; None if there are no points.
 
         A difference does not count if a third simulation differs again: such a model is not repeatable.
 
@@ -64,7 +66,7 @@ class RepeatedPoints:
             Its tolerance applies.
         """
         if not self._points:
-            return True
+            return None
         tolerance = None if cache is None else cache.tolerance
         tolerance = response_tolerance(run.model) if tolerance is None else tolerance
         start = time.perf_counter()

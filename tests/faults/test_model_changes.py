@@ -294,7 +294,7 @@ def test_a_user_may_call_the_function_between_two_batches_of_a_pool(body):
         assert np.isfinite(values).all()
         assert likelihood.cache.info().simulations == likelihood.simulations == 6
         # two points are simulated again before the second batch, and none before the third
-        assert likelihood.verifications in (0, 2)
+        assert likelihood.verifications == (0 if body == STARTED else 2)
 
 
 OTHERS = {
