@@ -87,13 +87,11 @@ class ModelGuard:
         ChangedModel
             If the model has changed; the simulations at `unchecked` may be those of either model.
         """
-        start = time.monotonic()
-        self._is_due = start >= self._not_before
+        self._is_due = time.monotonic() >= self._not_before
         if self._is_due:
             self._require_same(model, repeats)
-            now = time.monotonic()
-            self._seconds = now - start
-            self._not_before = now + max(0.0, 2.0 * self._seconds - _NO_TIME) / _SHARE_OF_TIME
+            pause = max(0.0, 2.0 * self._seconds - _NO_TIME) / _SHARE_OF_TIME
+            self._not_before = time.monotonic() + pause
 
     def after(
         self, model: Any, repeats: Callable[[], bool | None], thetas: np.ndarray, in_process: bool, seconds: float
@@ -130,7 +128,9 @@ class ModelGuard:
 
     def _require_same(self, model: Any, repeats: Callable[[], bool | None]) -> None:
         """Raise `ChangedModel` if the model differs in more than values that it may change itself."""
+        start = time.monotonic()
         why = self._difference(model)
+        self._seconds = time.monotonic() - start
         if why is None:
             self.unchecked.clear()
             return
