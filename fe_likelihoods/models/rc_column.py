@@ -8,10 +8,12 @@ converged step. The laws and equations are in ``docs/theory`` (``concrete.rst``,
 
 The type of `loading` selects the analysis:
 
-* a `Record` is a base acceleration; the channels are "acceleration" (absolute) and "displacement" (relative to the
-  base) of the top;
-* a `DisplacementHistory` is a reversed lateral displacement of the top; the channel is "force", the lateral force that
-  it requires.
+* a `Record` is a base acceleration; the default channels are "acceleration" (absolute) and "displacement" (relative to
+  the base) of the top;
+* a `DisplacementHistory` is a reversed lateral displacement of the top; the default channel is "force", the lateral
+  force that it requires.
+
+Other channels are moments, forces, curvatures, strains and rotations at the places of sensors (`rc_column_outputs`).
 
 The structural parameters are multiples of the nominal values in `RCColumn.nominal`. Choices that the literature leaves
 open (peak strain of the concrete, softening in tension, geometry, rotational inertia, mesh) change the response of the

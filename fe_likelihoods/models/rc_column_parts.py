@@ -98,7 +98,8 @@ class Bars:
     area : float or None
         Area of one bar [m²]. None: that of a circle of `diameter`.
     first_angle : float
-        Angle between the direction of loading and the first bar [rad].
+        Angle between the direction of negative displacements and the first bar [rad]. It matters only where the bars
+        are not symmetric to the axis of bending, such as an odd number of bars.
     """
 
     number: int

@@ -28,7 +28,7 @@ _CORE = "#b9cfe4"
 def plot_section(column: ColumnLike, axes: Axes | None = None) -> Axes:
     """Plot a circular section to scale: cover, core inside the hoops, mesh of the concrete, and bars.
 
-    The horizontal axis is the direction of loading. Positions on it are the coordinates `y` of the fibers.
+    The horizontal axis points in the direction of positive displacements, against the coordinate `y` of the fibers.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def plot_section(column: ColumnLike, axes: Axes | None = None) -> Axes:
     bars = column.bars
     angles = bars.first_angle + 2.0 * np.pi * np.arange(bars.number) / bars.number
     place = float(from_si(column.bar_circle_radius, unit))
-    circles = [Circle((place * np.cos(a), place * np.sin(a)), from_si(0.5 * bars.diameter, unit)) for a in angles]
+    circles = [Circle((-place * np.cos(a), place * np.sin(a)), from_si(0.5 * bars.diameter, unit)) for a in angles]
     text = f"{bars.number} bars, diameter {from_si(bars.diameter, unit):.3g} {unit}"
     steel = PatchCollection(circles, facecolor=ORANGE, edgecolor="0.25", linewidth=0.7, label=text, zorder=3)
     axes.add_collection(steel)

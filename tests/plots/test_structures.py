@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import plot_sensors
+from fe_likelihoods import Bars, plot_sensors
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
 from fe_likelihoods.models.rc_column import Patches, RCColumn
 from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
@@ -77,6 +77,20 @@ def test_section(record, mesh):
         assert low < -cover.radius < cover.radius < high
     assert axes.get_xlabel() == "position in the direction of loading [in]"
     assert axes.get_aspect() == 1.0 and "18 bars, diameter 1.41 in" in texts(axes)
+
+
+def test_the_first_bar_is_drawn_where_it_acts():
+    """Of three bars the first is on the side that positive displacements put in tension, as its strain shows."""
+    push = DisplacementHistory("push", np.linspace(0.0, 0.1, 12))
+    column = RCColumn.lhpost(push, parameters=("Ec",), bars=Bars(3, 0.05, area=0.006))
+    bars = column.plot_section().collections[1]
+    centers = [path.get_extents().get_points().mean(axis=0)[0] * 0.0254 for path in bars.get_paths()]
+    assert min(centers) == pytest.approx(-column.bar_circle_radius) and max(centers) < 0.3
+    turned = replace(column, bars=replace(column.bars, first_angle=np.pi))
+    one_in_tension, two_in_tension = (each.simulate([1.0])[0, -1] for each in (column, turned))
+    assert two_in_tension > 1.2 * one_in_tension
+    sensor = replace(column, outputs=(f"strain@0:{min(centers)}",))
+    assert sensor.simulate([1.0])[0, -1] > 0.005
 
 
 def test_sensors_are_drawn_at_their_places(record):
