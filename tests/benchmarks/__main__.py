@@ -34,6 +34,7 @@ from .rows import as_table, machine, write_json
 BENCHMARKS = {
     "simulation": column.simulation,
     "batch": column.batch,
+    "sensors": column.sensors,
     "bridge": bridge.simulation,
     "bridge_steps": bridge_steps.steps,
     "imports": startup.imports,

@@ -3,6 +3,7 @@
 import importlib.util
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from statistics import median
 from typing import Any
 
@@ -17,7 +18,7 @@ from tests.opensees_column import INCH, KIP, peer_of, shake
 
 from .rows import Row
 
-__all__ = ["batch", "simulation"]
+__all__ = ["batch", "sensors", "simulation"]
 
 TOLERANCE = 1e-8  # norm of the last increment [in and rad]
 NOMINAL, PAPER = np.ones(5), np.array(list(BRIDGE_COLUMN_MEANS.values()))
@@ -111,3 +112,27 @@ def _pools() -> Iterator[tuple[str, Any, Callable[[], None]]]:
 
 def _speedup(seconds: dict[int, list[float]], n: int) -> str:
     return f"{median(seconds[1]) / median(seconds[n]):.2f} times one thread" if n > 1 else ""
+
+
+def sensors(repeats: int) -> list[Row]:
+    """CPU time of one simulation with the outputs of the top, with three forces, and with twelve sensors more."""
+    model = RCColumn.lhpost(bridge_column_data().record.trim(0.0, 20.0))
+    theta, bar = PAPER, model.bar_circle_radius
+    forces = ("acceleration", "displacement", "base_moment", "base_shear", "axial_force")
+    places = [f"curvature@{z}" for z in (0.0, 0.3, 0.6)] + ["rotation@0:0.6", "rotation@0.6:1.2"]
+    places += [f"strain@{z}:{x}" for z in (0.0, 0.3, 0.6) for x in (bar, -bar)]
+    cases = {"top": None, "and 3 forces": forces, "and 14 sensors": (*forces, *places)}
+    models = {case: replace(model, outputs=outputs) for case, outputs in cases.items()}
+    seconds: dict[str, list[float]] = {case: [] for case in models}
+    for case in models:
+        models[case].simulate(theta)  # compile before the measurement
+    for _ in range(10 * repeats):
+        for case, each in models.items():
+            start = time.process_time()
+            each.simulate(theta)
+            seconds[case].append(time.process_time() - start)
+    note = "smallest of {} runs in alternation; 20 s of the bundled record"
+    return [
+        Row("RCColumn, CPU time with sensors", case, min(values), "s", note.format(len(values)))
+        for case, values in seconds.items()
+    ]
