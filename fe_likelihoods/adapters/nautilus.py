@@ -38,14 +38,15 @@ def nautilus_prior(posterior: Posterior) -> nautilus.Prior:
     >>> sampler = nautilus.Sampler(nautilus_prior(posterior), posterior.log_likelihood, vectorized=True)
     >>> sampler.run()
     """
-    import nautilus
-
-    prior = nautilus.Prior()
     for name, distribution in posterior.prior.distributions.items():
         if isinstance(name, tuple):
             raise ValueError(
                 f"nautilus_prior needs independent parameters; {', '.join(name)} have a {type(distribution).__name__}: "
                 "use nautilus.Sampler(posterior.prior_transform, posterior.log_likelihood, n_dim=posterior.ndim)"
             )
+    import nautilus
+
+    prior = nautilus.Prior()
+    for name, distribution in posterior.prior.distributions.items():
         prior.add_parameter(name, distribution)
     return prior

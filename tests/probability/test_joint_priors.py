@@ -19,7 +19,7 @@ from fe_likelihoods import (
     nautilus_prior,
 )
 from samplers import SMCSampler
-from tests.probability.linear_gaussian import KnownNoise, exact_log_evidence, likelihood_of
+from tests.probability.linear_gaussian import exact_log_evidence, likelihood_of
 
 MEAN, COVARIANCE = np.array([1.0, -0.5]), np.array([[0.5, 0.3], [0.3, 0.8]])
 NORMAL = TruncatedNormal(1.0, 0.7, -np.inf, np.inf)
@@ -183,8 +183,7 @@ def test_posterior_with_a_correlated_prior(rng):
     assert posterior.fingerprint != other.fingerprint and len(posterior.fingerprint) == 32
     marginal = posterior.marginal()
     assert marginal.parameter_names == ["a", "c"] and np.isfinite(marginal(point[:2]))
-    with pytest.raises(ValueError, match="a, c have a|c, a have a|c, a have"):
-        pytest.importorskip("nautilus")
+    with pytest.raises(ValueError, match="needs independent parameters; c, a have a MultivariateNormal"):
         nautilus_prior(posterior)
     together = {("a", "c", "sigma_top"): TruncatedMultivariateNormal([1.0, 1.0, 1.0], np.diag([0.5, 0.5, 0.5]))}
     with pytest.raises(ValueError, match="sigma_top have a joint prior distribution"):
@@ -231,4 +230,3 @@ def test_bad_input_is_refused():
             fit_mixture(*arguments)
     with pytest.raises(ValueError, match="log_prob must have one value for each of the 200 samples"):
         fit_mixture(samples, prior, log_prob=np.ones(3))
-    assert KnownNoise(1.0).sigma == 1.0
