@@ -57,7 +57,19 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .signals.durations import growing_durations
     from .signals.error_measures import rrmse
     from .signals.events import Events, EventWindow
-    from .signals.readers import ImposedTest, read_at2, read_columns, read_csv, read_imposed_test, read_v2
+    from .signals.readers import (
+        ImposedTest,
+        read_at2,
+        read_columns,
+        read_csv,
+        read_esm,
+        read_geonet,
+        read_imposed_test,
+        read_knet,
+        read_record,
+        read_smc,
+        read_v2,
+    )
     from .signals.records import DisplacementHistory, Record
     from .signals.response_spectrum import ResponseSpectrum, response_spectrum
     from .simulation.disk_cache import SimulationCache
@@ -166,7 +178,12 @@ __all__ = [
     "read_columns",
     "read_csv",
     "read_dataset",
+    "read_esm",
+    "read_geonet",
     "read_imposed_test",
+    "read_knet",
+    "read_record",
+    "read_smc",
     "read_v2",
     "residual_checks",
     "response_spectrum",
@@ -319,7 +336,12 @@ _EXPORTS = {
         "read_at2",
         "read_columns",
         "read_csv",
+        "read_esm",
+        "read_geonet",
         "read_imposed_test",
+        "read_knet",
+        "read_record",
+        "read_smc",
         "read_v2",
     ),
     "signals.records": (

@@ -1,11 +1,18 @@
-"""Readers of ground motions and measured responses: PEER AT2, CSMIP and COSMOS V2 (also in zip archives), and CSV.
+"""Readers of ground motions and measured responses: formats of strong-motion networks, CSV, and Excel workbooks.
+
+`read_record` recognises the format of a ground motion. The other readers name the format of a file that they do not
+read.
 
 Every reader converts to SI units. It takes the unit and the time step from the file or from its arguments, and raises
 ValueError if neither states them or if they disagree. The formats themselves are in
-`fe_likelihoods.signals.file_formats` (AT2, V2) and `fe_likelihoods.signals.tables` (CSV).
+`fe_likelihoods.signals.file_formats` (AT2, V2), `fe_likelihoods.signals.network_formats` (SMC, GeoNet, K-NET, ESM) and
+`fe_likelihoods.signals.tables` (CSV).
 """
 
-from collections.abc import Sequence
+import contextlib
+import io
+import zipfile
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,12 +21,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import to_si
-from . import file_formats, tables
+from . import file_formats, network_formats, tables
 from .channels import Channel, Measurements
 from .records import DisplacementHistory, Record
-from .text_files import Series, agree_on_unit, read_text
+from .text_files import Series, agree_on_unit, read_bytes, read_text
 
-__all__ = ["ImposedTest", "read_at2", "read_columns", "read_csv", "read_imposed_test", "read_v2"]
+__all__ = [
+    "ImposedTest",
+    "read_at2",
+    "read_columns",
+    "read_csv",
+    "read_esm",
+    "read_geonet",
+    "read_imposed_test",
+    "read_knet",
+    "read_record",
+    "read_smc",
+    "read_v2",
+]
 
 
 class ImposedTest(NamedTuple):
@@ -61,8 +80,150 @@ def read_at2(path: str | Path, units: str | None = None) -> Record:
         If the file does not exist, has no header or no unit, contains another quantity than acceleration, has another
         number of samples than NPTS, or has a sample that is not a finite number.
     """
-    series = file_formats.parse_at2(read_text(path), str(path))
+    with _named_format(path, "read_at2"):
+        series = file_formats.parse_at2(read_text(path), str(path))
     return _record(series, units, path, Path(path).stem)
+
+
+def read_smc(path: str | Path) -> Record:
+    """Read a ground motion from a USGS SMC file: uncorrected or corrected acceleration at a constant step.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the file.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist, is no SMC file of acceleration, or does not have the number of samples and the peaks
+        that its header states.
+    """
+    with _named_format(path, "read_smc"):
+        series = network_formats.parse_smc(read_text(path), str(path))
+    return _record(series, None, path, Path(path).stem)
+
+
+def read_geonet(path: str | Path, component: str | None = None) -> Record:
+    """Read one component from a GeoNet file of uncorrected (V1A) or corrected (V2A) accelerations.
+
+    Parameters
+    ----------
+    path : str or path
+        The file, which has three components as a rule.
+    component : str, optional
+        Direction as in the file, such as ``"S16W"`` or ``"Up"``. Needed if there is more than one component.
+
+    Returns
+    -------
+    Record
+        The ground motion, named after station and component.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist or is no GeoNet file, the component does not exist (the message lists them), or a
+        component does not have the number of samples and the peak that its header states.
+    """
+    with _named_format(path, "read_geonet"):
+        found = network_formats.parse_geonet(read_text(path), str(path))
+    chosen = [each for each in found if component is None or each.component.lower() == component.lower()]
+    if len(chosen) != 1:
+        raise ValueError(
+            f"{path}: expected one component with component = {component!r}, found {len(chosen)}; the components are "
+            f"{', '.join(each.component for each in found)}"
+        )
+    return _record(chosen[0].series, None, path, chosen[0].series.title)
+
+
+def read_knet(path: str | Path) -> Record:
+    """Read a ground motion from a K-NET or KiK-net file. Its mean is subtracted.
+
+    Parameters
+    ----------
+    path : str or path
+        The file of one component (``.NS``, ``.EW``, ``.UD``, or ``.NS1`` to ``.UD2``).
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the file.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist, is no K-NET file, or does not have the number of samples and the peak that its
+        header states.
+    """
+    with _named_format(path, "read_knet"):
+        series = network_formats.parse_knet(read_text(path), str(path))
+    return _record(series, None, path, Path(path).name)
+
+
+def read_esm(path: str | Path) -> Record:
+    """Read a ground motion from an ASCII file of the databases ESM or ITACA (format DYNA 1.x).
+
+    Parameters
+    ----------
+    path : str or path
+        The file of one component (``...ACC.ASC``).
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the file.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist, is no such file of acceleration, or does not have the number of samples and the peak
+        that its header states.
+    """
+    with _named_format(path, "read_esm"):
+        series = network_formats.parse_esm(read_text(path), str(path))
+    return _record(series, None, path, Path(path).stem)
+
+
+def read_record(path: str | Path, channel: int | str | None = None, units: str | None = None) -> Record:
+    """Read a ground motion from a file of any format that is read here, which is recognised by its first lines.
+
+    Parameters
+    ----------
+    path : str or path
+        A file, or a zip archive of CSMIP and COSMOS V2 files.
+    channel : int or str, optional
+        Channel number (V2), component (GeoNet) or column (CSV), if the file has more than one.
+    units : str, optional
+        Unit of the acceleration, if an AT2 or CSV file does not state it.
+
+    Returns
+    -------
+    Record
+        The ground motion.
+
+    Raises
+    ------
+    ValueError
+        As the reader of the format; for a format that is known and not read, with its name.
+    """
+    content = read_bytes(path)
+    if zipfile.is_zipfile(io.BytesIO(content)) and Path(path).suffix.lower() not in (".xlsx", ".xlsm"):
+        return read_v2(path, channel)
+    name, reader = network_formats.recognise(content.decode("latin-1"))
+    if name and reader is None:
+        raise ValueError(f"{path}: {_looks_like(name, None)}")
+    if reader == "read_at2":
+        return read_at2(path, units)
+    if reader in ("read_v2", "read_geonet"):
+        return {"read_v2": read_v2, "read_geonet": read_geonet}[reader](path, channel)
+    if reader is not None:
+        return {"read_smc": read_smc, "read_knet": read_knet, "read_esm": read_esm}[reader](path)
+    return read_csv(path, units, column=channel)
 
 
 def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:
@@ -93,7 +254,8 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
         If the file or the channel does not exist, several channels match (the message lists them), or the file is
         damaged.
     """
-    candidates = file_formats.find_v2_channels(path, member)
+    with _named_format(path, "read_v2"):
+        candidates = file_formats.find_v2_channels(path, member)
     chosen = [each for each in candidates if channel is None or each.channel == channel]
     if len(chosen) != 1:
         listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
@@ -153,7 +315,8 @@ def read_csv(
         If the file or the column does not exist, unit or step are missing or contradictory, a cell is not a finite
         number or is empty, or a time step is irregular (the message names the first one).
     """
-    series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt)
+    with _named_format(path, "read_csv"):
+        series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt)
     return _record(series, units, path, Path(path).stem)
 
 
@@ -207,7 +370,8 @@ def read_columns(
         If a column is missing, a unit is missing or has another dimension than its channel, the times are not uniform,
         or a cell is not a finite number.
     """
-    table = tables.read_table(path, skip, time_unit)
+    with _named_format(path, "read_columns"):
+        table = tables.read_table(path, skip, time_unit)
     values = _channel_values(table, channels, columns, units)
     step = tables.table_step(table, dt)
     start = tables.table_start(table, step) - zero
@@ -263,6 +427,27 @@ def read_imposed_test(
     values = _channel_values(table, channels, columns, units)
     measurements = Measurements(tuple(channels), 1.0, values, description)
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
+
+
+@contextlib.contextmanager
+def _named_format(path: str | Path, reader: str) -> Iterator[None]:
+    """Name the format of a file that a reader refuses, if it is another one that is known."""
+    try:
+        yield
+    except ValueError as error:
+        try:
+            name, other = network_formats.recognise(read_text(path))
+        except ValueError:
+            raise error from None
+        if not name or other == reader:
+            raise
+        raise ValueError(f"{path}: {_looks_like(name, other)}") from error
+
+
+def _looks_like(name: str, reader: str | None) -> str:
+    article = "an" if name.startswith(("ESM", "HDF5")) else "a"
+    advice = ", which is not read; take a file of another format" if reader is None else f": read it with {reader}"
+    return f"this looks like {article} {name} file{advice}"
 
 
 def _record(series: Series, units: str | None, file: str | Path, name: str) -> Record:

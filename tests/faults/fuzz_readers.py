@@ -31,10 +31,16 @@ from fe_likelihoods import (
     read_columns,
     read_csv,
     read_dataset,
+    read_esm,
+    read_geonet,
+    read_knet,
+    read_record,
+    read_smc,
     read_v2,
     write_dataset,
 )
 from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
+from tests.signals.network_files import esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
 
 SLOW = 5.0
@@ -111,10 +117,18 @@ def cases(folder):
     forms = [csmip(1, values, 0.0125, " .013 sec, in cm/sec2. (8f10.6)"), cosmos(1, values, 0.005)]
     v2 = ["\n".join(lines).encode() for lines in forms]
     archives = [zipped([("a.v2", v2[0]), ("inner.zip", zipped([("b.V2", v2[-1])]))])]
+    networks = (
+        ("smc", read_smc, smc(values, 200.0)),
+        ("V2A", lambda path: read_geonet(path, "Up"), geonet({"N": values, "Up": 2.0 * values}, 0.02)),
+        ("NS", read_knet, knet(np.round(1e4 * values).astype(int), 1)),
+        ("asc", read_esm, esm(values, 0.005)),
+    )
     return [
         Case("at2", read_at2, at2),
         Case("v2", lambda path: read_v2(path, channel=1), v2),
         Case("zip", lambda path: read_v2(path, channel=1), archives),
+        *(Case(name, read, ["\n".join(lines).encode()]) for name, read, lines in networks),
+        Case("any", read_record, [*at2, *csv, v2[0], *("\n".join(lines).encode() for _, _, lines in networks)]),
         Case("csv", read_csv, csv),
         Case("columns.csv", lambda path: read_columns(path, [TOP], ["acc_g"]), csv[1:2]),
         Case("h5", read_dataset, [(folder / "valid.h5").read_bytes()]),

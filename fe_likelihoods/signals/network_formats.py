@@ -1,0 +1,301 @@
+"""File formats of strong-motion networks: USGS SMC, GeoNet V1A and V2A, K-NET and KiK-net, ESM and ITACA.
+
+The functions return plain numbers with the unit, the step and the title that a file states, as those of
+`fe_likelihoods.signals.file_formats`. The stated number of samples and the stated peak are compared with what was read,
+so that a file of another form is refused instead of read wrongly.
+
+USGS SMC
+    11 lines of text, 48 integers in columns of 10, 50 reals in columns of 15, comment lines with ``|``, samples in
+    columns of 10 [cm/s²]. Format description: U.S. Geological Survey, National Strong-Motion Program, "SMC-format data
+    files", ``smcfmt.html``.
+GeoNet V1A, V2A
+    Per component 16 lines of text, 40 integers and 60 reals in columns of 8, then accelerations [mm/s²], and in V2A
+    velocities and displacements, in columns of 8. Format description: W. J. Cousins (2008), "GNS accelerogram data
+    files, standard format"; GeoNet, "Strong motion file formats".
+K-NET, KiK-net
+    17 lines of names and values, then counts. The scale factor is that of a count, and the mean is subtracted, as in
+    the stated peak. Format description: National Research Institute for Earth Science and Disaster Resilience, "About
+    K-NET ASCII format".
+ESM, ITACA (DYNA 1.x)
+    Lines ``NAME: value``, then one sample per line. Format description: ITACA development team, "DYNA 1.0".
+"""
+
+import math
+import re
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .text_files import NUMBER, Series, check_count, parse_count, parse_number
+
+__all__ = ["GeonetComponent", "parse_esm", "parse_geonet", "parse_knet", "parse_smc", "recognise"]
+
+_SMC_NULL = 1.6e38  # reals at least this large are not given
+_SMC_TYPES = {"1": "UNCORRECTED ACCELEROGRAM", "2": "CORRECTED ACCELEROGRAM"}
+_SMC_TEXT, _SMC_INTEGERS, _SMC_REALS, _SMC_DATA = 11, (48, 8, 10), (50, 5, 15), (8, 10)
+_GEONET_TEXT, _GEONET_INTEGERS, _GEONET_REALS, _GEONET_DATA = 16, (40, 10, 8), (60, 10, 8), (10, 8)
+_GEONET_PEAK = re.compile(rf"Acceleration:\s*peak\s*({NUMBER})\s*mm/s/s", re.IGNORECASE)
+_GEONET_STEP = re.compile(rf"\bat\s+(?:intervals\s+of\s+)?({NUMBER})\s*s", re.IGNORECASE)
+_GEONET_UNIT = re.compile(rf"in\s+units\s+of\s+({NUMBER})\s*mm/s/s", re.IGNORECASE)
+_KNET_TEXT, _KNET_NAME = 17, 18
+_KNET_SCALE = re.compile(rf"({NUMBER})\s*\(gal\)\s*/\s*({NUMBER})$", re.IGNORECASE)
+_ESM_TEXT, _ESM_NAME = 200, re.compile(r"[A-Z][A-Z0-9_/^]*:")  # most lines of the header; 55 to 64 in known versions
+_MOST_COMPONENTS = 100
+_LOOK = 40  # lines in which a format is recognised
+_READERS = {
+    "PEER AT2": "read_at2",
+    "CSMIP or COSMOS V2": "read_v2",
+    "USGS SMC": "read_smc",
+    "GeoNet": "read_geonet",
+    "K-NET or KiK-net": "read_knet",
+    "ESM or ITACA": "read_esm",
+}
+
+
+class GeonetComponent(NamedTuple):
+    """One component of a GeoNet file.
+
+    Attributes
+    ----------
+    component : str
+        Direction, such as ``"S16W"`` or ``"Up"``.
+    series : Series
+        The acceleration.
+    """
+
+    component: str
+    series: Series
+
+
+def recognise(text: str) -> tuple[str, str | None]:
+    """Return the name of the format of a file, and of the function that reads it.
+
+    Parameters
+    ----------
+    text : str
+        The text of the file.
+
+    Returns
+    -------
+    name : str
+        Name of the format; empty if it is none of those that are known.
+    reader : str or None
+        Name of the function; None for a format that is not read.
+    """
+    lines = text[:8000].splitlines()[:_LOOK]
+    name = _name_of(lines, text[:8])
+    return name, _READERS.get(name)
+
+
+def _name_of(lines: list[str], start: str) -> str:
+    first = next((line.strip() for line in lines), "")
+    head = "\n".join(lines)
+    rules = (
+        ("HDF5", start.startswith("\x89HDF")),
+        ("K-NET or KiK-net", first.startswith("Origin Time") and "Scale Factor" in head),
+        ("ESM or ITACA", first.startswith("EVENT_NAME:") and "SAMPLING_INTERVAL_S:" in head),
+        ("USGS SMC", bool(re.match(r"[0-9] +(UN)?CORRECTED ACCELEROGRAM", first))),
+        ("USGS SMC without acceleration", bool(re.match(r"[0-9] +(VELOCITY|DISPLACEMENT|RESPONSE|UNKNOWN)", first))),
+        (
+            "GeoNet",
+            bool(re.match(r"(un)?corrected accelerogram", first, re.IGNORECASE))
+            and any(line.startswith("Site ") for line in lines[1:2]),
+        ),
+        ("COSMOS V1 (raw acceleration)", bool(re.match(r"raw acc", first, re.IGNORECASE)) and "Format v0" in first),
+        ("CSMIP V1 (uncorrected)", bool(re.match(r"uncorrected accelerogram", first, re.IGNORECASE))),
+        ("CSMIP or COSMOS V2", bool(re.match(r"corrected acc", first, re.IGNORECASE))),
+        ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),
+        ("Taiwan CWB or SMART", first.startswith("#StationCode")),
+    )
+    return next((name for name, fits in rules if fits), "")
+
+
+def parse_smc(text: str, file: str) -> Series:
+    """Return the samples of a USGS SMC file (see `fe_likelihoods.read_smc`)."""
+    lines = text.splitlines()
+    title = lines[0].strip() if lines else ""
+    number, _, kind = title.partition(" ")
+    if _SMC_TYPES.get(number) != kind.strip():
+        raise ValueError(
+            f"{file}: expected the first line '1 UNCORRECTED ACCELEROGRAM' or '2 CORRECTED ACCELEROGRAM' of an SMC "
+            f"file, got {title[:80]!r}"
+        )
+    integers = _numbers(lines, _SMC_TEXT, *_SMC_INTEGERS, file)
+    first_real = _SMC_TEXT + _SMC_INTEGERS[0] // _SMC_INTEGERS[1]
+    reals = _numbers(lines, first_real, *_SMC_REALS, file)
+    comments, count = (_whole(integers[place], file, what) for place, what in ((15, "comment lines"), (16, "samples")))
+    rate, highest, lowest = reals[1], reals[29], reals[31]
+    if not 0.0 < rate < _SMC_NULL:
+        raise ValueError(
+            f"{file}: expected the number of samples per second as the second real, got {rate:g}; a file with samples "
+            "at uneven times is not read"
+        )
+    start = first_real + _SMC_REALS[0] // _SMC_REALS[1] + comments
+    if not all(line.startswith("|") for line in lines[start - comments : start]):
+        raise ValueError(f"{file}: expected {comments} comment lines that start with '|'; the file is damaged")
+    values = _samples(lines, start, count, _SMC_DATA, file)
+    for stated, found in ((highest, values.max()), (lowest, values.min())):
+        if abs(stated) < _SMC_NULL:
+            _check_peak(found, stated, 2e-4 * float(np.abs(values).max()), file)
+    station = next((line.strip() for line in lines[2:_SMC_TEXT] if line.startswith("station")), title)
+    return Series(re.sub(r"\s+", " ", station), 1.0 / rate, "cm/s2", values)
+
+
+def parse_geonet(text: str, file: str) -> list[GeonetComponent]:
+    """Return the components of a GeoNet V1A or V2A file (see `fe_likelihoods.read_geonet`)."""
+    lines, place, found = text.splitlines(), 0, []
+    while place < len(lines) and any(line.strip() for line in lines[place : place + 3]):
+        if len(found) >= _MOST_COMPONENTS:
+            raise ValueError(f"{file}: expected at most {_MOST_COMPONENTS} components")
+        component, place = _geonet_component(lines, place, file)
+        found.append(component)
+    if not found:
+        raise ValueError(f"{file}: expected a GeoNet V1A or V2A file, got an empty one")
+    return found
+
+
+def _geonet_component(lines: list[str], place: int, file: str) -> tuple[GeonetComponent, int]:
+    """One component, and the line after it."""
+    head = "\n".join(lines[place : place + _GEONET_TEXT])
+    where = f"{file}, line {place + 1}"
+    if not re.match(r"\s*(un)?corrected accelerogram", head, re.IGNORECASE):
+        raise ValueError(
+            f"{where}: expected 'Corrected accelerogram' or 'Uncorrected accelerogram', the first line of a component "
+            f"of a GeoNet file, got {lines[place][:80]!r}"
+        )
+    peak, component = _GEONET_PEAK.search(head), re.search(r"^Component\s+(\S+)", head, re.MULTILINE)
+    step = next((match for line in head.splitlines()[10:12] if (match := _GEONET_STEP.search(line))), None)
+    if peak is None or component is None or step is None:
+        raise ValueError(f"{where}: expected the component, the step and the peak acceleration in {_GEONET_TEXT} lines")
+    first = place + _GEONET_TEXT
+    integers = _numbers(lines, first, *_GEONET_INTEGERS, file)
+    first += _GEONET_INTEGERS[0] // _GEONET_INTEGERS[1]
+    reals = _numbers(lines, first, *_GEONET_REALS, file)
+    first += _GEONET_REALS[0] // _GEONET_REALS[1]
+    counts = [_whole(integers[k], file, "samples") for k in (33, 34, 35)]
+    dt = reals[25]
+    if not dt > 0.0 or abs(dt - float(step[1])) > 0.51e-3:
+        raise ValueError(
+            f"{where}: the step is {step[1]} s in the text but {dt:g} s in the header; the file is damaged"
+        )
+    unit = _GEONET_UNIT.search(head)
+    values = _samples(lines, first, counts[0], _GEONET_DATA, file) * (float(unit[1]) if unit else 1.0)
+    largest = float(values[np.argmax(np.abs(values))])
+    _check_peak(abs(largest), abs(float(peak[1])), 0.101, where)
+    end = first + sum(math.ceil(count / _GEONET_DATA[0]) for count in counts)
+    if end > len(lines):
+        raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")
+    site = re.search(r"^Site\s+(\S+)", head, re.MULTILINE)
+    title = f"{site[1] if site else 'GeoNet'}, component {component[1]}"
+    return GeonetComponent(component[1], Series(title, dt, "mm/s2", values)), end
+
+
+def parse_knet(text: str, file: str) -> Series:
+    """Return the samples of a K-NET or KiK-net file (see `fe_likelihoods.read_knet`)."""
+    lines = text.splitlines()
+    header = {line[:_KNET_NAME].strip().rstrip("."): line[_KNET_NAME:].strip() for line in lines[:_KNET_TEXT]}
+    names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor")
+    missing = [name for name in names if name not in header]
+    if missing:
+        raise ValueError(
+            f"{file}: expected the {_KNET_TEXT} header lines of a K-NET file, {', '.join(missing)} are missing"
+        )
+    rate = parse_number(
+        re.sub(r"\s*hz$", "", header["Sampling Freq(Hz)"], flags=re.IGNORECASE), f"{file}, Sampling Freq"
+    )
+    duration = parse_number(header["Duration Time(s)"], f"{file}, Duration Time")
+    scale = _KNET_SCALE.match(header["Scale Factor"])
+    if scale is None or not float(scale[2]) > 0.0 or not rate > 0.0:
+        raise ValueError(
+            f"{file}: expected a positive sampling frequency and a scale factor such as '3920(gal)/6182761', got "
+            f"{rate:g} and {header['Scale Factor']!r}"
+        )
+    fields = [(k, field) for k, line in enumerate(lines[_KNET_TEXT:], _KNET_TEXT + 1) for field in line.split()]
+    counts = np.array([parse_number(field, f"{file}, line {line}") for line, field in fields])
+    check_count(counts.size, _whole(rate * duration, file, "samples"), f"{file}: frequency times duration")
+    values = (counts - counts.mean()) * (float(scale[1]) / float(scale[2]))
+    stated = header.get("Max. Acc. (gal)", header.get("Max Acc. (gal)", header.get("Max. Acc (gal)")))
+    if stated is None:
+        raise ValueError(f"{file}: expected a header line 'Max. Acc. (gal)'")
+    peak = parse_number(stated, f"{file}, Max. Acc.")
+    _check_peak(float(np.abs(values).max()), peak, 2e-3 * abs(peak) + 2e-3, file)
+    title = f"{header['Station Code']}, channel {header['Dir']}, mean subtracted"
+    return Series(title, 1.0 / rate, "gal", values)
+
+
+def parse_esm(text: str, file: str) -> Series:
+    """Return the samples of an ESM or ITACA file (see `fe_likelihoods.read_esm`)."""
+    lines = text.splitlines()
+    header: dict[str, str] = {}
+    for line in lines[:_ESM_TEXT]:
+        if not _ESM_NAME.match(line):
+            break
+        name, _, value = line.partition(":")
+        header[name] = value.strip()
+    text_lines = len(header)
+    names = ("SAMPLING_INTERVAL_S", "NDATA", "UNITS", "DATA_TYPE", "STATION_CODE", "STREAM")
+    missing = [name for name in names if not header.get(name)]
+    if missing:
+        raise ValueError(f"{file}: expected the header of an ESM or ITACA file, {', '.join(missing)} are missing")
+    if header["DATA_TYPE"].upper() != "ACCELERATION":
+        raise ValueError(f"{file}: expected acceleration, got DATA_TYPE {header['DATA_TYPE']!r}; take the ACC file")
+    dt = parse_number(header["SAMPLING_INTERVAL_S"], f"{file}, SAMPLING_INTERVAL_S")
+    if not dt > 0.0:
+        raise ValueError(f"{file}: expected a positive SAMPLING_INTERVAL_S, got {dt:g}")
+    rows = [(k, line.strip()) for k, line in enumerate(lines[text_lines:], text_lines + 1) if line.strip()]
+    values = np.array([parse_number(row, f"{file}, line {k}") for k, row in rows])
+    where = f"{file}: NDATA"
+    check_count(values.size, _whole(parse_number(header["NDATA"], where), file, "samples"), where)
+    stated = header.get("PGA_CM/S^2", "")
+    if stated and values.size and header["UNITS"].lower() in ("cm/s^2", "cm/s2", "gal"):
+        peak = abs(parse_number(stated, f"{file}, PGA_CM/S^2"))
+        _check_peak(float(np.abs(values).max()), peak, 1e-4 * peak + 2e-6, file)
+    title = f"{header.get('NETWORK', '')}.{header['STATION_CODE']} {header['STREAM']}"
+    return Series(title, dt, header["UNITS"], values)
+
+
+def _numbers(lines: list[str], start: int, count: int, per_line: int, width: int, file: str) -> list[float]:
+    """Numbers of a header of Fortran columns, from the line with index `start`."""
+    numbers = []
+    for k in range(count):
+        row, column = divmod(k, per_line)
+        line = lines[start + row] if start + row < len(lines) else ""
+        numbers.append(
+            parse_number(line[column * width : (column + 1) * width].strip(), f"{file}, line {start + row + 1}")
+        )
+    return numbers
+
+
+def _samples(lines: list[str], start: int, count: int, form: tuple[int, int], file: str) -> NDArray[np.float64]:
+    """Samples in Fortran columns that may touch, from the line with index `start`."""
+    per_line, width = form
+    values: list[float] = []
+    for k in range(start, start - (-count // per_line)):
+        line, where = (lines[k].rstrip() if k < len(lines) else ""), f"{file}, line {k + 1}"
+        wanted = min(per_line, count - len(values))
+        if math.ceil(len(line) / width) != wanted:
+            raise ValueError(
+                f"{where}: expected {wanted} numbers of {width} columns after {len(values)} of {count} samples, got "
+                f"{math.ceil(len(line) / width)}; the file is truncated or damaged"
+            )
+        values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
+    if len(values) < 2:
+        raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
+    return np.array(values)
+
+
+def _whole(number: float, file: str, what: str) -> int:
+    """A number of lines or samples."""
+    if not 0.0 <= number < 1e9 or abs(number - round(number)) > 1e-6:
+        raise ValueError(f"{file}: expected a number of {what}, got {number:g}")
+    return parse_count(str(round(number)), file)
+
+
+def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
+    """Raise ValueError if the stated peak is not that of the samples."""
+    if not abs(found - stated) <= tolerance:
+        raise ValueError(
+            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
+            "another form than the one that is read here"
+        )
