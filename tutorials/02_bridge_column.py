@@ -44,14 +44,11 @@ import numpy as np
 import own_column
 
 from fe_likelihoods import (
-    Record,
     average_predictions,
     from_si,
     problems,
     propagate,
-    read_at2,
-    read_csv,
-    read_v2,
+    read_record,
     rrmse,
 )
 from samplers import (
@@ -76,7 +73,7 @@ PRESETS = {
 }
 
 parser = argparse.ArgumentParser(description="Update the bridge column with SMC; write tables and figures to a folder.")
-parser.add_argument("--record", type=Path, help="base motion: .csv, .at2, .v2 or .zip (default: bundled, synthetic)")
+parser.add_argument("--record", type=Path, help="base motion: AT2, V2, SMC, K-NET, ESM, CSV (default: synthetic)")
 parser.add_argument(
     "--measurements", type=Path, help="measured response of the top: .csv or .xlsx (default: synthetic)"
 )
@@ -111,19 +108,9 @@ args.out.mkdir(parents=True, exist_ok=True)
 # on the multiples of five nominal values; half-normal priors on the noise levels; and the likelihood of its equation
 # (3).
 
-
-def read_record(path: Path) -> Record:
-    """Read a record in any format that the library supports."""
-    if path.suffix.lower() == ".at2":
-        return read_at2(path, units=args.units)
-    if path.suffix.lower() in (".v2", ".v2c", ".zip"):
-        return read_v2(path)
-    return read_csv(path, units=args.units)
-
-
 own = own_column.read_settings(args.column) if args.measurements else None
 if own is not None:
-    record = read_record(args.record).scale(args.scale)
+    record = read_record(args.record, units=args.units).scale(args.scale)
     measurements = own_column.read_measurements(args.measurements, own, record)
 elif args.record is None:
     data = problems.bridge_column_data()
@@ -131,7 +118,7 @@ elif args.record is None:
     if args.scale != 1.0:
         measurements = problems.bridge_column_measurements(record, seed=args.seed)
 else:
-    record = read_record(args.record).scale(args.scale)
+    record = read_record(args.record, units=args.units).scale(args.scale)
     measurements = problems.bridge_column_measurements(record, seed=args.seed)
 
 
