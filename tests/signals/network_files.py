@@ -29,15 +29,16 @@ def geonet(components, dt, corrected=True):
         values = np.round(values, 1)
         peak = values[np.argmax(np.abs(values))]
         integers, reals = [0] * 40, [0.0] * 60
+        step = f"Raw readings in units of 1.00 mm/s/s  at intervals of {dt:.3f} s"
+        if corrected:
+            step = f"Instrument corrected data at {dt:.3f} sec intervals"
         integers[33:36] = [len(values)] * 3 if corrected else [len(values), 0, 0]
         reals[25], reals[29] = dt, 9806.6
         lines += [
             f"{'C' if corrected else 'Unc'}orrected accelerogram 20200101_000000_SYNT_20 GNS Science",
             "Site SYNT      40 00 00S  175 00 00E",
             *["synthetic"] * 8,
-            "Raw readings in units of 1.00 mm/s/s  at intervals of %.3f s" % dt
-            if not corrected
-            else "Instrument corrected data at %.3f sec intervals" % dt,
+            step,
             "",
             f"Component {name}",
             f"Acceleration:  peak {peak:8.1f} mm/s/s at   1.00 sec     rms      1.0 mm/s/s",
