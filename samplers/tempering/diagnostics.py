@@ -39,7 +39,7 @@ LARGE_DIFFERENCE = 1.0
 LOST_EVIDENCE = 0.3
 # Yield of a fitted proposal, as a share of that expected for Gaussian modes, below which the fit misses a part: nearly
 # Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent ones without a shear 0.4 to 0.7.
-POOR_FIT = 0.75
+POOR_FIT = 0.85
 # Correlation of log-weights with those of the nearest points, below which jumps of the likelihood explain a poor yield:
 # 0.2 to 0.44 with jumps of standard deviation 1, 0.45 to 0.9 for bent posteriors.
 SMOOTH_WEIGHTS = 0.45
@@ -212,7 +212,7 @@ def check_fallback(
 
 
 def fits_poorly(check: EvidenceCheck, mixture: Mixture, points: int) -> bool:
-    """Whether fresh draws of a proposal yield less than three quarters of what is usual for Gaussian modes.
+    """Whether fresh draws of a proposal yield less than 85 % of what is usual for Gaussian modes.
 
     The parameters are those of `check_fit`.
     """

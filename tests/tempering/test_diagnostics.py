@@ -83,7 +83,7 @@ def test_expected_yield_is_that_of_fits_to_gaussian_draws(rng):
     assert np.mean(yields) == pytest.approx(expected_yield(6, mixture.dof, 1, 400), rel=0.05)
 
 
-@pytest.mark.parametrize("posterior", [truth_targets.rosenbrock(1), truth_targets.rotated_banana(1, bend=0.1)])
+@pytest.mark.parametrize("posterior", [truth_targets.rosenbrock(1), truth_targets.rotated_banana(6)])
 def test_ends_of_a_bent_posterior_that_may_be_missing_are_reported(posterior):
     sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=4)
     with pytest.warns(SamplingWarning, match="Ends of the posterior may be missing"):
