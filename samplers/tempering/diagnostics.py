@@ -38,11 +38,12 @@ LARGE_DIFFERENCE = 1.0
 # mode with a quarter of the mass.
 LOST_EVIDENCE = 0.3
 # Yield of a fitted proposal, as a share of that expected for Gaussian modes, below which the fit misses a part: nearly
-# Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent ones without a shear 0.4 to 0.7.
+# Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent ones without a shear 0.4 to 0.93.
 POOR_FIT = 0.85
 # Correlation of log-weights with those of the nearest points, below which jumps of the likelihood explain a poor yield:
-# 0.2 to 0.44 with jumps of standard deviation 1, 0.45 to 0.9 for bent posteriors.
-SMOOTH_WEIGHTS = 0.45
+# 0.2 to 0.44 with jumps of standard deviation 1, 0.44 to 0.56 for Gaussian modes with the chance errors of a fit, and
+# 0.7 to 0.97 for bent posteriors.
+SMOOTH_WEIGHTS = 0.6
 NEIGHBOURS = 3
 OUR_PACKAGES = ("samplers", "emcee")
 
