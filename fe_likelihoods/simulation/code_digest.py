@@ -346,6 +346,7 @@ class _Digest:
         skipped = {"__doc__", "__module__", "__dict__", "__weakref__", "__annotations__", "__static_attributes__"}
         skipped |= {"__firstlineno__", "__annotations_cache__", "__annotate_func__", "__dataclass_fields__"}
         skipped |= {"__dataclass_params__", "__match_args__", "__orig_bases__", "_abc_impl"}
+        skipped |= {"__slotnames__"}  # copyreg writes it when the first instance is pickled or copied
         if issubclass(thing, tuple) and "_fields" in vars(thing):  # the generated members of a named tuple
             skipped |= {"__new__", *thing._fields}
         for name, member in vars(thing).items():

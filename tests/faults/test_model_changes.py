@@ -1,5 +1,6 @@
 """No way of changing a model lets the cache use simulations of another model in silence."""
 
+import copy
 import importlib
 import os
 import pickle
@@ -10,13 +11,14 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from fe_likelihoods import ExecutableModel, FunctionModel, LocalPool, SimulationCache
+from fe_likelihoods import ExecutableModel, FELikelihood, FunctionModel, LocalPool, SimulationCache
 from fe_likelihoods.simulation import changed_model
 from fe_likelihoods.simulation.changed_model import SentModel, current_fingerprint
 from fe_likelihoods.simulation.code_digest import code_digest
 from fe_likelihoods.simulation.faults import ChangedModel
 
 from . import model_changes as changes
+from . import value_models
 from .model_changes import CHANNELS, N_STEPS, NAMES, NOTICED, THETAS
 
 
@@ -157,7 +159,27 @@ def test_a_worker_with_an_earlier_version_of_a_file_refuses(options, old, new):
             pickle.loads(data)
 
 
+@pytest.mark.parametrize("name", ["Data", "Frozen", "Slotted", "Named", "Concrete"])
+def test_a_pickle_or_copy_of_an_instance_changes_no_digest(name):
+    """Python writes attributes of its own into the class, such as `__slotnames__`."""
+    function = getattr(value_models, name)()
+    before = code_digest(function)
+    same = [pickle.loads(pickle.dumps(function, protocol)) for protocol in (2, 4, 5)]
+    same += [copy.copy(function), copy.deepcopy(function)]
+    isinstance(function, value_models.Abstract)
+    assert {code_digest(each) for each in (function, *same)} == {before}
+
+
 # real processes -------------------------------------------------------------------------------------------------------
+
+
+def test_a_dataclass_runs_in_a_pool():
+    likelihood = FELikelihood(FunctionModel(value_models.Pooled(), NAMES, CHANNELS, 0.1, N_STEPS), changes.DATA)
+    with LocalPool(2) as likelihood.pool:
+        misfits = likelihood.misfit(THETAS)
+    direct = FELikelihood(likelihood.model, changes.DATA)
+    np.testing.assert_array_equal(misfits, direct.misfit(THETAS))
+    assert likelihood.failure_count == 0
 
 
 @pytest.mark.parametrize("isolated", [False, True], ids=["pool", "process of its own"])
