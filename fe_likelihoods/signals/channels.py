@@ -83,7 +83,8 @@ class Measurements:
         Time step [s], or one per channel.
     values : (n_channels, n_steps) array_like, or sequence of n_channels arrays
         Samples in SI units, one row per channel, stored as a read-only copy. NaN marks a missing sample: a gap, or
-        times at which a channel was not measured. Rows of different lengths are filled with NaN at their ends.
+        times at which a channel was not measured. So does a masked element of a `numpy.ma` array. Rows of different
+        lengths are filled with NaN at their ends.
     description : str, optional
         What was measured, where and when.
     start : float or sequence of float, optional
@@ -368,9 +369,12 @@ class Measurements:
 
 def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
     """Samples as a new array (n_channels, n_steps); rows of different lengths are filled with NaN at their ends."""
-    if not isinstance(values, np.ndarray):
+    if isinstance(values, np.ma.MaskedArray):
+        values = _without_masked(values)
+    elif not isinstance(values, np.ndarray):
         try:
-            rows = [np.asarray(row) for row in values]
+            rows = [_without_masked(row) for row in values]
+            values = rows
             lengths = [row.size for row in rows]
             ragged = len(set(lengths)) > 1 and all(row.ndim == 1 for row in rows)
         except TypeError:
@@ -387,6 +391,15 @@ def _values_array(values: Any, names: Sequence[str]) -> NDArray[np.float64]:
             f"expected values of shape (n_channels, n_steps) = ({len(names)}, n_steps), got {values.shape}"
         )
     return values
+
+
+def _without_masked(row: Any) -> NDArray[Any]:
+    """The samples as an array, with NaN for masked ones: `numpy.asarray` returns the numbers below the mask."""
+    if not isinstance(row, np.ma.MaskedArray):
+        return np.asarray(row)
+    if np.iscomplexobj(row):
+        return row.data
+    return row.astype(np.float64).filled(np.nan)
 
 
 def _per_channel(value: Any, n_channels: int, what: str) -> tuple[Any, ...]:

@@ -374,9 +374,7 @@ def read_columns(
         table = tables.read_table(path, skip, time_unit)
     values = _channel_values(table, channels, columns, units)
     step = tables.table_step(table, dt)
-    start = tables.table_start(table, step) - zero
-    start = 0.0 if abs(start) <= 1e-9 * step else start
-    return Measurements(tuple(channels), step, values, description, start)
+    return Measurements(tuple(channels), step, values, description, tables.table_start(table, step, zero))
 
 
 def read_imposed_test(

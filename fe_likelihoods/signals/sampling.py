@@ -46,6 +46,11 @@ def check_samples(values: ArrayLike, what: str, name: str) -> NDArray[np.float64
     """
     if np.iscomplexobj(values):
         raise ValueError(f"{what} of {name!r} must be real numbers, got complex ones")
+    if np.ma.is_masked(values):
+        raise ValueError(
+            f"{what} of {name!r} must have all samples, {np.ma.count_masked(values)} are masked; interpolate them, "
+            "or cut the data"
+        )
     try:
         samples = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:

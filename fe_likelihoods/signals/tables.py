@@ -210,16 +210,19 @@ def csv_series(table: Table, column: str | None = None, dt: float | None = None)
     return Series(title, table_step(table, dt), unit or (comment and comment[1]), table.values[:, place])
 
 
-def table_start(table: Table, step: float) -> float:
-    """Return the time of the first row [s], zero for a file without times.
+def table_start(table: Table, step: float, zero: float = 0.0) -> float:
+    """Return the time of the first row after `zero` [s]; a file without times begins at time zero.
 
-    A printed time is rounded. A start that is a whole number of steps within this rounding is that number of steps.
+    A printed time is rounded by half a unit of its last digit at most. With ``zero=0``, a start that is a whole number
+    of steps within this rounding is that number of steps. For another `zero` this holds within round-off.
     """
     place = _time_column(table)
     if place is None:
-        return 0.0
+        return 0.0 - zero
     unit = _time_unit(table, place)
-    start, rounding = (float(to_si(each, unit)) for each in (table.values[0, place], 10.0 ** -table.decimals[place]))
+    first, digit = (float(to_si(each, unit)) for each in (table.values[0, place], 10.0 ** -table.decimals[place]))
+    start = first - zero
+    rounding = 0.5 * digit * (1 + 1e-6) if zero == 0.0 else 4 * float(np.spacing(max(abs(first), abs(zero))))
     nearest = round(start / step)
     return nearest * step if abs(start - nearest * step) <= rounding + 1e-9 * step else start
 

@@ -113,3 +113,12 @@ class TestMeasurements:
         np.testing.assert_allclose(fewer.values[0], np.cos(2 * np.pi * 5 * fewer.time), atol=1e-9)
         resampled = Record("same motion", 0.005, np.cos(2 * np.pi * 45 * time)).resample(0.02)
         assert np.abs(resampled.acceleration[30:-30]).max() < 3e-3
+
+    @pytest.mark.parametrize("form", [lambda rows: rows, list, lambda rows: [rows[0], rows[1, :2]]])
+    def test_masked_samples_are_missing(self, form):
+        rows = np.ma.array([[1.0, -9999.0, 2.0], [3.0, 4.0, 5.0]], mask=[[0, 1, 0], [0, 0, 0]])
+        values = Measurements((TOP, DRIFT), 0.01, form(rows)).values
+        np.testing.assert_array_equal(values[0], [1.0, np.nan, 2.0])
+        np.testing.assert_array_equal(values[1, :2], [3.0, 4.0])
+        with pytest.raises(ValueError, match="1 are masked"):
+            Record("masked", 0.01, rows[0])

@@ -464,6 +464,15 @@ class TestColumns:
         found = read_columns(path, (TOP,), ("acc_g",))
         assert (found.dt, found.start) == (1 / 120, 1 / 120)
 
+    @pytest.mark.parametrize(
+        ("first", "dt", "digits", "zero", "start"),
+        [(0.37, 0.02, 2, 0.0, 0.37), (86000.123, 0.002, 3, 86000.123, 0.0), (86000.123, 1 / 120, 5, 86000.123, 0.0)],
+    )
+    def test_a_start_between_two_steps_is_kept(self, tmp_path, first, dt, digits, zero, start):
+        path = tmp_path / "a.csv"
+        path.write_text("time_s,acc_g\n" + "".join(f"{first + k * dt:.{digits}f},{k}\n" for k in range(500)))
+        assert read_columns(path, (TOP,), ("acc_g",), zero=zero).start == start
+
     def test_excel(self, tmp_path):
         book = pytest.importorskip("openpyxl").Workbook()
         for row in (["Logger 7"], ["Time", "Acc"], ["s", "m/s²"], [0, 0.1], [0.01, None], [0.02, 12.5], [0.03, 0]):
