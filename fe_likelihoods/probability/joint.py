@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .distributions import Distribution, RandomState
+from .event_noise import EventNoise
 from .inputs import as_points
 from .likelihood import FELikelihood
 from .noise import sampled_noise
@@ -50,14 +51,14 @@ class JointLikelihood:
     ------
     ValueError
         If there are no likelihoods, one is not an `FELikelihood`, a name stands for different units or different
-        nominal values, or for a structural parameter in one likelihood and a noise parameter in another, or a name in
-        `separate` is unknown.
+        nominal values, or for a structural parameter in one likelihood and a noise parameter in another, a name in
+        `separate` is unknown, or `separate` gives two parameters one name.
 
     Notes
     -----
-    Units are compared where they are known: those of ``sigma_<channel>`` from the quantities of the channels, the
-    nominal values of which parameters are multiples from the attribute ``nominal`` of the models, and the mapping
-    ``parameter_units`` (name to text) that a model of your own may have.
+    Units are compared where they are known: those of ``sigma_<channel>`` and ``sigma_<channel>_<event>`` from the
+    quantities of the channels, the nominal values of which parameters are multiples from the attribute ``nominal`` of
+    the models, and the mapping ``parameter_units`` (name to text) that a model of your own may have.
 
     Examples
     --------
@@ -86,6 +87,15 @@ class JointLikelihood:
             )
         if taken := sorted({f"{name}_{key}" for name in self.separate for key in self.likelihoods} & known):
             raise ValueError(f"separate makes the names {', '.join(taken)}, which exist already; rename likelihoods")
+        sources: dict[str, str] = {}
+        for key, likelihood in self.likelihoods.items():
+            for name in likelihood.parameter_names:
+                joint = self._joint_name(key, name)
+                if sources.setdefault(joint, name) != name:
+                    raise ValueError(
+                        f"separate makes the name {joint!r} of two parameters, {sources[joint]!r} and {name!r}; rename "
+                        "likelihoods"
+                    )
         structural: dict[str, str] = {}
         noise: dict[str, str] = {}
         for key, likelihood in self.likelihoods.items():
@@ -349,7 +359,11 @@ def _unit(likelihood: FELikelihood, name: str) -> str | None:
         if name in units:
             return str(units[name])
         return f"multiples of {nominal[name]:.12g}" if isinstance(nominal, Mapping) and name in nominal else None
-    channels = {f"sigma_{channel.name}": channel for channel in likelihood.model.channels}
+    noise = sampled_noise(likelihood.noise)
+    channels = {f"sigma_{channel.name}": channel for channel in model.channels}
+    if isinstance(noise, EventNoise):
+        rows = [noise.channels[row] for _, row in noise.levels]
+        channels = dict(zip(noise.parameter_names, rows, strict=True))
     return channels[name].si_unit if name in channels else None
 
 

@@ -28,6 +28,7 @@ __all__ = [
 
 _LOG_TWO_PI = math.log(2.0 * math.pi)
 _FEWEST_INSIDE = 1e-3  # probability of a box below which draws by rejection take too long
+_LARGEST_ASYMMETRY = 1e-8  # of a covariance, in standard deviations of the two parameters
 _LATTICE_POINTS = 2**14
 _SHIFTS = 8
 
@@ -37,7 +38,15 @@ class MultivariateDistribution(ABC):
 
     A subclass has `dim`, `logpdf` and either `from_normal` and `to_normal` or `rvs`. If it is not defined for all real
     numbers it also has `bounds`. Its ``repr`` must show all values, because it is part of fingerprints.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the parameters, in the order of the values; empty if the distribution has none. `Prior` checks its
+        names against them.
     """
+
+    names: tuple[str, ...] = ()
 
     @property
     @abstractmethod
@@ -84,7 +93,8 @@ class MultivariateNormal(MultivariateDistribution):
     mean : (dim,) array_like
         Mean.
     covariance : (dim, dim) array_like
-        Covariance, symmetric and positive definite.
+        Covariance, positive definite, and symmetric to 1e-8 of the product of the two standard deviations. It is
+        made symmetric.
 
     Raises
     ------
@@ -107,8 +117,12 @@ class MultivariateNormal(MultivariateDistribution):
             )
         if not (np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()):
             raise ValueError(f"{kind} expects finite numbers; got mean {self.mean} and covariance {self.covariance}")
-        if not np.allclose(self.covariance, self.covariance.T, rtol=1e-10, atol=0.0):
+        # round-off of a computed covariance is measured against the standard deviations, because an element may be zero
+        deviations = np.sqrt(np.abs(np.diag(self.covariance)))
+        difference = np.abs(self.covariance - self.covariance.T)
+        if (difference > _LARGEST_ASYMMETRY * np.outer(deviations, deviations)).any():
             raise ValueError(f"{kind} expects a symmetric covariance; got {self.covariance}")
+        self.covariance = 0.5 * (self.covariance + self.covariance.T)
         try:
             self._factor = np.linalg.cholesky(self.covariance)
         except np.linalg.LinAlgError:
@@ -362,7 +376,7 @@ def as_distribution(name: str, distribution: Any) -> Distribution:
 
 
 def as_multivariate(names: tuple[str, ...], distribution: Any) -> MultivariateDistribution:
-    """The distribution of several parameters; ValueError if it is none, or one of another number of parameters."""
+    """The distribution of several parameters; ValueError if it is none, or one of other parameters."""
     if not isinstance(distribution, MultivariateDistribution):
         if not all(hasattr(distribution, member) for member in ("logpdf", "rvs")) or hasattr(distribution, "ppf"):
             raise ValueError(
@@ -377,5 +391,10 @@ def as_multivariate(names: tuple[str, ...], distribution: Any) -> MultivariateDi
         raise ValueError(
             f"Prior: {len(names)} names, {', '.join(names)}, for a distribution of {distribution.dim} parameters; give "
             "one name for each"
+        )
+    if distribution.names and sorted(distribution.names) != sorted(names):
+        raise ValueError(
+            f"Prior: the names {', '.join(names)} differ from those of the distribution, "
+            f"{', '.join(distribution.names)}; use its names, in any order"
         )
     return distribution

@@ -21,8 +21,9 @@ class Prior:
     ----------
     distributions : mapping of str to Distribution, and of tuples of str to MultivariateDistribution
         Parameter names and their distributions, in the order of the parameters. A tuple of names has a distribution of
-        these parameters together, such as `MultivariateNormal` or the result of `fit_mixture`. Frozen continuous
-        distributions of `scipy.stats` are accepted as well.
+        these parameters together, such as `MultivariateNormal` or the result of `fit_mixture`, which has names of its
+        own: the tuple must have the same names, in any order. Frozen continuous distributions of `scipy.stats` are
+        accepted as well.
 
     Attributes
     ----------
@@ -41,7 +42,7 @@ class Prior:
     ------
     ValueError
         If `distributions` is not such a mapping, or empty, if names repeat, or a joint distribution has another number
-        of parameters than names.
+        of parameters than names, or other names.
 
     Examples
     --------
@@ -68,6 +69,11 @@ class Prior:
         names = [name for key in self.distributions for name in (key if isinstance(key, tuple) else (key,))]
         if len(set(names)) != len(names):
             raise ValueError(f"Prior: the names of the parameters must differ; got {', '.join(names)}")
+        # a distribution with names gets its parameters in its own order, whatever the order of the key
+        self.distributions = {
+            distribution.names or key if isinstance(key, tuple) else key: distribution
+            for key, distribution in self.distributions.items()
+        }
         self._set_order(tuple(names))
 
     def _set_order(self, names: tuple[str, ...]) -> None:

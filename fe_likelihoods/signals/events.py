@@ -209,12 +209,17 @@ class Events(Record):
         rows = {name: row for row, name in enumerate(channels)}
         for name, each in measurements.items():
             end, duration = each.start + (each.n_steps - 1) * dt, self.records[self.names.index(name)].duration
-            start = _whole_steps(windows[name].start + each.start, dt, name)
+            if each.start < -1e-9 * duration:  # these samples would be at times of the pause or of another event
+                raise ValueError(
+                    f"the measurements of {name!r} begin at {each.start:g} s, before the first sample of the event, "
+                    "which is their time zero; use Measurements.trim(0.0, stop)"
+                )
             if end > duration * (1 + 1e-9):
                 raise ValueError(
                     f"the measurements of {name!r} end at {end:g} s, after the end of the event at {duration:g} s; use "
                     "Measurements.trim(start, stop)"
                 )
+            start = _whole_steps(windows[name].start + each.start, dt, name)
             for channel, samples in zip(each.channels, each.values, strict=True):
                 values[rows[channel.name], start : start + each.n_steps] = samples
         described = [f"{name}: {each.description}" for name, each in measurements.items() if each.description]

@@ -148,6 +148,8 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
         "expected Measurements for one or more of EQ1, EQ2": {},
         "those of 'EQ2' differ": measured | {"EQ2": measured["EQ2"].decimate(2)},
         "end at 1.18 s, after the end of the event at 0.98 s": {"EQ2": measured["EQ1"]},
+        r"begin at -0.02 s, before .*\.trim\(0.0, stop\)": {"EQ1": measured["EQ1"].shift(-0.02)},
+        "'EQ2' begin at -1.2 s, before": {"EQ2": measured["EQ2"].shift(-1.2)},
         "is no multiple": {"EQ2": Measurements(channel, 0.04 * 1.5, np.ones((1, 3)))},
         "rename one of them": measured | {"EQ2": Measurements(channel, 0.02, np.ones((1, 5)))},
     }

@@ -7,6 +7,7 @@ import pytest
 
 from fe_likelihoods import (
     Channel,
+    Events,
     FELikelihood,
     FunctionModel,
     HalfNormal,
@@ -211,6 +212,28 @@ def test_bad_input_is_refused_before_anything_is_simulated(pieces, rng):
         with pytest.raises(ValueError, match=message):
             JointLikelihood(likelihoods, **settings)
     assert JointLikelihood(pieces | {"test": in_newton}, separate=["sigma_top"]).ndim == 6
+
+
+def test_units_of_the_noise_of_events_are_compared(rng):
+    events = Events([Record("EQ1", 0.02, rng.normal(size=20))])
+    likelihoods = {}
+    for key, quantity in {"a": "relative displacement", "b": "acceleration"}.items():
+        channels = (Channel("top", quantity, "m" if key == "a" else "m/s2"),)
+        model = FunctionModel(lambda theta: np.ones((1, 20)), ["k"], channels, 0.02, 20)
+        model.record = events
+        likelihoods[key] = FELikelihood(model, {"EQ1": Measurements(channels, 0.02, np.ones((1, 20)))}, "per event")
+    with pytest.raises(ValueError, match="'sigma_top_EQ1' must have one unit; it is in m in 'a' and in m/s2 in 'b'"):
+        JointLikelihood(likelihoods)
+    assert JointLikelihood(likelihoods, separate=["sigma_top_EQ1"]).ndim == 3
+
+
+def test_separate_gives_no_two_parameters_one_name(rng):
+    likelihoods = {
+        "b_c": likelihood_of(("a", "k"), rng, noise=None),
+        "c": likelihood_of(("a_b", "k"), rng, noise=None),
+    }
+    with pytest.raises(ValueError, match="separate makes the name 'a_b_c' of two parameters, 'a' and 'a_b'; rename"):
+        JointLikelihood(likelihoods, separate=["a", "a_b"])
 
 
 def test_multiples_of_different_nominal_values_are_different_units():

@@ -129,6 +129,26 @@ def test_mixture_describes_the_samples_within_its_stated_error(bent):
     np.testing.assert_allclose(whole.to_normal(whole.from_normal(z)), z, atol=1e-6)
 
 
+def test_a_mixture_gets_its_parameters_by_name(bent):
+    prior, samples, _ = bent
+    mixture = fit_mixture(samples, prior, ["k", "c"], max_components=1)
+    swapped = Prior({("c", "k"): mixture})
+    assert swapped.names == ("c", "k")
+    np.testing.assert_array_equal(swapped.logpdf(samples[:9, [1, 0]]), mixture.logpdf(samples[:9, :2]))
+    np.testing.assert_allclose(swapped.rvs(4000, 1).mean(axis=0), samples[:, [1, 0]].mean(axis=0), atol=0.05)
+    np.testing.assert_array_equal(swapped.bounds, mixture.bounds[::-1])
+    assert swapped.reorder(["k", "c"]).subset(["k", "c"]).logpdf(samples[0, :2]) == mixture.logpdf(samples[0, :2])
+    with pytest.raises(ValueError, match="the names k, m differ from those of the distribution, k, c"):
+        Prior({("k", "m"): mixture})
+
+
+def test_round_off_of_a_covariance_is_no_asymmetry():
+    computed = np.array([[1e-6, 1e-18], [3e-18, 4.0]])
+    np.testing.assert_array_equal(MultivariateNormal(MEAN, computed).covariance, [[1e-6, 2e-18], [2e-18, 4.0]])
+    with pytest.raises(ValueError, match="expects a symmetric covariance"):
+        MultivariateNormal(MEAN, [[1e-6, 1e-9], [0.0, 4.0]])
+
+
 def test_mixture_of_some_parameters(bent):
     prior, samples, _ = bent
     mixture = fit_mixture(dict(zip(prior.names, samples.T, strict=True)), prior, ["c", "k"])
