@@ -12,7 +12,7 @@ import numpy as np
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
-from ..probability.noise import sampled_noise
+from ..probability.marginal_noise import sampled_noise
 from ..simulation.executors import as_executor
 from ..simulation.memory_cache import distinct_keys
 from ..simulation.model import Model

@@ -17,7 +17,7 @@ from .distributions import Distribution, RandomState
 from .event_noise import EventNoise
 from .inputs import as_points
 from .likelihood import FELikelihood
-from .noise import sampled_noise
+from .marginal_noise import sampled_noise
 from .report import simulation_report
 
 __all__ = ["JointLikelihood"]

@@ -9,6 +9,7 @@ of the residuals, see `fe_likelihoods.probability.noise`.) The simulations are r
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -148,9 +149,15 @@ class FELikelihood(CachedSimulations):
 
     @property
     def data_fingerprint(self) -> str:
-        """Hex digest of the measurements: equal for likelihoods of the same data, in any order of the channels."""
+        """Hex digest of the samples that are compared: equal for likelihoods of the same data.
+
+        The order of the channels has no effect. A noise with unknown time shifts leaves out samples near the ends of
+        the response, so its digest depends on the largest shift.
+        """
         names = sorted(channel.name for channel in self.measurements.channels)
-        return self.measurements.select(names).fingerprint
+        return (
+            replace(self.measurements, values=getattr(self.measured, "values", self.measured)).select(names).fingerprint
+        )
 
     def first(self, seconds: float) -> "FELikelihood":
         """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .distributions import Distribution, RandomState, Uniform
-from .noise import GaussianNoise, SharedGaussianNoise
+from .noise import GaussianNoise, Noise, SharedGaussianNoise
 from .priors import Prior
 from .sample_counts import SampleCounts, samples_per_channel
 
-__all__ = ["MarginalNoise"]
+__all__ = ["MarginalNoise", "sampled_noise"]
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _FALL = 36.0  # decrease of the logarithm at which the integrand is negligible in double precision
@@ -162,6 +162,11 @@ class MarginalNoise:
             return misfit, counts, 0.0
         scales = np.array(self.noise.scales)
         return (misfit / scales**2).sum(axis=1, keepdims=True), counts.sum(keepdims=True), -counts @ np.log(scales)
+
+
+def sampled_noise(noise: Noise) -> Noise:
+    """Noise whose parameters are in a complete sample: for a `MarginalNoise` the one that was integrated out."""
+    return noise.noise if isinstance(noise, MarginalNoise) else noise
 
 
 class _Peak(NamedTuple):

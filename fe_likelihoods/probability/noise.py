@@ -42,7 +42,6 @@ __all__ = [
     "noise_statistic",
     "noise_time_shifts",
     "options_repr",
-    "sampled_noise",
     "set_channels",
     "total_deviations",
 ]
@@ -103,11 +102,6 @@ def noise_time_shifts(noise: Noise) -> Mapping[str, float] | None:
 def noise_of_part(noise: Noise, measurements: Measurements) -> Noise:
     """Noise of a part of the measurements: the same, unless it has a method ``with_measurements``."""
     return noise.with_measurements(measurements) if hasattr(noise, "with_measurements") else noise
-
-
-def sampled_noise(noise: Noise) -> Noise:
-    """Noise whose parameters are in a complete sample: for a `MarginalNoise` the one that was integrated out."""
-    return getattr(noise, "noise", noise)
 
 
 @dataclass(frozen=True)

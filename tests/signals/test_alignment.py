@@ -20,6 +20,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
     align,
+    propagate,
 )
 
 BASE = Channel("base", "acceleration", "g")
@@ -198,3 +199,29 @@ def test_shifts_that_do_not_fit_are_refused(rng):
         FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(white, {"top": 4.0}, DT))
     with pytest.raises(ValueError, match="make the noise with model.dt"):
         FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(white, {"top": 0.05}, 2.0 * DT))
+
+
+def test_samples_with_shifts_predict(rng):
+    """The noise of the samples has the parameters of the shifts too."""
+    likelihood = FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT))
+    samples = [[1.0, 1.0, 0.3, 0.0004, 0.02], [1.1, 0.9, 0.3, 0.0004, 0.03]]
+    for noise in (False, True):
+        found = propagate(likelihood, samples, noise=noise, progress=False)
+        assert found.mean == pytest.approx(np.mean([response(x) for x in samples], axis=0))
+    assert found.variance[0].min() >= 0.09 - 1e-9
+
+
+def test_evidences_of_other_largest_shifts_are_not_those_of_the_same_data(rng):
+    data, white = shifted_data(rng), GaussianNoise((TOP, DRIFT))
+    plain, *shifted = (
+        FELikelihood(MODEL, data, noise)
+        for noise in (white, *(TimeShiftNoise(white, {"top": shift}, DT) for shift in (0.05, 0.07)))
+    )
+    digests = {each.data_fingerprint for each in (plain, *shifted)}
+    assert len(digests) == 3
+    assert FELikelihood(MODEL, data, shifted[0].noise).data_fingerprint == shifted[0].data_fingerprint
+    # with the samples left out that the shifts leave out, the evidences can be compared
+    values = np.array(data.values)
+    values[0, :8] = values[0, -8:] = np.nan
+    same = FELikelihood(MODEL, Measurements(data.channels, DT, values), white)
+    assert same.data_fingerprint == shifted[0].data_fingerprint
