@@ -22,7 +22,8 @@ from .records import Record
 
 __all__ = ["Alignment", "align"]
 
-_FEWEST = 0.5  # share of the energy of a channel, and of its samples, that must overlap with the reference
+_FEWEST = 0.5  # share of the energy, and of the samples, of the shorter of channel and reference that must overlap
+_CANDIDATES = 8  # highest peaks on the grid of lags that are refined
 _WINDOW = 5.0  # length of the sums over lags of autocorrelations, in correlation times
 _GOOD = 0.7  # correlation below which the reference does not explain the channel
 
@@ -102,6 +103,11 @@ class _Pair(NamedTuple):
         """Time of the last sample of the reference [s]."""
         return (self.reference.size - 1) * self.dt
 
+    @property
+    def finer(self) -> int:
+        """Number of lags per step of the channel, so that they are not farther apart than the reference's samples."""
+        return max(1, math.ceil(self.step / self.dt - 1e-9))
+
 
 def align(
     reference: Record | Measurements,
@@ -120,7 +126,8 @@ def align(
     channels : sequence of str, optional
         The channels to use. Default: those that the response has as well; for a record, the only acceleration.
     max_lag : float, optional
-        Largest lag in both directions [s]. Default: half of the shorter duration.
+        Largest lag in both directions [s]. Default: half of the shorter duration. At a lag, half of the
+        shorter one of channel and reference must overlap with the other.
 
     Returns
     -------
@@ -140,15 +147,15 @@ def align(
     and p of the derivative r' of the reference.
     """
     pairs = _pairs(reference, measurements, channels)
-    duration = min(min(p.end, float(np.ptp(p.times))) for p in pairs)
+    longest = min(max(p.end, float(np.ptp(p.times))) for p in pairs)
     if max_lag is None:
-        max_lag = 0.5 * duration
-    if not 0.0 < max_lag < duration:
+        max_lag = 0.5 * min(min(p.end, float(np.ptp(p.times))) for p in pairs)
+    if not 0.0 < max_lag < longest:
         raise ValueError(
-            f"max_lag must be positive and below {duration:g} s, the duration of the shorter of record and "
+            f"max_lag must be positive and below {longest:g} s, the duration of the longer of record and "
             f"measurements, got {max_lag!r}"
         )
-    step = min(p.step for p in pairs)
+    step = min(p.step / p.finer for p in pairs)
     lags = step * np.arange(-math.floor(max_lag / step), math.floor(max_lag / step) + 1)
     correlations = np.array([_on_lags(p, lags) for p in pairs])
     rough = lags[int(np.argmax(-np.log1p(-np.minimum(correlations**2, 1.0 - 1e-12)).sum(axis=0)))]
@@ -160,16 +167,25 @@ def align(
             f"the correlation is largest at a lag of {lags[best]:g} s, the end of the range; give a larger max_lag, or "
             "other channels"
         )
-    lag = _refine(pairs, effective, float(lags[best]), step)
     peaks = 1 + np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:]))
     others = peaks[np.abs(peaks - best) > 1]
-    second = int(others[np.argmax(score[others])]) if others.size else None
-    advantage = math.inf if second is None else _advantage(pairs, effective, lag, float(lags[second]))
+    others = others[np.argsort(-score[others], kind="stable")][:_CANDIDATES]
+    # the peaks of a periodic signal differ on the grid of lags more than at their tops, but by less than a half
+    explained = effective @ correlations**2
+    others = others[(explained[others] > 0.5 * explained[best]) | (np.arange(others.size) == 0)]
+    lag, *tops = (_refine(pairs, effective, float(lags[k]), step) for k in (best, *others))
+    advantages = [_advantage(pairs, effective, lag, top) for top in tops]
+    if advantages and min(advantages) < 0.0:
+        k = int(np.argmin(advantages))
+        lag, tops[k] = tops[k], lag
+        advantages = [_advantage(pairs, effective, lag, top) for top in tops]
+    advantage = min(advantages, default=math.inf)
+    second = tops[int(np.argmin(advantages))] if tops else None
     probability = 1.0 / (1.0 + math.exp(-max(advantage, 0.0)))
     found = {p.name: _correlation(p, lag) for p in pairs}
     information = sum(_information(p, lag) for p in pairs)
     error = 1.0 / math.sqrt(information) if information > 0.0 else math.inf
-    return Alignment(lag, error, found, probability, None if second is None else float(lags[second]))
+    return Alignment(lag, error, found, probability, second)
 
 
 def _pairs(reference: Record | Measurements, measurements: Measurements, channels: Sequence[str] | None) -> list[_Pair]:
@@ -236,12 +252,16 @@ def _correlation(pair: _Pair, lag: float) -> float:
 
 
 def _on_lags(pair: _Pair, lags: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Correlations (n_lags,), interpolated between lags at the step of the channel; zero with too little overlap."""
-    steps = int(pair.end / pair.step + 1e-9) + 1
-    at = make_interpolation(pair.dt, pair.reference.size, np.minimum(pair.step * np.arange(steps), pair.end))
+    """Correlations (n_lags,), interpolated between the lags of the grid; zero with too little overlap.
+
+    The step of the grid is that of the channel, divided so that it is not longer than that of the reference.
+    """
+    step, places = pair.step / pair.finer, pair.finer * pair.places
+    steps = int(pair.end / step + 1e-9) + 1
+    at = make_interpolation(pair.dt, pair.reference.size, np.minimum(step * np.arange(steps), pair.end))
     reference = interpolate(pair.reference, at)
-    there, values = np.zeros(pair.places[-1] + 1), np.zeros(pair.places[-1] + 1)
-    there[pair.places], values[pair.places] = 1.0, pair.values
+    there, values = np.zeros(places[-1] + 1), np.zeros(places[-1] + 1)
+    there[places], values[places] = 1.0, pair.values
 
     def products(own: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sums over i of own_i other_(i - k), for k = 1 - steps, ..., own.size - 1."""
@@ -253,12 +273,17 @@ def _on_lags(pair: _Pair, lags: NDArray[np.float64]) -> NDArray[np.float64]:
     other, other_squares, both = products(there, reference), products(there, reference**2), products(values, reference)
     n = np.maximum(np.rint(n), 1.0)
     own_power, other_power = squares - own**2 / n, other_squares - other**2 / n
-    energy = float(pair.values @ pair.values)
-    enough = (n >= max(10, _FEWEST * pair.places.size)) & (own_power >= _FEWEST * energy)
-    enough &= other_power > 1e-9 * float(reference @ reference)
+    span = places[-1] - places[0] + 1
+    if span <= steps:
+        enough = (n >= max(10, _FEWEST * places.size)) & (own_power >= _FEWEST * float(pair.values @ pair.values))
+        enough &= other_power > 1e-9 * float(reference @ reference)
+    else:  # the channel is longer, so half of the reference must overlap with it
+        share = places.size / span  # of the samples that are there
+        enough = (n >= max(10, _FEWEST * share * steps)) & (own_power > 0.0)
+        enough &= other_power >= _FEWEST * share * float(reference @ reference)
     found = np.where(enough, both - own * other / n, 0.0)
     found /= np.sqrt(np.where(enough, own_power * other_power, 1.0))
-    grid = pair.start + pair.step * np.arange(1 - steps, there.size)
+    grid = pair.start + step * np.arange(1 - steps, there.size)
     return np.interp(lags, grid, np.clip(found, -1.0, 1.0), left=0.0, right=0.0)
 
 

@@ -79,6 +79,42 @@ def test_an_uncertain_lag_says_so(rng):
     assert "NOT SURE: base is not a shifted copy" in align(RECORD, noise, max_lag=1.0).statement
 
 
+def test_lag_of_a_sine_is_uncertain_off_the_grid_of_lags(rng):
+    time = 0.005 * np.arange(2000)
+    sine = Record("sine", 0.005, np.sin(4.0 * np.pi * time))
+    for _ in range(3):
+        waves = np.sin(4.0 * np.pi * (time - 0.1231)) + 0.05 * rng.normal(size=time.size)
+        found = align(sine, Measurements((BASE,), 0.005, [waves]))
+        assert found.probability < 0.9 and "is nearly as good" in found.statement
+
+
+def test_channel_that_is_coarser_than_the_record(rng):
+    """With eight samples per second, a period of 5 Hz has fewer than two of them."""
+    record = Record("waves", 0.005, high_waves(0.005 * np.arange(2400)))
+    for step in (0.05, 0.125):
+        values = high_waves(step * np.arange(int(11.8 / step)) - 0.1234)
+        found = align(
+            record, Measurements((BASE,), step, [values + 0.05 * values.std() * rng.normal(size=values.size)])
+        )
+        assert found.lag == pytest.approx(0.1234, abs=1e-3) and "NOT SURE" not in found.statement
+
+
+def high_waves(time):
+    draws = np.random.default_rng(5)
+    frequencies, phases = draws.uniform(5.0, 10.0, 25), draws.uniform(0.0, 2.0 * np.pi, 25)
+    return np.sin(2.0 * np.pi * frequencies * time[:, None] + phases).sum(axis=1) * np.exp(-(((time - 6.0) / 2.5) ** 2))
+
+
+@pytest.mark.parametrize(("begin", "lag"), [(0.0, 0.3), (0.0, 14.0), (-9.0, 0.3)])
+def test_measurements_longer_than_twice_the_record(rng, begin, lag):
+    time = begin + DT * np.arange(2500)
+    values = np.where(time - lag < TIME[-1], motion(time - lag), 0.0)
+    values += 0.1 * RECORD.acceleration.std() * rng.normal(size=time.size)
+    values[rng.random(time.size) < 0.2] = np.nan
+    found = align(RECORD, Measurements((BASE,), DT, [values], start=begin), max_lag=16.0)
+    assert found.lag == pytest.approx(lag, abs=1e-3) and "NOT SURE" not in found.statement
+
+
 def test_channels_of_a_simulated_response(rng):
     response = Measurements((TOP, DRIFT), DT, [motion(TIME), 0.01 * motion(TIME, 4)])
     time = 0.02 * np.arange(300)
