@@ -223,8 +223,9 @@ def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
     if measurements.simultaneous and measurements.start == 0.0 and same_step(dt, measurements.dt):
         fits = measurements.n_steps == n_steps
     else:
-        # missing samples at the end of simultaneous channels count: they say that the end was not measured
-        stated = measurements.time[-1] if measurements.simultaneous else last
+        # missing samples at the end count: they say that the end was not measured. Channels with fewer samples than
+        # others are filled with NaN, so only the channel whose rows end first states the end.
+        stated = max(last, min(float(measurements.times(channel.name)[-1]) for channel in measurements.channels))
         fits = last <= end + _LATEST * dt and stated >= end - (1.0 + _LATEST) * max(dt, *measurements.steps)
     if not fits:
         raise ValueError(

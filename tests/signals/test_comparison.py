@@ -169,3 +169,16 @@ def test_measurements_outside_the_response_are_refused(model):
             FELikelihood(model, wrong)
     ended = Measurements(CHANNELS, 0.02, np.where(np.arange(201) < 150, 1.0, np.nan) * np.ones((2, 1)))
     assert FELikelihood(model, ended).n_samples.samples.tolist() == [150, 150]
+
+
+def test_channels_with_steps_of_their_own_may_end_early_with_nan(model):
+    """NaN at the end says that the end was not measured, as for channels with one step."""
+    data = sampled((0.01, 0.02))
+    rows = [np.array(data.values[0]), np.array(data.values[1][:201])]
+    rows[0][-40:] = rows[1][-20:] = np.nan
+    likelihood = FELikelihood(model, Measurements(CHANNELS, (0.01, 0.02), rows), GaussianNoise(CHANNELS))
+    assert likelihood.n_samples.samples.tolist() == [361, 181]
+    with pytest.raises(ValueError, match="fill times that were not measured with NaN"):
+        FELikelihood(model, Measurements(CHANNELS, (0.01, 0.02), [rows[0][:361], rows[1][:181]]))
+    with pytest.raises(ValueError, match="correct the step"):
+        FELikelihood(model, Measurements(CHANNELS, (0.005, 0.01), rows))
