@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 _LONGEST_UNIT = 100
-_TIME = re.compile(r"(elapsed |relative )?(t|time|zeit|temps|tempo|tiempo)(\b|_)", re.IGNORECASE)
+_TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 
 
 class Table(NamedTuple):
@@ -171,9 +171,11 @@ def table_step(table: Table, dt: float | None = None) -> float:
     -----
     Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit for
     its own rounding, half a unit for the rounding of the two ends that define the grid. If that unit is more than half
-    a step, this tolerance would hide a missing sample, and the times must be exact to 2e-7 of the last one, the
-    precision of float32. If, within the rounding and within 1e-4 of it, the mean step corresponds to a whole number of
-    samples per second, that number is used.
+    a step, this tolerance would hide a missing sample, and it is not applied. Times that may have been stored in single
+    precision (float32) may differ by 2e-7 of the largest one, if that is less than a quarter of a step. Other times,
+    such as Unix times, must be uniform within 1e-4 of a step and the round-off of double precision. If, within the
+    rounding and within 1e-4 of it, the mean step corresponds to a whole number of samples per second, that number is
+    used.
     """
     stated = re.search(rf"\bdt\s*=\s*({NUMBER})\s*s\b", table.comments)
     place = _time_column(table)
@@ -252,10 +254,15 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
         raise ValueError(f"{table.file}, line {line}: expected a time, got an empty cell or NaN; write all times")
     if times.size < 2 or not times[-1] > times[0]:
         raise ValueError(f"{table.file}: expected times that increase over 2 rows or more, got {times.size} row(s)")
+    _check_single_clock(table, place)
     increments = np.diff(times)
     step = float(times[-1] - times[0]) / increments.size
     rounding = float(to_si(10.0 ** -table.decimals[place], unit)) * (1 + 1e-6)
-    tolerance = 2e-7 * float(np.abs(times).max()) + (rounding if rounding <= 0.501 * step else 0.0)
+    largest = float(np.abs(times).max())
+    # no term may reach a step, otherwise it hides lost samples where the times are large, such as Unix times
+    single = 2e-7 * largest if 2e-7 * largest <= 0.25 * step and _fits_single_precision(table, place) else 0.0
+    tolerance = (rounding if rounding <= 0.501 * step else 0.0) + single
+    tolerance += min(1e-4 * step + 4 * float(np.spacing(largest)), 0.1 * step)
     usual = float(np.median(increments))
     bad = np.abs(increments - usual) > tolerance
     off_grid = np.abs(times - times[0] - step * np.arange(times.size))[1:] > tolerance
@@ -271,6 +278,38 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
     if rate and abs(1 / rate - step) < min(tolerance, 1e-4 * step):
         step = 1 / rate
     return step, tolerance
+
+
+def _fits_single_precision(table: Table, place: int) -> bool:
+    """Return whether each printed time is that of a float32, rounded to the printed digits."""
+    printed = table.values[:, place]
+    with np.errstate(over="ignore"):
+        single = printed.astype(np.float32).astype(np.float64)
+    return bool(np.all(np.abs(single - printed) <= 0.501 * 10.0 ** -table.decimals[place]))
+
+
+def _check_single_clock(table: Table, place: int) -> None:
+    """Raise ValueError if another column has other times: it is not known which columns of values belong to them."""
+    own_unit = _time_unit(table, place)
+    times = to_si(table.values[:, place], own_unit, "time")
+    for other, name in enumerate(table.names):
+        unit = stated_unit(table, other) if other != place and _TIME.match(name) else None
+        try:
+            is_time = unit is not None and find_unit(unit).dimension == "time"
+        except ValueError:  # another quantity, such as a temperature T [°C]
+            is_time = False
+        is_time |= unit is None and other != place and bool(_TIME.match(name)) and not re.match(r"t(\b|_)", name, re.I)
+        if not is_time:
+            continue
+        unit = unit or own_unit
+        digit = max(
+            float(to_si(10.0 ** -table.decimals[column], each)) for column, each in ((place, own_unit), (other, unit))
+        )
+        if not np.all(np.abs(to_si(table.values[:, other], unit, "time") - times) <= digit):
+            raise ValueError(
+                f"{table.file}: expected one column of times, the columns {table.names[place]!r} and {name!r} have "
+                "different times; write one file for each of them with its columns of values"
+            )
 
 
 def _decimals(field: str) -> int:

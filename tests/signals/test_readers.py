@@ -240,6 +240,37 @@ class TestCSV:
         path.write_text("time_s,acc_g\n" + "".join(f"{float(time)!r},0\n" for time in times))
         assert read_csv(path).dt == 0.01
 
+    @pytest.mark.parametrize("first", [0.0, 43200.0, 1.7e9])
+    def test_lost_samples_are_found_where_the_times_are_large(self, tmp_path, first):
+        path = tmp_path / "a.csv"
+        rows = [f"{first + 0.01 * k:.2f},0" for k in range(3000)]
+        path.write_text("\n".join(["time_s,acc_g", *rows]))
+        assert read_csv(path).dt == 0.01
+        path.write_text("\n".join(["time_s,acc_g", *rows[:1000], *rows[1500:]]))
+        with pytest.raises(ValueError, match="line 1002: expected a uniform time step"):
+            read_csv(path)
+
+    def test_rounded_single_precision_times_are_accepted(self, tmp_path):
+        path = tmp_path / "a.csv"
+        times = (np.arange(4000) * np.float32(0.01)).astype(np.float32)
+        path.write_text("time_s,acc_g\n" + "".join(f"{time:.6f},0\n" for time in times))
+        assert read_csv(path).dt == 0.01
+
+    @pytest.mark.parametrize("names", ["Time_A [s],a_g,Time_B [s],b_g", "time1,a_g,time2,b_g"])
+    def test_two_columns_of_times(self, tmp_path, names):
+        path = tmp_path / "a.csv"
+        channel = Channel("b", "acceleration", "g")
+        path.write_text(names + "\n0.00,1,0.5,1\n0.01,2,0.52,2\n")
+        with pytest.raises(ValueError, match="expected one column of times, the columns '[Tt]ime.* have different"):
+            read_columns(path, (channel,), ("b_g",), time_unit=None if "[" in names else "s")
+        path.write_text(names + "\n0.00,1,0.00,1\n0.01,2,0.01,2\n")
+        assert read_columns(path, (channel,), ("b_g",), time_unit=None if "[" in names else "s").dt == 0.01
+
+    def test_a_temperature_is_no_column_of_times(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text("time_s,acc_g,T [°C],T\n0.00,1,20,20\n0.01,2,20,20\n", encoding="utf-8")
+        assert read_csv(path, column="acc_g").dt == 0.01
+
     @pytest.mark.parametrize("change", ["missing", "doubled", "shifted"])
     @pytest.mark.parametrize(("step", "digits"), [(0.01, 2), (0.02, 2), (0.005, 4)])
     def test_first_irregular_step_is_named(self, tmp_path, step, digits, change):
