@@ -69,7 +69,7 @@ class Fragility(NamedTuple):
     Attributes
     ----------
     names : tuple of str
-        Names of the records.
+        Names of the records; those of the components of an excitation are joined by a comma.
     intensity : ndarray, shape (n_records,)
         Intensities of the records.
     probability : ndarray, shape (n_records,)
@@ -101,15 +101,25 @@ class Fragility(NamedTuple):
     from_state: str = "virgin"
 
 
-def peak_ground_acceleration(record: Record) -> float:
-    """Return the largest absolute acceleration of a record [m/s²]."""
-    return float(np.max(np.abs(record.acceleration)))
+def peak_ground_acceleration(record: Record | Sequence[Record]) -> float:
+    """Return the largest absolute acceleration of a record, or of the first one of several components [m/s²]."""
+    return float(np.max(np.abs(_components(record)[0].acceleration)))
+
+
+def _components(record: Record | Sequence[Record]) -> tuple[Record, ...]:
+    """The records of one excitation: one, or those of its directions or supports."""
+    return (record,) if isinstance(record, Record) else tuple(record)
+
+
+def _name(record: Record | Sequence[Record]) -> str:
+    """Names of the records of one excitation."""
+    return ", ".join(each.name for each in _components(record))
 
 
 def fragility(
     posterior_or_model: Any,
     samples: Any,
-    records: Sequence[Record],
+    records: Sequence[Record | Sequence[Record]],
     quantity: ChannelQuantity | Callable[[np.ndarray], float],
     threshold: float,
     *,
@@ -130,8 +140,10 @@ def fragility(
     ----------
     posterior_or_model, samples
         As in `fe_likelihoods.prediction.propagation.propagate`.
-    records : sequence of Record
-        Excitations, such as one motion scaled, ``[record.scale(k) for k in factors]``, or different motions.
+    records : sequence of Record, or of tuples of Record
+        Excitations, such as one motion scaled, ``[record.scale(k) for k in factors]``, or different motions. Each is a
+        tuple if the model has several components: the horizontal and the vertical record of an `IsolatedBridge`, or the
+        records of the supports of a `LinearStructure`.
     quantity : ChannelQuantity or callable
         A quantity that is one number, such as ``peak("displacement")``.
     threshold : float
@@ -141,7 +153,8 @@ def fragility(
     unit : str, optional
         Unit of the threshold. It must have the dimension of the channel of the quantity. Default: SI.
     intensity : callable
-        Function of a record that returns a positive number. Default: peak acceleration [m/s²].
+        Function of an element of `records` that returns a positive number. Default: peak acceleration [m/s²], of the
+        first record of a tuple (the horizontal component, or the first support).
     failures_exceed : bool
         Count a failed simulation as an exceedance, for models whose simulation fails at collapse. Default: failed
         samples are left out.
@@ -212,7 +225,7 @@ def fragility(
             )
         except SimulationFailed as error:
             if not failures_exceed:
-                raise SimulationFailed(f"record {record.name!r}: {error.reason}") from error
+                raise SimulationFailed(f"record {_name(record)!r}: {error.reason}") from error
             exceeds[k] = counted[k] = 1.0
             failed[k] = n
             continue
@@ -233,7 +246,7 @@ def fragility(
     except ValueError as reason:
         logger.warning("no fragility curve: %s", reason)
         curve = None
-    names = tuple(record.name for record in records)
+    names = tuple(_name(record) for record in records)
     return Fragility(names, intensities, share, error, lower, upper, failed, curve, float(limit), state)
 
 

@@ -233,7 +233,7 @@ class Events(Record):
         """Return the events with all samples multiplied by `factor`; ValueError if it is not finite."""
         return Events([record.scale(factor) for record in self.records], self.rests, self.names)
 
-    def followed_by(self, other: Record, rest: float = 5.0) -> Events:
+    def followed_by(self, other: Record, rest: float = 10.0) -> Events:
         """Return these events, a pause of `rest` [s] and another record or further events; see `Record.followed_by`."""
         return Events([self, other], rest)
 

@@ -177,7 +177,7 @@ class Record:
         note = f"scaled by {factor:g}"
         return Record(self.name, self.dt, factor * self.acceleration, self._source(note))
 
-    def followed_by(self, other: "Record", rest: float = 5.0) -> "Record":
+    def followed_by(self, other: "Record", rest: float = 10.0) -> "Record":
         """Return this record, a pause without ground motion, and another record as one record.
 
         A model simulates the result as one loading, so the state of the structure at the end of this record (cracks,

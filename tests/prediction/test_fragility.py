@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fe_likelihoods import BridgeDeck, IsolatedBridge, LinearStructure, Record
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.prediction.fragility import fit_fragility, fragility
+from fe_likelihoods.prediction.fragility import fit_fragility, fragility, peak_ground_acceleration
 from fe_likelihoods.prediction.quantities import peak
 from fe_likelihoods.simulation.model import SimulationFailed
 from fe_likelihoods.units import G0
@@ -66,6 +67,36 @@ def test_collapse_can_count_as_an_exceedance(record, rng):
     with pytest.raises(SimulationFailed, match="record 'motion': nothing to predict"):
         fragility(Flexible(record, collapse=1e-6), *arguments, progress=False)
     assert fragility(Flexible(record, collapse=1e-6), *arguments, progress=False, failures_exceed=True).curve is None
+
+
+def test_excitations_of_several_components(record, monkeypatch):
+    """Horizontal and vertical motion of a bridge; motions of the supports of a structure."""
+    short = record.trim(0.0, 0.5).scale(0.2)
+    vertical = Record("up", short.dt, 3.0 * short.acceleration)
+    pairs = [(short.scale(k), vertical) for k in (0.5, 1.0)]
+    bridge = IsolatedBridge(short, vertical=vertical)
+    samples = np.ones((2, len(bridge.parameter_names)))
+    arguments = peak(bridge.channels[0].name), 1e-9
+    response = np.ones((len(bridge.channels), bridge.n_steps))
+    monkeypatch.setattr(IsolatedBridge, "simulate", lambda self, theta: response * self.vertical.acceleration.max())
+    found = fragility(bridge, samples, pairs, *arguments, from_state="virgin", progress=False)
+    peaks = [np.abs(horizontal.acceleration).max() for horizontal, _ in pairs]
+    assert found.names == (f"{short.name}, up",) * 2 and found.intensity.tolist() == peaks
+    up = fragility(
+        bridge,
+        samples,
+        pairs,
+        *arguments,
+        from_state="virgin",
+        progress=False,
+        intensity=lambda pair: peak_ground_acceleration(pair[1]),
+    )
+    assert up.intensity.tolist() == [np.abs(vertical.acceleration).max()] * 2
+    deck = LinearStructure(BridgeDeck("ch7"), [short] * 3)
+    supports = [[each.scale(k) for each in deck.supports] for k in (1.0, 2.0)]
+    samples = np.array([[3.7, 0.09, 0.8]] * 2)
+    found = fragility(deck, samples, supports, peak(deck.channels[0].name), 1e-9, progress=False)
+    assert found.names[0] == ", ".join([short.name] * 3) and found.intensity[1] == 2.0 * found.intensity[0]
 
 
 def test_fit_is_the_maximum_of_the_likelihood(rng):

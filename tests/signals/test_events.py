@@ -29,7 +29,8 @@ class TestFollowedBy:
         np.testing.assert_array_equal(joined.acceleration, by_hand(eq1, 50, eq2))
         assert joined.dt == eq1.dt and joined.name == "EQ1, EQ2"
         assert "first test; after a pause of 1 s followed by EQ2" in joined.source
-        assert eq1.followed_by(eq2).n_steps == 40 + 250 + 30  # 5 s
+        assert eq1.followed_by(eq2).n_steps == 40 + 500 + 30  # 10 s, as everywhere
+        assert Events([eq1]).followed_by(eq2).rests == Events([eq1, eq2]).rests == (10.0,)
 
     def test_pause_is_rounded_to_steps(self, eq1, eq2):
         assert eq1.followed_by(eq2, rest=0.031).n_steps == 72
