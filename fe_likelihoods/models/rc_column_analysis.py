@@ -22,7 +22,7 @@ from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from .base import BuiltInModel, History
 from .circular_section import Confinement
-from .rc_column_parts import Concrete, Steel
+from .rc_column_parts import Concrete, Steel, hardening_fault
 from .validation import check_values
 
 __all__ = [
@@ -205,6 +205,10 @@ def check_physical_values(values: dict[str, float], steel: Steel) -> None:
         raise SimulationFailed(
             f"the steel has no hardening: fu = {values['fu']:.4g} Pa is not above fy = {values['fy']:.4g} Pa"
         )
+    strains = steel.hardening_strain, steel.ultimate_strain
+    fault = hardening_fault(values["fy"], values["fu"], values["Es"], values["Esh"], *strains)
+    if fault:
+        raise SimulationFailed(f"the steel has no hardening branch: {fault}")
 
 
 def checked_history(

@@ -10,9 +10,12 @@ import math
 from dataclasses import dataclass
 from numbers import Integral
 
+import numpy as np
+
+from ..kernels import reinforcing_steel
 from .validation import check_fields, check_integer, invalid
 
-__all__ = ["Bars", "Concrete", "Hoops", "Patches", "Steel"]
+__all__ = ["Bars", "Concrete", "Hoops", "Patches", "Steel", "hardening_fault"]
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,36 @@ class Steel:
             raise invalid(
                 "fy/es < hardening_strain < ultimate_strain and fy < fu", self, "check the units of the steel"
             )
+        fault = hardening_fault(self.fy, self.fu, self.es, self.esh, self.hardening_strain, self.ultimate_strain)
+        if fault:
+            raise invalid("a steel with a hardening branch", self, fault)
+
+
+def hardening_fault(fy: float, fu: float, es: float, esh: float, eps_sh: float, eps_u: float) -> str:
+    """Return why the law of the steel has no hardening branch at these constants, or an empty text.
+
+    The arguments are those of `fe_likelihoods.kernels.reinforcing_steel.constants`, with fy/es < eps_sh < eps_u. The
+    law is written in natural strains and stresses. There, fu > fy and Esh > 0 are not sufficient for a hardening branch
+    that rises from the end of the plateau to the ultimate strain.
+    """
+    length = math.log1p(eps_u) - math.log1p(eps_sh)
+    onset, slope = fy * (1.0 + eps_sh), fu * (1.0 + eps_u)
+    rise = slope * (1.0 - length) - onset
+    if not rise > 0.0:
+        return (
+            f"fu = {fu:.4g} Pa is too close to fy = {fy:.4g} Pa for an ultimate strain of {eps_u:.4g}; "
+            "a larger fu or a smaller ultimate strain is needed"
+        )
+    start = esh * (1.0 + eps_sh) ** 2 + onset - slope
+    constants = np.full(reinforcing_steel.N_CONSTANTS, math.nan)
+    if start > 0.0 and rise - reinforcing_steel.TRANSITION * slope > 0.0:  # else the constants divide by zero
+        reinforcing_steel.constants(fy, fu, es, esh, eps_sh, eps_u, constants)
+    if not (np.isfinite(constants).all() and constants[reinforcing_steel.A_SHIFT] > 0.0):
+        return (
+            f"the hardening modulus Esh = {esh:.4g} Pa does not fit fy = {fy:.4g} Pa and fu = {fu:.4g} Pa; "
+            "a larger Esh or a larger difference between fy and fu is needed"
+        )
+    return ""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ..signals.channels import Channel
 from ..signals.sampling import sample_window
 from ..simulation.model import SimulationFailed
 from .base import BuiltInModel
-from .rc_column_parts import Steel
+from .rc_column_parts import Steel, hardening_fault
 from .validation import check_names, check_values, invalid
 
 __all__ = ["PARAMETERS", "SteelCoupon"]
@@ -134,6 +134,9 @@ class SteelCoupon(BuiltInModel):
             raise SimulationFailed("no yield plateau or no hardening branch: fy/Es < eps_sh < eps_u is required")
         if v["fu"] <= v["fy"]:
             raise SimulationFailed(f"no hardening: fu = {v['fu']:.4g} Pa is not above fy = {v['fy']:.4g} Pa")
+        fault = hardening_fault(*v.values())
+        if fault:
+            raise SimulationFailed(f"no hardening branch: {fault}")
         constants = np.zeros(reinforcing_steel.N_CONSTANTS)
         reinforcing_steel.constants(*v.values(), constants)
         stress = np.empty((1, self.n_steps))

@@ -566,6 +566,25 @@ def test_steel_without_hardening_fails(strong):
         RCColumn.lhpost(strong, parameters=("fy",)).simulate([1.4])
 
 
+@pytest.mark.parametrize(
+    ("theta", "words"), [([1.0, 0.735, 1.0], "too close to fy"), ([1.0, 1.0, 0.05], "hardening modulus Esh")]
+)
+def test_steel_whose_law_breaks_down_fails(strong, theta, words):
+    """With fu = 1.001 fy, and with a falling hardening branch, the law had stresses up to 1e47 Pa."""
+    with pytest.raises(SimulationFailed, match=words):
+        RCColumn.lhpost(strong, parameters=("fy", "fu", "Esh")).simulate(theta)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"fu": 1.001 * 518.5e6}, "too close to fy"), ({"esh": 1e8}, "Esh"), ({"fy": 1e308, "es": 1e310}, "positive")],
+)
+def test_steel_whose_law_breaks_down_is_refused(change, words):
+    values = dict(fy=518.5e6, fu=706e6, es=195.8e9, esh=3.144e9, hardening_strain=0.011, ultimate_strain=0.122)
+    with pytest.raises(ValueError, match=words):
+        Steel(**values | change)
+
+
 def test_strains_beyond_the_fracture_of_bars_are_reported_once(pushed, caplog):
     """At a drift of 5 % the bars are within the law of the steel, at 20 % they would have fractured."""
     assert 0.3 < pushed.history([1, 1, 1]).beyond_range < 0.6

@@ -80,6 +80,8 @@ def test_the_response_is_plotted_per_step(coupon):
         ([-1, 1, 1, 1, 1, 1], "fy = -"),
         ([1, 1, np.nan, 1, 1, 1], "Es = nan"),
         ([1, 0.5, 1, 1, 1, 1], "no hardening: fu"),
+        ([1, 0.695, 1, 1, 1, 1], "too close to fy"),
+        ([1, 1, 1, 0.01, 1, 1], "Esh = 5e"),
         ([1, 1, 0.1, 1, 1, 1], "plateau"),
         ([1, 1, 1, 1, 20, 1], "plateau"),
     ],
