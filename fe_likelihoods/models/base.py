@@ -16,7 +16,7 @@ import numpy as np
 from ..signals.channels import Channel, Measurements, plot_response
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import array_digest
-from .validation import check_theta
+from .validation import check_theta, invalid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,6 +45,8 @@ class History:
     values: np.ndarray
 
     def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.names:
+            raise invalid(f"the name of a history out of {self.names}", name, "names are those of the attribute names")
         return self.values[self.names.index(name)]
 
 

@@ -48,7 +48,7 @@ from .rc_column_analysis import (
     checked_history,
     set_materials,
 )
-from .rc_column_outputs import AT_TOP, Output, Sections, check_units, display_channels, parse_outputs, section_heights
+from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
 from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
 from .rc_column_presets import lhpost_arguments
 from .rc_column_section import ReinforcedSection
@@ -350,12 +350,19 @@ class RCColumn(ThreadedModel):
         return self.with_record(replace(self.loading, displacement=self.loading.displacement[window]))
 
     def history(self, theta: np.ndarray) -> ColumnHistory:
-        """Simulate and return all histories that the kernels record, and the sensors among the outputs.
+        """Simulate and return all histories that the kernels record, and the outputs of the column by their names.
 
         Parameters and errors are those of `simulate`.
+
+        Notes
+        -----
+        The histories of the kernels, such as "base moment" and "base curvature", have the signs of the element, whose
+        second axis points against the direction of loading. Outputs, such as "base_moment" and "curvature@0", are
+        positive where the column bends towards positive displacements: ``history["base_moment"]`` is
+        ``-history["base moment"]``.
         """
         history, outputs = self._run(check_theta(theta, self.parameters))
-        sensors = {name: values for name, values in outputs.items() if name not in AT_TOP}
+        sensors = {name: values for name, values in outputs.items() if name not in history.names}
         values = np.vstack([history.values, *sensors.values()])
         return replace(history, names=(*history.names, *sensors), values=values)
 

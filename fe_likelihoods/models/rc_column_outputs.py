@@ -36,7 +36,7 @@ from ..signals.channels import Channel
 from ..units import find_unit
 from .validation import invalid
 
-__all__ = ["AT_TOP", "Output", "Sections", "check_units", "display_channels", "parse_outputs", "section_heights"]
+__all__ = ["Output", "Sections", "check_units", "display_channels", "parse_outputs", "section_heights"]
 
 
 class _Row(NamedTuple):
@@ -56,10 +56,13 @@ _ROWS = {
     "base_shear": _Row("base shear force", "N", "base shear", 1.0),
     "axial_force": _Row("axial force", "N", "base axial force", 1.0),
 }
-AT_TOP = ("acceleration", "displacement", "force")
+_AT_TOP = ("acceleration", "displacement", "force")
 """Outputs at the top, which depend on the type of loading."""
 _LOCATED = {"curvature": ("curvature", "1/m", 1), "strain": ("strain", "1", 2), "rotation": ("rotation", "rad", 2)}
 """Outputs with a place: quantity, SI unit and number of values of the place."""
+
+_ROUNDING = 1e-9
+"""Share of the height and of the radius by which a place may be outside the column, as a result of its rounding."""
 
 _NUMBER = r"([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?|[+-]?\.\d+(?:[eE][+-]?\d+)?)"
 _PLACE = re.compile(rf"(\w+)@{_NUMBER}(?::{_NUMBER})?")
@@ -212,7 +215,7 @@ def parse_outputs(names: object, sections: Sections, at_top: Sequence[str]) -> t
 
 
 def _parse(name: object, sections: Sections, at_top: Sequence[str]) -> Output:
-    if isinstance(name, str) and name in _ROWS and (name in at_top or name not in AT_TOP):
+    if isinstance(name, str) and name in _ROWS and (name in at_top or name not in _AT_TOP):
         quantity, si_unit, row, sign = _ROWS[name]
         return Output(name, quantity, si_unit, row, sign)
     match = _PLACE.fullmatch(name) if isinstance(name, str) else None
@@ -223,13 +226,15 @@ def _parse(name: object, sections: Sections, at_top: Sequence[str]) -> Output:
         raise invalid(f"outputs out of {known} for this loading", name, _ADVICE)
     quantity, si_unit, _ = _LOCATED[kind]
     heights = place if kind == "rotation" else place[:1]
-    if not all(0.0 <= height <= sections.height for height in heights):
+    rounding = _ROUNDING * sections.height
+    if not all(-rounding <= height <= sections.height + rounding for height in heights):
         raise invalid(f"heights between 0 and {sections.height:.6g} m", name, "heights are measured from the base")
+    place[: len(heights)] = [min(max(height, 0.0), sections.height) for height in heights]
     none = np.zeros(sections.n_elements * len(sections.points))
     if kind == "curvature":
         return Output(name, quantity, si_unit, None, strain=none, curvature=-sections.interpolation(place[0]))
     if kind == "strain":
-        if not abs(place[1]) <= sections.radius:
+        if not abs(place[1]) <= sections.radius * (1.0 + _ROUNDING):
             raise invalid(
                 f"a position in the section, between {-sections.radius:.6g} and {sections.radius:.6g} m",
                 name,

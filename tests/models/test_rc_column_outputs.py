@@ -56,10 +56,31 @@ def test_channels_have_quantities_and_display_units(shaken):
 
 def test_history_contains_the_sensors(shaken):
     history, response = shaken.history(np.ones(5)), shaken.simulate(np.ones(5))
-    for name, row in zip(shaken.outputs[2:], response[2:], strict=True):
+    for name, row in zip(shaken.outputs, response, strict=True):
         np.testing.assert_array_equal(history[name], row)
     np.testing.assert_array_equal(history["base_moment"], -history["base moment"])
     np.testing.assert_array_equal(history["axial_force"], history["base axial force"])
+    with pytest.raises(ValueError, match="out of .*'base moment'.*'base_moment'.*; got 'moment'"):
+        history["moment"]
+
+
+def test_a_place_at_the_surface_is_not_refused_for_its_rounding(shaken):
+    """The radius of a section of 48 in is one rounding below 0.6096 m."""
+    radius, height = 0.5 * shaken.diameter, shaken.height
+    assert radius < 0.6096
+    outside = np.nextafter(height, 2.0 * height)
+    for name in (
+        "strain@0:0.6096",
+        "strain@0:-0.6096",
+        f"curvature@{float(outside)!r}",
+        f"rotation@-1e-16:{float(outside)!r}",
+    ):
+        replace(shaken, outputs=(name,))
+    top = [replace(shaken, outputs=(f"rotation@{lower}:1",))._prepared.outputs[0] for lower in ("0", "-1e-16")]
+    assert top[0].slip and top[1].slip
+    for name in ("strain@0:0.60961", f"curvature@{1.0001 * height}", "curvature@-0.001"):
+        with pytest.raises(ValueError, match="in the section|heights between"):
+            replace(shaken, outputs=(name,))
 
 
 @pytest.mark.parametrize(("n_elements", "n_points"), [(1, 3), (2, 3), (3, 5)])
