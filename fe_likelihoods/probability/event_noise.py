@@ -16,7 +16,7 @@ from ..simulation.model import Model
 from .noise import HALF_LOG_TWO_PI, GaussianNoise, Noise
 from .sample_counts import SampleCounts
 
-__all__ = ["EventNoise", "EventSums", "join_measurements", "named_noise"]
+__all__ = ["EventNoise", "EventSums", "find_events", "join_measurements", "named_noise"]
 
 
 @dataclass(frozen=True)
@@ -190,13 +190,22 @@ def named_noise(model: Model, measurements: Measurements, noise: Noise | str | N
     return EventNoise.of(_events_of(model), measurements)
 
 
+def find_events(model: Model) -> Events | None:
+    """The events that are the excitation of a model, None if it is another one."""
+    for name in ("record", "loading", "supports"):  # of the models of this package; optional in others
+        excitation = getattr(model, name, None)
+        for each in excitation if isinstance(excitation, tuple | list) else (excitation,):
+            if isinstance(each, Events):
+                return each
+    return None
+
+
 def _events_of(model: Model) -> Events:
     """The events that are the excitation of a model; raise ValueError if it is another one."""
-    for name in ("record", "loading"):  # of the models of this package; optional in others
-        events = getattr(model, name, None)
-        if isinstance(events, Events):
-            return events
-    raise ValueError(
-        f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]); that of this "
-        f"{type(model).__name__} is not"
-    )
+    events = find_events(model)
+    if events is None:
+        raise ValueError(
+            f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]); that of this "
+            f"{type(model).__name__} is not"
+        )
+    return events

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from .data_identity import combined_digest
 from .distributions import Distribution, RandomState
 from .event_noise import EventNoise
 from .inputs import as_points
@@ -267,7 +268,7 @@ class JointLikelihood:
     @property
     def data_fingerprint(self) -> str:
         """Hex digest of all measurements, in any order: evidences for the same measurements can be compared."""
-        return _digest(sorted(likelihood.data_fingerprint for likelihood in self.likelihoods.values()))
+        return combined_digest([digest for each in self.likelihoods.values() for digest in each.data_digests()])
 
     def density_parts(self) -> list[str]:
         """Texts that identify the density, as `FELikelihood.density_parts`."""

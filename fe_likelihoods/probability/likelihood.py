@@ -20,6 +20,7 @@ from ..signals.sampling import same_step
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
 from .cached_simulations import CachedSimulations
+from .data_identity import combined_digest, data_digests
 from .distributions import Distribution, RandomState
 from .event_noise import join_measurements, named_noise
 from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
@@ -151,13 +152,16 @@ class FELikelihood(CachedSimulations):
     def data_fingerprint(self) -> str:
         """Hex digest of the samples that are compared: equal for likelihoods of the same data.
 
-        The order of the channels has no effect. A noise with unknown time shifts leaves out samples near the ends of
-        the response, so its digest depends on the largest shift.
+        The order of the channels has no effect. The times are those of each event and missing samples do not count, so
+        that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared. A noise with unknown time
+        shifts leaves out samples near the ends of the response, so its digest depends on the largest shift.
         """
-        names = sorted(channel.name for channel in self.measurements.channels)
-        return (
-            replace(self.measurements, values=getattr(self.measured, "values", self.measured)).select(names).fingerprint
-        )
+        return combined_digest(self.data_digests())
+
+    def data_digests(self) -> list[str]:
+        """Digests of the samples of each event that are compared; one digest if there are no events."""
+        compared = replace(self.measurements, values=getattr(self.measured, "values", self.measured))
+        return data_digests(self.model, compared)
 
     def first(self, seconds: float) -> "FELikelihood":
         """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).

@@ -11,11 +11,14 @@ from fe_likelihoods import (
     FELikelihood,
     GaussianNoise,
     HalfNormal,
+    JointLikelihood,
     LinearOscillator,
+    LinearStructure,
     Measurements,
     Posterior,
     Record,
     SharedGaussianNoise,
+    ShearFrame,
     SimulationCache,
     TruncatedNormal,
     propagate,
@@ -63,11 +66,44 @@ def test_pauses_are_not_compared(model, events, measured):
         for sigma in ([1.0, 0.01], [0.5, 0.02]):
             expected = sum(gaussian(part[row], sigma[row]) for part in errors.values() for row in range(2))
             assert likelihood([*theta, *sigma]) == pytest.approx(expected, rel=1e-12)
-    joined = events.join(measured)
-    assert (
-        np.isnan(joined.values).sum() == 2 * 50
-        and likelihood.data_fingerprint == joined.select(["acceleration", "displacement"]).fingerprint
+    assert np.isnan(events.join(measured).values).sum() == 2 * 50
+
+
+def test_data_of_an_event_are_the_same_after_another_event_and_alone(model, events, measured):
+    alone = {
+        name: FELikelihood(model.with_record(record), measured[name])
+        for name, record in zip(events.names, events.records, strict=True)
+    }
+    after = FELikelihood(model, {"EQ2": measured["EQ2"]})
+    assert after.data_fingerprint == alone["EQ2"].data_fingerprint != alone["EQ1"].data_fingerprint
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in NAMES}
+    prior |= {name: HalfNormal(1.0) for name in after.parameter_names[2:]}
+    assert Posterior(after, prior).data_fingerprint == Posterior(alone["EQ2"], prior).data_fingerprint
+    both = FELikelihood(model, measured, "per event")
+    turned = FELikelihood(
+        model, {name: each.select(["displacement", "acceleration"]) for name, each in measured.items()}
     )
+    assert both.data_fingerprint == turned.data_fingerprint == JointLikelihood(alone).data_fingerprint
+    assert both.data_fingerprint not in (after.data_fingerprint, alone["EQ1"].data_fingerprint)
+    other_pause = Events(events.records, 0.5, events.names)
+    assert FELikelihood(model.with_record(other_pause), measured).data_fingerprint == both.data_fingerprint
+    short = measured["EQ2"].trim(0.0, 0.8)
+    digests = {FELikelihood(model, {"EQ2": each}).data_fingerprint for each in (short, short.shift(0.1))}
+    assert len(digests | {after.data_fingerprint}) == 3  # other times are other data
+    whole = Measurements(model.channels, 0.02, model.simulate([1.0, 1.0]))  # as are samples in the pauses
+    parts = events.split(whole.values)
+    cut = {name: Measurements(model.channels, 0.02, part) for name, part in parts.items()}
+    assert FELikelihood(model, whole).data_fingerprint != FELikelihood(model, cut).data_fingerprint
+
+
+def test_events_on_the_supports_of_a_structure(events):
+    structure = LinearStructure(ShearFrame({"low": 1, "top": 2}, (1.0, 1.0), (900.0, 900.0)), events)
+    theta = np.array([1.0, 1.0, 0.05, 0.05])
+    parts = events.split(structure.simulate(theta))
+    measured = {name: Measurements(structure.channels, 0.02, part) for name, part in parts.items()}
+    likelihood = FELikelihood(structure, measured, noise="per event")
+    assert likelihood.parameter_names[4:] == ("sigma_low_EQ1", "sigma_top_EQ1", "sigma_low_EQ2", "sigma_top_EQ2")
+    assert np.nanmax(np.abs(likelihood.residuals(theta))) == 0.0
 
 
 def test_an_event_without_measurement_changes_the_state_only(model, events, measured):
