@@ -334,7 +334,7 @@ def read_columns(
 ) -> Measurements:
     """Read measured responses from the columns of a CSV file or workbook with a header line (see `read_csv`).
 
-    An empty cell, ``NaN`` or ``#N/A`` is a missing sample.
+    An empty cell, ``NaN``, ``NA``, ``N/A``, ``#N/A``, ``NULL``, ``-`` or ``--`` is a missing sample.
 
     Parameters
     ----------

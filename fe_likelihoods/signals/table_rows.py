@@ -22,8 +22,10 @@ __all__ = ["Rows", "decode_table", "read_rows"]
 
 _SEPARATORS = (";", "\t", ",", " ")
 _LAST_LINES = 50  # lines that determine the separator
-_MISSING = frozenset({"", "nan", "#n/a"})
+_MISSING = frozenset({"", "nan", "#n/a", "n/a", "na", "null", "-", "--"})
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")  # 1,000: a thousand, or one with three decimals
+_HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
 _EXCEL = {".xlsx", ".xlsm"}
 _LARGEST_WORKBOOK, _MOST_CELLS = 256 * 2**20, 50_000_000  # bytes of the unpacked workbook; cells of the sheet
 
@@ -81,7 +83,7 @@ def read_rows(path: str | Path, skip: int | None = None) -> Rows:
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
     if Path(path).suffix.lower() in _EXCEL:
-        return _arrange([line for line in _workbook(path) if line[0] > (skip or 0)], [], str(path))
+        return _arrange([line for line in _workbook(path) if line[0] > (skip or 0)], [], str(path), "")
     lines, comments = [], []
     for number, line in enumerate(decode_table(read_bytes(path)).splitlines(), 1):
         if number <= (skip or 0) or not line.strip():
@@ -92,7 +94,7 @@ def read_rows(path: str | Path, skip: int | None = None) -> Rows:
             lines.append((number, line))
     separator = _find_separator([line for _, line in lines[-_LAST_LINES:]])
     cells = [(number, _split(line, separator, f"{path}, line {number}")) for number, line in lines]
-    return _arrange(cells, comments, str(path))
+    return _arrange(cells, comments, str(path), separator)
 
 
 def _split(line: str, separator: str, where: str) -> list[str]:
@@ -133,7 +135,7 @@ def _is_missing(cell: str) -> bool:
     return cell.lower() in _MISSING
 
 
-def _arrange(lines: list[tuple[int, list[str]]], comments: list[str], file: str) -> Rows:
+def _arrange(lines: list[tuple[int, list[str]]], comments: list[str], file: str, separator: str) -> Rows:
     """Find header line, line of units and rows of numbers."""
     data = itertools.islice((place for place, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)
     places = list(data)
@@ -143,17 +145,19 @@ def _arrange(lines: list[tuple[int, list[str]]], comments: list[str], file: str)
         first = next(place for place in places if len(lines[place][1]) == width)
     else:
         width, first = max((len(cells) for _, cells in lines), default=0), len(lines)
-    names, units, after = _find_header(lines[:first], width)
+    spare = not any(cells[-1] for _, cells in lines[first:] if len(cells) == width)
+    names, units, after = _find_header(lines[:first], width, spare)
     if not names:
-        # a damaged first row is an error and no text above the table
-        damaged = (k for k in range(first) if len(lines[k][1]) == width and any(_known(c) for c in lines[k][1]))
-        after = next(damaged, first)
+        _check_short_header(lines[:first], width, file)
+        # a damaged first row is an error and no text above the table, and a row of missing samples is a row
+        after = next((k for k in range(first) if len(lines[k][1]) == width and _is_row(lines[k][1])), first)
     rows = lines[after:]
     if not rows:
         raise ValueError(f"{file}: expected rows of numbers, found none")
     for number, cells in rows:
         if len(cells) != width:
             raise ValueError(f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}")
+    _check_thousands(rows, file, separator)
     return _without_empty_columns(names, units, _with_points(rows, file), comments)
 
 
@@ -161,17 +165,62 @@ def _is_data(cells: Sequence[str]) -> bool:
     return any(_known(cell) for cell in cells) and all(_known(cell) or _is_missing(cell) for cell in cells)
 
 
-def _find_header(lines: Sequence[tuple[int, list[str]]], width: int) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+def _is_row(cells: Sequence[str]) -> bool:
+    """Whether some cells are numbers, or all are missing and not all empty."""
+    return any(map(_known, cells)) or (any(cells) and all(map(_is_missing, cells)))
+
+
+def _check_short_header(lines: Sequence[tuple[int, list[str]]], width: int, file: str) -> None:
+    """Raise ValueError if the line above the rows has the names of all their cells but one."""
+    number, cells = lines[-1] if lines else (0, [])
+    if width > 2 and len(cells) == width - 1 and _is_text(cells) and all(cells):
+        raise ValueError(
+            f"{file}, line {number}: expected a name for each of the {width} cells in a row, got {len(cells)}; write "
+            "decimal points, or semicolons between the cells, if commas separate cells and decimals; leave out the "
+            "names of rows, in R with row.names = FALSE"
+        )
+
+
+def _check_thousands(rows: list[tuple[int, list[str]]], file: str, separator: str) -> None:
+    """Raise ValueError for cells such as ``1,000`` that may be thousands.
+
+    They are taken for numbers with three decimals unless commas separate the cells and the file has no other decimal
+    comma, or the column has no other decimal comma and integers of three digits.
+    """
+    if not any("," in cell for _, cells in rows for cell in cells):
+        return
+    thousands: dict[int, tuple[int, str]] = {}  # the first such cell of each column
+    decimals, hundreds = set(), set()  # columns
+    for number, cells in rows:
+        for column, cell in enumerate(cells):
+            if _THOUSANDS.match(cell):
+                thousands.setdefault(column, (number, cell))
+            elif _DECIMAL_COMMA.match(cell):
+                decimals.add(column)
+            elif _HUNDREDS.match(cell):
+                hundreds.add(column)
+    for column, (number, cell) in thousands.items():
+        if (separator == "," and not decimals) or (column in hundreds and column not in decimals):
+            raise ValueError(
+                f"{file}, line {number}: expected a number, got {cell!r}, which may have a separator of thousands or a "
+                "decimal comma; write it without separators of thousands and with a decimal point"
+            )
+
+
+def _find_header(
+    lines: Sequence[tuple[int, list[str]]], width: int, spare: bool
+) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     """Names, units and the place after them: the last line of words as wide as the rows, and a line of units below.
 
-    Separators at the ends of the rows may be missing at the end of the header line, and the other way round.
+    Separators at the ends of the rows may be missing at the end of the header line, and the other way round. Only then,
+    if the last cells of all rows are empty (`spare`), the header line may have one cell less.
     """
     found: list[tuple[int, tuple[str, ...]]] = []
     for place, (_, cells) in enumerate(lines):
         words = list(cells)
         while len(words) > width and not words[-1]:
             words.pop()
-        if len(words) == width - 1 and width > 2:
+        if spare and len(words) == width - 1 and width > 2:
             words.append("")
         if len(words) == width and _is_text(words):
             found.append((place, tuple(words)))
@@ -184,7 +233,8 @@ def _find_header(lines: Sequence[tuple[int, list[str]]], width: int) -> tuple[tu
 
 
 def _is_text(cells: Sequence[str]) -> bool:
-    return any(any(map(str.isalpha, cell)) for cell in cells) and not any(_known(cell) for cell in cells)
+    words = any(any(map(str.isalpha, cell)) and not _is_missing(cell) for cell in cells)
+    return words and not any(_known(cell) for cell in cells)
 
 
 def _unit_of(cell: str) -> str:

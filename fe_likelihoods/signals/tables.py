@@ -80,7 +80,7 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
     Returns
     -------
     Table
-        The columns, with NaN for empty cells and cells ``NaN`` or ``#N/A``.
+        The columns, with NaN for missing cells: empty, ``NaN``, ``NA``, ``N/A``, ``#N/A``, ``NULL``, ``-`` or ``--``.
 
     Raises
     ------

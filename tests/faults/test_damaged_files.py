@@ -63,7 +63,7 @@ def test_archives_have_total_limits(content, match, tmp_path):
         ("# dt=" + "9" * 100_000 + "\nacc_g\n1\n2\n", "give dt="),
         ("# dt=" + "9" * 100_000 + " s\nacc_g\n1\n2\n", "positive|finite"),
         ("# npts = " + "9" * 5000 + "\n# dt = 1 s\nacc_g\n1\n2\n", "a number with 5000 digits"),
-        ('time_s,acc_g\n0,"' + "1" * 200_000 + '"\n', "cells separated by commas"),
+        ('time_s,acc_g\n0,"' + "1" * 200_000 + '"\n', "cells separated by ','"),
         ("time_s,acc_g\n0,1_000\n1,2\n", "expected a number, got '1_000'"),
         ("time_s,acc_g\n0e400,1\n1,2\n2,x\n", "expected a number, got 'x'"),
         ("time_s,acc" + "_g" * 50_000 + "(" * 50_000 + "\n0,1\n1,2\n", "unit"),

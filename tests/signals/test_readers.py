@@ -495,6 +495,48 @@ class TestColumns:
         found = read_columns(path, (TOP,), ("acc_g",))
         assert (found.dt, found.start) == (1 / 120, 1 / 120)
 
+    @pytest.mark.parametrize("word", ["NA", "N/A", "NULL", "null", "-", "--"])
+    def test_words_for_missing_samples(self, tmp_path, word):
+        path = tmp_path / "a.csv"
+        path.write_text(f"acc_g\n{word}\n{word}\n0\n1\n{word}\n2\n")
+        found = read_columns(path, (TOP,), ("acc_g",), dt=0.01)
+        np.testing.assert_array_equal(found.values / G0, [[np.nan, np.nan, 0, 1, np.nan, 2]])
+        path.write_text(f"{word}\n0\n1\n")
+        with pytest.raises(ValueError, match="line 1: expected a number, .* 1 are missing"):
+            read_csv(path, "g", 0.01)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "time_ms,acc_g\n" + "".join(f"{10 * k},1,{k % 10}\n" for k in range(30)),
+            "time_s\tacc_g\n" + "".join(f"{k + 1}\t{k / 100}\t{7 + k}\n" for k in range(30)),
+        ],
+        ids=["unquoted decimal commas", "names of rows"],
+    )
+    def test_header_with_one_name_too_few(self, tmp_path, text):
+        path = tmp_path / "a.csv"
+        path.write_text(text)
+        with pytest.raises(ValueError, match="line 1: expected a name for each of the 3 cells .* got 2; write decimal"):
+            read_columns(path, (TOP,), ("acc_g",))
+
+    @pytest.mark.parametrize("separator", [",", ";", "\t"])
+    def test_separators_of_thousands(self, tmp_path, separator):
+        path = tmp_path / "a.csv"
+        for first in (980, 1000):
+            if first == 1000 and separator != ",":
+                continue  # numbers with three decimals
+            rows = (f'{10 * k}{separator}"{first + 5 * k:,}"\n' for k in range(30))
+            path.write_text(f"time_ms{separator}acc_g\n" + "".join(rows))
+            with pytest.raises(ValueError, match="got '1,0[0-9]+', which may have a separator of thousands"):
+                read_csv(path)
+
+    def test_decimal_commas_with_three_digits(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_text('time_s,acc_g\n"0,000","1,250"\n"0,010","2,500"\n')
+        np.testing.assert_allclose(read_csv(path).acceleration / G0, [1.25, 2.5])
+        path.write_text("time_ms;acc_g\n0;1,250\n10;2,500\n")
+        np.testing.assert_allclose(read_csv(path).acceleration / G0, [1.25, 2.5])
+
     @pytest.mark.parametrize(
         ("first", "dt", "digits", "zero", "start"),
         [(0.37, 0.02, 2, 0.0, 0.37), (86000.123, 0.002, 3, 86000.123, 0.0), (86000.123, 1 / 120, 5, 86000.123, 0.0)],
