@@ -20,7 +20,7 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fe_likelihoods import RCColumn, from_si, problems, rrmse
+from fe_likelihoods import RCColumn, Record, from_si, problems, rrmse
 
 ROOT = Path(__file__).parents[1]
 TUTORIALS = sorted((ROOT / "tutorials").glob("[0-9]*.py"))
@@ -323,6 +323,8 @@ def test_own_column(tmp_path):
         ("[column]\nconcrete = 1\n", r"expected a table \[concrete\]"),
         ('[noise]\nkind = "pink"\n', "expected a kind of 'per channel'"),
         ("[column\n", "cannot read .*own.toml"),
+        ('[measurements]\nzero = "5 s"\n', r"\[measurements\] zero: expected the time .* got '5 s'"),
+        ("[measurements]\nzero = true\n", r"\[measurements\] zero: expected"),
     ],
 )
 def test_settings_of_an_own_column_are_checked(tmp_path, monkeypatch, text, message):
@@ -331,6 +333,29 @@ def test_settings_of_an_own_column_are_checked(tmp_path, monkeypatch, text, mess
     (tmp_path / "own.toml").write_text(text)
     with pytest.raises(ValueError, match=message):
         own_column.read_settings(tmp_path / "own.toml")
+
+
+def test_own_measurements_before_and_after_the_record_are_left_out(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tutorials")
+    own_column = importlib.import_module("own_column")
+    record = Record("base", 0.01, np.sin(0.1 * np.arange(201)))
+    table = ["time_s,top [mm]", *(f"{0.01 * k:.2f},{k % 89}" for k in range(901))]
+    (tmp_path / "top.csv").write_text("\n".join(table))
+    for zero in (5.0, 3):
+        (tmp_path / "own.toml").write_text(f'[measurements]\ncolumns = {{displacement = "top [mm]"}}\nzero = {zero}\n')
+        settings = own_column.read_settings(tmp_path / "own.toml")
+        measured = own_column.read_measurements(tmp_path / "top.csv", settings, record)
+        assert measured.description == (
+            "measurements of top.csv, without 700 samples of displacement before or after the record"
+        )
+        expected = 1e-3 * (np.arange(100 * int(zero), 100 * int(zero) + 201) % 89)
+        assert measured.values[0] == pytest.approx(expected) and measured.start == 0.0
+        for every in (1, 4):
+            posterior = own_column.make_posterior(record, measured, settings, every)
+            assert posterior.likelihood.measurements.n_steps == 1 + 200 // every
+    late = settings._replace(measurements={**settings.measurements, "zero": 9.5})
+    with pytest.raises(ValueError, match="no sample within the record, 0 to 2 s; set zero"):
+        own_column.read_measurements(tmp_path / "top.csv", late, record)
 
 
 def test_settings_in_the_documentation_are_those_of_the_tutorial(tmp_path, monkeypatch):

@@ -4,11 +4,14 @@ The page ``docs/own_column.rst`` describes the file. What it leaves out is that 
 are in SI units; a text such as ``"48 in"`` is a number with its unit.
 """
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from fe_likelihoods import (
     Bars,
@@ -83,6 +86,12 @@ def read_settings(path: Path | None) -> Settings:
         _table(content, section, path)
     measurements = dict(content.get("measurements", {}))
     _known(measurements, MEASUREMENTS, f"{path}, [measurements]")
+    zero = measurements.get("zero", 0.0)
+    if isinstance(zero, bool) or not isinstance(zero, int | float) or not math.isfinite(zero):
+        raise ValueError(
+            f"{path}, [measurements] zero: expected the time in the file at which the base motion begins, a number "
+            f"without a unit [s], got {zero!r}"
+        )
     noise = dict(content.get("noise", {}))
     _known(noise, ("kind",), f"{path}, [noise]")
     if noise.get("kind", NOISES[0]) not in NOISES:
@@ -95,14 +104,17 @@ def read_settings(path: Path | None) -> Settings:
 
 
 def read_measurements(path: Path, settings: Settings, record: Record) -> Measurements:
-    """Read the measured channels, ``acceleration`` and ``displacement`` of the top or one, from CSV or a workbook."""
+    """Read the measured channels, ``acceleration`` and ``displacement`` of the top or one, from CSV or a workbook.
+
+    Samples before and after the record are left out; the description says so.
+    """
     channels = {channel.name: channel for channel in RCColumn.lhpost(record, **settings.column).channels}
     options = dict(settings.measurements)
     columns = options.pop("columns", {name: name for name in channels})
     units = options.pop("units", {})
     _known(columns, tuple(channels), "columns of the measurements")
     _known(units, tuple(columns), "units of the measurements")
-    return read_columns(
+    measurements = read_columns(
         path,
         [channels[name] for name in channels if name in columns],
         [columns[name] for name in channels if name in columns],
@@ -110,6 +122,29 @@ def read_measurements(path: Path, settings: Settings, record: Record) -> Measure
         description=f"measurements of {path.name}",
         **options,
     )
+    return _within(measurements, record)
+
+
+def _within(measurements: Measurements, record: Record) -> Measurements:
+    """The samples between the first and the last one of the record."""
+    end, rows, starts, left_out = record.time[-1], [], [], []
+    for channel, values, step in zip(measurements.channels, measurements.values, measurements.steps, strict=True):
+        times = measurements.times(channel.name)
+        inside = np.flatnonzero((times >= -1e-6 * step) & (times <= end + 1e-6 * step))
+        outside = np.isfinite(values).sum() - np.isfinite(values[inside]).sum()
+        if not np.isfinite(values[inside]).any():
+            raise ValueError(
+                f"channel {channel.name!r} was measured from {times[0]:g} to {times[-1]:g} s and has no sample within "
+                f"the record, 0 to {end:g} s; set zero in [measurements] to the time in the file at which the base "
+                "motion begins"
+            )
+        rows.append(values[inside])
+        starts.append(0.0 if abs(times[inside[0]]) <= 1e-6 * step else float(times[inside[0]]))
+        left_out += [f"{outside} samples of {channel.name}"] if outside else []
+    if not left_out:
+        return measurements
+    text = f"{measurements.description}, without {', '.join(left_out)} before or after the record"
+    return Measurements(measurements.channels, measurements.steps, rows, text, starts)
 
 
 def make_posterior(record: Record, measurements: Measurements, settings: Settings, every: int, **changes) -> Posterior:
