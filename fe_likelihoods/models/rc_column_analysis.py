@@ -67,7 +67,8 @@ class ColumnHistory(History):
         Number of steps that were repeated with half their size.
     beyond_range : float
         Largest strain of a bar in the base section, divided by the ultimate strain of the steel. Above 1, real bars
-        fracture, whereas the law of the steel was continued along its tangent.
+        fracture, whereas the law of the steel was continued along its tangent. A warning about this is logged when the
+        column is simulated, not when a row comes from a cache.
     """
 
     retries: int

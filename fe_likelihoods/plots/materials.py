@@ -38,7 +38,14 @@ def plot_material(
     -------
     matplotlib Axes
         The axes with the figure.
+
+    Raises
+    ------
+    ValueError
+        If there is no curve, or a unit is unknown or of another quantity.
     """
+    if not curves:
+        raise ValueError("expected one or more curves; got none; give the results of material_curves(column, theta)")
     axes = _with_origin(new_axes(axes, (5.4, 4.0)))
     for curve, colour in zip(curves, _cycle(len(curves)), strict=True):
         strain = from_si(curve.strain, strain_unit, "strain")

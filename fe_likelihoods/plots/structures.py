@@ -101,7 +101,7 @@ def plot_sensors(column: ColumnLike, axes: Axes | None = None) -> Axes:
     axes.add_patch(Rectangle((-1.4 * radius, height), 2.8 * radius, 0.06 * height, facecolor="0.8", edgecolor="0.5"))
     axes.hlines(np.unique(column.section_heights), -radius, radius, color="0.65", linestyle=":", linewidth=1.0)
     places = sorted((_draw_sensor(name, axes, radius, height) for name in (c.name for c in column.channels)), key=_rank)
-    ends = np.linspace(0.0, height, len(places)) if len(places) > 1 else [0.5 * height]
+    ends = _label_heights([z for _, z, _ in places], height)
     for (x, z, name), end in zip(places, ends, strict=True):
         axes.plot([x, 2.4 * radius, 2.8 * radius], [z, end, end], color=GREY, linewidth=0.6, zorder=1)
         axes.text(2.85 * radius, end, name, va="center", fontsize="small")
@@ -130,6 +130,16 @@ def _draw_sensor(name: str, axes: Axes, radius: float, height: float) -> tuple[f
     z = height if kind in ("acceleration", "displacement", "force") else 0.0
     axes.plot(0.0, z, "s", color="0.25", markersize=5, zorder=3)
     return 0.0, z, name
+
+
+def _label_heights(heights: list[float], height: float) -> list[float]:
+    """Heights of labels, in order, as close to those of their sensors as an even minimum distance allows."""
+    gap = min(height / max(1, len(heights) - 1), 0.05 * height)
+    ends: list[float] = []
+    for k, z in enumerate(heights):
+        lowest = ends[-1] + gap if ends else 0.0
+        ends.append(min(max(z, lowest), height - gap * (len(heights) - 1 - k)))
+    return ends
 
 
 def _rank(place: tuple[float, float, str]) -> tuple[float, float]:

@@ -18,6 +18,8 @@ def test_stress_against_strain():
     np.testing.assert_allclose(second.get_ydata(), 6e9 * strain / 6.894757293168361e6)
     assert shows(axes, [first, second]) and first.get_color() != second.get_color()
     assert plot_material(curves[0], strain_unit="1").get_xlabel() == "strain"
+    with pytest.raises(ValueError, match="one or more curves; got none"):
+        plot_material()
     with pytest.raises(ValueError, match="unit of stress"):
         plot_material(curves[0], stress_unit="kN")
 

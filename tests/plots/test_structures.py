@@ -106,3 +106,16 @@ def test_sensors_are_drawn_at_their_places(record):
     np.testing.assert_allclose([s[0, 1] for s in sections.get_segments()], [0.0, 1.8288, 3.6576, 5.4864, 7.3152])
     low, high = axes.get_ylim()
     assert low < 0.0 and high > 7.3152
+
+
+def test_labels_are_beside_their_sensors():
+    record = bridge_column_data().record.trim(5.0, 6.0)
+    top = plot_sensors(RCColumn.lhpost(record))
+    heights = sorted(text.get_position()[1] for text in top.texts)
+    np.testing.assert_allclose(heights, [0.95 * 7.3152, 7.3152])
+    many = tuple(f"curvature@{z}" for z in np.round(np.linspace(0.0, 7.0, 40), 3))
+    heights = [text.get_position()[1] for text in plot_sensors(RCColumn.lhpost(record, outputs=many)).texts]
+    np.testing.assert_allclose(np.sort(heights), np.linspace(0.0, 7.3152, 40), atol=1e-9)
+    foot = plot_sensors(RCColumn.lhpost(record, outputs=("base_moment", "base_shear", "strain@0.3:0.5")))
+    heights = sorted(text.get_position()[1] for text in foot.texts)
+    assert heights[0] == 0.0 and heights[-1] < 0.11 * 7.3152
