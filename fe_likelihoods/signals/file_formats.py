@@ -37,8 +37,9 @@ __all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
 
 # Expressions are searched from one place of a line, and no two parts of one match the same text: their time is linear.
 _AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
-_AT2_STEP = re.compile(rf"DT\s*=\s*({NUMBER})", re.IGNORECASE)
+_AT2_STEP = re.compile(rf"DT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
 _AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
+_SECONDS = frozenset({"", "s", "sec", "secs", "second", "seconds"})
 _UNITS_OF = re.compile(r"UNITS\s+OF\s+([^\s,;]+?)[.]?(?=[\s,;]|$)", re.IGNORECASE)
 _CSMIP_DATA = re.compile(rf"^\s*(\d+)\s+points\s+of\s+accel\s+data\s+equally\s+spaced\s+at\s*({NUMBER})", re.IGNORECASE)
 _CSMIP_UNITS = re.compile(r"units:\s*([^\s)]+)|\bin\s+([^\s.,]+)", re.IGNORECASE)
@@ -112,16 +113,21 @@ def parse_at2(text: str, file: str) -> Series:
     values = np.array([parse_number(field, f"{file}, line {line}") for line, field in fields])
     where = f"{file}: NPTS in line {index + 1}"
     check_count(values.size, parse_count(stated[0], where), where)
+    if stated[2].lower() not in _SECONDS:
+        raise ValueError(
+            f"{file}, line {index + 1}: expected DT in seconds, such as 'DT= .0100 SEC', got {stated[1]} {stated[2]}; "
+            "write it in seconds"
+        )
     title = lines[index - 2].strip() if index >= 2 else ""
     return Series(title, float(stated[1]), units[1] if units else None, values)
 
 
-def _at2_header(line: str) -> tuple[str, str] | None:
-    """Number of samples and step as the line of an AT2 header states them; None for another line."""
+def _at2_header(line: str) -> tuple[str, str, str] | None:
+    """Number of samples, step and its unit as the line of an AT2 header states them; None for another line."""
     if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line, count.end())):
-        return count[1], step[1]
+        return count[1], step[1], step[2]
     old = _AT2_OLD.match(line)
-    return (old[1], old[2]) if old else None
+    return (old[1], old[2], "") if old else None
 
 
 def find_v2_channels(path: str | Path, member: str | None = None) -> list[V2Channel]:

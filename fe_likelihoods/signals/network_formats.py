@@ -27,7 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .text_files import NUMBER, Series, check_count, parse_count, parse_number
+from ..units import from_si, to_si
+from .text_files import NUMBER, Series, agree_on_unit, check_count, parse_count, parse_number
 
 __all__ = ["GeonetComponent", "parse_esm", "parse_geonet", "parse_knet", "parse_smc", "recognise"]
 
@@ -248,9 +249,12 @@ def parse_esm(text: str, file: str) -> Series:
     where = f"{file}: NDATA"
     check_count(values.size, _whole(parse_number(header["NDATA"], where), file, "samples"), where)
     stated = header.get("PGA_CM/S^2", "")
-    if stated and values.size and header["UNITS"].lower() in ("cm/s^2", "cm/s2", "gal"):
+    if stated and values.size:
         peak = abs(parse_number(stated, f"{file}, PGA_CM/S^2"))
-        _check_peak(float(np.abs(values).max()), peak, 1e-4 * peak + 2e-6, file)
+        unit = agree_on_unit(header["UNITS"], None, "acceleration", file)
+        scale = float(from_si(to_si(1.0, unit), "cm/s2"))
+        found = scale * float(np.abs(values).max())
+        _check_peak(found, peak, 1e-4 * peak + 2e-6 * scale, file)
     title = f"{header.get('NETWORK', '')}.{header['STATION_CODE']} {header['STREAM']}"
     return Series(title, dt, header["UNITS"], values)
 

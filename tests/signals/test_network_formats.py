@@ -85,6 +85,10 @@ def test_synthetic_files_are_read(tmp_path):
     found = read_esm(write(tmp_path / "a.asc", esm(VALUES, 0.005)))
     np.testing.assert_allclose(found.acceleration, 1e-2 * VALUES, atol=1e-8)
     assert found.dt == 0.005
+    lines = changed(esm(VALUES / 980.665, 0.005), "UNITS: cm/s^2", "UNITS: g")
+    peak = next(line for line in lines if line.startswith("PGA"))
+    in_g = write(tmp_path / "g.asc", changed(lines, peak, f"PGA_CM/S^2: {np.abs(VALUES).max():.6f}"))
+    np.testing.assert_allclose(read_esm(in_g).acceleration, found.acceleration, atol=1e-5)
 
 
 def changed(lines, old, new):
@@ -120,6 +124,11 @@ def changed(lines, old, new):
         (read_esm, esm(VALUES, 0.005)[:-1], "announces 61 samples, the file has 60"),
         (read_esm, esm(VALUES, 0.005, "VELOCITY"), "got DATA_TYPE 'VELOCITY'"),
         (read_esm, changed(esm(VALUES, 0.005), f"PGA_CM/S^2: {max(VALUES):.6f}", "PGA_CM/S^2: 1.0"), "a peak of 1"),
+        (
+            read_esm,
+            changed(esm(VALUES, 0.005), "UNITS: cm/s^2", "UNITS: g"),
+            "a peak of 27.*, the samples have 2[0-9]{4}",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, read, lines, message):

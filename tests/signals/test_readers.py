@@ -80,6 +80,7 @@ class TestAT2:
             ("NPTS= 23, DT= .01 SEC", "VELOCITY TIME SERIES IN UNITS OF CM/SEC", None, "a unit of velocity"),
             ("NPTS= 23, DT= .01 SEC", "UNITS OF PARSEC", None, "unknown unit 'PARSEC'"),
             ("NPTS= 23, DT= 0.0 SEC", "UNITS OF G", None, "positive number of seconds"),
+            ("NPTS= 23, DT= 10 MSEC", "UNITS OF G", None, "line 4: expected DT in seconds, .* got 10 MSEC"),
             ("no header at all", "UNITS OF G", None, "expected a header line 'NPTS="),
         ],
     )
