@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from ..signals.comparison import Comparison, compare_with
+from ..signals.comparison import Comparison, compare_shifted, compare_with
 from ..signals.error_measures import rrmse
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from matplotlib.figure import Figure
 
@@ -61,6 +61,9 @@ class Prediction:
     from_state : str
         State of the structure at the beginning: "virgin", that of the model before any excitation, or "end", that after
         the excitation with which the model was made.
+    shifted : tuple of str
+        Channels of the measurements with unknown time shifts (`fe_likelihoods.TimeShiftNoise`). The histories are those
+        of the response, without a shift.
     """
 
     mean: np.ndarray
@@ -79,6 +82,7 @@ class Prediction:
     dt: float | None = None
     noise: bool = False
     from_state: str = "virgin"
+    shifted: tuple[str, ...] = ()
 
     @property
     def sd(self) -> np.ndarray:
@@ -105,7 +109,12 @@ class Prediction:
             )
         return self.quantiles[self.probabilities.index(probability)]
 
-    def rrmse(self, measurements: Measurements, part: slice = slice(None)) -> np.ndarray:
+    def rrmse(
+        self,
+        measurements: Measurements,
+        part: slice = slice(None),
+        time_shifts: "Mapping[str, float] | None" = None,
+    ) -> np.ndarray:
         """Compute the relative root mean square error of the mean.
 
         Parameters
@@ -115,6 +124,9 @@ class Prediction:
             has times of its own, the histories are interpolated there.
         part : slice
             The samples of the history to compare. Default: all.
+        time_shifts : mapping of str to float, optional
+            Time [s] by which the measurements of a channel are later than the response, needed for the channels of
+            `shifted`: for instance the posterior means of their shifts. Samples beyond the histories are left out.
 
         Returns
         -------
@@ -124,15 +136,20 @@ class Prediction:
         Raises
         ------
         ValueError
-            If the prediction has no histories, the measurements lack a channel or have samples outside of the
-            histories, or a measured channel is zero, or has no sample, in the part.
+            If the prediction has no histories, a shift of `shifted` is not given, the measurements lack a channel or
+            have samples outside of the histories, or a measured channel is zero, or has no sample, in the part.
         """
-        compared = self._compared(measurements)
+        compared = self._compared(measurements, time_shifts)
         measured, mean = _values_of(compared), _at_samples(compared, self.mean)
         return rrmse(mean[:, part], measured[:, part], [channel.name for channel in self.channels])
 
     def coverage(
-        self, measurements: Measurements, lower: float = 0.05, upper: float = 0.95, part: slice = slice(None)
+        self,
+        measurements: Measurements,
+        lower: float = 0.05,
+        upper: float = 0.95,
+        part: slice = slice(None),
+        time_shifts: "Mapping[str, float] | None" = None,
     ) -> np.ndarray:
         """Compute the fraction of the measured samples between two quantiles.
 
@@ -145,6 +162,8 @@ class Prediction:
             Probabilities of the two quantiles.
         part : slice
             The samples of the history to compare. Default: all.
+        time_shifts : mapping of str to float, optional
+            As for `rrmse`.
 
         Returns
         -------
@@ -163,7 +182,7 @@ class Prediction:
         """
         if not lower < upper:
             raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
-        compared = self._compared(measurements)
+        compared = self._compared(measurements, time_shifts)
         measured = _values_of(compared)[:, part]
         below, above = (_at_samples(compared, self.quantile(p))[:, part] for p in (lower, upper))
         samples = np.isfinite(measured).sum(axis=1)
@@ -182,7 +201,9 @@ class Prediction:
         if self.dt is None:
             raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
 
-    def _compared(self, measurements: Measurements) -> np.ndarray | Comparison:
+    def _compared(
+        self, measurements: Measurements, time_shifts: "Mapping[str, float] | None"
+    ) -> np.ndarray | Comparison:
         """Return what the histories are compared with, in the order of `channels`."""
         self._need_histories()
         chosen = measurements.select([channel.name for channel in self.channels])
@@ -192,7 +213,17 @@ class Prediction:
                     f"channel {predicted.name!r} is {predicted.quantity!r} in the prediction, {measured.quantity!r} in "
                     "the measurements"
                 )
-        return compare_with(chosen, self.dt, self.mean.shape[1])
+        shifts = dict(time_shifts or {})
+        names = [channel.name for channel in self.channels]
+        if missing := [name for name in names if name in self.shifted and name not in shifts]:
+            raise ValueError(
+                f"the channels {', '.join(missing)} have unknown time shifts: give time_shifts={{name: seconds}}, for "
+                "instance the posterior means of their parameters time_shift_<channel>"
+            )
+        if unknown := sorted(set(shifts) - set(names)):
+            raise ValueError(f"time_shifts has {', '.join(unknown)}, the prediction has {', '.join(names)}")
+        compared = compare_with(chosen, self.dt, self.mean.shape[1])
+        return compare_shifted(chosen, compared, self.dt, self.mean.shape[1], shifts) if shifts else compared
 
 
 def _values_of(compared: np.ndarray | Comparison) -> np.ndarray:

@@ -20,12 +20,15 @@ Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
+from ..probability.inputs import as_points
+from ..probability.noise import noise_time_shifts
+from ..probability.time_shift_noise import TimeShiftNoise
 from ..signals.channels import Channel
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
@@ -177,7 +180,8 @@ def propagate(
             responses, reasons = simulate_batch(model, distinct[start : start + batch], source.executor)
             accumulator.add(start, np.ascontiguousarray(responses[:, :, first:]), reasons)
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
-    return _prediction(accumulator, n, effective, evaluate.channels, model.dt, state)
+    shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
+    return _prediction(accumulator, n, effective, evaluate.channels, model.dt, state, shifted)
 
 
 def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.ndarray:
@@ -191,7 +195,8 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     posterior : Posterior, FELikelihood or JointLikelihood
         The likelihood with the measurements.
     samples : (n, ndim) array_like, or named values of shape (n,)
-        All parameters, or the structural parameters alone.
+        All parameters, or the structural parameters alone. All for a noise with unknown time shifts, whose channels
+        are compared at the shifts of the samples.
     part : str, optional
         As for `propagate`.
 
@@ -205,14 +210,27 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     ValueError
         As `propagate`, and if there are no measurements or a measured channel is zero at all samples.
     """
-    posterior, samples = part_of(posterior, samples, part, False)
+    complete = samples
+    joint = posterior
+    posterior, samples = part_of(joint, complete, part, False)
     source = read_source(posterior)
+    if source.likelihood is not None and isinstance(source.likelihood.noise, TimeShiftNoise):
+        posterior, samples = part_of(joint, complete, part, True)
     if source.likelihood is None:
         raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")
-    measurements = source.likelihood.measurements
-    power = sum_of_squares(measurements.values, [channel.name for channel in measurements.channels])
+    likelihood = source.likelihood
+    compared = getattr(likelihood.measured, "values", likelihood.measured)
+    power = sum_of_squares(compared, [channel.name for channel in likelihood.measurements.channels])
     thetas, _ = split_samples(source, samples, False)
-    return source.likelihood.misfit(thetas) / power
+    if not isinstance(likelihood.noise, TimeShiftNoise):
+        return likelihood.misfit(thetas) / power
+    if not (isinstance(samples, Mapping) or np.shape(samples)[-1:] == (likelihood.ndim,)):
+        raise ValueError(
+            f"the channels {', '.join(likelihood.noise.time_shifts)} have unknown time shifts: give samples of all "
+            f"{likelihood.ndim} parameters"
+        )
+    noise = as_points(samples, likelihood.parameter_names)[:, thetas.shape[1] :]
+    return likelihood.noise.misfit(likelihood.statistics(thetas), noise) / power
 
 
 def check_effective_sample_size(effective_sample_size: float | None, n: int) -> float:
@@ -225,7 +243,13 @@ def check_effective_sample_size(effective_sample_size: float | None, n: int) -> 
 
 
 def _prediction(
-    accumulator: Accumulator, n: int, effective: float, channels: tuple[Channel, ...], dt: float, from_state: str
+    accumulator: Accumulator,
+    n: int,
+    effective: float,
+    channels: tuple[Channel, ...],
+    dt: float,
+    from_state: str,
+    shifted: tuple[str, ...],
 ) -> Prediction:
     failed = np.sort(np.concatenate(accumulator.failed)) if accumulator.failed else np.zeros(0, dtype=int)
     frequent = "; ".join(f"{count}: {reason}" for reason, count in accumulator.reasons.most_common(3))
@@ -272,6 +296,7 @@ def _prediction(
         dt=dt if histories else None,
         noise=noise,
         from_state=from_state,
+        shifted=shifted,
     )
 
 

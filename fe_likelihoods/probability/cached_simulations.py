@@ -154,7 +154,7 @@ class CachedSimulations:
         return self.simulation_key, simulation_fingerprint(self.model)
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals: the first columns of `statistics`.
+        """Sums of squared residuals, without unknown time shifts: the first columns of `statistics`.
 
         Parameters
         ----------

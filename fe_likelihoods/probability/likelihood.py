@@ -198,7 +198,8 @@ class FELikelihood(CachedSimulations):
         Parameters
         ----------
         theta : (n_structural,) or (ndim,) float
-            Structural parameters; the noise parameters may follow.
+            Structural parameters; the noise parameters may follow. They must for a noise with unknown time shifts,
+            whose channels are compared at the shifts of `theta`.
 
         Returns
         -------
@@ -208,7 +209,7 @@ class FELikelihood(CachedSimulations):
         Raises
         ------
         ValueError
-            For a wrong number of parameters.
+            For a wrong number of parameters, or a shift beyond the largest one.
         SimulationFailed
             If the simulation fails.
         """
@@ -218,12 +219,32 @@ class FELikelihood(CachedSimulations):
                 f"expected one point, of shape ({self._n_structural},), or ({self.ndim},) with the noise parameters; "
                 f"got shape {theta.shape}"
             )
+        shifts = self._shifts_of(theta)
         response, (reason,) = simulate_batch(self.model, theta[None, : self._n_structural])
         if reason:
             raise SimulationFailed(reason)
+        if shifts:
+            times = {name: self.measurements.times(name) - shift for name, shift in shifts.items()}
+            return -self.measured.residuals_at(response[0], self.model.dt, self.measurements.channels, times)
         if isinstance(self.measured, Comparison):
             return -self.measured.residuals(response[0])
         return self.measurements.values - response[0]
+
+    def _shifts_of(self, theta: np.ndarray) -> dict[str, float]:
+        """Time shifts [s] of channels at a point, empty for a noise without such parameters."""
+        largest = noise_time_shifts(self.noise)
+        if not largest:
+            return {}
+        if theta.shape != (self.ndim,):
+            raise ValueError(
+                f"the channels {', '.join(largest)} have unknown time shifts: give the noise parameters too, a point "
+                f"of shape ({self.ndim},)"
+            )
+        values = dict(zip(self.parameter_names, theta.tolist(), strict=True))
+        shifts = {name: values[f"time_shift_{name}"] for name in largest}
+        if beyond := [name for name, shift in shifts.items() if not abs(shift) <= largest[name]]:
+            raise ValueError(f"the time shifts of {', '.join(beyond)} are beyond the largest ones, {dict(largest)} s")
+        return shifts
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
         """Log-likelihood of structural parameters followed by noise parameters.

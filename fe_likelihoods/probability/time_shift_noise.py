@@ -120,18 +120,25 @@ class TimeShiftNoise:
         (n,) float
             As that of the noise; -inf also where a shift is larger than the largest one.
         """
+        parameters = np.asarray(parameters, dtype=float)
+        largest = np.array([shift for _, shift in self.shifts])
+        possible = (np.abs(parameters[:, self._n_noise :]) <= largest).all(axis=1)
+        values = self.noise.log_likelihood(
+            self.misfit(statistics, parameters), n_samples, parameters[:, : self._n_noise]
+        )
+        return np.where(possible, values, -np.inf)
+
+    def misfit(self, statistics: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Sums of squared residuals (n, n_channels) at the shifts of `parameters`, both as for `log_likelihood`."""
         statistics, parameters = np.asarray(statistics, dtype=float), np.asarray(parameters, dtype=float)
         n_channels = len(self.channels)
         misfit = statistics[:, :n_channels].copy()
         sums = statistics[:, n_channels:].reshape(len(statistics), -1, POINTS, n_channels)
         names = [channel.name for channel in self.channels]
-        possible = np.ones(len(statistics), dtype=bool)
         for k, (name, largest) in enumerate(self.shifts):
             shift, channel = parameters[:, self._n_noise + k], names.index(name)
-            possible &= np.abs(shift) <= largest
             misfit[:, channel] = _misfit_at(sums[..., channel], np.clip(shift, -largest, largest) / self.dt)
-        values = self.noise.log_likelihood(misfit, n_samples, parameters[:, : self._n_noise])
-        return np.where(possible, values, -np.inf)
+        return misfit
 
     @property
     def _n_noise(self) -> int:

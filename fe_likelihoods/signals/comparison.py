@@ -19,11 +19,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .channels import Measurements
+from .channels import Channel, Measurements
 from .interpolation import POINTS, Interpolation, interpolate, make_interpolation
 from .sampling import same_sampling, same_step
 
-__all__ = ["Comparison", "Lags", "compare_with", "measured_values"]
+__all__ = ["Comparison", "Lags", "compare_shifted", "compare_with", "measured_values"]
 
 _LATEST = 1e-6  # in steps: how far a sample may be after the end of the response, for round-off
 
@@ -80,6 +80,22 @@ class Comparison:
     def residuals(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return response minus measurement, shape (n_channels, n_samples) [SI], NaN where a sample is missing."""
         return np.ascontiguousarray(self.at_samples(response) - self.values)  # as for a complete response
+
+    def residuals_at(
+        self,
+        response: NDArray[np.float64],
+        dt: float,
+        channels: Sequence[Channel],
+        times: Mapping[str, NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Return `residuals` with the response, of step `dt` [s], at other times (n_samples,) [s] for some channels."""
+        residuals = self.residuals(response)
+        for row, channel in enumerate(channels):
+            if channel.name in times:
+                there = ~self.missing[row]
+                place = make_interpolation(dt, response.shape[1], times[channel.name][there])
+                residuals[row, there] = interpolate(response[row], place) - self.values[row, there]
+        return residuals
 
     def known_residuals(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `residuals` with zero where a sample is missing."""
@@ -181,6 +197,39 @@ def compare_with(
     if all(place is None for place in places) and not np.isnan(measurements.values).any():
         return measurements.values
     return Comparison(measurements.values, tuple(places))
+
+
+def compare_shifted(
+    measurements: Measurements,
+    compared: NDArray[np.float64] | Comparison,
+    dt: float,
+    n_steps: int,
+    shifts: Mapping[str, float],
+) -> Comparison:
+    """Return a comparison, as of `compare_with`, at known time shifts of some channels.
+
+    Parameters
+    ----------
+    measurements, dt, n_steps
+        As for `compare_with`.
+    compared : ndarray or Comparison
+        The result of `compare_with` without a shift.
+    shifts : mapping of str to float
+        Time by which a channel is later than the response [s], by its name.
+
+    Returns
+    -------
+    Comparison
+        Samples beyond the response are left out.
+    """
+    places = list(compared.places) if isinstance(compared, Comparison) else [None] * measurements.n_channels
+    values, end = np.array(measurements.values), (n_steps - 1) * dt
+    for row, channel in enumerate(measurements.channels):
+        if channel.name in shifts:
+            times = measurements.times(channel.name) - shifts[channel.name]
+            values[row, (times < -_LATEST * dt) | (times > end + _LATEST * dt)] = np.nan
+            places[row] = make_interpolation(dt, n_steps, np.clip(times, 0.0, end))
+    return Comparison(values, tuple(places))
 
 
 def _with_lags(

@@ -20,6 +20,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
     align,
+    fit_measures,
     propagate,
 )
 
@@ -261,3 +262,31 @@ def test_evidences_of_other_largest_shifts_are_not_those_of_the_same_data(rng):
     values[0, :8] = values[0, -8:] = np.nan
     same = FELikelihood(MODEL, Measurements(data.channels, DT, values), white)
     assert same.data_fingerprint == shifted[0].data_fingerprint
+
+
+def test_residuals_and_errors_are_at_the_shift(rng):
+    data = shifted_data(rng, dt=0.0125)
+    likelihood = FELikelihood(MODEL, data, TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT))
+    point = [1.0, 1.0, 0.02, 0.0004, 0.0234]
+    residuals = likelihood.residuals(point)
+    known = np.isfinite(residuals)
+    assert known.sum(axis=1).tolist() == likelihood.n_samples.samples.tolist()
+    assert np.nanstd(residuals, axis=1) == pytest.approx([0.02, 0.0004], rel=0.15)  # the noise of the data
+    compared = np.where(known, data.values, np.nan)
+    expected = np.nansum(residuals**2, axis=1) / np.nansum(compared**2, axis=1)
+    assert fit_measures(likelihood, [point])[0] == pytest.approx(expected, rel=1e-4)  # interpolated twice
+    found = propagate(likelihood, [point], noise=True, quantiles=(0.05, 0.95), progress=False)
+    assert found.rrmse(data, time_shifts={"top": 0.0234}) == pytest.approx(np.sqrt(expected), rel=0.05)
+    assert found.rrmse(data, time_shifts={"top": 0.0})[0] > 5.0 * np.sqrt(expected[0])
+    for call in (
+        lambda: likelihood.residuals(point[:2]),
+        lambda: likelihood.residuals([*point[:4], 0.06]),
+        lambda: fit_measures(likelihood, [point[:2]]),
+        lambda: found.rrmse(data),
+        lambda: found.coverage(data),
+    ):
+        with pytest.raises(ValueError, match="time shifts"):
+            call()
+    with pytest.raises(ValueError, match="time_shifts has base"):
+        found.rrmse(data, time_shifts={"top": 0.0, "base": 0.0})
+    assert found.coverage(data, time_shifts={"top": 0.0234}).shape == (2,)
