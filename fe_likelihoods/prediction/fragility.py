@@ -26,7 +26,7 @@ from scipy import optimize, special
 
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
-from .excitation import chosen_state, excite
+from .excitation import chosen_state, excite, under_record
 from .inputs import part_of, read_source, split_samples
 from .propagation import check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
@@ -197,6 +197,7 @@ def fragility(
     records = list(records)
     if not records:
         raise ValueError("fragility needs one record or more, such as [record.scale(k) for k in factors]; got none")
+    under_record(source.model, records[0])  # errors come before the warning about the state
     state = chosen_state(source.model, records, from_state)
     for record in records:
         excite(source.model, record, state, rest)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..probability.event_noise import EventNoise
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
@@ -216,6 +217,11 @@ def samples_of_rows(row_of_sample: np.ndarray, n_rows: int) -> list[np.ndarray]:
 
 
 def _sample_noise(noise_model: Any, parameters: np.ndarray, n_channels: int) -> SampleNoise:
+    if isinstance(noise_model, EventNoise):
+        raise ValueError(
+            "a prediction with noise needs one standard deviation per channel, and EventNoise has one per channel and "
+            "event; predict with noise=False, or calibrate with GaussianNoise or with the measurements of one event"
+        )
     if not hasattr(noise_model, "standard_deviations"):
         raise ValueError(
             f"{type(noise_model).__name__} cannot be drawn from: give it a method standard_deviations(parameters (n, "

@@ -34,7 +34,7 @@ from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed, simulate_batch
 from .accumulator import Accumulator
-from .excitation import chosen_state, excite
+from .excitation import chosen_state, excite, under_record
 from .inputs import (
     distinct_rows,
     part_of,
@@ -150,6 +150,8 @@ def propagate(
         raise ValueError(f"batch must be a whole number of simulations, 1 or more; got {batch!r}")
     if memory_bytes is not None and not memory_bytes >= 0:
         raise ValueError(f"memory_bytes must be a number of bytes, or None for no limit; got {memory_bytes!r}")
+    if record is not None:
+        under_record(source.model, record)  # errors come before the warning about the state
     state = chosen_state(source.model, record, from_state)
     model, first, n_steps, _ = excite(source.model, record, state, rest)
     evaluate = evaluator(quantity, model.channels)

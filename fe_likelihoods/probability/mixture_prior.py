@@ -29,6 +29,7 @@ _ITERATIONS = 100
 _STARTS = 2
 _GAIN = 1e-6  # of the log-likelihood per sample and iteration, below which the maximisation ends
 _REFITS = 16
+_SMALLEST_EIGENVALUE = 1e-10  # of the correlations, below which the samples are linearly dependent
 
 
 class MixtureDistribution(MultivariateDistribution):
@@ -46,7 +47,10 @@ class MixtureDistribution(MultivariateDistribution):
         Covariances in the coordinates.
     fit_error : float
         Standard error of the logarithm of the density [-], root mean square over the samples, from fits to resampled
-        samples. An evidence with this prior has this error in addition to that of the sampler.
+        samples. An evidence with this prior has this error in addition to that of the sampler, as long as the next data
+        move the posterior by up to about 1.5 standard deviations. It is too small for larger moves: for a move of 3
+        standard deviations to a posterior with 0.7 times the standard deviation it was 0.03 to 0.14, and the root mean
+        square error of the log-evidence 0.09 to 0.23, because the samples determine the tails poorly.
     misfit : float or None
         Standard deviation over the samples of the logarithm of the ratio of the posterior to the mixture [-], which is
         zero for a perfect fit. None if the posterior density was not given.
@@ -194,8 +198,8 @@ def fit_mixture(
     Raises
     ------
     ValueError
-        If the samples have another dimension or are too few, a sample is impossible under the prior, a name is unknown,
-        or an argument is out of range.
+        If the samples have another dimension, are too few or linearly dependent, a sample is impossible under the
+        prior, a name is unknown, or an argument is out of range.
 
     Examples
     --------
@@ -214,11 +218,12 @@ def fit_mixture(
         )
     if not np.isfinite(np.atleast_1d(prior.logpdf(points))).all():
         raise ValueError("some samples are impossible under the prior; give the prior with which they were drawn")
-    if max_components < 1:
-        raise ValueError(f"max_components must be 1 or more; got {max_components}")
+    if not isinstance(max_components, int | np.integer) or max_components < 1:
+        raise ValueError(f"max_components must be a whole number, 1 or more; got {max_components!r}")
     chosen = points[:, [prior.names.index(name) for name in names]]
     part = prior.subset(names)
     z = np.clip(part.to_normal(chosen), -_LARGEST_SCORE, _LARGEST_SCORE)
+    _check_independent(z, names)
     rng = np.random.default_rng(seed)
     distinct = len(np.unique(z, axis=0))
     effective = float(distinct if effective_sample_size is None else effective_sample_size)
@@ -256,6 +261,20 @@ def fit_mixture(
         slope = np.atleast_1d(part.logpdf(chosen)) + 0.5 * np.square(z).sum(axis=1)
         misfit = float(np.std(log_prob - density - slope))
     return MixtureDistribution(part, weights, means, covariances, fit_error, misfit)
+
+
+def _check_independent(z: np.ndarray, names: Sequence[str]) -> None:
+    """Raise ValueError if the samples z (n, dim) are constant or on a plane, where they have no density."""
+    deviations = z.std(axis=0)
+    if constant := [name for name, each in zip(names, deviations, strict=True) if each < 1e-12]:
+        raise ValueError(f"all samples have the same value of {', '.join(constant)}; leave it out of names")
+    values, vectors = np.linalg.eigh(np.atleast_2d(np.corrcoef(z.T)))
+    if values[0] < _SMALLEST_EIGENVALUE:
+        members = ", ".join(name for name, share in zip(names, vectors[:, 0], strict=True) if abs(share) > 0.1)
+        raise ValueError(
+            f"the samples of {members} are linearly dependent in the coordinates of the prior, so that they have no "
+            "joint density; leave one of these parameters out of names"
+        )
 
 
 def _log_mixture(z: np.ndarray, weights: np.ndarray, means: np.ndarray, factors: np.ndarray) -> np.ndarray:

@@ -245,8 +245,12 @@ def test_bad_input_is_refused():
         "needs 40 different samples or more": (samples[:10], prior),
         "impossible under the prior": (-samples, prior),
         "no parameters m; it has k, c": (samples, prior, ["m"]),
+        "the samples of k, c are linearly dependent": (samples[:, [0, 0]], prior),
+        "all samples have the same value of c": (samples * [1.0, 0.0] + [0.0, 0.5], prior),
     }.items():
         with pytest.raises(ValueError, match=message):
             fit_mixture(*arguments)
+    with pytest.raises(ValueError, match="max_components must be a whole number, 1 or more; got 2.5"):
+        fit_mixture(samples, prior, max_components=2.5)
     with pytest.raises(ValueError, match="log_prob must have one value for each of the 200 samples"):
         fit_mixture(samples, prior, log_prob=np.ones(3))
