@@ -276,6 +276,7 @@ def read_csv(
     *,
     time_unit: str | None = None,
     skip: int | None = None,
+    missing: Sequence[float] | None = None,
 ) -> Record:
     """Read a ground motion from a CSV file with a header line such as ``time_s,acc_g``, or from an Excel workbook.
 
@@ -303,6 +304,10 @@ def read_csv(
         Unit of the times, if the name of their column does not end with it.
     skip : int, optional
         Number of lines above the table, if they are not found.
+    missing : sequence of float, optional
+        Numbers that stand for missing samples; they are read as NaN, which an excitation must not have. By default,
+        -9999, -999.25, 1e30 and 9.97e36 are refused unless other numbers lie within 1 % of them; ``()`` takes all
+        numbers as measured.
 
     Returns
     -------
@@ -316,7 +321,7 @@ def read_csv(
         number or is empty, or a time step is irregular (the message names the first one).
     """
     with _named_format(path, "read_csv"):
-        series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt)
+        series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt, missing)
     return _record(series, units, path, Path(path).stem)
 
 
@@ -331,6 +336,7 @@ def read_columns(
     time_unit: str | None = None,
     skip: int | None = None,
     zero: float = 0.0,
+    missing: Sequence[float] | None = None,
 ) -> Measurements:
     """Read measured responses from the columns of a CSV file or workbook with a header line (see `read_csv`).
 
@@ -357,6 +363,9 @@ def read_columns(
         Number of lines above the table, if they are not found.
     zero : float, optional
         Time in the file at which the excitation begins [s].
+    missing : sequence of float, optional
+        Numbers that stand for missing samples; they are read as NaN. By default, -9999, -999.25, 1e30 and 9.97e36
+        are refused unless other numbers lie within 1 % of them; ``()`` takes all numbers as measured.
 
     Returns
     -------
@@ -372,7 +381,7 @@ def read_columns(
     """
     with _named_format(path, "read_columns"):
         table = tables.read_table(path, skip, time_unit)
-    values = _channel_values(table, channels, columns, units)
+    values = _channel_values(table, channels, columns, units, missing)
     step = tables.table_step(table, dt)
     return Measurements(tuple(channels), step, values, description, tables.table_start(table, step, zero))
 
@@ -387,6 +396,7 @@ def read_imposed_test(
     description: str = "",
     *,
     skip: int | None = None,
+    missing: Sequence[float] | None = None,
 ) -> ImposedTest:
     """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
 
@@ -408,6 +418,8 @@ def read_imposed_test(
         Description of the measurements.
     skip : int, optional
         Number of lines above the table, if they are not found.
+    missing : sequence of float, optional
+        As in `read_columns`.
 
     Returns
     -------
@@ -421,8 +433,8 @@ def read_imposed_test(
     """
     table = tables.read_table(path, skip)
     imposed = Channel(displacement, "displacement", displacement_unit or "m")
-    (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit)
-    values = _channel_values(table, channels, columns, units)
+    (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit, missing)
+    values = _channel_values(table, channels, columns, units, missing)
     measurements = Measurements(tuple(channels), 1.0, values, description)
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
 
@@ -456,7 +468,11 @@ def _record(series: Series, units: str | None, file: str | Path, name: str) -> R
 
 
 def _channel_values(
-    table: tables.Table, channels: Sequence[Channel], columns: Sequence[str], units: str | Sequence[str] | None
+    table: tables.Table,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None,
+    missing: Sequence[float] | None,
 ) -> NDArray[np.float64]:
     """Return columns of a table in SI units, shape (n_channels, n_rows)."""
     given = [units] * len(columns) if units is None or isinstance(units, str) else list(units)
@@ -470,5 +486,5 @@ def _channel_values(
         place = tables.value_column(table, column)
         where = f"{table.file}, column {column!r}"
         unit = agree_on_unit(tables.stated_unit(table, place), unit, channel.dimension, where)
-        rows.append(to_si(table.values[:, place], unit))
+        rows.append(to_si(tables.column_values(table, place, missing), unit))
     return np.array(rows)

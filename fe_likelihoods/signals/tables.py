@@ -4,6 +4,7 @@ The functions return plain numbers, with the units and the step that the file st
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from .text_files import NUMBER, Series, agree_on_unit, check_count, parse_count,
 __all__ = [
     "Table",
     "column_unit",
+    "column_values",
     "csv_series",
     "read_table",
     "stated_unit",
@@ -26,6 +28,7 @@ __all__ = [
 ]
 
 _LONGEST_UNIT = 100
+_SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
 _TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 
 
@@ -191,7 +194,29 @@ def table_step(table: Table, dt: float | None = None) -> float:
     return chosen
 
 
-def csv_series(table: Table, column: str | None = None, dt: float | None = None) -> Series:
+def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
+    """Return the numbers of a column, with NaN for those equal to a number of `missing`.
+
+    If `missing` is None, ValueError is raised for a number that usually stands for missing samples, unless the column
+    has other numbers within 1 % of it.
+    """
+    values = table.values[:, place]
+    if missing is not None:
+        return np.where(np.isin(values, np.asarray(missing, dtype=float)), np.nan, values)
+    for sentinel in _SENTINELS:
+        found = np.flatnonzero(values == sentinel)
+        if found.size and np.count_nonzero(np.abs(values - sentinel) <= 0.01 * abs(sentinel)) == found.size:
+            raise ValueError(
+                f"{table.file}, line {table.lines[found[0]]}: expected a measured number, got {sentinel:g} in "
+                f"{found.size} rows, which usually stands for a missing sample; give missing=({sentinel:g},) to read "
+                "it as NaN, or missing=() if it was measured"
+            )
+    return values
+
+
+def csv_series(
+    table: Table, column: str | None = None, dt: float | None = None, missing: Sequence[float] | None = None
+) -> Series:
     """Return one column of a table as a series, checked against the comments (see `fe_likelihoods.read_csv`)."""
     place = value_column(table, column)
     stated = re.search(r"\bnpts\s*=\s*(\d+)", table.comments)
@@ -202,14 +227,15 @@ def csv_series(table: Table, column: str | None = None, dt: float | None = None)
     unit = stated_unit(table, place)
     if comment and unit is not None:
         unit = agree_on_unit(unit, comment[1], find_unit(unit).dimension, f"{table.file} (column and comment)")
-    missing = np.flatnonzero(np.isnan(table.values[:, place]))
-    if missing.size:
+    values = column_values(table, place, missing)
+    absent = np.flatnonzero(np.isnan(values))
+    if absent.size:
         raise ValueError(
-            f"{table.file}, line {table.lines[missing[0]]}: expected a number, got an empty cell or NaN; an excitation "
-            f"needs all samples, {missing.size} are missing: interpolate them, or cut the file"
+            f"{table.file}, line {table.lines[absent[0]]}: expected a number, got an empty cell or NaN; an excitation "
+            f"needs all samples, {absent.size} are missing: interpolate them, or cut the file"
         )
     title = table.comments.split("\n", 1)[0]
-    return Series(title, table_step(table, dt), unit or (comment and comment[1]), table.values[:, place])
+    return Series(title, table_step(table, dt), unit or (comment and comment[1]), values)
 
 
 def table_start(table: Table, step: float, zero: float = 0.0) -> float:

@@ -496,6 +496,19 @@ class TestColumns:
         found = read_columns(path, (TOP,), ("acc_g",))
         assert (found.dt, found.start) == (1 / 120, 1 / 120)
 
+    @pytest.mark.parametrize("number", ["-9999", "-999.25", "1E+30", "9.97E+36"])
+    def test_numbers_for_missing_samples(self, tmp_path, number):
+        path = tmp_path / "a.csv"
+        path.write_text(f"time_s,acc_g\n0.00,1\n0.01,{number}\n0.02,{number}\n0.03,4\n")
+        for read in (read_csv, lambda path: read_columns(path, (TOP,), ("acc_g",))):
+            with pytest.raises(ValueError, match="line 3: expected a measured number, got .* in 2 rows, .*missing="):
+                read(path)
+        found = read_columns(path, (TOP,), ("acc_g",), missing=(float(number),))
+        np.testing.assert_array_equal(found.values / G0, [[1, np.nan, np.nan, 4]])
+        assert read_csv(path, missing=()).acceleration[1] == pytest.approx(float(number) * G0)
+        path.write_text(f"time_s,acc_g\n0.00,1\n0.01,{number}\n0.02,{0.995 * float(number)}\n0.03,4\n")
+        assert read_csv(path).n_steps == 4
+
     @pytest.mark.parametrize("word", ["NA", "N/A", "NULL", "null", "-", "--"])
     def test_words_for_missing_samples(self, tmp_path, word):
         path = tmp_path / "a.csv"
