@@ -92,7 +92,8 @@ def stated_value(thing: Any) -> list[Any] | None:
 
 def reduced_value(thing: Any) -> list[Any] | None:
     """Parts of the value that an object states for pickle; None if it states none."""
-    reduce = copyreg.dispatch_table.get(type(thing))
+    # libraries that send tracebacks between processes register other forms of the exceptions, in some processes only
+    reduce = None if isinstance(thing, BaseException) else copyreg.dispatch_table.get(type(thing))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of iterators, in later versions of Python

@@ -198,7 +198,8 @@ def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
     assert report["simulations"] == posterior.likelihood.model.runs - report["verifications"] == distinct - stored
     again, replayed = cached_run.make(path)
     again.run_mcmc(None, cached_run.STEPS)
-    assert replayed.likelihood.model.runs == replayed.likelihood.verifications < 5
+    most = 3 + again.evaluations // 1000  # two before the first row, and one of every thousand rows
+    assert replayed.likelihood.model.runs == replayed.likelihood.verifications <= most
     for other in (sampler, again):
         np.testing.assert_array_equal(other.get_chain(), whole.get_chain())
         np.testing.assert_array_equal(other.get_log_prob(), whole.get_log_prob())

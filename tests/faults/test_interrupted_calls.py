@@ -19,6 +19,14 @@ from tests.faults.interrupted import interrupt_lines, make, state_of
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
 
+@pytest.fixture(autouse=True)
+def python_handles_sigint():
+    """Tests that run in the background of a shell start with an ignored SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class Died(Exception):
     """Raised in the body of a loop."""
 

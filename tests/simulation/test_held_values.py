@@ -1,5 +1,6 @@
 """Whatever an object of a user holds is digested by its value, or carries none, or is refused with advice."""
 
+import copyreg
 import json
 import os
 import subprocess
@@ -54,6 +55,12 @@ def test_digests_are_the_same_in_every_process():
     result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True)
     here, there = held_values.digests(), json.loads(result.stdout)
     assert [name for name in here if here[name] != there[name]] == []
+
+
+def test_another_form_of_an_exception_for_pickle_changes_no_digest(monkeypatch):
+    before = code_digest(Holder(VALUES["exception"](1)))
+    monkeypatch.setitem(copyreg.dispatch_table, ValueError, lambda error: (str, ("another form",)))
+    assert code_digest(Holder(VALUES["exception"](1))) == before
 
 
 def test_use_changes_no_digest():
