@@ -32,6 +32,7 @@ from fe_likelihoods import (
     SimulationCache,
     StaleCache,
 )
+from fe_likelihoods.models.function import _changes_itself, _observed
 from fe_likelihoods.simulation import changed_model, source_digest, used_modules
 from fe_likelihoods.simulation.changed_model import SentModel
 from fe_likelihoods.simulation.faults import ChangedModel
@@ -612,6 +613,8 @@ def forget_modules(folder: Path) -> None:
     importlib.invalidate_caches()
     for cached in (used_modules.is_own, used_modules.package_version, source_digest.is_standard):
         cached.cache_clear()
+    _observed.clear()
+    _changes_itself.clear()
 
 
 def likelihood_of(folder: Path, options: dict[str, Any], cache: SimulationCache | None) -> FELikelihood:
