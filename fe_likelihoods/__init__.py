@@ -75,7 +75,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .simulation.disk_cache import SimulationCache
     from .simulation.faults import TransientReason
     from .simulation.local_pool import LocalPool
-    from .simulation.model import Model, SimulationFailed
+    from .simulation.model import ContinuedResponse, Model, SimulationFailed
     from .simulation.verification import StaleCache
     from .units import from_si, to_si
 
@@ -88,6 +88,7 @@ __all__ = [
     "BridgeDeck",
     "Channel",
     "Concrete",
+    "ContinuedResponse",
     "Damper",
     "Dataset",
     "DisplacementHistory",
@@ -356,6 +357,7 @@ _EXPORTS = {
     "simulation.faults": ("TransientReason",),
     "simulation.local_pool": ("LocalPool",),
     "simulation.model": (
+        "ContinuedResponse",
         "Model",
         "SimulationFailed",
     ),

@@ -27,12 +27,14 @@ import numpy as np
 from .bearings import BOUC_WEN, ELASTIC_PLASTIC, RubberLaw, Slider, coulomb, elastic_plastic, regularised
 from .jit import kernel
 
-__all__ = ["N_OUT", "N_STATES", "Isolators", "StepMatrices", "step_isolated"]
+__all__ = ["N_MEMORY", "N_OUT", "N_STATES", "Isolators", "StepMatrices", "step_isolated"]
 
 N_STATES = 12
 """Displacements (5), velocities (5), damper forces (2)."""
 N_OUT = 16
 """Columns of the output: the state, the forces F of the isolators (2), Z (2)."""
+N_MEMORY = 20
+"""Numbers from which an integration goes on: r (12), F of the last two instants (2 + 2), Z (2), displacements (2)."""
 
 
 class StepMatrices(NamedTuple):
@@ -74,8 +76,8 @@ class Isolators(NamedTuple):
 
 
 @kernel
-def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_iterations, work, out):
-    """Integrate from rest.
+def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_iterations, work, out, first, memory):
+    """Integrate from rest, or go on from a sample of an earlier integration.
 
     Parameters
     ----------
@@ -96,6 +98,11 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
         Scratch.
     out : ndarray (n_steps, 16)
         Written: state, F and Z at the samples of the record.
+    first : int
+        0 for an integration from rest. Otherwise `memory` holds the state at this sample, and only later samples are
+        computed and written.
+    memory : ndarray (20,)
+        Written: what the integration needs to go on after the last sample. Read if `first` is not 0.
 
     Returns
     -------
@@ -105,21 +112,23 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
         Newton iterations of all steps.
     """
     step_matrix, end, compliance = matrices.transposed, matrices.end, matrices.compliance
-    first, second = isolators.sliders
+    slider0, slider1 = isolators.sliders
     c, law, form = isolators.c, isolators.rubber, isolators.form
     u, r = work[0], work[1]
-    for i in range(16):
-        u[i] = 0.0
-        out[0, i] = 0.0
-    f0 = f1 = before0 = before1 = 0.0  # F at the last two instants
-    z0 = z1 = 0.0
-    d0 = d1 = 0.0  # bearing displacements
+    if first == 0:
+        memory[:] = 0.0
+        out[0, :] = 0.0
+    for i in range(12):
+        u[i] = memory[i]
+    f0, f1, before0, before1 = memory[12], memory[13], memory[14], memory[15]  # F at the last two instants
+    z0, z1 = memory[16], memory[17]
+    d0, d1 = memory[18], memory[19]  # bearing displacements
     c00, c01, c10, c11 = compliance[0, 0], compliance[0, 1], compliance[1, 0], compliance[1, 1]
     s00, s01, s10, s11 = compliance[2, 0], compliance[2, 1], compliance[3, 0], compliance[3, 1]
     # factor that turns a velocity into a force: the change of F that changes v by one within the step
     pull0, pull1 = 1.0 / abs(s00), 1.0 / abs(s11)
     iterations = 0
-    for k in range(ground.size - 1):
+    for k in range(first, ground.size - 1):
         for sub in range(n_sub):
             at, to = sub / n_sub, (sub + 1) / n_sub
             u[12] = ground[k] + (ground[k + 1] - ground[k]) * at
@@ -149,14 +158,14 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
                 v0, v1 = b2 + s00 * n0 + s01 * n1, b3 + s10 * n0 + s11 * n1
                 stick0 = stick1 = False
                 if form == BOUC_WEN:
-                    p0, k0, m0, g0 = regularised(y0 - d0, y0, v0, z0, w0, first, c, law)
-                    p1, k1, m1, g1 = regularised(y1 - d1, y1, v1, z1, w1, second, c, law)
+                    p0, k0, m0, g0 = regularised(y0 - d0, y0, v0, z0, w0, slider0, c, law)
+                    p1, k1, m1, g1 = regularised(y1 - d1, y1, v1, z1, w1, slider1, c, law)
                 elif form == ELASTIC_PLASTIC:
-                    p0, k0, m0, g0 = elastic_plastic(y0 - d0, y0, v0, z0, w0, first, c, law)
-                    p1, k1, m1, g1 = elastic_plastic(y1 - d1, y1, v1, z1, w1, second, c, law)
+                    p0, k0, m0, g0 = elastic_plastic(y0 - d0, y0, v0, z0, w0, slider0, c, law)
+                    p1, k1, m1, g1 = elastic_plastic(y1 - d1, y1, v1, z1, w1, slider1, c, law)
                 else:
-                    stick0, p0, k0, m0, g0 = coulomb(n0, y0, v0, pull0, w0, first, law)
-                    stick1, p1, k1, m1, g1 = coulomb(n1, y1, v1, pull1, w1, second, law)
+                    stick0, p0, k0, m0, g0 = coulomb(n0, y0, v0, pull0, w0, slider0, law)
+                    stick1, p1, k1, m1, g1 = coulomb(n1, y1, v1, pull1, w1, slider1, law)
                 # residual F - law(y(F)), or v(F) where a bearing sticks, and its derivatives
                 if stick0:
                     e0, j00, j01 = v0 * pull0, s00 * pull0, s01 * pull0
@@ -183,4 +192,8 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
             out[k + 1, i] = u[i] + end[i, 0] * f0 + end[i, 1] * f1
         out[k + 1, 12], out[k + 1, 13] = f0, f1
         out[k + 1, 14], out[k + 1, 15] = z0, z1
+    for i in range(12):
+        memory[i] = u[i]
+    memory[12], memory[13], memory[14], memory[15] = f0, f1, before0, before1
+    memory[16], memory[17], memory[18], memory[19] = z0, z1, d0, d1
     return 0, iterations

@@ -22,21 +22,21 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Slider
-from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, step_isolated
+from ..kernels.isolated_bridge import N_STATES
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples, same_sampling, sample_window
-from ..simulation.model import SimulationFailed
+from ..simulation.model import ContinuedResponse
 from .base import History
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS, channel_matrix
 from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
-from .isolated_bridge_system import BridgeMatrices, BridgeStateSpace
+from .isolated_bridge_run import FORMS, BridgeRun, PreparedBridge, prepare_bridge, run_bridge
+from .isolated_bridge_system import BridgeMatrices
 from .threaded import ThreadedModel
 from .validation import (
     check_fields,
@@ -44,7 +44,6 @@ from .validation import (
     check_names,
     check_nominal,
     check_theta,
-    check_values,
     invalid,
 )
 
@@ -56,27 +55,14 @@ __all__ = ["PARAMETERS", "BridgeHistory", "IsolatedBridge"]
 logger = logging.getLogger(__name__)
 
 PARAMETERS = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
-_MAY_BE_ZERO = ("df_1", "a_1", "df_2", "a_2")
 _EXCHANGED = [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]  # PARAMETERS with the devices of the two piers exchanged
 _LONGEST_STEP = {"bouc-wen": 0.25e-3, "elastic-plastic": 0.05e-3, "coulomb": 0.025e-3}  # of the default [s]
-_FORMS = {"bouc-wen": BOUC_WEN, "elastic-plastic": ELASTIC_PLASTIC, "coulomb": COULOMB}
 _STATE_ROWS = (
     *("deck", "pier_1", "rotation_1", "pier_2", "rotation_2"),
     *("deck velocity", "pier_1 velocity", "rotation_1 velocity", "pier_2 velocity", "rotation_2 velocity"),
     *("damper_1", "damper_2"),
 )
 _WARNED: weakref.WeakSet[IsolatedBridge] = weakref.WeakSet()
-
-
-class _Prepared(NamedTuple):
-    """Inputs of the kernel that are the same for every theta."""
-
-    linear: BridgeStateSpace
-    to_channels: csr_array
-    weights: np.ndarray  # (n_steps, 2) load on the bearings at the samples of the record, negative in uplift [N]
-    law: RubberLaw
-    tolerance: float  # of a correction of the isolator forces [N]
-    rubber_range: float  # bearing displacement up to which the law of the rubber holds [m]
 
 
 @dataclass(frozen=True)
@@ -340,12 +326,40 @@ class IsolatedBridge(ThreadedModel):
         Parameters and errors are those of `simulate`.
         """
         prepared = self._prepared
-        values, iterations = self._integrate(check_theta(theta, self.parameters))
-        beyond = np.abs(prepared.linear.kinematics @ values[:5]).max(axis=1) / prepared.rubber_range
-        rows = csr_array(channel_matrix(self.matrices, self.piers, ALL_CHANNELS)) @ self._drivers(values)
+        run = run_bridge(self, prepared, check_theta(theta, self.parameters), None)
+        beyond = np.abs(prepared.linear.kinematics @ run.values[:5]).max(axis=1) / prepared.rubber_range
+        rows = csr_array(channel_matrix(self.matrices, self.piers, ALL_CHANNELS)) @ run.drivers
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
-        kept = np.concatenate([values[:N_STATES], values[14:16], rows])[:, :: self.every]
-        return BridgeHistory(names, kept, beyond, iterations)
+        kept = np.concatenate([run.values[:N_STATES], run.values[14:16], rows])[:, :: self.every]
+        return BridgeHistory(names, kept, beyond, run.iterations)
+
+    def simulate_from(self, theta: np.ndarray, state: np.ndarray | None = None) -> ContinuedResponse:
+        """Simulate from the state at a sample of the response, and return the state at the last sample.
+
+        Parameters
+        ----------
+        theta : ndarray[n_parameters]
+            As for `simulate`.
+        state : ndarray, optional
+            The state that this method returned for the same theta, and the same bridge under the beginning of its
+            excitation. Default: the bridge at rest.
+
+        Returns
+        -------
+        ContinuedResponse
+            The response after the sample of `state`, with the bits of the last part of ``simulate(theta)``, and the
+            state at the last sample (168 bytes).
+
+        Raises
+        ------
+        SimulationFailed
+            As for `simulate`.
+        ValueError
+            If `state` is not one of this bridge.
+        """
+        theta = check_theta(theta, self.parameters)
+        run = run_bridge(self, self._prepared, theta, state)
+        return ContinuedResponse(self._outputs_of(run, theta), run.state)
 
     def exchange_piers(self, thetas: np.ndarray) -> np.ndarray:
         """Exchange the devices of the two piers: multiples (..., 10) with the same physical values at the other pier.
@@ -366,9 +380,12 @@ class IsolatedBridge(ThreadedModel):
         return plot_bearing_loops(replace(self, every=1).history(theta))
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
+        return self._outputs_of(run_bridge(self, self._prepared, theta, None), theta)
+
+    def _outputs_of(self, run: BridgeRun, theta: np.ndarray) -> np.ndarray:
+        """Channels (n_channels, n_steps) of a simulation; warns once per model beyond the range of the rubber."""
         prepared = self._prepared
-        values, _ = self._integrate(theta)
-        largest = np.abs(prepared.linear.kinematics @ values[:5]).max()
+        largest = np.abs(prepared.linear.kinematics @ run.values[:5]).max()
         if largest > prepared.rubber_range and self not in _WARNED:
             _WARNED.add(self)
             logger.warning(
@@ -379,62 +396,10 @@ class IsolatedBridge(ThreadedModel):
                 1e3 * prepared.rubber_range,
                 dict(zip(self.parameters, theta.tolist(), strict=True)),
             )
-        return prepared.to_channels @ self._drivers(values)[:, :: self.every]
+        return prepared.to_channels @ run.drivers[:, :: self.every]
 
-    def _prepare(self) -> _Prepared:
-        matrices, rubber = self.matrices, self.rubber
-        load = np.array([bearing.load for bearing in self.bearings])
-        lift = np.zeros(self.record.n_steps) if self.vertical is None else self.vertical.acceleration / self.gravity
-        return _Prepared(
-            linear=BridgeStateSpace.of(matrices),
-            # Sparse, because a dense product is left to BLAS, whose last bit depends on its number of threads.
-            to_channels=csr_array(channel_matrix(matrices, self.piers, self.outputs)),
-            weights=(1.0 + lift)[:, None] * load,
-            law=RubberLaw(*map(float, (*rubber.skeleton[1:], *rubber.half_loop, rubber.scale, rubber.limit))),
-            tolerance=self.tolerance * load.min(),
-            rubber_range=rubber.limit * rubber.scale,
-        )
-
-    def _integrate(self, theta: np.ndarray) -> tuple[np.ndarray, float]:
-        """Output of the kernel (16, n_steps of the record), and Newton iterations per step."""
-        v = self.physical_values(theta)
-        check_values(v, _MAY_BE_ZERO)
-        prepared = self._prepared
-        dampers = [Damper(v[f"Kd_{i}"], v[f"C0_{i}"], damper.count) for i, damper in enumerate(self.dampers, 1)]
-        step = self.integration_step
-        matrices = prepared.linear.step_matrices(dampers, step, constant_forces=self.friction == "coulomb")
-        first, second = (
-            Slider(
-                f_min=float(v[f"fmin_{i}"]),
-                df=float(v[f"df_{i}"]),
-                a=float(v[f"a_{i}"]),
-                yield_displacement=float(bearing.yield_displacement),
-                stiffness=float(v[f"fmin_{i}"] * bearing.load / bearing.yield_displacement),
-            )
-            for i, bearing in enumerate(self.bearings, 1)
-        )
-        c = math.sqrt(2.0 * self.bearings[0].gamma - 1.0)
-        out = np.zeros((self.record.n_steps, N_OUT))
-        n_sub = round(self.record.dt / step)
-        status, iterations = step_isolated(
-            matrices,
-            Isolators((first, second), prepared.law, c, _FORMS[self.friction]),
-            self.record.acceleration,
-            prepared.weights,
-            n_sub,
-            prepared.tolerance,
-            self.max_iterations,
-            np.zeros((2, 16)),
-            out,
-        )
-        n_steps = n_sub * (self.record.n_steps - 1)
-        if status:
-            raise SimulationFailed(f"step {status} of {n_steps} (t = {status * step:.4g} s) did not converge")
-        return out.T, iterations / max(1, n_steps)
-
-    def _drivers(self, values: np.ndarray) -> np.ndarray:
-        """State, isolator forces F and acceleration of the table (15, n_steps), of which the channels are linear."""
-        return np.vstack([values[:14], self.record.acceleration])
+    def _prepare(self) -> PreparedBridge:
+        return prepare_bridge(self)
 
     def _check_parts(self) -> None:
         """Raise ValueError for parts of the wrong type or number."""
@@ -471,8 +436,8 @@ class IsolatedBridge(ThreadedModel):
         check_fields(self, positive=("deck_mass", "gravity", "step", "tolerance"), optional=("step",))
         check_integer("max_iterations", self.max_iterations, 2, 10_000)
         check_integer("every", self.every, 1, max(1, self.record.n_steps - 1))
-        if self.friction not in _FORMS:
-            raise invalid(f"friction out of {tuple(_FORMS)}", self.friction, 'the default is "bouc-wen"')
+        if self.friction not in FORMS:
+            raise invalid(f"friction out of {tuple(FORMS)}", self.friction, 'the default is "bouc-wen"')
         ratio = self.record.dt / self.integration_step
         if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             whole = self.record.dt / max(1, math.ceil(ratio))

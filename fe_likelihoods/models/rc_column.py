@@ -28,29 +28,20 @@ a full-scale bridge-column using sequential Monte Carlo (2022): the tested colum
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..kernels.frame import allocate
-from ..kernels.newmark import Dynamics
-from ..kernels.static import Iteration
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
-from ..units import G0
+from ..simulation.model import ContinuedResponse
 from .circular_section import Confinement, gauss_lobatto
-from .rc_column_analysis import (
-    BaseMotion,
-    ColumnHistory,
-    ImposedMotion,
-    check_physical_values,
-    checked_history,
-    set_materials,
-)
+from .rc_column_analysis import ColumnHistory
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
 from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
 from .rc_column_presets import lhpost_arguments
+from .rc_column_run import PreparedColumn, prepare_column, run_column
 from .rc_column_section import ReinforcedSection
 from .threaded import ThreadedModel
 from .validation import (
@@ -81,17 +72,6 @@ PARAMETERS = {
     "mass": "mass at the top [kg]",
     "penetration": "length of strain penetration into the foundation [m]",
 }
-
-
-class _Prepared(NamedTuple):
-    """Inputs of the kernels that are the same for every theta."""
-
-    section: ReinforcedSection
-    fibers: dict[str, np.ndarray]
-    points: np.ndarray
-    weights: np.ndarray
-    motion: BaseMotion | ImposedMotion
-    outputs: tuple[Output, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,7 +341,7 @@ class RCColumn(ThreadedModel):
         positive where the column bends towards positive displacements: ``history["base_moment"]`` is
         ``-history["base moment"]``.
         """
-        history, outputs = self._run(check_theta(theta, self.parameters))
+        history, outputs, _ = run_column(self, self._prepared, check_theta(theta, self.parameters), None)
         sensors = {name: values for name, values in outputs.items() if name not in history.names}
         values = np.vstack([history.values, *sensors.values()])
         return replace(history, names=(*history.names, *sensors), values=values)
@@ -378,49 +358,42 @@ class RCColumn(ThreadedModel):
 
         return plot_column_loops(self, self.history(theta))
 
+    def simulate_from(self, theta: np.ndarray, state: np.ndarray | None = None) -> ContinuedResponse:
+        """Simulate from the state at a sample of the response, and return the state at the last sample.
+
+        Parameters
+        ----------
+        theta : ndarray[n_parameters]
+            As for `simulate`.
+        state : ndarray, optional
+            The state that this method returned for the same theta, and the same column under the beginning of this
+            excitation. Default: the beginning, before the gravity load.
+
+        Returns
+        -------
+        ContinuedResponse
+            The response after the sample of `state`, with the bits of the last part of ``simulate(theta)``, and the
+            state at the last sample (64 kB for the default mesh and two elements).
+
+        Raises
+        ------
+        SimulationFailed
+            As for `simulate`.
+        ValueError
+            For a column under imposed displacement, or a state that is not one of this column.
+        """
+        if not isinstance(self.loading, Record):
+            raise invalid(
+                "a column under a Record", type(self.loading).__name__, "use simulate for imposed displacements"
+            )
+        run = run_column(self, self._prepared, check_theta(theta, self.parameters), state)
+        return ContinuedResponse(np.stack(list(run.outputs.values())), run.state)
+
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        return np.stack(list(self._run(theta)[1].values()))
+        return np.stack(list(run_column(self, self._prepared, theta, None).outputs.values()))
 
-    def _prepare(self) -> _Prepared:
-        section = self.section
-        core, cover, bars = section.fibers()
-        if isinstance(self.loading, Record):
-            motion = BaseMotion.of(self.loading, self.substeps)
-        else:
-            motion = ImposedMotion.of(self.loading, self.max_increment or self.height / 5000.0)
-        fibers = dict(core=core, cover=cover, bars=bars)
-        return _Prepared(section, fibers, *gauss_lobatto(self.n_points), motion, self._parsed_outputs())
-
-    def _run(self, theta: np.ndarray) -> tuple[ColumnHistory, dict[str, np.ndarray]]:
-        """Simulate for multiples `theta` of the nominal parameters; return the history and the outputs by name."""
-        values = self.physical_values(theta)
-        check_physical_values(values, self.steel)
-        prepared = self._prepared
-        column = allocate(
-            n_elements=self.n_elements,
-            height=self.height,
-            corotational=self.geometry == "corotational",
-            element_tolerance=self.element_tolerance,
-            points=prepared.points,
-            weights=prepared.weights,
-            **prepared.fibers,
-            penetration=values["penetration"],
-        )
-        set_materials(column.sections, values, self.concrete, self.steel, prepared.section.confinement(values["fc"]))
-        iteration = Iteration(float(self.tolerance), int(self.max_iterations), int(self.halvings))
-        record = any(output.row is None for output in prepared.outputs)
-        gravity = np.zeros(3 * self.n_elements)
-        gravity[-2] = -(self.axial_load if self.axial_load is not None else values["mass"] * G0)
-        if isinstance(prepared.motion, ImposedMotion):
-            analysis = prepared.motion.run(column, gravity, iteration, record)
-        else:
-            mass = np.zeros(3 * self.n_elements)
-            mass[-3:] = values["mass"], values["mass"] * self.vertical_mass, self.rotational_inertia
-            dynamics = Dynamics(gravity, mass, float(values["a0"]), float(values["a1"]), 0.0)
-            analysis = prepared.motion.run(column, dynamics, iteration, record)
-        rows = dict(zip(analysis.names, analysis.values, strict=True))
-        outputs = {o.name: o.evaluate(rows, analysis.sections, values["penetration"]) for o in prepared.outputs}
-        return checked_history(self, self.steel, self.bar_circle_radius, analysis, theta), outputs
+    def _prepare(self) -> PreparedColumn:
+        return prepare_column(self, self._parsed_outputs())
 
     @property
     def _time_label(self) -> str:

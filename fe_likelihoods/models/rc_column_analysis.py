@@ -123,10 +123,29 @@ class BaseMotion(NamedTuple):
         acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
         return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
 
-    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration, record_sections: bool) -> Analysis:
+    def run(
+        self,
+        column: Column,
+        dynamics: Dynamics,
+        iteration: Iteration,
+        record_sections: bool,
+        first: int,
+        energies: np.ndarray,
+    ) -> Analysis:
         """Integrate the equations of motion; SimulationFailed if a step does not converge.
 
-        With `record_sections`, the deformations of all sections are returned too.
+        Parameters
+        ----------
+        column : Column
+        dynamics : Dynamics
+        iteration : Iteration
+        record_sections : bool
+            Whether the deformations of all sections are returned too.
+        first : int
+            0 for an analysis from the beginning. Otherwise the sample of the response whose state `column` and
+            `energies` hold; the histories are those of the samples after it.
+        energies : ndarray[4]
+            Written, as by `newmark`.
 
         Returns
         -------
@@ -135,13 +154,15 @@ class BaseMotion(NamedTuple):
         """
         history = np.zeros((len(HISTORY_ROWS), self.n_steps))
         sections = _allocate_sections(column, self.n_steps if record_sections else 0)
+        loading = self.acceleration, self.dt, self.substeps
         status, retries, _ = newmark(
-            column, dynamics, self.acceleration, self.dt, self.substeps, iteration, history, sections
+            column, dynamics, *loading, iteration, history, sections, first * self.substeps, energies
         )
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings))
-        return Analysis(HISTORY_ROWS, history, retries, sections)
+        start = first + 1 if first else 0
+        return Analysis(HISTORY_ROWS, history[:, start:], retries, sections[start:])
 
 
 class ImposedMotion(NamedTuple):

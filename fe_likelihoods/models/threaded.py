@@ -21,8 +21,14 @@ class ThreadedModel(BuiltInModel):
 
     A subclass defines `_prepare`, the work that is the same for every theta, and `_respond`, which uses its result,
     `_prepared`.
+
+    Attributes
+    ----------
+    runs_on_threads : bool
+        Whether several simulations may run at once in this process.
     """
 
+    runs_on_threads: ClassVar[bool] = True
     _code_version: ClassVar[str] = KERNEL_HASH
 
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:

@@ -3,14 +3,18 @@
 A model with memory, such as reinforced concrete after cracking, responds to an earthquake according to what happened
 before. A prediction under another record therefore starts from one of two states: "virgin", the state of the model at
 the beginning of its own excitation, or "end", the state at the end of that excitation. For the second, the model runs
-its own excitation, a pause, and the new record, and only the response to the new record is used.
+its own excitation, a pause, and the new record, and only the response to the new record is used. The states at the end
+of both are kept (`fe_likelihoods.simulation.kept_states`).
 """
 
 import warnings
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..signals.records import Record
-from ..simulation.model import Model
+from ..simulation.kept_states import simulate_last_part
+from ..simulation.model import Model, SimulationBatch, simulate_batch
 
 __all__ = ["STATES", "Excitation", "chosen_state", "excite", "under_record"]
 
@@ -36,6 +40,12 @@ class Excitation(NamedTuple):
     first: int
     n_steps: int
     from_state: str
+
+    def simulate(self, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
+        """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters)."""
+        if self.first:
+            return simulate_last_part(self.model, self.first, thetas, pool)
+        return simulate_batch(self.model, thetas, pool)
 
 
 def chosen_state(model: Model, record: Any, from_state: str | None, stacklevel: int = 3) -> str:

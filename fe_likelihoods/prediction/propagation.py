@@ -32,7 +32,8 @@ from ..probability.time_shift_noise import TimeShiftNoise
 from ..signals.channels import Channel
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
-from ..simulation.model import SimulationFailed, simulate_batch
+from ..simulation.kept_states import KEPT_STATES
+from ..simulation.model import SimulationFailed
 from .accumulator import Accumulator
 from .excitation import chosen_state, excite, under_record
 from .inputs import (
@@ -69,6 +70,7 @@ def propagate(
     effective_sample_size: float | None = None,
     batch: int | None = None,
     memory_bytes: int | None = 512 * 2**20,
+    state_bytes: int | None = 256 * 2**20,
     pool: Any = None,
     seed: int | None = None,
     progress: bool = True,
@@ -117,6 +119,10 @@ def propagate(
         retained in single precision (seven digits) if they do not fit in double precision. If they do not fit in
         single precision either, a random subsample is retained, and `Prediction.n_quantile` is its size. None: no
         limit. Single numbers are always retained.
+    state_bytes : int or None
+        Largest size [bytes] of the states that this process keeps for "end". A later prediction with samples at the
+        same parameters then does not run the earlier excitations again; its results have the same bits. 0: no states.
+        None: no limit. Models without a method ``simulate_from`` run the whole excitation.
     pool : optional
         Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
     seed : int, optional
@@ -150,10 +156,13 @@ def propagate(
         raise ValueError(f"batch must be a whole number of simulations, 1 or more; got {batch!r}")
     if memory_bytes is not None and not memory_bytes >= 0:
         raise ValueError(f"memory_bytes must be a number of bytes, or None for no limit; got {memory_bytes!r}")
+    if state_bytes is not None and not state_bytes >= 0:
+        raise ValueError(f"state_bytes must be a number of bytes, or None for no limit; got {state_bytes!r}")
     if record is not None:
         under_record(source.model, record)  # errors come before the warning about the state
     state = chosen_state(source.model, record, from_state)
-    model, first, n_steps, _ = excite(source.model, record, state, rest)
+    excitation = excite(source.model, record, state, rest)
+    model, n_steps = excitation.model, excitation.n_steps
     evaluate = evaluator(quantity, model.channels)
 
     distinct, row_of_sample = distinct_rows(thetas)
@@ -161,6 +170,7 @@ def propagate(
         seeds = np.random.SeedSequence(seed)
     except (TypeError, ValueError) as error:
         raise ValueError(f"seed must be a whole number, zero or more, or None; got {seed!r}") from error
+    KEPT_STATES.limit(state_bytes)
     accumulator = Accumulator(
         members=samples_of_rows(row_of_sample, len(distinct)),
         noise=sample_noise,
@@ -179,8 +189,8 @@ def propagate(
         batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
-            responses, reasons = simulate_batch(model, distinct[start : start + batch], source.executor)
-            accumulator.add(start, np.ascontiguousarray(responses[:, :, first:]), reasons)
+            responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor)
+            accumulator.add(start, responses, reasons)
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
     return _prediction(accumulator, n, effective, evaluate.channels, model.dt, state, shifted)

@@ -25,6 +25,7 @@ from .changed_model import SentModel
 from .faults import ChangedModel, FailedRun, MisfitReason, is_transient, reason_of
 
 __all__ = [
+    "ContinuedResponse",
     "MisfitBatch",
     "Model",
     "SimulationBatch",
@@ -34,6 +35,7 @@ __all__ = [
     "has_batch_method",
     "misfit_batch",
     "misfit_of_responses",
+    "not_finite",
     "real_response",
     "simulate_batch",
     "split_seconds",
@@ -93,6 +95,21 @@ class SimulationBatch(NamedTuple):
     reasons: list[str]
 
 
+class ContinuedResponse(NamedTuple):
+    """Response of one simulation from a given state, and the state at its end.
+
+    Attributes
+    ----------
+    response : (n_channels, n) float
+        [SI] at the samples after that of the given state; at all samples if there was none.
+    state : ndarray
+        What the model needs to go on after the last sample.
+    """
+
+    response: np.ndarray
+    state: np.ndarray
+
+
 class MisfitBatch(NamedTuple):
     """Misfits of a batch of parameter sets.
 
@@ -120,6 +137,9 @@ class Model(Protocol):
     excitation, a model has its `Record` in the attribute ``record`` and one sample of the response per sample of the
     record, or a method ``followed_by(record, rest)``, which returns the same model under its own excitation, a pause of
     ``rest`` seconds and another excitation; the response must end with the samples of the latter.
+
+    With ``simulate_from(theta, state) -> ContinuedResponse`` such predictions do not run the earlier excitation again
+    where theta is the same (`fe_likelihoods.simulation.kept_states`).
 
     With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
     returns the same model under the first part of its excitation. The response of that model must be the first samples
@@ -273,7 +293,7 @@ def misfit_of_responses(
     reduce = _sums_of_squares if statistic is None else statistic
     rows = [_reduced(response, measured, reduce) for response in batch.response]
     misfit = np.reshape(rows, (len(rows), statistic_width(measured, statistic)))
-    reasons = [reason or _not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
+    reasons = [reason or not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
     misfit[[bool(reason) for reason in reasons]] = np.nan
     return MisfitBatch(misfit, reasons)
 
@@ -367,7 +387,7 @@ def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> n
 
 def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, theta: np.ndarray) -> np.ndarray:
     response = _response(model, theta)
-    if reason := _not_finite(model, response):
+    if reason := not_finite(model, response):
         raise SimulationFailed(reason)
     try:
         return _reduced(response, measured, reduce)
@@ -375,7 +395,7 @@ def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, 
         raise SimulationFailed(reason_of(error) if is_transient(error) else MisfitReason(reason_of(error))) from error
 
 
-def _not_finite(model: Model, values: np.ndarray) -> str:
+def not_finite(model: Model, values: np.ndarray) -> str:
     """Reason why one row of responses or misfits is not usable, or an empty string."""
     for channel, value in zip(cycle(model.channels), values, strict=False):  # a statistic repeats the channels
         if not np.isfinite(value).all():
@@ -395,7 +415,7 @@ def _attempt(
         raise
     except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
         return None, reason_of(error)
-    reason = _not_finite(model, result)
+    reason = not_finite(model, result)
     return (None, reason) if reason else (result, "")
 
 
@@ -443,6 +463,6 @@ def _run_whole(
         )
         return None
     for row in np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))):
-        reasons[row] = reasons[row] or _not_finite(model, values[row])
+        reasons[row] = reasons[row] or not_finite(model, values[row])
     values[[bool(reason) for reason in reasons]] = np.nan
     return values, reasons

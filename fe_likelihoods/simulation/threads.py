@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numba
 import numpy as np
 
 from .model import SimulationFailed
 
-__all__ = ["map_threads"]
+__all__ = ["map_threads", "run_on_threads"]
 
 
 def map_threads(
@@ -47,15 +48,18 @@ def map_threads(
         except SimulationFailed as failure:
             reasons[i] = failure.reason
 
-    n_threads = min(numba.get_num_threads(), len(thetas), os.cpu_count() or 1)
+    run_on_threads(one, range(len(thetas)))
+    return out, reasons
+
+
+def run_on_threads(run: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """Results of a function for every item, in their order, on as many threads as numba uses."""
+    n_threads = min(numba.get_num_threads(), len(items), os.cpu_count() or 1)
     if n_threads <= 1:
-        for i in range(len(thetas)):
-            one(i)
-        return out, reasons
+        return [run(item) for item in items]
     with ThreadPoolExecutor(n_threads) as threads:
         try:
-            list(threads.map(one, range(len(thetas))))
+            return list(threads.map(run, items))
         except BaseException:  # Ctrl-C: cancel the simulations that have not begun
             threads.shutdown(wait=False, cancel_futures=True)
             raise
-    return out, reasons

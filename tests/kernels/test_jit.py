@@ -233,7 +233,7 @@ def short_subset() -> dict[str, np.ndarray]:
     out["run"] = np.zeros((len(HISTORY_ROWS), 40))
     ground = 300.0 * np.sin(np.linspace(0.0, 6.0, 40))
     dynamics = Dynamics(golden.gravity(), golden.mass(), golden.A0, golden.A1, 0.0)
-    status = newmark(column(), dynamics, ground, 0.02, 1, iteration, out["run"], np.zeros((0, 6, 2)))
+    status = newmark(column(), dynamics, ground, 0.02, 1, iteration, out["run"], np.zeros((0, 6, 2)), 0, np.zeros(4))
     out["status"] = np.array(status)
     return out
 

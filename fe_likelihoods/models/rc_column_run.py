@@ -1,0 +1,142 @@
+"""One simulation of the reinforced-concrete column, from the beginning or from the state at the end of an earlier one.
+
+The state at a sample of the response is one array: the number of the sample, the energies, and what the kernel keeps
+between two steps (`fe_likelihoods.kernels.newmark.committed_state`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..kernels.frame import Column, allocate
+from ..kernels.newmark import Dynamics, committed_state
+from ..kernels.static import Iteration
+from ..signals.records import Record
+from ..units import G0
+from .circular_section import gauss_lobatto
+from .rc_column_analysis import (
+    BaseMotion,
+    ColumnHistory,
+    ImposedMotion,
+    check_physical_values,
+    checked_history,
+    set_materials,
+)
+from .rc_column_outputs import Output
+from .rc_column_section import ReinforcedSection
+from .validation import check_state
+
+__all__ = ["ColumnRun", "PreparedColumn", "prepare_column", "run_column"]
+
+_N_ENERGIES = 4
+
+
+class PreparedColumn(NamedTuple):
+    """Inputs of the kernels that are the same for every theta."""
+
+    section: ReinforcedSection
+    fibers: dict[str, np.ndarray]
+    points: np.ndarray
+    weights: np.ndarray
+    motion: BaseMotion | ImposedMotion
+    outputs: tuple[Output, ...]
+
+
+class ColumnRun(NamedTuple):
+    """Result of one simulation.
+
+    Attributes
+    ----------
+    history : ColumnHistory
+        Histories of the kernels.
+    outputs : dict of str to ndarray, shape (n_steps,)
+        Outputs of the column by their names.
+    state : ndarray or None
+        State at the last sample; None under imposed displacement.
+    """
+
+    history: ColumnHistory
+    outputs: dict[str, np.ndarray]
+    state: np.ndarray | None
+
+
+def prepare_column(model: Any, outputs: tuple[Output, ...]) -> PreparedColumn:
+    """Inputs of the kernels for a column and its resolved outputs."""
+    section = model.section
+    core, cover, bars = section.fibers()
+    if isinstance(model.loading, Record):
+        motion = BaseMotion.of(model.loading, model.substeps)
+    else:
+        motion = ImposedMotion.of(model.loading, model.max_increment or model.height / 5000.0)
+    fibers = dict(core=core, cover=cover, bars=bars)
+    return PreparedColumn(section, fibers, *gauss_lobatto(model.n_points), motion, outputs)
+
+
+def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: np.ndarray | None) -> ColumnRun:
+    """Simulate for multiples `theta` of the nominal parameters.
+
+    Parameters
+    ----------
+    model : RCColumn
+    prepared : PreparedColumn
+    theta : ndarray[n_parameters]
+    state : ndarray or None
+        State at a sample of the response, from which the simulation goes on; the results are those after this sample.
+        None: from the beginning.
+
+    Returns
+    -------
+    ColumnRun
+
+    Raises
+    ------
+    SimulationFailed
+        If the parameters describe no structure, or the solution does not converge.
+    ValueError
+        If `state` is not a state of this column at a sample before the last one.
+    """
+    values = model.physical_values(theta)
+    check_physical_values(values, model.steel)
+    column = allocate(
+        n_elements=model.n_elements,
+        height=model.height,
+        corotational=model.geometry == "corotational",
+        element_tolerance=model.element_tolerance,
+        points=prepared.points,
+        weights=prepared.weights,
+        **prepared.fibers,
+        penetration=values["penetration"],
+    )
+    set_materials(column.sections, values, model.concrete, model.steel, prepared.section.confinement(values["fc"]))
+    iteration = Iteration(float(model.tolerance), int(model.max_iterations), int(model.halvings))
+    record = any(output.row is None for output in prepared.outputs)
+    gravity = np.zeros(3 * model.n_elements)
+    gravity[-2] = -(model.axial_load if model.axial_load is not None else values["mass"] * G0)
+    if isinstance(prepared.motion, ImposedMotion):
+        analysis, end = prepared.motion.run(column, gravity, iteration, record), None
+    else:
+        mass = np.zeros(3 * model.n_elements)
+        mass[-3:] = values["mass"], values["mass"] * model.vertical_mass, model.rotational_inertia
+        dynamics = Dynamics(gravity, mass, float(values["a0"]), float(values["a1"]), 0.0)
+        energies = np.zeros(_N_ENERGIES)
+        first = 0 if state is None else _restore(column, energies, state, model.n_steps)
+        analysis = prepared.motion.run(column, dynamics, iteration, record, first, energies)
+        parts = (part.ravel() for part in committed_state(column))
+        end = np.concatenate([[model.n_steps - 1], energies, *parts])
+    rows = dict(zip(analysis.names, analysis.values, strict=True))
+    outputs = {o.name: o.evaluate(rows, analysis.sections, values["penetration"]) for o in prepared.outputs}
+    return ColumnRun(checked_history(model, model.steel, model.bar_circle_radius, analysis, theta), outputs, end)
+
+
+def _restore(column: Column, energies: np.ndarray, state: np.ndarray, n_steps: int) -> int:
+    """Write a state into the memory of the column and the energies; return the sample of the response it is for."""
+    parts = committed_state(column)
+    state = check_state(state, 1 + energies.size + sum(part.size for part in parts), n_steps)
+    energies[:] = state[1 : 1 + energies.size]
+    start = 1 + energies.size
+    for part in parts:
+        part[...] = state[start : start + part.size].reshape(part.shape)
+        start += part.size
+    return int(state[0])
