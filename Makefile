@@ -49,6 +49,7 @@ format: $(READY) ## format and fix with ruff
 
 data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_bridge_column_eq1.py
+	$(BIN)/python data/make_bridge_column_events.py
 	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environments, the built documentation and the results

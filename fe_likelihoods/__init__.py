@@ -27,12 +27,16 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .models.rc_column_curves import MaterialCurve, MomentCurvature, material_curves, moment_curvature
     from .models.rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
     from .models.steel_coupon import SteelCoupon
+    from .plots.damage import plot_damage
     from .plots.histories import plot_histories, plot_loop
     from .plots.materials import plot_material, plot_moment_curvature
     from .plots.predictions import plot_bands, plot_fragility
     from .plots.structures import plot_sensors
     from .prediction.averaging import AveragedPrediction, average_predictions
+    from .prediction.damage import Damage, LimitState, damage, limit_states
+    from .prediction.damage_measures import DamageMeasures, damage_measures, damage_outputs
     from .prediction.fragility import Fragility, fit_fragility, fragility, peak_ground_acceleration
+    from .prediction.park_ang import ParkAng, park_ang_constants
     from .prediction.prediction import Prediction
     from .prediction.propagation import fit_measures, propagate
     from .prediction.quantities import peak
@@ -89,6 +93,8 @@ __all__ = [
     "Channel",
     "Concrete",
     "ContinuedResponse",
+    "Damage",
+    "DamageMeasures",
     "Damper",
     "Dataset",
     "DisplacementHistory",
@@ -107,6 +113,7 @@ __all__ = [
     "ImposedTest",
     "IsolatedBridge",
     "JointLikelihood",
+    "LimitState",
     "LinearOscillator",
     "LinearStructure",
     "LocalPool",
@@ -123,6 +130,7 @@ __all__ = [
     "MultivariateNormal",
     "Noise",
     "OpenSeesModel",
+    "ParkAng",
     "Patches",
     "Pier",
     "Posterior",
@@ -150,6 +158,9 @@ __all__ = [
     "Uniform",
     "align",
     "average_predictions",
+    "damage",
+    "damage_measures",
+    "damage_outputs",
     "effective_samples",
     "exceedance",
     "find_modes",
@@ -160,12 +171,15 @@ __all__ = [
     "from_si",
     "growing_durations",
     "innovations",
+    "limit_states",
     "material_curves",
     "moment_curvature",
     "nautilus_prior",
+    "park_ang_constants",
     "peak",
     "peak_ground_acceleration",
     "plot_bands",
+    "plot_damage",
     "plot_fragility",
     "plot_histories",
     "plot_loop",
@@ -243,6 +257,7 @@ _EXPORTS = {
         "Steel",
     ),
     "models.steel_coupon": ("SteelCoupon",),
+    "plots.damage": ("plot_damage",),
     "plots.histories": (
         "plot_histories",
         "plot_loop",
@@ -260,11 +275,26 @@ _EXPORTS = {
         "AveragedPrediction",
         "average_predictions",
     ),
+    "prediction.damage": (
+        "Damage",
+        "LimitState",
+        "damage",
+        "limit_states",
+    ),
+    "prediction.damage_measures": (
+        "DamageMeasures",
+        "damage_measures",
+        "damage_outputs",
+    ),
     "prediction.fragility": (
         "Fragility",
         "fit_fragility",
         "fragility",
         "peak_ground_acceleration",
+    ),
+    "prediction.park_ang": (
+        "ParkAng",
+        "park_ang_constants",
     ),
     "prediction.prediction": ("Prediction",),
     "prediction.propagation": (

@@ -2,8 +2,9 @@
 
 `bridge_column` is the full-scale bridge column of the LHPOST tests, updated as in Ramancha et al. (2022): five
 multiples of nominal values with normal priors truncated at zero, and two noise levels with half-normal priors. The
-measured record and responses are not public. The bundled data are **synthetic** (see ``data/README.md``), and
-`bridge_column_measurements` makes such data for any other base motion.
+measured record and responses are not public. The bundled data are **synthetic** (``data/README.md``): EQ1, and a set
+of EQ1 and a stronger EQ2 (``events=2``) that informs every parameter. `bridge_column_measurements` makes such data for
+any other base motion.
 
 `isolated_bridge` is a bridge on sliding bearings with fluid dampers, after the shake-table tests of Tsopelas et al.
 (1994): ten multiples of nominal values of friction and dampers. Its data are **synthetic** and most nominal values are
@@ -32,13 +33,13 @@ import numpy as np
 
 from .models.isolated_bridge_channels import CHANNEL_SETS
 from .probability.autoregressive_noise import AutoregressiveNoise
-from .probability.distributions import HalfNormal, TruncatedNormal, Uniform
 from .probability.likelihood import FELikelihood
 from .probability.noise import GaussianNoise, SharedGaussianNoise
 from .probability.posterior import Posterior
-from .probability.priors import Prior
+from .probability.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
 from .signals.channels import Channel, Measurements
 from .signals.datasets import Dataset, read_dataset
+from .signals.events import Events
 from .signals.records import Record
 from .simulation.disk_cache import SimulationCache
 from .units import to_si
@@ -46,6 +47,7 @@ from .units import to_si
 __all__ = [
     "BRIDGE_COLUMN_MEANS",
     "BRIDGE_COLUMN_NOISE",
+    "BRIDGE_COLUMN_SENSOR_NOISE",
     "ISOLATED_BRIDGE_NOISE",
     "ISOLATED_BRIDGE_OUTPUTS",
     "ISOLATED_BRIDGE_TRUTH",
@@ -67,10 +69,12 @@ BRIDGE_COLUMN_NOISE = MappingProxyType(
 )
 """Noise levels of Ramancha et al. (2022), Table 2 [SI]: standard deviations of the white noise in the data."""
 
+BRIDGE_COLUMN_SENSOR_NOISE = MappingProxyType({name: 0.25 * level for name, level in BRIDGE_COLUMN_NOISE.items()})
+"""Noise levels of the bundled set of two events [SI], **assumed**: a quarter of those of the paper, which also contain
+the error of its model. 0.005 g and 0.57 mm."""
+
 _COARSE_SHARE = 0.75  # part of the Arias intensity that the coarse column sees
 _COARSE_TOLERANCES = {"tolerance": 1e-3, "element_tolerance": 1e-3}
-
-_NOISE_SCALE = 0.3  # half-normal prior of a sigma in root mean squares of the measured channels (assumed)
 
 
 def _bundled(name: str) -> Dataset:
@@ -78,20 +82,48 @@ def _bundled(name: str) -> Dataset:
         return read_dataset(path)
 
 
-def bridge_column_data() -> Dataset:
-    """Read the bundled synthetic data of earthquake EQ1: base motion, channels and truth (``data/README.md``)."""
-    return _bundled("bridge_column_eq1.h5")
+def bridge_column_data(events: int = 1) -> Dataset:
+    """Read the bundled synthetic data of the bridge column: base motion, channels and truth (``data/README.md``).
+
+    Parameters
+    ----------
+    events : {1, 2}
+        1 is earthquake EQ1. 2 is EQ1, a pause of 10 s and a stronger EQ2: the record is an `Events`, and the
+        measurements are NaN in the pause. Both have the same truth, but other noise levels.
+
+    Returns
+    -------
+    Dataset
+        Base motion, measured channels and truth.
+
+    Raises
+    ------
+    ValueError
+        If there is no such set.
+    """
+    if events == 1:
+        return _bundled("bridge_column_eq1.h5")
+    if events != 2:
+        raise ValueError(f"expected events=1 (EQ1) or events=2 (EQ1 and EQ2); got {events!r}")
+    return _bundled("bridge_column_events.h5")
 
 
 def bridge_column_measurements(
-    record: Record, *, seed: int = 1, n_strips: int = 200, substeps: int = 4, noise: bool = True, **changes
+    record: Record,
+    *,
+    seed: int = 1,
+    n_strips: int = 200,
+    substeps: int = 4,
+    noise: bool = True,
+    levels: Mapping[str, float] = BRIDGE_COLUMN_NOISE,
+    **changes,
 ) -> Measurements:
     """Make synthetic measurements of the bridge column: the response of a refined model plus white noise.
 
     Parameters
     ----------
     record : Record
-        Base acceleration.
+        Base acceleration. In the pauses of `Events` nothing is measured (NaN).
     seed : int
         Seed of the noise.
     n_strips : int
@@ -100,13 +132,15 @@ def bridge_column_measurements(
         Integration steps per sample of the record in the refined model (1 in the model that is updated).
     noise : bool
         Whether to add the noise. False: the response alone.
+    levels : mapping of str to float
+        Standard deviation of the noise of each channel [SI].
     **changes
         Other arguments of `RCColumn.lhpost`.
 
     Returns
     -------
     Measurements
-        The channels "acceleration" and "displacement".
+        The channels "acceleration" and "displacement", or those of the outputs.
     """
     from .models.rc_column import RCColumn
 
@@ -114,64 +148,15 @@ def bridge_column_measurements(
     values = model.simulate([BRIDGE_COLUMN_MEANS[name] for name in model.parameter_names])
     if noise:
         rng = np.random.default_rng(seed)
-        levels = np.array([BRIDGE_COLUMN_NOISE[c.name] for c in model.channels])
-        values = values + levels[:, None] * rng.standard_normal(values.shape)
+        deviations = np.array([levels[c.name] for c in model.channels])
+        values = values + deviations[:, None] * rng.standard_normal(values.shape)
+    if isinstance(record, Events):
+        values = np.where(record.in_events, values, np.nan)
     description = (
         f"SYNTHETIC: response of RCColumn.lhpost ({n_strips} strips, {substeps} integration steps per sample) to "
         f"{record.name} at the paper's posterior means" + (f", plus white noise (seed {seed})" if noise else "")
     )
     return Measurements(model.channels, record.dt, values, description)
-
-
-def bridge_column_prior(
-    noise_parameters: Sequence[str] = ("sigma_acceleration", "sigma_displacement"),
-) -> Prior:
-    """Make the prior of Ramancha et al. (2022).
-
-    The structural parameters are normal with mean 1, truncated at zero, with coefficients of variation of 0.30 (Ec),
-    0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal with scales of 0.1 g and 1.2 in.
-
-    Parameters
-    ----------
-    noise_parameters : sequence of str
-        Parameters of the noise. For another noise than that of the paper: a shared ``sigma`` in root mean squares of
-        the measured channels is half-normal with scale 0.3, correlations ``rho_...`` are uniform between -1 and 1 (both
-        assumed).
-
-    Returns
-    -------
-    Prior
-        The prior of structural parameters and noise.
-
-    Raises
-    ------
-    ValueError
-        If there is no default prior for a parameter of the noise.
-    """
-    structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
-    scales = {
-        "sigma_acceleration": to_si(0.1, "g").item(),
-        "sigma_displacement": to_si(1.2, "in").item(),
-        "sigma": _NOISE_SCALE,
-    }
-    noise = {name: HalfNormal(scales[name]) for name in noise_parameters if name in scales}
-    return Prior(
-        {name: TruncatedNormal(1.0, cv) for name, cv in structural.items()}
-        | noise
-        | _correlation_priors(noise_parameters, scales)
-    )
-
-
-def _correlation_priors(noise_parameters: Sequence[str], scales: Mapping[str, float]) -> dict[str, Uniform]:
-    """Return priors of the noise parameters that are correlations, not standard deviations with a scale."""
-    others = [name for name in noise_parameters if name not in scales]
-    unknown = [name for name in others if not name.startswith("rho_")]
-    if unknown:
-        raise ValueError(
-            f"no default prior for {', '.join(unknown)} of this noise: make Posterior(FELikelihood(...), prior) with "
-            "your own prior"
-        )
-    return {name: Uniform(-1.0, 1.0) for name in others}
 
 
 def _make_noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) -> Any:
@@ -192,6 +177,7 @@ def _make_noise(noise: Any, channels: Sequence[Channel], measurements: Measureme
 
 def bridge_column(
     *,
+    events: int = 1,
     record: Record | None = None,
     measurements: Measurements | None = None,
     every: int = 1,
@@ -207,8 +193,11 @@ def bridge_column(
 
     Parameters
     ----------
+    events : {1, 2}
+        Bundled data: 1 is EQ1, during which the bars stay elastic and the data say nothing about a1. 2 is EQ1 and a
+        stronger EQ2, which inform every parameter (`bridge_column_data`).
     record : Record, optional
-        Base motion. Default: the bundled synthetic EQ1.
+        Base motion. Default: that of the bundled data.
     measurements : Measurements, optional
         Responses at the step of the record. Default: the bundled ones, or, for another record, synthetic measurements
         (`bridge_column_measurements`).
@@ -238,7 +227,8 @@ def bridge_column(
     Raises
     ------
     ValueError
-        If measurements are given without a record or do not match it, or the noise is unknown.
+        If measurements are given without a record or do not match it, there is no such bundled set, or the noise is
+        unknown.
 
     Notes
     -----
@@ -252,8 +242,10 @@ def bridge_column(
     if record is None:
         if measurements is not None:
             raise ValueError("measurements need the record under which they were measured: give record= too")
-        data = bridge_column_data()
+        data = bridge_column_data(events)
         record, measurements = data.record, data.measurements
+    elif events != 1:
+        raise ValueError("events= chooses bundled data; leave it out with a record of your own, which may be Events")
     elif measurements is None:
         measurements = bridge_column_measurements(record, seed=seed)
     if duration is not None:
@@ -373,29 +365,6 @@ def isolated_bridge_measurements(
     return Measurements(model.channels, model.dt, values, description)
 
 
-def isolated_bridge_prior(parameter_names: Sequence[str], sigmas: Mapping[str, float]) -> Prior:
-    """Make the prior of the isolated bridge (assumed).
-
-    The multiples of nominal values are normal with mean 1 and standard deviation 0.5, truncated to [0.2, 2.5]. A noise
-    level with scale s is half-normal with scale 0.3 s, truncated below at 0.001 s.
-
-    Parameters
-    ----------
-    parameter_names : sequence of str
-        Structural parameters.
-    sigmas : mapping of str to float
-        Scale of each noise parameter: 1 for a shared sigma, the measured root mean square of the channel [SI] for a
-        sigma per channel.
-
-    Returns
-    -------
-    Prior
-        The prior of structural parameters and noise.
-    """
-    structural = {name: TruncatedNormal(1.0, 0.5, 0.2, 2.5) for name in parameter_names}
-    return Prior(structural | {name: TruncatedNormal(0.0, _NOISE_SCALE * s, 1e-3 * s) for name, s in sigmas.items()})
-
-
 def isolated_bridge(
     *,
     data: str = "twin",
@@ -467,7 +436,7 @@ def isolated_bridge(
     rms = SharedGaussianNoise.of(measurements).scales
     scales = {"sigma": 1.0} | {f"sigma_{c.name}": scale for c, scale in zip(measurements.channels, rms, strict=True)}
     sigmas = {name: scales[name] for name in law.parameter_names if name in scales}
-    prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | _correlation_priors(
+    prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | correlation_priors(
         law.parameter_names, scales
     )
     posterior = Posterior(FELikelihood(model, measurements, law, cache=cache), prior)

@@ -17,6 +17,8 @@ __all__ = [
     "ChannelLike",
     "ColumnLike",
     "CurveLike",
+    "DamageLike",
+    "ExceedanceLike",
     "FragilityLike",
     "HistoryLike",
     "HoopsLike",
@@ -120,6 +122,27 @@ class FragilityLike(Protocol):
     lower: np.ndarray
     upper: np.ndarray
     curve: CurveLike | None
+
+
+class ExceedanceLike(Protocol):
+    """Probabilities of exceedance, such as `fe_likelihoods.Exceedance`."""
+
+    probability: np.ndarray
+    standard_error: np.ndarray
+
+
+class DamageLike(Protocol):
+    """Damage of a column after events, such as `fe_likelihoods.Damage`; lengths in metres."""
+
+    events: Sequence[str]
+    presence: Mapping[str, ExceedanceLike]
+    location: Mapping[str, ExceedanceLike]
+    extent: Mapping[str, np.ndarray]
+    probabilities: Sequence[float]
+    heights: np.ndarray
+    height: float
+    effective_sample_size: float
+    uncertainty: str
 
 
 class ResidualChecksLike(Protocol):

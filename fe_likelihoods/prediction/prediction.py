@@ -64,6 +64,8 @@ class Prediction:
     shifted : tuple of str
         Channels of the measurements with unknown time shifts (`fe_likelihoods.TimeShiftNoise`). The histories are those
         of the response, without a shift.
+    quantity : object
+        The quantity as it was given to `fe_likelihoods.propagate`.
     """
 
     mean: np.ndarray
@@ -83,6 +85,7 @@ class Prediction:
     noise: bool = False
     from_state: str = "virgin"
     shifted: tuple[str, ...] = ()
+    quantity: object = None
 
     @property
     def sd(self) -> np.ndarray:

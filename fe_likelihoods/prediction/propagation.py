@@ -21,6 +21,7 @@ Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -193,7 +194,8 @@ def propagate(
             accumulator.add(start, responses, reasons)
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
-    return _prediction(accumulator, n, effective, evaluate.channels, model.dt, state, shifted)
+    prediction = _prediction(accumulator, n, effective, evaluate.channels, model.dt, state, shifted)
+    return replace(prediction, quantity=quantity)
 
 
 def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.ndarray:

@@ -7,7 +7,7 @@ data. It carries a checksum over all of them, because a posterior from damaged d
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from ..units import DIMENSIONS
 from .channels import Channel, Measurements
+from .events import Events
 from .hdf5_files import DAMAGE, read_values
 from .records import Record
 
@@ -30,7 +31,7 @@ class Dataset(NamedTuple):
     Attributes
     ----------
     record : Record
-        The excitation.
+        The excitation, an `Events` if one was written.
     measurements : Measurements
         The response.
     attributes : dict
@@ -81,6 +82,9 @@ def write_dataset(path: str | Path, record: Record, measurements: Measurements, 
             samples = file.create_dataset("record/acceleration", data=record.acceleration, dtype="<f8")
             samples.attrs.update({"name": record.name, "source": record.source, "dt": record.dt})
             samples.attrs.update({"units": DIMENSIONS["acceleration"], "dt_units": "s"})
+            if isinstance(record, Events):
+                samples.attrs["events"] = _windows_text(record)
+                samples.attrs["sources"] = json.dumps([each.source for each in record.records])
             values = file.create_dataset("measurements/values", data=measurements.values, dtype="<f8")
             values.attrs.update({"description": measurements.description, "dt": measurements.dt, "dt_units": "s"})
             values.attrs["start"] = measurements.start  # [s]; NaN among the values is a missing sample
@@ -123,7 +127,7 @@ def read_dataset(path: str | Path) -> Dataset:
             samples, values = file["record/acceleration"], file["measurements/values"]
             text, checksum = file.attrs["attributes"], file.attrs["checksum"]
             acceleration, responses = read_values(samples, path), read_values(values, path)
-            record = Record(samples.attrs["name"], samples.attrs["dt"], acceleration, samples.attrs["source"])
+            record = _record(acceleration, samples.attrs)
             columns = [values.attrs[key] for key in ("channel_names", "quantities", "display_units")]
             channels = tuple(Channel(*map(str, each)) for each in zip(*columns, strict=True))
             dt, start = (np.atleast_1d(values.attrs.get(key, 0.0)).tolist() for key in ("dt", "start"))
@@ -142,6 +146,22 @@ def read_dataset(path: str | Path) -> Dataset:
             f"{path}: the contents do not match their checksum; the file is damaged, make it or download it again"
         )
     return Dataset(record, measurements, free)
+
+
+def _windows_text(events: Events) -> str:
+    return json.dumps([window[:3] for window in events.windows])  # name, first sample, sample after the last
+
+
+def _record(acceleration: np.ndarray, attributes: Mapping) -> Record:
+    """Return the record of a file, an `Events` if it was one when it was written."""
+    dt = attributes["dt"]
+    if "events" not in attributes:
+        return Record(attributes["name"], dt, acceleration, attributes["source"])
+    names, firsts, stops = zip(*json.loads(attributes["events"]), strict=True)
+    places = zip(names, firsts, stops, json.loads(attributes["sources"]), strict=True)
+    parts = [Record(name, dt, acceleration[first:stop], source) for name, first, stop, source in places]
+    rests = [(first - stop) * dt for first, stop in zip(firsts[1:], stops[:-1], strict=True)]
+    return Events(parts, rests, names)
 
 
 def _channel_columns(channels: Sequence[Channel]) -> dict[str, list[str]]:
@@ -167,5 +187,7 @@ def _attributes_text(attributes: dict) -> str:
 
 def _checksum(record: Record, measurements: Measurements, attributes: str) -> str:
     names = json.dumps([record.name, record.source, measurements.description, _channel_columns(measurements.channels)])
-    parts = (record.fingerprint, measurements.fingerprint, names, attributes)
+    parts = [record.fingerprint, measurements.fingerprint, names, attributes]
+    if isinstance(record, Events):
+        parts.append(_windows_text(record))
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()

@@ -1,0 +1,288 @@
+r"""Damage as a quantity of the posterior: presence, location and extent.
+
+The presence of a limit state is the probability that its measure exceeds its limit, estimated by the fraction of the
+samples (`fe_likelihoods.prediction.reliability`). Where a limit is one of strain, its location is the same probability
+at each section and side of a column. The extent is given by quantiles of the measures.
+
+The samples are those of the parameters. The probabilities therefore contain the uncertainty of the parameters and not
+the error of the model, which is often larger: a probability of 0 or 1 means that all samples of the parameters agree.
+
+References
+----------
+M. J. Kowalsky (2000), Deformation limit states for circular reinforced concrete bridge columns, Journal of Structural
+Engineering 126(8), 869-878, doi:10.1061/(ASCE)0733-9445(2000)126:8(869).
+California Department of Transportation (2013), Seismic Design Criteria, version 1.7, section 3.2.3.
+K. Kawashima, G. A. MacRae, J. Hoshikuma, K. Nagaya (1998), Residual displacement response spectrum, Journal of
+Structural Engineering 124(5), 523-530, doi:10.1061/(ASCE)0733-9445(1998)124:5(523).
+Y. J. Park, A. H.-S. Ang, Y. K. Wen (1985), Seismic damage analysis of reinforced concrete buildings, Journal of
+Structural Engineering 111(4), 740-757, doi:10.1061/(ASCE)0733-9445(1985)111:4(740).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .damage_measures import SIDES, STRAIN_MEASURES, DamageMeasures
+from .prediction import Prediction
+from .reliability import Exceedance, exceedance
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Damage", "LimitState", "damage", "limit_states"]
+
+_UNITS = {"dissipated energy": (1e-3, "kJ"), "period": (1.0, "s")}
+"""Factor and unit in which a measure is printed; the others are numbers."""
+
+
+class LimitState(NamedTuple):
+    """A limit of a measure of damage.
+
+    Attributes
+    ----------
+    name : str
+        Name of the state that is reached when the measure exceeds the limit.
+    measure : str
+        Name of the measure, such as "bar tension" or "residual drift".
+    limit : float or ndarray, shape (n_samples,)
+        Limit [SI], or one limit for each sample of the prediction, such as fy/Es.
+    source : str
+        Where the limit comes from.
+    """
+
+    name: str
+    measure: str
+    limit: ArrayLike
+    source: str = ""
+
+
+_ASSUMED = (
+    LimitState("cover spalling", "cover compression", 0.004, "Kowalsky (2000), serviceability"),
+    LimitState("wide cracks", "bar tension", 0.015, "Kowalsky (2000), serviceability: residual cracks of about 1 mm"),
+    LimitState("bar fracture", "bar tension", 0.06, "Kowalsky (2000), damage control; Caltrans (2013), #11 and larger"),
+    LimitState(
+        "large residual drift", "residual drift", 0.01, "Japanese practice after 1996, see Kawashima et al. (1998)"
+    ),
+    LimitState("beyond repair", "Park-Ang index", 0.4, "Park, Ang & Wen (1985)"),
+    LimitState("collapse", "Park-Ang index", 1.0, "Park, Ang & Wen (1985)"),
+)
+"""Limit states from the literature. They are assumed to hold for any column."""
+
+
+class Damage(NamedTuple):
+    """Damage of a structure after each event, given the data.
+
+    Attributes
+    ----------
+    events : tuple of str
+        Names of the events.
+    limits : tuple of LimitState
+        The limit states.
+    presence : dict of str to Exceedance
+        For each limit state, the probability that it is reached anywhere, arrays of shape (n_events,), with its Monte
+        Carlo error and interval. Strains, energy and index count from the beginning of the response; drifts are those
+        of the event.
+    location : dict of str to Exceedance
+        For each limit state of strains, the probability at each place, arrays of shape (n_events, n_sections, 2).
+    extent : dict of str to ndarray
+        For each measure its quantiles [SI], shape (n_probabilities, n_events), or, for "bar tension" and "cover
+        compression", (n_probabilities, n_events, n_sections, 2).
+    probabilities : tuple of float
+        Probabilities of the quantiles.
+    heights : ndarray, shape (n_sections,)
+        Heights of the sections [m].
+    sides : tuple of str
+        The sides, "-" at negative and "+" at positive positions in the direction of loading.
+    height, diameter : float
+        Height and diameter of the column [m].
+    measures : DamageMeasures
+        How the measures are defined, with the constants of the Park-Ang index.
+    effective_sample_size : float
+        Effective number of independent samples.
+    from_state : str
+        State of the structure at the beginning, "virgin" or "end".
+    uncertainty : str
+        What the probabilities contain.
+    """
+
+    events: tuple[str, ...]
+    limits: tuple[LimitState, ...]
+    presence: dict[str, Exceedance]
+    location: dict[str, Exceedance]
+    extent: dict[str, np.ndarray]
+    probabilities: tuple[float, ...]
+    heights: np.ndarray
+    sides: tuple[str, ...]
+    height: float
+    diameter: float
+    measures: DamageMeasures
+    effective_sample_size: float
+    from_state: str
+    uncertainty: str
+
+    def table(self) -> str:
+        """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
+
+        A probability of 0 or 1 is given with the bound of its interval, others with their Monte Carlo error. Strains
+        are those of the place with the largest quantile.
+        """
+        width = max(len(name) for name in (*self.presence, *self.extent, "probability of")) + 10
+        head = "".join(f"{event[:23]:>25}" for event in self.events)
+        lines = [f"{'probability of':<{width}}{head}"]
+        for name, each in self.presence.items():
+            cells = [_stated(*values) for values in zip(*each[1:5], strict=True)]
+            lines.append(f"{name:<{width}}" + "".join(f"{cell:>25}" for cell in cells))
+        if self.probabilities:
+            lines += ["", f"{'quantiles ' + ', '.join(f'{p:g}' for p in self.probabilities):<{width}}{head}"]
+        for name, values in self.extent.items():
+            factor, unit = _UNITS.get(name, (1.0, ""))
+            largest = values.reshape(*values.shape[:2], -1).max(axis=2) * factor
+            cells = [" ".join(f"{v:.3g}" for v in column) for column in largest.T]
+            lines.append(f"{name + (f' [{unit}]' if unit else ''):<{width}}" + "".join(f"{c:>25}" for c in cells))
+        return "\n".join([*lines, "", f"The probabilities contain {self.uncertainty}."])
+
+    def plot(self, events: Sequence[str] | None = None) -> Figure:
+        """Draw the column with its probabilities, see `fe_likelihoods.plots.damage.plot_damage`."""
+        from ..plots.damage import plot_damage
+
+        return plot_damage(self, events)
+
+
+def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
+    """Return the default limit states for which there are measures.
+
+    Parameters
+    ----------
+    measures : DamageMeasures
+        The measures.
+
+    Returns
+    -------
+    tuple of LimitState
+        For a column: yield of a bar at the nominal fy/Es, and limits from the literature, which are **assumed**. Use
+        ``limit._replace(limit=...)`` to change one.
+    """
+    names = _names(measures)
+    states = _ASSUMED
+    if np.isfinite(measures.yield_strain):
+        states = (LimitState("bar yield", "bar tension", measures.yield_strain, "nominal fy/Es of the steel"), *states)
+    if not measures.sensors.heights.size:  # limits of drift are for lengths that were divided by a height
+        states = tuple(state for state in states if state.measure != "residual drift" or measures.height != 1.0)
+    return tuple(state for state in states if state.measure in names)
+
+
+def damage(
+    prediction: Prediction,
+    limits: Sequence[LimitState] | None = None,
+    *,
+    effective_sample_size: float | None = None,
+    level: float = 0.95,
+) -> Damage:
+    """Find presence, location and extent of damage from a prediction.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        The result of ``propagate(model, samples, quantity=damage_measures(model))``.
+    limits : sequence of LimitState, optional
+        The limit states. Default: `limit_states`.
+    effective_sample_size : float, optional
+        Effective number of independent samples. Default: that of the prediction.
+    level : float
+        Probability of the intervals of the probabilities, between 0 and 1.
+
+    Returns
+    -------
+    Damage
+
+    Raises
+    ------
+    ValueError
+        If the prediction is of another quantity, contains noise or has no values of the samples, or a limit is of an
+        unknown measure, is not positive, or does not have one value or one for each sample.
+
+    Notes
+    -----
+    With ``from_state="end"`` the prediction, and therefore the damage, covers the new record only. For the damage that
+    accumulates over several events, propagate a model whose loading is `Events`.
+    """
+    measures = prediction.quantity
+    if not isinstance(measures, DamageMeasures):
+        raise ValueError(
+            "damage needs a prediction of damage measures: propagate(model, samples, "
+            f"quantity=damage_measures(model)); this one has quantity={measures!r}"
+        )
+    if prediction.noise:
+        raise ValueError("the noise of sensors does no damage: propagate the measures with noise=False")
+    if prediction.values is None:
+        raise ValueError("damage needs the values of the samples: propagate with memory_bytes=None")
+    states = limit_states(measures) if limits is None else tuple(limits)
+    names = [state.name for state in states]
+    if len(set(names)) != len(names):
+        raise ValueError(f"limit states need different names; got {', '.join(names)}")
+    values = measures.split(prediction.values)
+    effective = prediction.effective_sample_size if effective_sample_size is None else effective_sample_size
+    presence, location = {}, {}
+    for state in states:
+        if state.measure not in values:
+            raise ValueError(
+                f"limit state {state.name!r} is of {state.measure!r}, the measures are {', '.join(values)}; "
+                "damage_measures(measures=...) chooses them"
+            )
+        found, limit = values[state.measure], _limit_per_sample(state, prediction)
+        ratio = found / limit.reshape(-1, *(1,) * (found.ndim - 1))
+        reported = state.limit if np.ndim(state.limit) == 0 else limit.mean()
+        largest = ratio.max(axis=(2, 3)) if ratio.ndim == 4 else ratio
+        presence[state.name] = _exceeded(largest, reported, effective, level)
+        if ratio.ndim == 4:
+            location[state.name] = _exceeded(ratio, reported, effective, level)
+    quantiles = measures.split(prediction.quantiles) if prediction.probabilities else {}
+    return Damage(
+        events=measures.events,
+        limits=states,
+        presence=presence,
+        location=location,
+        extent=quantiles,
+        probabilities=prediction.probabilities,
+        heights=measures.sensors.heights,
+        sides=SIDES,
+        height=measures.height,
+        diameter=measures.diameter,
+        measures=measures,
+        effective_sample_size=float(effective),
+        from_state=prediction.from_state,
+        uncertainty="the uncertainty of the parameters, not the error of the model or of the limits",
+    )
+
+
+def _stated(probability: float, error: float, lower: float, upper: float) -> str:
+    """Probability with its error, or with the bound of its interval if none or all of the samples exceed."""
+    if probability in (0.0, 1.0):
+        return f"{probability:.0f} (< {upper:.3f})" if probability == 0.0 else f"{probability:.0f} (> {lower:.3f})"
+    return f"{probability:.3f} +- {error:.3f}"
+
+
+def _names(measures: DamageMeasures) -> tuple[str, ...]:
+    return measures.measures + (STRAIN_MEASURES if measures.sensors.strains else ())
+
+
+def _limit_per_sample(state: LimitState, prediction: Prediction) -> np.ndarray:
+    """Limits of the samples that did not fail, shape (n,) or (1,)."""
+    limit = np.asarray(state.limit, dtype=float)
+    n = prediction.n_samples + prediction.n_failed
+    if limit.shape not in ((), (n,)) or not np.isfinite(limit).all() or not (limit > 0.0).all():
+        raise ValueError(
+            f"the limit of {state.name!r} must be a positive number, or one for each of the {n} samples; got "
+            f"{state.limit!r}"
+        )
+    return limit.reshape(1) if limit.ndim == 0 else np.delete(limit, prediction.failed)
+
+
+def _exceeded(ratio: np.ndarray, limit: ArrayLike, effective: float, level: float) -> Exceedance:
+    """Probability that the ratio of measure and limit exceeds one, with the limit as its threshold."""
+    found = exceedance(ratio, 1.0, effective_sample_size=effective, level=level)
+    return found._replace(threshold=np.asarray(limit, dtype=float))

@@ -1,0 +1,141 @@
+r"""The damage index of Park & Ang (1985), and its constants from a static analysis of a column.
+
+The index adds the largest displacement and the dissipated energy,
+
+.. math:: D = \frac{\delta_{max}}{\delta_u} + \frac{\beta}{Q_y \delta_u} \int dE,
+
+with the ultimate displacement :math:`\delta_u` under monotonic loading, the yield strength :math:`Q_y` and a factor
+:math:`\beta` of strength deterioration. See ``docs/damage.rst``.
+
+References
+----------
+Y.-J. Park, A. H.-S. Ang (1985), Mechanistic seismic damage model for reinforced concrete, Journal of Structural
+Engineering 111(4), 722-739, doi:10.1061/(ASCE)0733-9445(1985)111:4(722).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..signals.records import DisplacementHistory
+
+if TYPE_CHECKING:
+    from ..models.rc_column import RCColumn
+
+__all__ = ["ParkAng", "park_ang_constants"]
+
+_DRIFTS = (0.03, 0.06, 0.12, 0.2)
+"""Largest drifts of the static analyses; the next one is run only if the column survives."""
+_STEPS = 150
+_LOSS = 0.8  # share of the largest force at which the column has failed
+
+
+class ParkAng(NamedTuple):
+    """Constants of the damage index.
+
+    Attributes
+    ----------
+    ultimate_displacement : float
+        Displacement at failure under monotonic loading [m].
+    yield_force : float
+        Force at yield [N].
+    beta : float
+        Factor of the energy [-].
+    source : str
+        How the constants were found.
+    """
+
+    ultimate_displacement: float
+    yield_force: float
+    beta: float = 0.05
+    source: str = ""
+
+    def check(self) -> None:
+        """Raise ValueError if a constant is not positive and finite; `beta` may be zero."""
+        for name, value in (("ultimate_displacement", self[0]), ("yield_force", self[1])):
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} of ParkAng must be positive [SI]; got {value!r}")
+        if not 0.0 <= self.beta < math.inf:
+            raise ValueError(f"beta of ParkAng must be zero or more; got {self.beta!r}")
+
+    def index(self, peak: ArrayLike, energy: ArrayLike) -> np.ndarray:
+        """Compute the index [-] from the largest absolute displacement [m] and the dissipated energy [J]."""
+        share = self.beta / (self.yield_force * self.ultimate_displacement)
+        return np.asarray(peak) / self.ultimate_displacement + share * np.asarray(energy)
+
+
+def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: float = 0.05) -> ParkAng:
+    """Find the constants of the damage index by pushing the column to failure.
+
+    The top is displaced in one direction. The yield force is the lateral force at the first yield of a bar. The
+    ultimate displacement is reached at the first of three events: a bar in the base section reaches the ultimate strain
+    of the steel; the core, at the hoops, reaches the strain at which the hoops fracture (`RCColumn.confinement`); or
+    the lateral force has decreased to 80 % of its largest value.
+
+    Parameters
+    ----------
+    column : RCColumn
+        The column; its loading is not used.
+    theta : (n_parameters,) array_like, optional
+        Its parameters, such as posterior means. Default: ones, the nominal values.
+    beta : float
+        Factor of the energy. The default, 0.05, is **assumed**. Park & Ang derive it from axial load and reinforcement;
+        0.05 to 0.15 are usual for columns that fail in flexure.
+
+    Returns
+    -------
+    ParkAng
+
+    Raises
+    ------
+    ValueError
+        If `theta` has another length, or no bar yields or none of the three events is reached up to a drift of 20 %.
+    SimulationFailed
+        If the analysis does not converge.
+    """
+    values = np.ones(len(column.parameters)) if theta is None else np.asarray(theta, dtype=float)
+    if values.shape != (len(column.parameters),):
+        raise ValueError(f"expected one value for each of {', '.join(column.parameters)}; got shape {values.shape}")
+    kept = [name not in ("a0", "a1") for name in column.parameters]  # damping does not act in a static analysis
+    names = tuple(name for name, keep in zip(column.parameters, kept, strict=True) if keep)
+    bar, core = column.bar_circle_radius, 0.5 * column.core_diameter
+    outputs = ("force", f"strain@0:{-bar:.10g}", f"strain@0:{core:.10g}")
+    physical = {**column.nominal, **{n: column.nominal[n] * v for n, v in zip(column.parameters, values, strict=True)}}
+    limits = column.steel.ultimate_strain, column.section.confinement(physical["fc"]).ultimate_strain
+    yield_strain = physical["fy"] / physical["Es"]
+    for drift in _DRIFTS:
+        push = DisplacementHistory("monotonic", np.linspace(0.0, drift * column.height, _STEPS + 1))
+        # with a parameter that does not change the column, if all parameters were those of damping
+        static = replace(column, loading=push, outputs=outputs, units=(), parameters=names or ("Ec",))
+        force, tension, compression = static.simulate(values[kept] if names else np.ones(1))
+        after = np.arange(force.size) > np.argmax(force)
+        low = _LOSS * force.max()
+        failures = {
+            "bars at their ultimate strain": _first(tension >= limits[0], tension - limits[0], push.displacement),
+            "fracture of the hoops": _first(-compression >= limits[1], -compression - limits[1], push.displacement),
+            "loss of force": _first(after & (force <= low), force - low, push.displacement),
+        }
+        yield_force = _first(tension >= yield_strain, tension - yield_strain, force)
+        cause = min(failures, key=failures.__getitem__)
+        if failures[cause] < math.inf and yield_force < math.inf:
+            at = "nominal parameters" if theta is None else "given parameters"
+            source = f"static analysis at {at}: first yield of a bar, {cause}; beta assumed"
+            return ParkAng(failures[cause], yield_force, float(beta), source)
+    raise ValueError(
+        f"the column does not fail up to a drift of {100 * _DRIFTS[-1]:.0f} %: give ParkAng(ultimate_displacement, "
+        "yield_force, beta) from a test or from another analysis"
+    )
+
+
+def _first(reached: np.ndarray, excess: np.ndarray, values: np.ndarray) -> float:
+    """Value, interpolated between two steps, at which an excess over a limit is first zero; inf if never reached."""
+    if not reached.any():
+        return math.inf
+    k = max(int(np.argmax(reached)), 1)
+    share = -excess[k - 1] / (excess[k] - excess[k - 1])
+    return float(values[k - 1] + share * (values[k] - values[k - 1]))

@@ -1,0 +1,93 @@
+"""Priors of the ready-made problems in `fe_likelihoods.problems`.
+
+References
+----------
+M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd (2022), Bayesian nonlinear finite element model
+updating of a full-scale bridge-column using sequential Monte Carlo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ..units import to_si
+from .distributions import HalfNormal, TruncatedNormal, Uniform
+from .priors import Prior
+
+__all__ = ["bridge_column_prior", "correlation_priors", "isolated_bridge_prior"]
+
+_NOISE_SCALE = 0.3  # half-normal prior of a sigma in root mean squares of the measured channels (assumed)
+
+
+def bridge_column_prior(
+    noise_parameters: Sequence[str] = ("sigma_acceleration", "sigma_displacement"),
+) -> Prior:
+    """Make the prior of Ramancha et al. (2022).
+
+    The structural parameters are normal with mean 1, truncated at zero, with coefficients of variation of 0.30 (Ec),
+    0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal with scales of 0.1 g and 1.2 in.
+
+    Parameters
+    ----------
+    noise_parameters : sequence of str
+        Parameters of the noise. For another noise than that of the paper: a shared ``sigma`` in root mean squares of
+        the measured channels is half-normal with scale 0.3, correlations ``rho_...`` are uniform between -1 and 1 (both
+        assumed).
+
+    Returns
+    -------
+    Prior
+        The prior of structural parameters and noise.
+
+    Raises
+    ------
+    ValueError
+        If there is no default prior for a parameter of the noise.
+    """
+    structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
+    scales = {
+        "sigma_acceleration": to_si(0.1, "g").item(),
+        "sigma_displacement": to_si(1.2, "in").item(),
+        "sigma": _NOISE_SCALE,
+    }
+    noise = {name: HalfNormal(scales[name]) for name in noise_parameters if name in scales}
+    return Prior(
+        {name: TruncatedNormal(1.0, cv) for name, cv in structural.items()}
+        | noise
+        | correlation_priors(noise_parameters, scales)
+    )
+
+
+def correlation_priors(noise_parameters: Sequence[str], scales: Mapping[str, float]) -> dict[str, Uniform]:
+    """Return priors of the noise parameters that are correlations, not standard deviations with a scale."""
+    others = [name for name in noise_parameters if name not in scales]
+    unknown = [name for name in others if not name.startswith("rho_")]
+    if unknown:
+        raise ValueError(
+            f"no default prior for {', '.join(unknown)} of this noise: make Posterior(FELikelihood(...), prior) with "
+            "your own prior"
+        )
+    return {name: Uniform(-1.0, 1.0) for name in others}
+
+
+def isolated_bridge_prior(parameter_names: Sequence[str], sigmas: Mapping[str, float]) -> Prior:
+    """Make the prior of the isolated bridge (assumed).
+
+    The multiples of nominal values are normal with mean 1 and standard deviation 0.5, truncated to [0.2, 2.5]. A noise
+    level with scale s is half-normal with scale 0.3 s, truncated below at 0.001 s.
+
+    Parameters
+    ----------
+    parameter_names : sequence of str
+        Structural parameters.
+    sigmas : mapping of str to float
+        Scale of each noise parameter: 1 for a shared sigma, the measured root mean square of the channel [SI] for a
+        sigma per channel.
+
+    Returns
+    -------
+    Prior
+        The prior of structural parameters and noise.
+    """
+    structural = {name: TruncatedNormal(1.0, 0.5, 0.2, 2.5) for name in parameter_names}
+    return Prior(structural | {name: TruncatedNormal(0.0, _NOISE_SCALE * s, 1e-3 * s) for name, s in sigmas.items()})

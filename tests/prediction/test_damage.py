@@ -1,0 +1,249 @@
+"""Damage: measures against closed forms and the histories of the column, limit states, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    Channel,
+    DisplacementHistory,
+    Events,
+    IsolatedBridge,
+    LimitState,
+    LinearOscillator,
+    ParkAng,
+    RCColumn,
+    Record,
+    SimulationFailed,
+    damage,
+    damage_measures,
+    damage_outputs,
+    limit_states,
+    park_ang_constants,
+    problems,
+    propagate,
+)
+
+TRUTH = np.array(list(problems.BRIDGE_COLUMN_MEANS.values()))
+CONSTANTS = ParkAng(0.36, 5e5)
+
+
+class Loop:
+    """A model whose response to theta = (amplitude,) is a viscous-elastic loop; it fails for negative amplitudes."""
+
+    parameter_names = ("amplitude",)
+    channels = (
+        Channel("u", "relative displacement", "m"),
+        Channel("f", "lateral force", "N"),
+        Channel("a", "absolute acceleration", "m/s2"),
+    )
+    dt, n_steps, omega, k, c, m = 0.001, 8001, 2.0 * np.pi, 4e5, 6e3, 1e4
+    fingerprint = "loop"
+
+    def simulate(self, theta):
+        if theta[0] < 0.0:
+            raise SimulationFailed("negative amplitude")
+        time = self.dt * np.arange(self.n_steps)
+        u, v = theta[0] * np.sin(self.omega * time), theta[0] * self.omega * np.cos(self.omega * time)
+        force = self.k * u + self.c * v
+        return np.stack([u + 0.01, force, -force / self.m])
+
+
+@pytest.fixture(scope="module")
+def column():
+    motion = problems.bridge_column_data().record.trim(6.0, 12.0).resample(8 / 256)
+    events = Events([motion, motion.scale(4.0), motion], rest=4.0, names=["EQ1", "EQ2", "EQ3"])
+    plain = RCColumn.lhpost(events)
+    return replace(plain, outputs=damage_outputs(plain))
+
+
+@pytest.fixture(scope="module")
+def prediction(column):
+    samples = TRUTH * (1.0 + 0.1 * np.random.default_rng(1).standard_normal((12, 5)))
+    return propagate(column, samples, quantity=damage_measures(column, park_ang=CONSTANTS), progress=False)
+
+
+def test_energy_drifts_and_index_of_a_loop():
+    model, constants = Loop(), ParkAng(0.2, 8e3, 0.1)
+    channels = {"displacement": "u", "force": "f", "acceleration": "a"}
+    measures = damage_measures(model, **channels, height=5.0, park_ang=constants, settle=2.0)
+    found = measures.split(measures(model.simulate([0.05])))
+    energy = 8 * np.pi * model.c * model.omega * 0.05**2  # eight cycles
+    np.testing.assert_allclose(found["dissipated energy"], energy, rtol=1e-4)
+    np.testing.assert_allclose(found["peak drift"], 0.06 / 5.0, rtol=1e-5)
+    np.testing.assert_allclose(found["residual drift"], 0.01 / 5.0, rtol=1e-3)
+    np.testing.assert_allclose(found["Park-Ang index"], 0.06 / 0.2 + 0.1 * energy / (8e3 * 0.2), rtol=1e-4)
+    omega = np.sqrt(model.k / model.m)
+    np.testing.assert_allclose(found["period"], 2.0 * np.pi / omega, rtol=1e-4)
+    np.testing.assert_allclose(found["damping"], model.c / (2.0 * model.m * omega), rtol=1e-4)
+
+
+def test_period_and_damping_are_those_of_a_linear_oscillator():
+    motion = problems.bridge_column_data().record.trim(4.0, 14.0)
+    oscillator = LinearOscillator(Events([motion, motion.scale(0.5)], names=["EQ1", "EQ2"]), period=0.8)
+    measures = damage_measures(
+        oscillator, displacement="displacement", acceleration="acceleration", events=oscillator.record
+    )
+    found = measures.split(measures(oscillator.simulate([1.21, 0.9])))
+    np.testing.assert_allclose(found["period"], 0.8 / 1.1, rtol=2e-3)
+    np.testing.assert_allclose(found["stiffness ratio"], 1.0, rtol=2e-3)
+    np.testing.assert_allclose(found["damping change"], 0.0, atol=2e-4)
+    assert measures.measures == (
+        "peak drift",
+        "residual drift",
+        "period",
+        "damping",
+        "stiffness ratio",
+        "damping change",
+    )
+    assert 0.01 < found["damping"][0] < 0.1
+
+
+def test_strains_of_a_column_are_the_largest_so_far_at_their_places(column):
+    measures = damage_measures(column, park_ang=CONSTANTS)
+    found = measures.split(measures(column.simulate(TRUTH)))
+    history = column.history(TRUTH)
+    bar, radius, height = column.bar_circle_radius, 0.5 * column.diameter, column.section_heights[1]
+    names = [channel.name for channel in column.channels]
+    for k, x in enumerate((-bar, bar)):
+        (name,) = [n for n in names if n.startswith(f"strain@{height:g}:") and abs(float(n.split(":")[1]) - x) < 1e-6]
+        ends = [*(w.first for w in column.loading.windows[1:]), column.n_steps]
+        expected = [history[name][:end].max() for end in ends]
+        np.testing.assert_array_equal(found["bar tension"][:, 1, k], expected)
+    surface = history[f"strain@0:{radius:.10g}"]
+    assert found["cover compression"][2, 0, 1] == -surface.min()
+    assert found["bar tension"].shape == (3, len(np.unique(np.round(column.section_heights, 9))), 2)
+    assert (np.diff(found["bar tension"], axis=0) >= 0.0).all() and found["bar tension"].argmax(axis=1).max() == 0
+
+
+def test_the_stronger_event_leaves_a_softer_column_and_the_energy_accumulates(column):
+    measures = damage_measures(column, measures=("dissipated energy", "stiffness ratio", "period"))
+    found = measures.split(measures(column.simulate(TRUTH)))
+    first, second, third = found["stiffness ratio"]
+    assert first == 1.0 and second < 0.8 and third < 0.8  # EQ3 is EQ1 again
+    assert (np.diff(found["dissipated energy"]) > 0.0).all()
+    history = column.history(TRUTH)
+    shear, u = history["base_shear"], history["displacement"]
+    np.testing.assert_allclose(found["dissipated energy"][-1], np.trapezoid(shear, u))
+    assert measures.sensors.strains == () and "bar tension" not in found
+
+
+def test_presence_location_and_extent(column, prediction):
+    found = damage(prediction)
+    tension = prediction.quantity.split(prediction.values)["bar tension"]
+    limit = column.steel.fy / column.steel.es
+    np.testing.assert_allclose(found.location["bar yield"].probability, (tension > limit).mean(axis=0))
+    np.testing.assert_allclose(found.presence["bar yield"].probability, (tension.max(axis=(2, 3)) > limit).mean(axis=0))
+    assert found.presence["bar yield"].threshold == limit and found.presence["bar yield"].probability[0] < 1.0
+    assert found.presence["bar yield"].probability[1] == 1.0 and 0.5 < found.presence["bar yield"].lower[1] < 1.0
+    np.testing.assert_allclose(
+        found.extent["bar tension"], np.quantile(tension, found.probabilities, axis=0), rtol=1e-6
+    )
+    drift = prediction.quantity.split(prediction.values)["residual drift"]
+    share = damage(prediction, [LimitState("any", "residual drift", np.median(drift[:, 1]))]).presence["any"]
+    assert share.probability[1] == 0.5 and share.standard_error[1] == pytest.approx(np.sqrt(0.25 / 12))
+    text = found.table()
+    assert "bar yield" in text and "1 (> 0.7" in text and "not the error of the model" in text
+    assert found.events == ("EQ1", "EQ2", "EQ3") and found.from_state == "virgin"
+
+
+def test_a_limit_may_differ_between_the_samples_of_which_some_failed():
+    model = Loop()
+    measures = damage_measures(model, displacement="u")
+    amplitudes = np.array([[0.01], [-1.0], [0.02], [0.03]])
+    found = propagate(model, amplitudes, quantity=measures, progress=False)
+    limits = [LimitState("reached", "peak drift", np.array([0.015, 1.0, 0.05, 0.03]))]  # peaks: 0.02, -, 0.03, 0.04
+    assert damage(found, limits).presence["reached"].probability == pytest.approx(2.0 / 3.0)
+    with pytest.raises(ValueError, match="one for each of the 4 samples"):
+        damage(found, [LimitState("reached", "peak drift", np.ones(3))])
+    with pytest.raises(ValueError, match="measures are peak drift, residual drift"):
+        damage(found, [LimitState("reached", "bar tension", 0.1)])
+
+
+def test_a_bridge_on_bearings_has_the_measures_of_its_channels():
+    data = problems.isolated_bridge_data()
+    bridge = IsolatedBridge(data.record.trim(0.0, 4.0), outputs=("Ub_1", "Fb_1"), every=2, step=1e-3)
+    measures = damage_measures(bridge, displacement="Ub_1", force="Fb_1")
+    assert measures.measures == ("peak drift", "residual drift", "dissipated energy")
+    found = damage(propagate(bridge, np.ones((2, 10)), quantity=measures, progress=False))
+    history = bridge.simulate(np.ones(10))
+    np.testing.assert_allclose(found.extent["dissipated energy"][1], np.trapezoid(history[1], history[0]))
+    assert found.limits == () and found.location == {}
+    with pytest.raises(ValueError, match="needs probabilities at sections"):
+        found.plot()
+
+
+def test_constants_of_the_index_are_those_of_the_pushed_column(column):
+    constants = park_ang_constants(column, TRUTH)
+    bar, core = column.bar_circle_radius, 0.5 * column.core_diameter
+    push = DisplacementHistory("push", np.linspace(0.0, constants.ultimate_displacement, 120))
+    outputs = ("force", f"strain@0:{-bar:.10g}", f"strain@0:{core:.10g}")
+    static = replace(column, loading=push, outputs=outputs, units=(), parameters=("Ec", "Es", "ft"))
+    force, tension, compression = static.simulate(TRUTH[[0, 1, 4]])
+    assert -compression[-1] == pytest.approx(column.confinement.ultimate_strain, rel=2e-3)
+    at_yield = np.interp(column.steel.fy / (TRUTH[1] * column.steel.es), tension, force)
+    assert constants.yield_force == pytest.approx(at_yield, rel=2e-3) and "hoops" in constants.source
+    assert park_ang_constants(column).ultimate_displacement != constants.ultimate_displacement
+    with pytest.raises(ValueError, match="one value for each of Ec, Es"):
+        park_ang_constants(column, [1.0])
+
+
+def test_what_the_outputs_do_not_show_is_refused_with_the_output_that_is_needed(column, prediction):
+    plain = replace(column, outputs=None)
+    with pytest.raises(ValueError, match=r"lacks the outputs base_shear, strain@0:.*damage_outputs"):
+        damage_measures(plain)
+    with pytest.raises(ValueError, match="lacks the outputs base_shear that dissipated energy need"):
+        damage_measures(plain, measures=("period", "dissipated energy"))
+    assert damage_measures(plain, measures=("period",)).measures == ("period",)
+    with pytest.raises(ValueError, match="measures must be some of"):
+        damage_measures(column, measures=("crack width",))
+    with pytest.raises(ValueError, match="needs its constants"):
+        damage_measures(Loop(), measures=("Park-Ang index",), displacement="u", force="f")
+    with pytest.raises(ValueError, match="without a channel of acceleration: name it"):
+        damage_measures(Loop(), measures=("period",), displacement="u")
+    with pytest.raises(ValueError, match="are measures of an RCColumn"):
+        damage_measures(Loop(), measures=("bar tension",))
+    with pytest.raises(ValueError, match="under a Record"):
+        damage_measures(RCColumn.lhpost(DisplacementHistory("push", [0.0, 0.1]), parameters=("Ec",)))
+    with pytest.raises(ValueError, match="propagate"):
+        damage(replace(prediction, quantity=None))
+    with pytest.raises(ValueError, match="memory_bytes=None"):
+        damage(replace(prediction, values=None))
+    with pytest.raises(ValueError, match="different names"):
+        damage(prediction, [LimitState("a", "peak drift", 1.0)] * 2)
+    other = Record("short", column.dt, np.zeros(20))
+    with pytest.raises(ValueError, match="samples, got 20"):
+        propagate(column, TRUTH[None], quantity=prediction.quantity, record=other, from_state="virgin", progress=False)
+
+
+def test_noise_is_no_damage(prediction):
+    with pytest.raises(ValueError, match="noise of sensors does no damage"):
+        damage(replace(prediction, noise=True))
+
+
+def test_default_limits_have_sources(prediction):
+    states = limit_states(prediction.quantity)
+    assert {state.measure for state in states} == {
+        "bar tension",
+        "cover compression",
+        "residual drift",
+        "Park-Ang index",
+    }
+    assert all(state.source for state in states)
+    assert limit_states(damage_measures(Loop(), displacement="u")) == ()
+
+
+def test_figure_has_the_probabilities_of_each_section(prediction):
+    found = damage(prediction)
+    figure = found.plot(["EQ1", "EQ2"])
+    panels = figure.axes[:10]  # two rows of four limit states and the text
+    titles = [axes.get_title() for axes in panels]
+    assert titles[5].startswith("bar yield\n100 %") and titles[3].startswith("bar fracture\n0 %")
+    at_base = found.location["bar yield"].probability[1, 0]
+    shown = [text.get_text() for text in panels[5].texts]
+    assert shown[:2] == [f"{100 * p:.0f}" for p in at_base]
+    assert any("Park-Ang index" in text.get_text() for text in panels[9].texts)
+    assert "not the error of the model" in figure.axes[-1].get_xlabel()
+    with pytest.raises(ValueError, match="EQ9"):
+        found.plot(["EQ9"])
