@@ -61,14 +61,12 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .signals.durations import growing_durations
     from .signals.error_measures import rrmse
     from .signals.events import Events, EventWindow
+    from .signals.measurement_readers import ImposedTest, read_columns, read_imposed_test
     from .signals.readers import (
-        ImposedTest,
         read_at2,
-        read_columns,
         read_csv,
         read_esm,
         read_geonet,
-        read_imposed_test,
         read_knet,
         read_record,
         read_smc,
@@ -362,14 +360,16 @@ _EXPORTS = {
         "EventWindow",
         "Events",
     ),
-    "signals.readers": (
+    "signals.measurement_readers": (
         "ImposedTest",
-        "read_at2",
         "read_columns",
+        "read_imposed_test",
+    ),
+    "signals.readers": (
+        "read_at2",
         "read_csv",
         "read_esm",
         "read_geonet",
-        "read_imposed_test",
         "read_knet",
         "read_record",
         "read_smc",

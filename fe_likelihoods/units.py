@@ -98,9 +98,9 @@ def find_unit(name: str, dimension: str | None = None) -> Unit:
     """Return the unit with a name.
 
     The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are all
-    ``cm/s2``; ``kN-m``, ``kN*m`` and ``kNm`` are ``kN m``; ``ue`` is ``microstrain``. Letter case is ignored, because
-    file headers are often in capitals, except for the prefix of ``MN`` and ``MPa``: ``mN`` would be smaller by a factor
-    of 10⁹.
+    ``cm/s2``; ``kN-m``, ``kN*m``, ``kN.m``, ``kN_m`` and ``kNm`` are ``kN m``; ``seconds`` is ``s``; ``ue`` is
+    ``microstrain``. Letter case is ignored, because file headers are often in capitals, except for the prefix of ``MN``
+    and ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
 
     Parameters
     ----------
@@ -189,10 +189,15 @@ def _lookup(name: str) -> Unit | None:
         return UNITS[text]
     if text.lower() in _MICROSTRAIN:
         return UNITS["microstrain"]
-    text = re.sub(r"(?<=[A-Za-z])[-*·](?=[A-Za-z])", "", text)
-    text = re.sub("sec", "s", text, flags=re.IGNORECASE).replace("**", "").replace("^", "").replace("²", "2")
+    text = re.sub(r"(?<=[A-Za-z])[-*·.](?=[A-Za-z])", "", text)
+    text = re.sub(r"milli(?=sec)", "m", text, flags=re.IGNORECASE)
+    text = re.sub(r"sec(onds?|s)?(?![a-z])", "s", text, flags=re.IGNORECASE)
+    text = text.replace("**", "").replace("^", "").replace("²", "2")
+    product = _BY_LOWER_CASE.get(text.replace("_", "").lower())
     text = re.sub(r"/s/s$", "/s2", text.replace("_", "/"), flags=re.IGNORECASE)
     unit = _BY_LOWER_CASE.get(text.lower())
+    if unit is None and product is not None and product.dimension == "moment":  # kN_m; c_m is no unit
+        unit = product
     if unit is not None and unit.name.startswith("M") and not text.startswith("M"):
         return None
     return unit

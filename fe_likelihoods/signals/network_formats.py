@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import from_si, to_si
-from .text_files import NUMBER, Series, agree_on_unit, check_count, parse_count, parse_number
+from .clock_times import is_clock
+from .text_files import NUMBER, Series, agree_on_unit, check_count, is_number, parse_count, parse_number
 
 __all__ = ["GeonetComponent", "parse_esm", "parse_geonet", "parse_knet", "parse_smc", "recognise"]
 
@@ -84,9 +85,22 @@ def recognise(text: str) -> tuple[str, str | None]:
     reader : str or None
         Name of the function; None for a format that is not read.
     """
-    lines = text[:8000].splitlines()[:_LOOK]
-    name = _name_of(lines, text[:8])
+    lines = text[:8000].splitlines()
+    name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text[:8])
     return name, _READERS.get(name)
+
+
+def _is_table(lines: list[str]) -> bool:
+    """Whether two successive lines are numbers between commas, semicolons or tabs, which no format here has."""
+    before = False
+    for line in lines:
+        separator = next((each for each in (";", "\t", ",") if each in line), None)
+        cells = [] if separator is None else [cell.strip() for cell in line.split(separator)]
+        numbers = len(cells) > 1 and all(is_number(cell.replace(",", ".")) or is_clock(cell) for cell in cells)
+        if numbers and before:
+            return True
+        before = numbers
+    return False
 
 
 def _name_of(lines: list[str], start: str) -> str:

@@ -1,4 +1,4 @@
-"""Readers of ground motions and measured responses: formats of strong-motion networks, CSV, and Excel workbooks.
+"""Readers of ground motions: formats of strong-motion networks, CSV, and Excel workbooks.
 
 `read_record` recognises the format of a ground motion. The other readers name the format of a file that they do not
 read.
@@ -6,7 +6,8 @@ read.
 Every reader converts to SI units. It takes the unit and the time step from the file or from its arguments, and raises
 ValueError if neither states them or if they disagree. The formats themselves are in
 `fe_likelihoods.signals.file_formats` (AT2, V2), `fe_likelihoods.signals.network_formats` (SMC, GeoNet, K-NET, ESM) and
-`fe_likelihoods.signals.tables` (CSV).
+`fe_likelihoods.signals.tables` (CSV). Measured responses have their readers in
+`fe_likelihoods.signals.measurement_readers`.
 """
 
 import contextlib
@@ -15,45 +16,23 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ..units import to_si
 from . import file_formats, network_formats, tables
-from .channels import Channel, Measurements
-from .records import DisplacementHistory, Record
+from .records import Record
 from .text_files import Series, agree_on_unit, read_bytes, read_text
 
 __all__ = [
-    "ImposedTest",
+    "named_format",
     "read_at2",
-    "read_columns",
     "read_csv",
     "read_esm",
     "read_geonet",
-    "read_imposed_test",
     "read_knet",
     "read_record",
     "read_smc",
     "read_v2",
 ]
-
-
-class ImposedTest(NamedTuple):
-    """A laboratory test with an imposed displacement.
-
-    Attributes
-    ----------
-    history : DisplacementHistory
-        The imposed displacement.
-    measurements : Measurements
-        The channels measured at its steps. ``measurements.dt`` is 1, one step.
-    """
-
-    history: DisplacementHistory
-    measurements: Measurements
 
 
 def read_at2(path: str | Path, units: str | None = None) -> Record:
@@ -80,7 +59,7 @@ def read_at2(path: str | Path, units: str | None = None) -> Record:
         If the file does not exist, has no header or no unit, contains another quantity than acceleration, has another
         number of samples than NPTS, or has a sample that is not a finite number.
     """
-    with _named_format(path, "read_at2"):
+    with named_format(path, "read_at2"):
         series = file_formats.parse_at2(read_text(path), str(path))
     return _record(series, units, path, Path(path).stem)
 
@@ -104,7 +83,7 @@ def read_smc(path: str | Path) -> Record:
         If the file does not exist, is no SMC file of acceleration, or does not have the number of samples and the peaks
         that its header states.
     """
-    with _named_format(path, "read_smc"):
+    with named_format(path, "read_smc"):
         series = network_formats.parse_smc(read_text(path), str(path))
     return _record(series, None, path, Path(path).stem)
 
@@ -130,7 +109,7 @@ def read_geonet(path: str | Path, component: str | None = None) -> Record:
         If the file does not exist or is no GeoNet file, the component does not exist (the message lists them), or a
         component does not have the number of samples and the peak that its header states.
     """
-    with _named_format(path, "read_geonet"):
+    with named_format(path, "read_geonet"):
         found = network_formats.parse_geonet(read_text(path), str(path))
     chosen = [each for each in found if component is None or each.component.lower() == component.lower()]
     if len(chosen) != 1:
@@ -160,7 +139,7 @@ def read_knet(path: str | Path) -> Record:
         If the file does not exist, is no K-NET file, or does not have the number of samples and the peak that its
         header states.
     """
-    with _named_format(path, "read_knet"):
+    with named_format(path, "read_knet"):
         series = network_formats.parse_knet(read_text(path), str(path))
     return _record(series, None, path, Path(path).name)
 
@@ -184,12 +163,17 @@ def read_esm(path: str | Path) -> Record:
         If the file does not exist, is no such file of acceleration, or does not have the number of samples and the peak
         that its header states.
     """
-    with _named_format(path, "read_esm"):
+    with named_format(path, "read_esm"):
         series = network_formats.parse_esm(read_text(path), str(path))
     return _record(series, None, path, Path(path).stem)
 
 
-def read_record(path: str | Path, channel: int | str | None = None, units: str | None = None) -> Record:
+def read_record(
+    path: str | Path,
+    channel: int | str | None = None,
+    units: str | None = None,
+    missing: Sequence[float] | None = None,
+) -> Record:
     """Read a ground motion from a file of any format that is read here, which is recognised by its first lines.
 
     Parameters
@@ -200,6 +184,8 @@ def read_record(path: str | Path, channel: int | str | None = None, units: str |
         Channel number (V2), component (GeoNet) or column (CSV), if the file has more than one.
     units : str, optional
         Unit of the acceleration, if an AT2 or CSV file does not state it.
+    missing : sequence of float, optional
+        For a CSV file: numbers that stand for missing samples, as in `read_csv`.
 
     Returns
     -------
@@ -223,7 +209,7 @@ def read_record(path: str | Path, channel: int | str | None = None, units: str |
         return {"read_v2": read_v2, "read_geonet": read_geonet}[reader](path, channel)
     if reader is not None:
         return {"read_smc": read_smc, "read_knet": read_knet, "read_esm": read_esm}[reader](path)
-    return read_csv(path, units, column=channel)
+    return read_csv(path, units, column=channel, missing=missing)
 
 
 def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:
@@ -254,7 +240,7 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
         If the file or the channel does not exist, several channels match (the message lists them), or the file is
         damaged.
     """
-    with _named_format(path, "read_v2"):
+    with named_format(path, "read_v2"):
         candidates = file_formats.find_v2_channels(path, member)
     chosen = [each for each in candidates if channel is None or each.channel == channel]
     if len(chosen) != 1:
@@ -320,127 +306,13 @@ def read_csv(
         If the file or the column does not exist, unit or step are missing or contradictory, a cell is not a finite
         number or is empty, or a time step is irregular (the message names the first one).
     """
-    with _named_format(path, "read_csv"):
+    with named_format(path, "read_csv"):
         series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt, missing)
     return _record(series, units, path, Path(path).stem)
 
 
-def read_columns(
-    path: str | Path,
-    channels: Sequence[Channel],
-    columns: Sequence[str],
-    units: str | Sequence[str] | None = None,
-    dt: float | None = None,
-    description: str = "",
-    *,
-    time_unit: str | None = None,
-    skip: int | None = None,
-    zero: float = 0.0,
-    missing: Sequence[float] | None = None,
-) -> Measurements:
-    """Read measured responses from the columns of a CSV file or workbook with a header line (see `read_csv`).
-
-    An empty cell, ``NaN``, ``NA``, ``N/A``, ``#N/A``, ``NULL``, ``-`` or ``--`` is a missing sample.
-
-    Parameters
-    ----------
-    path : str or path
-        The file.
-    channels : sequence of Channel
-        The measured channels.
-    columns : sequence of str
-        Names of the columns in the header line, one per channel.
-    units : str or sequence of str, optional
-        Unit of the numbers, one for all columns or one per column. Not needed if the names of the columns end with the
-        unit (``disp_in``). If both are given, they must agree.
-    dt : float, optional
-        Time step [s], needed for a file without times.
-    description : str, optional
-        Description of the measurements.
-    time_unit : str, optional
-        Unit of the times, if the name of their column does not end with it.
-    skip : int, optional
-        Number of lines above the table, if they are not found.
-    zero : float, optional
-        Time in the file at which the excitation begins [s].
-    missing : sequence of float, optional
-        Numbers that stand for missing samples; they are read as NaN. By default, -9999, -999.25, 1e30 and 9.97e36
-        are refused unless other numbers lie within 1 % of them; ``()`` takes all numbers as measured.
-
-    Returns
-    -------
-    Measurements
-        The channels. They start at the first time of the file minus `zero`, so a file that begins at 0.37 s keeps this
-        time; give ``zero=0.37`` if the excitation begins with it.
-
-    Raises
-    ------
-    ValueError
-        If a column is missing, a unit is missing or has another dimension than its channel, the times are not uniform,
-        or a cell is not a finite number.
-    """
-    with _named_format(path, "read_columns"):
-        table = tables.read_table(path, skip, time_unit)
-    values = _channel_values(table, channels, columns, units, missing)
-    step = tables.table_step(table, dt)
-    return Measurements(tuple(channels), step, values, description, tables.table_start(table, step, zero))
-
-
-def read_imposed_test(
-    path: str | Path,
-    displacement: str,
-    channels: Sequence[Channel],
-    columns: Sequence[str],
-    units: str | Sequence[str] | None = None,
-    displacement_unit: str | None = None,
-    description: str = "",
-    *,
-    skip: int | None = None,
-    missing: Sequence[float] | None = None,
-) -> ImposedTest:
-    """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
-
-    Parameters
-    ----------
-    path : str or path
-        The file.
-    displacement : str
-        Name of the column with the imposed displacement.
-    channels : sequence of Channel
-        The measured channels, as in `read_columns`.
-    columns : sequence of str
-        Names of the columns in the header line, one per channel.
-    units : str or sequence of str, optional
-        Unit of the numbers, as in `read_columns`.
-    displacement_unit : str, optional
-        Unit of the displacement, if the name of its column does not end with it.
-    description : str, optional
-        Description of the measurements.
-    skip : int, optional
-        Number of lines above the table, if they are not found.
-    missing : sequence of float, optional
-        As in `read_columns`.
-
-    Returns
-    -------
-    ImposedTest
-        The history, named after the file, and the measurements.
-
-    Raises
-    ------
-    ValueError
-        As `read_columns`, except for times, which the test does not have.
-    """
-    table = tables.read_table(path, skip)
-    imposed = Channel(displacement, "displacement", displacement_unit or "m")
-    (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit, missing)
-    values = _channel_values(table, channels, columns, units, missing)
-    measurements = Measurements(tuple(channels), 1.0, values, description)
-    return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
-
-
 @contextlib.contextmanager
-def _named_format(path: str | Path, reader: str) -> Iterator[None]:
+def named_format(path: str | Path, reader: str) -> Iterator[None]:
     """Name the format of a file that a reader refuses, if it is another one that is known."""
     try:
         yield
@@ -465,26 +337,3 @@ def _record(series: Series, units: str | None, file: str | Path, name: str) -> R
     # The source has the name of the file without its folder, because it is written into data sets that are shared.
     source = Path(file).name + (f": {series.title}" if series.title else "")
     return Record(name, series.dt, to_si(series.values, unit, "acceleration"), source)
-
-
-def _channel_values(
-    table: tables.Table,
-    channels: Sequence[Channel],
-    columns: Sequence[str],
-    units: str | Sequence[str] | None,
-    missing: Sequence[float] | None,
-) -> NDArray[np.float64]:
-    """Return columns of a table in SI units, shape (n_channels, n_rows)."""
-    given = [units] * len(columns) if units is None or isinstance(units, str) else list(units)
-    if isinstance(columns, str) or not len(channels) == len(columns) == len(given):
-        raise ValueError(
-            f"expected one column and one unit for each of {len(channels)} channels, got columns {columns!r}, "
-            f"units {units!r}"
-        )
-    rows = []
-    for channel, column, unit in zip(channels, columns, given, strict=True):
-        place = tables.value_column(table, column)
-        where = f"{table.file}, column {column!r}"
-        unit = agree_on_unit(tables.stated_unit(table, place), unit, channel.dimension, where)
-        rows.append(to_si(tables.column_values(table, place, missing), unit))
-    return np.array(rows)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..units import find_unit
+from .clock_times import is_clock, is_date
 from .text_files import LARGEST_FILE, is_number, read_bytes
 
 __all__ = ["Rows", "decode_table", "read_rows"]
@@ -128,7 +129,9 @@ def _find_separator(lines: Sequence[str]) -> str:
 
 
 def _known(cell: str) -> bool:
-    return not _is_missing(cell) and (is_number(cell) or bool(_DECIMAL_COMMA.match(cell)))
+    return not _is_missing(cell) and (
+        is_number(cell) or bool(_DECIMAL_COMMA.match(cell)) or is_clock(cell) or is_date(cell)
+    )
 
 
 def _is_missing(cell: str) -> bool:
@@ -227,9 +230,26 @@ def _find_header(
     if not found:
         return (), (), len(lines)
     place, last = found[-1]
-    if len(found) > 1 and found[-2][0] == place - 1 and all(cell == "" or _unit_of(cell) for cell in last):
-        return found[-2][1], tuple(_unit_of(cell) for cell in last), place + 1
+    if len(found) > 1 and found[-2][0] == place - 1 and _are_units(last):
+        return found[-2][1], tuple(cell.strip("[]() ") for cell in last), place + 1
     return last, (), place + 1
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Whether a line below a header line has units: all cells are, one is a unit of time, or all are in brackets.
+
+    Cells that are no known unit are refused where their column is read.
+    """
+    given = [cell for cell in cells if cell]
+    if all(map(_unit_of, given)) or all(cell[0] + cell[-1] in ("()", "[]") for cell in given):
+        return True
+    return any(_is_time_unit(cell) for cell in given)
+
+
+def _is_time_unit(cell: str) -> bool:
+    """Whether a cell is a unit of time; a capital S may be the direction south."""
+    text = _unit_of(cell)
+    return text != "" and text != "S" and find_unit(text).dimension == "time"
 
 
 def _is_text(cells: Sequence[str]) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import find_unit, to_si
+from .clock_times import is_clock, is_date, parse_clock, seconds_since_midnight
 from .table_rows import read_rows
 from .text_files import NUMBER, Series, agree_on_unit, check_count, parse_count, parse_number
 
@@ -53,6 +54,12 @@ class Table(NamedTuple):
         Units below the header line, an empty string per column if there are none.
     time_unit : str or None
         Unit of the times as given by the caller.
+    clocks : frozenset of int
+        Columns of clock times. Their values are the seconds since the midnight before the first one.
+    dates : frozenset of int
+        Columns of dates, which have no values.
+    day : int or None
+        Number of the day of the first clock time, None without a date.
     """
 
     file: str
@@ -63,6 +70,9 @@ class Table(NamedTuple):
     comments: str
     units: tuple[str, ...]
     time_unit: str | None = None
+    clocks: frozenset[int] = frozenset()
+    dates: frozenset[int] = frozenset()
+    day: int | None = None
 
 
 def read_table(path: str | Path, skip: int | None = None, time_unit: str | None = None) -> Table:
@@ -94,26 +104,40 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
     width = len(rows.cells[0][1])
     if time_unit is not None:
         find_unit(time_unit, "time")
-    values = np.array(
-        [
-            [parse_number(cell, f"{file}, line {number}") if cell else np.nan for cell in cells]
-            for number, cells in rows.cells
-        ]
-    )
-    decimals = tuple(max(_decimals(cells[i]) for _, cells in rows.cells) for i in range(width))
+    values = np.empty((len(rows.cells), width))
+    decimals, clocks, dates, day = [], set(), set(), None
+    for column in range(width):
+        cells = [(cells[column], f"{file}, line {number}") for number, cells in rows.cells]
+        if any(is_clock(cell) for cell, _ in cells):
+            clocks.add(column)
+            times = [parse_clock(cell, where) if cell else None for cell, where in cells]
+            values[:, column] = seconds_since_midnight(times, file)
+            decimals.append(max(time.decimals for time in times if time is not None))
+            day = next(time.day for time in times if time is not None) if day is None else day
+        elif any(is_date(cell) for cell, _ in cells) and all(is_date(cell) or not cell for cell, _ in cells):
+            dates.add(column)
+            values[:, column] = np.nan
+            decimals.append(0)
+        else:
+            values[:, column] = [parse_number(cell, where) if cell else np.nan for cell, where in cells]
+            decimals.append(max(_decimals(cell) for cell, _ in cells))
     lines = tuple(number for number, _ in rows.cells)
     units = rows.units or ("",) * width
-    return Table(file, rows.names, values, lines, decimals, "\n".join(rows.comments), units, time_unit)
+    numbers = rows.names, values, lines, tuple(decimals), "\n".join(rows.comments), units, time_unit
+    return Table(file, *numbers, frozenset(clocks), frozenset(dates), day)
 
 
 def value_column(table: Table, column: str | None = None) -> int:
     """Return the index of the named column, or of the only column that is not the time."""
-    if not table.names and table.values.shape[1] - (_time_column(table) is not None) > 1:
+    n_other = len({_time_column(table)} - {None} | table.clocks | table.dates)
+    if not table.names and table.values.shape[1] - n_other > 1:
         raise ValueError(
             f"{table.file} has {table.values.shape[1]} columns and no header line; write one such as 'time_s,acc_g'"
             ", or give time_unit= if there are two columns, times and values"
         )
-    candidates = [i for i in range(table.values.shape[1]) if i != _time_column(table)]
+    candidates = [
+        i for i in range(table.values.shape[1]) if i not in {_time_column(table)} | table.clocks | table.dates
+    ]
     if column is not None:
         candidates = [i for i in candidates if table.names and table.names[i] == column]
     if len(candidates) != 1:
@@ -125,13 +149,29 @@ def value_column(table: Table, column: str | None = None) -> int:
     return candidates[0]
 
 
-def stated_unit(table: Table, place: int) -> str | None:
-    """Return the unit of a column as the file states it, in its name or below the header line, or None."""
+def stated_unit(table: Table, place: int, dimension: str | None = None) -> str | None:
+    """Return the unit of a column as the file states it, in its name or below the header line, or None.
+
+    With a `dimension` other than force, the N at the end of a name such as ``acc_N`` is the direction north.
+    """
     named = column_unit(table.names[place]) if table.names else None
+    if dimension is not None and _direction(table, place, dimension):
+        named = None
     below = table.units[place] or None
-    if named is not None and below is not None:
-        return agree_on_unit(named, below, find_unit(below).dimension, f"{table.file} (name and line of units)")
-    return named if below is None else below
+    if named is None or below is None:
+        return named or below
+    where = f"{table.file} (name and line of units)"
+    try:
+        stated = find_unit(below).dimension
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+    return agree_on_unit(named, below, stated, where)
+
+
+def _direction(table: Table, place: int, dimension: str) -> bool:
+    """Whether the name of a column ends with the direction north or south, which look like newton and second."""
+    end = table.names[place][-2:] if table.names else ""
+    return (end == "_N" and dimension != "force") or (end == "_S" and dimension != "time")
 
 
 def column_unit(name: str) -> str | None:
@@ -224,9 +264,9 @@ def csv_series(
         where = f"{table.file}: npts in the comments"
         check_count(len(table.values), parse_count(stated[1], where), where)
     comment = re.search(r"\bunits:\s*([^\s;,]+)", table.comments)
-    unit = stated_unit(table, place)
+    unit = stated_unit(table, place, "acceleration")
     if comment and unit is not None:
-        unit = agree_on_unit(unit, comment[1], find_unit(unit).dimension, f"{table.file} (column and comment)")
+        unit = agree_on_unit(unit, comment[1], "acceleration", f"{table.file} (column and comment)")
     values = column_values(table, place, missing)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
@@ -238,13 +278,17 @@ def csv_series(
     return Series(title, table_step(table, dt), unit or (comment and comment[1]), values)
 
 
-def table_start(table: Table, step: float, zero: float = 0.0) -> float:
+def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
     """Return the time of the first row after `zero` [s]; a file without times begins at time zero.
+
+    For a file with clock times, `zero` may be a clock time.
 
     A printed time is rounded by half a unit of its last digit at most. With ``zero=0``, a start that is a whole number
     of steps within this rounding is that number of steps. For another `zero` this holds within round-off.
     """
     place = _time_column(table)
+    if isinstance(zero, str):
+        zero = _clock_zero(table, place, zero)
     if place is None:
         return 0.0 - zero
     unit = _time_unit(table, place)
@@ -255,13 +299,28 @@ def table_start(table: Table, step: float, zero: float = 0.0) -> float:
     return nearest * step if abs(start - nearest * step) <= rounding + 1e-9 * step else start
 
 
+def _clock_zero(table: Table, place: int | None, text: str) -> float:
+    """Return the clock time `zero` in the times of the table [s]; without a date, it is on the day of the first row."""
+    if place not in table.clocks:
+        raise ValueError(f"{table.file}: zero={text!r} needs a column of clock times; give zero in seconds")
+    zero = parse_clock(text, "zero")
+    if zero.day is not None and table.day is None:
+        raise ValueError(f"{table.file}: the times have no date; give zero={text!r} without one")
+    days = 0 if zero.day is None else zero.day - table.day
+    return 86400 * days + zero.seconds
+
+
 def _time_column(table: Table) -> int | None:
+    clock = min(table.clocks, default=None)
     if not table.names:
-        return 0 if table.time_unit is not None and table.values.shape[1] > 1 else None
-    return next((i for i, name in enumerate(table.names) if _TIME.match(name)), None)
+        return 0 if table.time_unit is not None and table.values.shape[1] > 1 else clock
+    named = (i for i, name in enumerate(table.names) if _TIME.match(name) and i not in table.clocks | table.dates)
+    return next(named, clock)
 
 
 def _time_unit(table: Table, place: int) -> str:
+    if place in table.clocks:
+        return "s"
     stated = stated_unit(table, place)
     if stated is None and table.time_unit is None:
         raise ValueError(
@@ -319,6 +378,8 @@ def _check_single_clock(table: Table, place: int) -> None:
     own_unit = _time_unit(table, place)
     times = to_si(table.values[:, place], own_unit, "time")
     for other, name in enumerate(table.names):
+        if place in table.clocks or other in table.clocks | table.dates:
+            continue
         unit = stated_unit(table, other) if other != place and _TIME.match(name) else None
         try:
             is_time = unit is not None and find_unit(unit).dimension == "time"

@@ -1,0 +1,89 @@
+"""Clock times in tables, ``03:19:53.010``, ``2019-07-06T03:19:53.010Z`` or ``2019-07-06 03:19:53``, and dates."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from typing import NamedTuple
+
+__all__ = ["ClockTime", "is_clock", "is_date", "parse_clock", "seconds_since_midnight"]
+
+_DATE = r"(\d{4})-(\d{2})-(\d{2})"
+_TIME = r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?"
+_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}(?: ?(?:Z|UTC|[-+]\d{{2}}:?\d{{2}}))?", re.IGNORECASE)
+_DAY_ONLY = re.compile(r"\d{1,4}([-/.])\d{1,2}\1\d{1,4}")
+_DAY = 86400
+
+
+class ClockTime(NamedTuple):
+    """A clock time.
+
+    Attributes
+    ----------
+    day : int or None
+        Number of the day, None without a date.
+    seconds : float
+        Seconds since the midnight before [s].
+    decimals : int
+        Digits after the decimal point of the seconds.
+    """
+
+    day: int | None
+    seconds: float
+    decimals: int
+
+
+def is_clock(cell: str) -> bool:
+    """Whether a cell is a clock time, with a date or without."""
+    return ":" in cell and _CLOCK.fullmatch(cell) is not None
+
+
+def is_date(cell: str) -> bool:
+    """Whether a cell is a date without a time, in any order of day, month and year."""
+    return _DAY_ONLY.fullmatch(cell) is not None
+
+
+def parse_clock(cell: str, where: str) -> ClockTime:
+    """Return the clock time in a cell; raise ValueError for anything else. A time zone is left out."""
+    found = _CLOCK.fullmatch(cell)
+    if found is None:
+        raise ValueError(
+            f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', got {cell[:100]!r}"
+        )
+    year, month, day, hour, minute, second, fraction = found.groups()
+    number = None
+    if year is not None:
+        try:
+            number = datetime.date(int(year), int(month), int(day)).toordinal()
+        except ValueError as error:
+            raise ValueError(f"{where}: expected a date, got {cell[:100]!r} ({error})") from None
+    whole = 3600 * int(hour) + 60 * int(minute) + int(second)
+    return ClockTime(number, float(f"{whole}.{fraction or 0}"), len(fraction or ""))
+
+
+def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[float]:
+    """Return the seconds since the midnight before the first time, NaN for None.
+
+    Without dates, a time that is earlier than the one before by more than half a day belongs to the next day.
+
+    Raises
+    ------
+    ValueError
+        If some times have a date and others have none.
+    """
+    known = [time for time in times if time is not None]
+    dates = {time.day is None for time in known}
+    if len(dates) > 1:
+        raise ValueError(f"{where}: expected a date in all clock times or in none; write them alike")
+    day, last, found = 0, 0.0, []
+    for time in times:
+        if time is None:
+            found.append(float("nan"))
+            continue
+        if time.day is not None:
+            day = time.day - known[0].day
+        elif time.seconds < last - _DAY / 2:
+            day += 1
+        last = time.seconds
+        found.append(day * _DAY + time.seconds)
+    return found

@@ -1,0 +1,174 @@
+"""Readers of measured responses in CSV files and Excel workbooks: histories, and tests with an imposed displacement.
+
+They convert to SI units, with the units and the time step of the file or of their arguments, and raise ValueError if
+neither states them or if they disagree (`fe_likelihoods.signals.tables`).
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..units import to_si
+from . import tables
+from .channels import Channel, Measurements
+from .readers import named_format
+from .records import DisplacementHistory
+from .text_files import agree_on_unit
+
+__all__ = ["ImposedTest", "read_columns", "read_imposed_test"]
+
+
+class ImposedTest(NamedTuple):
+    """A laboratory test with an imposed displacement.
+
+    Attributes
+    ----------
+    history : DisplacementHistory
+        The imposed displacement.
+    measurements : Measurements
+        The channels measured at its steps. ``measurements.dt`` is 1, one step.
+    """
+
+    history: DisplacementHistory
+    measurements: Measurements
+
+
+def read_columns(
+    path: str | Path,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None = None,
+    dt: float | None = None,
+    description: str = "",
+    *,
+    time_unit: str | None = None,
+    skip: int | None = None,
+    zero: float | str = 0.0,
+    missing: Sequence[float] | None = None,
+) -> Measurements:
+    """Read measured responses from the columns of a CSV file or workbook with a header line (see `read_csv`).
+
+    An empty cell, ``NaN``, ``NA``, ``N/A``, ``#N/A``, ``NULL``, ``-`` or ``--`` is a missing sample.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    channels : sequence of Channel
+        The measured channels.
+    columns : sequence of str
+        Names of the columns in the header line, one per channel.
+    units : str or sequence of str, optional
+        Unit of the numbers, one for all columns or one per column. Not needed if the names of the columns end with the
+        unit (``disp_in``). If both are given, they must agree.
+    dt : float, optional
+        Time step [s], needed for a file without times.
+    description : str, optional
+        Description of the measurements.
+    time_unit : str, optional
+        Unit of the times, if the name of their column does not end with it.
+    skip : int, optional
+        Number of lines above the table, if they are not found.
+    zero : float or str, optional
+        Time in the file at which the excitation begins [s]. For clock times, which count from midnight, it may be a
+        clock time, such as ``"03:19:53.37"`` or ``"2019-07-06T03:19:53.37"``.
+    missing : sequence of float, optional
+        Numbers that stand for missing samples; they are read as NaN. By default, -9999, -999.25, 1e30 and 9.97e36
+        are refused unless other numbers lie within 1 % of them; ``()`` takes all numbers as measured.
+
+    Returns
+    -------
+    Measurements
+        The channels. They start at the first time of the file minus `zero`, so a file that begins at 0.37 s keeps this
+        time; give ``zero=0.37`` if the excitation begins with it.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, a unit is missing or has another dimension than its channel, the times are not uniform,
+        or a cell is not a finite number.
+    """
+    with named_format(path, "read_columns"):
+        table = tables.read_table(path, skip, time_unit)
+    values = _channel_values(table, channels, columns, units, missing)
+    step = tables.table_step(table, dt)
+    return Measurements(tuple(channels), step, values, description, tables.table_start(table, step, zero))
+
+
+def read_imposed_test(
+    path: str | Path,
+    displacement: str,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None = None,
+    displacement_unit: str | None = None,
+    description: str = "",
+    *,
+    skip: int | None = None,
+    missing: Sequence[float] | None = None,
+) -> ImposedTest:
+    """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    displacement : str
+        Name of the column with the imposed displacement.
+    channels : sequence of Channel
+        The measured channels, as in `read_columns`.
+    columns : sequence of str
+        Names of the columns in the header line, one per channel.
+    units : str or sequence of str, optional
+        Unit of the numbers, as in `read_columns`.
+    displacement_unit : str, optional
+        Unit of the displacement, if the name of its column does not end with it.
+    description : str, optional
+        Description of the measurements.
+    skip : int, optional
+        Number of lines above the table, if they are not found.
+    missing : sequence of float, optional
+        As in `read_columns`.
+
+    Returns
+    -------
+    ImposedTest
+        The history, named after the file, and the measurements.
+
+    Raises
+    ------
+    ValueError
+        As `read_columns`, except for times, which the test does not have.
+    """
+    table = tables.read_table(path, skip)
+    imposed = Channel(displacement, "displacement", displacement_unit or "m")
+    (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit, missing)
+    values = _channel_values(table, channels, columns, units, missing)
+    measurements = Measurements(tuple(channels), 1.0, values, description)
+    return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
+
+
+def _channel_values(
+    table: tables.Table,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None,
+    missing: Sequence[float] | None,
+) -> NDArray[np.float64]:
+    """Return columns of a table in SI units, shape (n_channels, n_rows)."""
+    given = [units] * len(columns) if units is None or isinstance(units, str) else list(units)
+    if isinstance(columns, str) or not len(channels) == len(columns) == len(given):
+        raise ValueError(
+            f"expected one column and one unit for each of {len(channels)} channels, got columns {columns!r}, "
+            f"units {units!r}"
+        )
+    rows = []
+    for channel, column, unit in zip(channels, columns, given, strict=True):
+        place = tables.value_column(table, column)
+        where = f"{table.file}, column {column!r}"
+        unit = agree_on_unit(tables.stated_unit(table, place, channel.dimension), unit, channel.dimension, where)
+        rows.append(to_si(tables.column_values(table, place, missing), unit))
+    return np.array(rows)
