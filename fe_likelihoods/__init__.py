@@ -45,6 +45,8 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
     from .probability.event_noise import EventNoise
     from .probability.failures import TooManyFailures
+    from .probability.hierarchical_posterior import HierarchicalPosterior, Varying
+    from .probability.hierarchy import Hierarchy
     from .probability.joint import JointLikelihood
     from .probability.likelihood import FELikelihood
     from .probability.marginal_noise import MarginalNoise
@@ -54,6 +56,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.posterior import Posterior
     from .probability.priors import Prior
     from .probability.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
+    from .probability.stored_posterior import StoredPosterior
     from .probability.time_shift_noise import TimeShiftNoise
     from .signals.alignment import Alignment, align
     from .signals.channels import Channel, Measurements
@@ -107,6 +110,8 @@ __all__ = [
     "FunctionModel",
     "GaussianNoise",
     "HalfNormal",
+    "HierarchicalPosterior",
+    "Hierarchy",
     "Hoops",
     "ImposedTest",
     "IsolatedBridge",
@@ -148,12 +153,14 @@ __all__ = [
     "StaleCache",
     "Steel",
     "SteelCoupon",
+    "StoredPosterior",
     "TimeShiftNoise",
     "TooManyFailures",
     "TransientReason",
     "TruncatedMultivariateNormal",
     "TruncatedNormal",
     "Uniform",
+    "Varying",
     "align",
     "average_predictions",
     "damage",
@@ -314,6 +321,11 @@ _EXPORTS = {
     ),
     "probability.event_noise": ("EventNoise",),
     "probability.failures": ("TooManyFailures",),
+    "probability.hierarchical_posterior": (
+        "HierarchicalPosterior",
+        "Varying",
+    ),
+    "probability.hierarchy": ("Hierarchy",),
     "probability.joint": ("JointLikelihood",),
     "probability.likelihood": ("FELikelihood",),
     "probability.marginal_noise": ("MarginalNoise",),
@@ -340,6 +352,7 @@ _EXPORTS = {
         "plot_residuals",
         "residual_checks",
     ),
+    "probability.stored_posterior": ("StoredPosterior",),
     "probability.time_shift_noise": ("TimeShiftNoise",),
     "signals.alignment": (
         "Alignment",

@@ -29,6 +29,7 @@ _ITERATIONS = 100
 _STARTS = 2
 _GAIN = 1e-6  # of the log-likelihood per sample and iteration, below which the maximisation ends
 _REFITS = 16
+_REFIT_ITERATIONS = 20
 _SMALLEST_EIGENVALUE = 1e-10  # of the correlations, below which the samples are linearly dependent
 
 
@@ -145,6 +146,12 @@ class MixtureDistribution(MultivariateDistribution):
         z = self.means[rows] + np.einsum("nij,nj->ni", self._factors[rows], rng.standard_normal((size, self.dim)))
         return self.prior.from_normal(z)
 
+    def refitted(self, samples: np.ndarray) -> "MixtureDistribution":
+        """The mixture fitted to other samples (n, dim), with as many components, starting from this one."""
+        z = np.clip(self.prior.to_normal(samples), -_LARGEST_SCORE, _LARGEST_SCORE)
+        fit, _ = _maximise(z, (self.weights, self.means, self.covariances), _REFIT_ITERATIONS)
+        return MixtureDistribution(self.prior, *fit, self.fit_error)
+
     def _conditional(self, z: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Shares, means and standard deviations (n, n_components) of coordinate i, given the earlier ones in z."""
         log_shares = np.tile(np.log(self.weights), (len(z), 1))
@@ -247,7 +254,7 @@ def fit_mixture(
     refits = []
     for _ in range(_REFITS):
         rows = rng.integers(len(z), size=max(round(effective), 2 * dim))
-        again, _ = _maximise(z[rows], best[1], 20)
+        again, _ = _maximise(z[rows], best[1], _REFIT_ITERATIONS)
         refits.append(_log_mixture(z, again[0], again[1], np.linalg.cholesky(again[2])))
     fit_error = np.sqrt(np.mean(np.var(refits, axis=0, ddof=1)))
     misfit = None

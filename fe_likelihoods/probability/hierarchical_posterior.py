@@ -1,0 +1,328 @@
+r"""Hierarchical model of several tests, from the stored posteriors of the single tests, without simulations.
+
+Some parameters vary between the tests (specimens, events) as draws of a normal population. Its means, standard
+deviations and correlations are the hyper-parameters. Other parameters are common to all tests, and the rest belongs to
+each test alone. The likelihood of the hyper-parameters is the product over the tests of
+
+.. math::
+
+   m_k(\varphi) = Z_k\, E\left[\frac{p(\theta \mid \varphi)}{p_k(\theta)}\right],
+
+the expectation over the posterior of test k, with its prior density :math:`p_k` and its evidence :math:`Z_k`.
+`HierarchicalPosterior` is the posterior density of the hyper-parameters, for any sampler. See
+``docs/theory/hierarchy.rst``.
+
+References
+----------
+D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
+2166-2175, doi:10.1088/0004-637X/725/2/2166, eq. (9).
+
+D. Lewandowski, D. Kurowicka, H. Joe (2009), Generating random correlation matrices based on vines and extended onion
+method, Journal of Multivariate Analysis 100, 1989-2001, doi:10.1016/j.jmva.2009.04.008, section 2.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .distributions import Distribution, RandomState
+from .inputs import as_points, complete_repr
+from .multivariate import as_distribution
+from .population_marginal import population_marginal
+from .priors import Prior
+from .stored_posterior import StoredPosterior, describe
+
+__all__ = ["HierarchicalPosterior", "Varying"]
+
+_SCALES = ("log", "linear")
+_SMALLEST_SD = 1e-12  # of the posterior's, below which the population is a point
+
+
+@dataclass(frozen=True)
+class Varying:
+    """Prior of the population of a parameter that varies between tests.
+
+    Parameters
+    ----------
+    location : Distribution
+        Prior of the median (scale "log") or the mean (scale "linear") of the population, in the unit of the parameter.
+    sd : Distribution
+        Prior of the standard deviation of the population: of the natural logarithm of the parameter (scale "log"), or
+        of the parameter, in its unit (scale "linear").
+    scale : {"log", "linear"}
+        Whether the logarithm of the parameter or the parameter itself has a normal distribution.
+
+    Raises
+    ------
+    ValueError
+        If a standard deviation or a median could be negative, or the scale is unknown.
+
+    Examples
+    --------
+    >>> Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))
+    """
+
+    location: Distribution
+    sd: Distribution
+    scale: str = "log"
+
+    def __post_init__(self) -> None:
+        if self.scale not in _SCALES:
+            raise ValueError(f"Varying: scale must be one of {', '.join(map(repr, _SCALES))}; got {self.scale!r}")
+        for name in ("location", "sd"):
+            object.__setattr__(self, name, as_distribution(name, getattr(self, name)))
+        if self.sd.bounds[0] < 0.0:
+            raise ValueError(
+                f"Varying: sd must have a prior of positive values, such as HalfNormal(0.3); got {self.sd}"
+            )
+        if self.scale == "log" and self.location.bounds[0] < 0.0:
+            raise ValueError(
+                "Varying: with scale='log' the location is a median, which needs a prior of positive values such as "
+                f"LogNormal(1.0, 0.5); got {self.location}"
+            )
+
+
+class HierarchicalPosterior:
+    """Posterior density of the hyper-parameters of several tests.
+
+    It has the interface of `Posterior`: every density takes one point (ndim,) and returns a float, or n points
+    (n, ndim) and returns (n,). No simulation is run.
+
+    Parameters
+    ----------
+    tests : mapping of str to StoredPosterior
+        The posterior of each test, under its name.
+    varying : mapping of str to Varying
+        The parameters that vary between the tests, and the priors of their populations.
+    common : mapping of str to Distribution, optional
+        Parameters with one value for all tests, and their priors. All parameters that are neither varying nor common
+        belong to each test alone, with the prior of its stored posterior.
+    correlation : float, optional
+        Shape eta > 0 of the LKJ prior of the correlations between the varying parameters: 1 is uniform over correlation
+        matrices, larger values favour small correlations. Default: the varying parameters are independent.
+    max_samples : int
+        Largest number of samples of each test. More are thinned; the time of an evaluation is proportional to it.
+
+    Attributes
+    ----------
+    tests, varying : dict
+        As given.
+    prior : Prior
+        Prior of the hyper-parameters.
+    described : dict of str to DescribedPosterior
+        The samples of each test as they are used.
+
+    Raises
+    ------
+    ValueError
+        If a test lacks a parameter, a parameter is both varying and common, the prior of a test joins one of these
+        parameters with others, or an argument is out of range.
+
+    Notes
+    -----
+    The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log") or ``mean_NAME`` and ``sd_NAME`` (scale
+    "linear"), then ``correlation_A_B``, then the names of the common parameters. With three varying parameters or more,
+    the correlations after those with the first parameter are partial: ``partial_correlation_B_C`` is that of B and C
+    given the parameters before B.
+
+    The likelihood is taken as zero outside the bounds of the prior of a test.
+
+    The result is exact up to the finite number of samples if no parameter is common. The exact value of a common
+    parameter is not among the samples, so the density of common and varying parameters is that of the mixture which is
+    fitted to the samples of each test: correlations between them are kept, and shapes that the mixture does not
+    describe are lost. `Hierarchy` states the errors.
+
+    Examples
+    --------
+    >>> tests = {name: StoredPosterior(chain, posterior.prior) for name, chain in chains.items()}
+    >>> posterior = HierarchicalPosterior(tests, {"stiffness": Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))})
+    >>> sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True)
+    """
+
+    def __init__(
+        self,
+        tests: Mapping[str, StoredPosterior],
+        varying: Mapping[str, Varying],
+        *,
+        common: Mapping[str, Distribution] | None = None,
+        correlation: float | None = None,
+        max_samples: int = 1000,
+    ) -> None:
+        common = {} if common is None else common
+        _check(tests, varying, common, correlation, max_samples)
+        self.tests, self.varying, self.common = dict(tests), dict(varying), tuple(common)
+        self._correlated = correlation is not None and len(varying) > 1
+        self._logarithmic = np.array([each.scale == "log" for each in varying.values()] + [False] * len(common))
+        distributions: dict[str, Any] = {}
+        for name, each in varying.items():
+            is_log = each.scale == "log"
+            distributions[f"median_{name}" if is_log else f"mean_{name}"] = each.location
+            distributions[f"sd_log_{name}" if is_log else f"sd_{name}"] = each.sd
+        if self._correlated:
+            distributions |= _lkj_prior(list(varying), float(correlation))
+        self.prior = Prior(distributions | dict(common))
+        self.described = {}
+        for name, test in self.tests.items():
+            try:
+                self.described[name] = describe(test, [*varying, *common], self._logarithmic, max_samples)
+            except ValueError as error:
+                raise ValueError(f"test {name!r}: {error}") from None
+        deviations = [
+            np.sqrt(np.cov(each.points.T, ddof=0).reshape(len(self._logarithmic), -1).diagonal())
+            for each in self.described.values()
+        ]
+        self._smallest_sd = _SMALLEST_SD * np.min(deviations, axis=0)[: len(varying)]
+
+    @property
+    def ndim(self) -> int:
+        """Number of hyper-parameters."""
+        return self.prior.dim
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """Names of the hyper-parameters."""
+        return list(self.prior.names)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hex digest (BLAKE2b, 128 bits) of everything the density depends on."""
+        state = hashlib.blake2b(digest_size=16)
+        state.update(repr([list(self.varying), self.common]).encode())
+        state.update(complete_repr(self.prior).encode())
+        for name, each in self.described.items():
+            state.update(f"{name} {self.tests[name].log_evidence} {each.effective_sample_size}".encode())
+            for array in (each.points, each.log_weights, each.log_prior, each.means, each.covariances):
+                state.update(np.ascontiguousarray(array).tobytes())
+        return state.hexdigest()
+
+    def __call__(self, x: Any) -> np.ndarray | float:
+        """Same as `log_prob`."""
+        return self.log_prob(x)
+
+    def log_prob(self, x: Any) -> np.ndarray | float:
+        """Log-prior plus log-likelihood of hyper-parameters."""
+        return self.log_prior(x) + self.log_likelihood(x)
+
+    def log_prior(self, x: Any) -> np.ndarray | float:
+        """Normalised log-density of the prior of the hyper-parameters."""
+        return self.prior.logpdf(as_points(x, self.prior.names))
+
+    def log_likelihood(self, x: Any) -> np.ndarray | float:
+        """Logarithm of the marginal likelihood of all tests; -inf outside the support of the prior."""
+        points = as_points(x, self.prior.names)
+        rows = np.atleast_2d(points)
+        total = np.full(len(rows), -np.inf)
+        inside = np.atleast_1d(self.prior.logpdf(rows)) > -np.inf
+        if inside.any():
+            total[inside] = self.log_marginals(rows[inside]).sum(axis=1)
+        return total if points.ndim == 2 else float(total[0])
+
+    def prior_transform(self, u: np.ndarray) -> np.ndarray:
+        """Map from the unit cube to the hyper-parameters, for nested samplers."""
+        return self.prior.transform(u)
+
+    def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
+        """Draws (n, ndim) of the prior; arguments as of `Posterior.sample_prior`."""
+        return self.prior.rvs(n, rng)
+
+    def log_marginals(self, x: Any) -> np.ndarray:
+        """Logarithms of the marginal likelihoods of the tests.
+
+        Parameters
+        ----------
+        x : (n, ndim) float, or mapping
+            Hyper-parameters within the bounds of their prior.
+
+        Returns
+        -------
+        (n, n_tests) float
+        """
+        center, factor = self.population(x)
+        columns = [
+            population_marginal(each, center, factor).log_value + (self.tests[name].log_evidence or 0.0)
+            for name, each in self.described.items()
+        ]
+        return np.stack(columns, axis=1)
+
+    def population(self, x: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Center and spread of the populations of the varying parameters, on their scales.
+
+        Parameters
+        ----------
+        x : (n, ndim) float, or mapping
+            Hyper-parameters.
+
+        Returns
+        -------
+        center : (n, n_varying + n_common) float
+            Means of the varying parameters (of their logarithms for the scale "log"), then the common parameters.
+        factor : (n, n_varying, n_varying) float
+            Cholesky factors of the covariances of the varying parameters.
+        """
+        points, n = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying)
+        end = points.shape[1] - len(self.common)
+        center = np.concatenate([points[:, 0 : 2 * n : 2], points[:, end:]], axis=1)
+        with np.errstate(divide="ignore"):
+            center = np.where(self._logarithmic, np.log(np.where(self._logarithmic, center, 1.0)), center)
+        factor = _correlation_factor(points[:, 2 * n : end], n)
+        return center, np.maximum(points[:, 1 : 2 * n : 2], self._smallest_sd)[:, :, None] * factor
+
+    def from_scale(self, values: np.ndarray) -> np.ndarray:
+        """Parameters (..., n_varying + n_common) from their values on the scales of the populations."""
+        with np.errstate(over="ignore"):
+            return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, values, 0.0)), values)
+
+
+def _check(tests: Any, varying: Any, common: Any, correlation: Any, max_samples: Any) -> None:
+    """Raise ValueError for arguments of `HierarchicalPosterior` that cannot be used."""
+    for what, values, kind in (("tests", tests, StoredPosterior), ("varying", varying, Varying)):
+        if (
+            not isinstance(values, Mapping)
+            or not values
+            or not all(isinstance(name, str) and isinstance(each, kind) for name, each in values.items())
+        ):
+            raise ValueError(
+                f"HierarchicalPosterior: {what} must be a non-empty mapping of names to {kind.__name__}; got {values!r}"
+            )
+    if not isinstance(common, Mapping):
+        raise ValueError(f"HierarchicalPosterior: common must be a mapping of names to distributions; got {common!r}")
+    if both := sorted(set(varying) & set(common)):
+        raise ValueError(f"HierarchicalPosterior: {', '.join(both)} cannot be both varying and common")
+    if correlation is not None and not 0.0 < correlation < np.inf:
+        raise ValueError(
+            f"HierarchicalPosterior: correlation is the shape of the LKJ prior, above 0, or None for independent "
+            f"parameters; got {correlation!r}"
+        )
+    if not isinstance(max_samples, int | np.integer) or max_samples < 100:
+        raise ValueError(f"HierarchicalPosterior: max_samples must be a whole number, 100 or more; got {max_samples!r}")
+
+
+def _lkj_prior(names: list[str], shape: float) -> dict[str, Any]:
+    """Independent priors of the partial correlations, by which the correlation matrix has the LKJ distribution."""
+    from scipy.stats import beta  # slow to import, and not needed for independent parameters
+
+    prior = {}
+    for level, first in enumerate(names[:-1]):
+        b = shape + 0.5 * (len(names) - 2 - level)
+        kind = "partial_correlation" if level else "correlation"
+        prior |= {f"{kind}_{first}_{other}": beta(b, b, loc=-1.0, scale=2.0) for other in names[level + 1 :]}
+    return prior
+
+
+def _correlation_factor(partial: np.ndarray, n: int) -> np.ndarray:
+    """Cholesky factors (m, n, n) of correlation matrices from partial correlations (m, n (n - 1) / 2), or identity."""
+    factor = np.tile(np.eye(n), (len(partial), 1, 1))
+    if not partial.shape[1]:
+        return factor
+    left = np.ones((len(partial), n))  # 1 minus the sum of the squares of a row so far
+    column = 0
+    for j in range(n - 1):
+        for i in range(j + 1, n):
+            factor[:, i, j] = partial[:, column] * np.sqrt(left[:, i])
+            left[:, i] -= np.square(factor[:, i, j])
+            column += 1
+        factor[:, j + 1, j + 1] = np.sqrt(np.maximum(left[:, j + 1], 1e-12))
+    return factor

@@ -1,0 +1,228 @@
+"""Result of a hierarchical model of several tests: population, parameters of each test, and of a new test.
+
+`Hierarchy` combines a `HierarchicalPosterior` with samples of its hyper-parameters, which any sampler has drawn. It
+checks where the stored posteriors do not suffice, and draws the parameters of the tests and of a further one.
+"""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .distributions import RandomState
+from .hierarchical_posterior import HierarchicalPosterior
+from .hierarchy_checks import check_hierarchy
+from .inputs import as_points, complete_repr
+from .population_marginal import draw_parameters, sample_weights
+
+__all__ = ["Hierarchy"]
+
+_HYPER_SAMPLES = 200
+_LARGEST_OUTSIDE = 0.01  # of the draws of a new test, outside the bounds of the priors of the tests
+
+
+class Hierarchy:
+    """Population of the parameters of several tests.
+
+    Parameters
+    ----------
+    posterior : HierarchicalPosterior
+        Posterior density of the hyper-parameters.
+    samples : (n, ndim) array_like, or mapping
+        Posterior samples of the hyper-parameters, of equal weight (``sampler.get_chain(flat=True)``).
+    seed : int
+        Seed of the resampling for the errors.
+
+    Attributes
+    ----------
+    posterior : HierarchicalPosterior
+        As given.
+    samples : ndarray[n, ndim]
+        As given.
+    checks : HierarchyChecks
+        Effective sample sizes and errors of the stored posteriors; ``print(hierarchy.checks)`` is a table. Every
+        message in it is a warning as well.
+
+    Raises
+    ------
+    ValueError
+        If the samples have another dimension, are fewer than 20, or are impossible under the prior of the
+        hyper-parameters.
+
+    Examples
+    --------
+    >>> hierarchy = Hierarchy(posterior, sampler.get_chain(flat=True))
+    >>> prediction = propagate(model, hierarchy.new_test(500), record=record)
+    """
+
+    def __init__(self, posterior: HierarchicalPosterior, samples: Any, seed: int = 0) -> None:
+        points = as_points(samples, posterior.parameter_names)
+        if points.ndim != 2 or len(points) < 20:
+            raise ValueError(
+                f"Hierarchy expects 20 samples of the hyper-parameters or more, (n, {posterior.ndim}); got shape "
+                f"{points.shape}"
+            )
+        if not np.isfinite(posterior.log_prior(points)).all():
+            raise ValueError(
+                "some samples of the hyper-parameters are impossible under their prior; give samples of "
+                "this posterior, with its parameters in the order of parameter_names"
+            )
+        self.posterior, self.samples = posterior, points
+        self.checks = check_hierarchy(posterior, points, seed)
+        for message in self.checks.messages:
+            warnings.warn(message, stacklevel=2)
+
+    def new_test(self, n: int, names: Sequence[str] | None = None, rng: RandomState = None) -> dict[str, np.ndarray]:
+        """Draw the parameters of a further test: the predictive density of the population.
+
+        The draws contain the uncertainty of the hyper-parameters and the spread between tests.
+
+        Parameters
+        ----------
+        n : int
+            Number of draws.
+        names : sequence of str, optional
+            Parameters to draw, in this order, such as ``model.parameter_names``. Default: the varying and the common
+            ones. Others are drawn from their prior, which must be the same in all tests.
+        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+            As for `Posterior.sample_prior`.
+
+        Returns
+        -------
+        dict of str to (n,) float
+            Accepted as samples by `propagate`.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, or the priors of a parameter differ between the tests.
+
+        Warns
+        -----
+        UserWarning
+            If more than 1 % of the draws are outside the bounds of the priors of the tests.
+        """
+        if not isinstance(n, int | np.integer) or n < 1:
+            raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")
+        generator, posterior = _generator(rng), self.posterior
+        rows = generator.permutation(np.resize(generator.permutation(len(self.samples)), n))
+        center, factor = posterior.population(self.samples[rows])
+        varying = len(posterior.varying)
+        center[:, :varying] += np.einsum("nij,nj->ni", factor, generator.standard_normal((n, varying)))
+        draws = posterior.from_scale(center)
+        own = [*posterior.varying, *posterior.common]
+        outside = np.zeros(n, dtype=bool)
+        for each in posterior.described.values():
+            low, high = each.prior.bounds.T
+            outside |= ((draws < low) | (draws > high)).any(axis=1)
+        if outside.mean() > _LARGEST_OUTSIDE:
+            warnings.warn(
+                f"{outside.mean():.0%} of the draws of a new test are outside the bounds of the priors of the tests: "
+                "use scale='log' for positive parameters, or a narrower prior of the spread",
+                stacklevel=2,
+            )
+        found = dict(zip(own, draws.T, strict=True))
+        for name in () if names is None else [name for name in names if name not in own]:
+            found[name] = self._prior_draws(name, n, generator)
+        return found if names is None else {name: found[name] for name in names}
+
+    def weights(self, test: str) -> np.ndarray:
+        """Weights of the stored samples of one test, by which they are samples of its posterior in the hierarchy.
+
+        Together with the other tests, the parameters of a test are known better than from the test alone: its posterior
+        shrinks towards the population.
+
+        Parameters
+        ----------
+        test : str
+            Name of the test.
+
+        Returns
+        -------
+        (n,) ndarray
+            Weights of all samples of the test, which sum to one. Their mean over the hyper-samples, of which at most
+            200 are used.
+
+        Raises
+        ------
+        ValueError
+            If the test is unknown, or there are common parameters, whose exact value is not among the samples: use
+            `draw_test`.
+        """
+        self._check_name(test)
+        if self.posterior.common:
+            raise ValueError(
+                f"the stored samples do not have the exact value of {', '.join(self.posterior.common)}, which is "
+                f"common to all tests: use draw_test({test!r})"
+            )
+        stored, described = self.posterior.tests[test], self.posterior.described[test]
+        if len(described.points) < len(stored.samples):  # described with fewer samples
+            columns = [stored.prior.names.index(name) for name in self.posterior.varying]
+            values, logarithmic = stored.samples[:, columns], described.logarithmic
+            points = np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+            described = described._replace(
+                points=points, log_weights=stored.log_weights, log_prior=described.log_prior_at(points)
+            )
+        used = np.linspace(0, len(self.samples) - 1, min(len(self.samples), _HYPER_SAMPLES)).astype(int)
+        center, factor = self.posterior.population(self.samples[used])
+        total = sum(sample_weights(described, center[i : i + 1], factor[i : i + 1])[0] for i in range(len(center)))
+        return total / total.sum()
+
+    def draw_test(self, test: str, rng: RandomState = None) -> dict[str, np.ndarray]:
+        """Draw the varying and common parameters of one test, one draw for each sample of the hyper-parameters.
+
+        Unlike `weights` it also draws points between the stored samples, from the fitted mixture, and therefore serves
+        populations that are narrow and common parameters. The draws and the rows of `samples` belong together.
+
+        Parameters
+        ----------
+        test : str
+            Name of the test.
+        rng : int, numpy.random.Generator, numpy.random.RandomState or None
+            As for `Posterior.sample_prior`.
+
+        Returns
+        -------
+        dict of str to (n,) float
+
+        Raises
+        ------
+        ValueError
+            If the test is unknown.
+        """
+        self._check_name(test)
+        center, factor = self.posterior.population(self.samples)
+        draws = draw_parameters(self.posterior.described[test], center, factor, _generator(rng))
+        names = [*self.posterior.varying, *self.posterior.common]
+        return dict(zip(names, self.posterior.from_scale(draws).T, strict=True))
+
+    def _check_name(self, test: str) -> None:
+        if test not in self.posterior.tests:
+            raise ValueError(f"there is no test {test!r}; the tests are {', '.join(map(repr, self.posterior.tests))}")
+
+    def _prior_draws(self, name: str, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draws of the prior of a parameter that belongs to each test alone."""
+        priors = {}
+        for test, stored in self.posterior.tests.items():
+            if name not in stored.prior.names:
+                raise ValueError(
+                    f"new_test: test {test!r} has no parameter {name!r}; it has {', '.join(stored.prior.names)}"
+                )
+            part = stored.prior.subset([name])
+            priors[complete_repr(part)] = part
+        if len(priors) > 1:
+            raise ValueError(
+                f"new_test: the prior of {name} differs between the tests; leave it out of names and draw it yourself"
+            )
+        return next(iter(priors.values())).rvs(n, rng)[:, 0]
+
+
+def _generator(rng: RandomState) -> np.random.Generator:
+    """A generator from a seed, a generator, or NumPy's global stream."""
+    if isinstance(rng, np.random.Generator):
+        return rng
+    if rng is None or isinstance(rng, np.random.RandomState):
+        stream = np.random if rng is None else rng  # as in Prior.rvs: np.random.seed makes it reproducible
+        return np.random.default_rng(stream.randint(2**31, size=4))
+    return np.random.default_rng(rng)

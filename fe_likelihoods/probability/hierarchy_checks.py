@@ -1,0 +1,249 @@
+"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails, bounds and errors.
+
+References
+----------
+A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry (2024), Pareto smoothed importance sampling, Journal of Machine
+Learning Research 25(72), 1-58: shapes above 0.7 mean that the weights have no usable mean.
+
+J. Zhang, M. A. Stephens (2009), A new and efficient estimation method for the generalized Pareto distribution,
+Technometrics 51, 316-325, doi:10.1198/tech.2009.08017.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from .population_marginal import draw_products, inverse_prior, population_marginal, sample_weights
+from .stored_posterior import resampled_description
+
+if TYPE_CHECKING:
+    from .hierarchical_posterior import HierarchicalPosterior
+
+__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy", "pareto_shape"]
+
+_HYPER_SAMPLES = 100
+_RESAMPLINGS = 12
+_LARGEST_SHAPE = 0.7
+_DRAWS = 500
+_FEWEST_EFFECTIVE = 20.0
+_LARGEST_ERROR = 0.3  # of the mean of a hyper-parameter, in posterior standard deviations
+_LARGEST_SHARE = 0.1  # of the hyper-samples at which weights may be unusable
+_LARGEST_OUTSIDE = 0.05  # of a population, beyond a bound that the samples reach
+_OUTER = 0.02  # probability of the prior next to a bound
+
+
+class ReweightingCheck(NamedTuple):
+    """How well the stored samples of one test serve the hierarchical model.
+
+    Attributes
+    ----------
+    effective_samples : float
+        Effective sample size of the weights, median over the hyper-samples. NaN with common parameters, whose exact
+        value is not among the samples.
+    sample_share : float
+        Share of the marginal likelihood that is from the samples, mean over the hyper-samples. The rest is from the
+        mixture fitted to them.
+    pareto_shape : float
+        Shape of the upper tail of the inverse prior density over the posterior of the test in the hierarchy, 90 %
+        quantile over the hyper-samples. Above 0.7 this posterior reaches values that the prior of the test, and
+        therefore its samples, leave out.
+    outside : float
+        Mean probability of the population beyond bounds of the prior that the samples reach.
+    error : float
+        Standard error of the logarithm of the marginal likelihood, root mean square over the hyper-samples, from
+        resampled samples.
+    shift : float
+        Largest standard error of the mean of a hyper-parameter that this test causes, in posterior standard deviations.
+    """
+
+    effective_samples: float
+    sample_share: float
+    pareto_shape: float
+    outside: float
+    error: float
+    shift: float
+
+
+class HierarchyChecks(NamedTuple):
+    """Reliability of a hierarchical result.
+
+    Attributes
+    ----------
+    tests : dict of str to ReweightingCheck
+        The checks of each test.
+    mean_errors : dict of str to float
+        Standard error of the posterior mean of each hyper-parameter from the finite samples of all tests, in its
+        posterior standard deviations. The error of the sampler of the hyper-parameters is not included.
+    log_evidence_error : float
+        Standard error of the log-evidence of the hierarchical model from the finite samples of all tests and the errors
+        of their evidences. The error of the sampler of the hyper-parameters is not included.
+    messages : tuple of str
+        What is not reliable and what to do; empty if nothing was found.
+    """
+
+    tests: dict[str, ReweightingCheck]
+    mean_errors: dict[str, float]
+    log_evidence_error: float
+    messages: tuple[str, ...]
+
+    def __str__(self) -> str:
+        lines = ["test                 effective  of samples  Pareto  outside   error   shift"]
+        for name, each in self.tests.items():
+            lines.append(
+                f"{name:20s} {each.effective_samples:9.0f} {each.sample_share:10.0%} {each.pareto_shape:8.2f} "
+                f"{each.outside:8.1%} {each.error:7.2f} {each.shift:7.2f}"
+            )
+        worst = max(self.mean_errors, key=lambda name: self.mean_errors[name])
+        lines.append(f"largest error of a mean: {self.mean_errors[worst]:.2f} posterior sd ({worst})")
+        lines.append(f"error of the log-evidence: {self.log_evidence_error:.2f}")
+        return "\n".join([*lines, *self.messages])
+
+
+def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, seed: int = 0) -> HierarchyChecks:
+    """Check the stored samples of every test at samples of the hyper-parameters.
+
+    Parameters
+    ----------
+    posterior : HierarchicalPosterior
+        The hierarchical model.
+    samples : (n, ndim) ndarray
+        Posterior samples of the hyper-parameters; 100 evenly spaced ones are used.
+    seed : int
+        Seed of the resampling.
+
+    Returns
+    -------
+    HierarchyChecks
+    """
+    rng = np.random.default_rng(seed)
+    used = samples[np.linspace(0, len(samples) - 1, min(len(samples), _HYPER_SAMPLES)).astype(int)]
+    center, factor = posterior.population(used)
+    weighted = not posterior.common
+    found, changes = {}, []
+    for name, described in posterior.described.items():
+        marginal = population_marginal(described, center, factor)
+        change = np.empty((_RESAMPLINGS, len(used)))
+        for row in change:
+            row[:] = population_marginal(resampled_description(described, rng), center, factor).log_value
+        change -= marginal.log_value
+        changes.append(change)
+        sizes = np.full(2, np.nan)
+        drawn = draw_products(described, center, factor, _DRAWS, rng)
+        shapes = np.array([pareto_shape(row) for row in inverse_prior(described, drawn)])
+        if weighted:
+            weights = sample_weights(described, center, factor)
+            square = np.square(weights).sum(axis=1)
+            independent = described.effective_sample_size * np.exp(2.0 * described.log_weights).sum()
+            sizes = np.where(square > 0.0, min(independent, 1.0) / np.where(square > 0.0, square, 1.0), 0.0)
+        found[name] = ReweightingCheck(
+            float(np.median(sizes)),
+            float(marginal.sample_share.mean()),
+            float(np.sort(shapes)[int((1.0 - _LARGEST_SHARE) * (len(shapes) - 1))]),
+            _outside(posterior, name, center, factor, rng),
+            float(np.sqrt(np.mean(np.var(change, axis=0, ddof=1)))),
+            float(_mean_errors(used, change)[0].max()),
+        )
+    errors, evidence = _mean_errors(used, np.sum(changes, axis=0))
+    evidences = sum(test.log_evidence_error**2 for test in posterior.tests.values())
+    return HierarchyChecks(
+        found,
+        dict(zip(posterior.parameter_names, errors.tolist(), strict=True)),
+        float(np.sqrt(evidence**2 + evidences)),
+        tuple(_messages(posterior, found, errors)),
+    )
+
+
+def pareto_shape(weights: np.ndarray) -> float:
+    """Shape of a generalised Pareto distribution fitted to the largest of n weights; -inf where it has no tail.
+
+    The estimate of Zhang and Stephens (2009), with the prior of Vehtari et al. (2024), section 3.2 and appendix: the
+    largest of 0.2 n and 3 sqrt(n) weights, whichever is less.
+    """
+    ordered = np.sort(weights)
+    size = int(min(0.2 * len(ordered), 3.0 * np.sqrt(len(ordered))))
+    if size < 5:
+        return np.nan
+    excess = ordered[-size:] - ordered[-size - 1]
+    excess = excess[excess > 1e-12 * ordered[-1]]
+    if len(excess) < 5:
+        return -np.inf
+    n = len(excess)
+    index = np.arange(1, 31 + int(np.sqrt(n)))
+    theta = 1.0 / excess[-1] + (1.0 - np.sqrt(len(index) / (index - 0.5))) / (3.0 * excess[int(n / 4 + 0.5) - 1])
+    shapes = np.log1p(-theta[:, None] * excess).mean(axis=1)
+    profile = n * (np.log(-theta / shapes) - shapes - 1.0)
+    shares = np.exp(profile - profile.max())
+    mean = (theta * shares).sum() / shares.sum()
+    shape = np.log1p(-mean * excess).mean()
+    return float((n * shape + 5.0) / (n + 10.0))
+
+
+def _mean_errors(samples: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, float]:
+    """Standard errors of the means, in standard deviations, and of the log-evidence, if log-likelihoods change.
+
+    `change` (n_resamplings, n) is added to the log-likelihood of the samples (n, ndim).
+    """
+    largest = change.max(axis=1, keepdims=True)
+    weights = np.exp(change - largest)
+    evidence = largest[:, 0] + np.log(weights.mean(axis=1))
+    means = (weights / weights.sum(axis=1, keepdims=True)) @ samples
+    deviations = samples.std(axis=0)
+    return np.std(means, axis=0, ddof=1) / np.where(deviations > 0.0, deviations, 1.0), float(np.std(evidence, ddof=1))
+
+
+def _outside(
+    posterior: "HierarchicalPosterior", name: str, center: np.ndarray, factor: np.ndarray, rng: np.random.Generator
+) -> float:
+    """Mean probability of the populations beyond bounds of the prior of a test that its samples reach."""
+    described, varying = posterior.described[name], len(posterior.varying)
+    if not np.isfinite(described.prior.bounds[:varying]).any():
+        return 0.0
+    z = rng.standard_normal((len(center), 20, varying))
+    draws = center[:, None, :varying] + np.einsum("nij,nkj->nki", factor, z)
+    values = posterior.from_scale(np.concatenate([draws, np.zeros((*draws.shape[:2], len(posterior.common)))], axis=-1))
+    samples = posterior.from_scale(described.points)
+    beyond = np.zeros(draws.shape[:2], dtype=bool)
+    prior = posterior.tests[name].prior.rvs(20_000, 0)
+    for i, parameter in enumerate(posterior.varying):
+        column = prior[:, posterior.tests[name].prior.names.index(parameter)]
+        low, high = described.prior.bounds[i]
+        weights = np.exp(described.log_weights)
+        if weights[samples[:, i] < np.quantile(column, _OUTER)].sum() > 0.5 * _OUTER:
+            beyond |= values[..., i] < low
+        if weights[samples[:, i] > np.quantile(column, 1.0 - _OUTER)].sum() > 0.5 * _OUTER:
+            beyond |= values[..., i] > high
+    return float(beyond.mean())
+
+
+def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCheck], errors: np.ndarray) -> list[str]:
+    """Sentences about what is not reliable."""
+    messages = []
+    parameters = ", ".join(posterior.varying)
+    for name, each in found.items():
+        if each.pareto_shape > _LARGEST_SHAPE:
+            messages.append(
+                f"test {name!r}: the population reaches values that the prior of this test, and therefore its samples, "
+                f"leave out (Pareto shape {each.pareto_shape:.2f}, above {_LARGEST_SHAPE}): the spread between tests "
+                f"is not reliable. Sample this test again with a wider prior of {parameters}"
+            )
+        elif each.outside > _LARGEST_OUTSIDE:
+            messages.append(
+                f"test {name!r}: its samples reach a bound of its prior, and {each.outside:.0%} of the population is "
+                f"beyond that bound, where the likelihood is taken as zero. Unless the bound is physical, sample this "
+                f"test again with a wider prior of {parameters}"
+            )
+        elif each.effective_samples < _FEWEST_EFFECTIVE:
+            messages.append(
+                f"test {name!r}: the population is narrower than its posterior, or beside it: the weights have an "
+                f"effective sample size of {each.effective_samples:.0f} (median), and "
+                f"{1.0 - each.sample_share:.0%} of its marginal likelihood is from the fitted mixture. Give more "
+                "samples of this test, or draw fresh samples with the population as its prior"
+            )
+    if errors.max() > _LARGEST_ERROR:
+        worst = max(found, key=lambda name: found[name].shift)
+        messages.append(
+            f"the finite samples of the tests give the mean of {posterior.parameter_names[int(errors.argmax())]} an "
+            f"error of {errors.max():.1f} posterior standard deviations, mostly from test {worst!r}: give more samples "
+            "of the tests"
+        )
+    return messages

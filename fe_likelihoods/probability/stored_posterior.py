@@ -1,0 +1,249 @@
+"""Posterior samples of one test, as input of a hierarchical model, and a description of them by a mixture.
+
+`StoredPosterior` holds what a sampler has stored: samples, the prior with which they were drawn, and the evidence.
+`DescribedPosterior` is the part of it that a hierarchical model needs: the samples of some parameters on the scale of
+the population, the prior density at them, and a mixture of normal distributions fitted to them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .distributions import TruncatedNormal
+from .inputs import as_points
+from .mixture_prior import MixtureDistribution, fit_mixture
+from .priors import Prior
+
+__all__ = ["DescribedPosterior", "StoredPosterior", "describe", "resampled_description"]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPosterior:
+    """Samples of the posterior of one test, with the prior and the evidence.
+
+    Parameters
+    ----------
+    samples : (n, dim) array_like, or mapping of str to (n,) array_like
+        Posterior samples of all parameters of `prior`, in its order, such as ``sampler.get_chain(flat=True)``, or
+        ``emcee.backends.HDFBackend("run.h5").get_chain(flat=True)`` for a stored run.
+    prior : Prior
+        Prior with which the samples were drawn (``posterior.prior``).
+    log_weights : (n,) array_like, optional
+        Logarithms of the importance weights of the samples, up to a constant. Default: equal weights.
+    log_evidence : float, optional
+        Logarithm of the evidence of the test. It adds a constant to the log-likelihood of the hyper-parameters. Without
+        it the evidence of the hierarchical model lacks this constant; nothing else changes.
+    log_evidence_error : float
+        Standard error of `log_evidence`.
+    effective_sample_size : float, optional
+        Effective number of independent samples, for the statistical errors. Default: the number of distinct samples,
+        or for weighted samples the effective sample size of the weights.
+
+    Raises
+    ------
+    ValueError
+        If the samples have another dimension than the prior or are not finite, a sample has no prior density, or an
+        argument has another shape or is out of range.
+
+    Examples
+    --------
+    >>> StoredPosterior(sampler.get_chain(flat=True), posterior.prior, log_evidence=sampler.log_evidence)
+    """
+
+    samples: Any
+    prior: Prior
+    log_weights: Any = None
+    log_evidence: float | None = None
+    log_evidence_error: float = 0.0
+    effective_sample_size: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.prior, Prior):
+            raise ValueError(
+                f"StoredPosterior: prior must be the Prior with which the samples were drawn (posterior.prior); got "
+                f"{self.prior!r}"
+            )
+        points = as_points(self.samples, self.prior.names)
+        if points.ndim != 2 or not len(points):
+            raise ValueError(f"StoredPosterior: expected samples of shape (n, {self.prior.dim}); got {points.shape}")
+        if not np.isfinite(points).all():
+            raise ValueError("StoredPosterior: the samples must be finite; leave the others out")
+        if (impossible := np.flatnonzero(np.isneginf(self.prior.logpdf(points)))).size:
+            raise ValueError(
+                f"StoredPosterior: {impossible.size} of {len(points)} samples have no prior density, the first is "
+                f"{points[impossible[0]]}; give the prior with which the samples were drawn"
+            )
+        weights = np.zeros(len(points)) if self.log_weights is None else np.array(self.log_weights, dtype=float)
+        if weights.shape != (len(points),) or not (weights < np.inf).all() or not np.isfinite(weights).any():
+            raise ValueError(
+                f"StoredPosterior: log_weights needs one number below infinity for each of the {len(points)} samples; "
+                f"got shape {weights.shape}"
+            )
+        weights = weights - weights.max()
+        weights -= np.log(np.exp(weights).sum())
+        effective = self.effective_sample_size
+        if effective is None:
+            distinct = len(np.unique(points, axis=0))
+            effective = distinct if self.log_weights is None else 1.0 / np.exp(2.0 * weights).sum()
+        values = [0.0 if self.log_evidence is None else self.log_evidence, self.log_evidence_error, effective]
+        if not np.isfinite(values).all() or values[1] < 0.0 or not 1.0 <= round(values[2], 9) <= len(points):
+            raise ValueError(
+                "StoredPosterior: expected a finite log_evidence, a log_evidence_error of 0 or more, and an "
+                f"effective_sample_size between 1 and the {len(points)} samples; got {values}"
+            )
+        for name, value in (
+            ("samples", points),
+            ("log_weights", weights),
+            ("effective_sample_size", float(effective)),
+        ):
+            object.__setattr__(self, name, value)
+
+
+class DescribedPosterior(NamedTuple):
+    """Posterior samples of some parameters on the scale of a population, and a mixture fitted to them.
+
+    Attributes
+    ----------
+    points : ndarray[n, dim]
+        Samples: logarithms of parameters with a logarithmic scale, the other parameters as they are.
+    log_weights : ndarray[n]
+        Logarithms of their weights, which sum to one.
+    log_prior : ndarray[n]
+        Logarithm of the prior density of the points.
+    prior : Prior
+        Prior of these parameters, before the change of scale.
+    logarithmic : ndarray[dim] of bool
+        Which parameters have a logarithmic scale.
+    log_shares : ndarray[n_components]
+        Logarithms of the shares of the components of the mixture.
+    means : ndarray[n_components, dim]
+        Means of the components.
+    covariances : ndarray[n_components, dim, dim]
+        Covariances of the components.
+    mixture : MixtureDistribution
+        The mixture in standardised coordinates.
+    effective_sample_size : float
+        Effective number of independent samples.
+    """
+
+    points: np.ndarray
+    log_weights: np.ndarray
+    log_prior: np.ndarray
+    prior: Prior
+    logarithmic: np.ndarray
+    log_shares: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
+    mixture: MixtureDistribution
+    effective_sample_size: float
+
+    def log_prior_at(self, points: np.ndarray) -> np.ndarray:
+        """Logarithm of the prior density (...) of points (..., dim) on the scale of the population."""
+        rows = points.reshape(-1, points.shape[-1])
+        with np.errstate(over="ignore"):
+            values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, rows, 0.0)), rows)
+        density = self.prior.logpdf(values) + (rows * self.logarithmic).sum(axis=1)
+        return density.reshape(points.shape[:-1])
+
+
+def describe(
+    stored: StoredPosterior, names: Sequence[str], logarithmic: np.ndarray, max_samples: int, seed: int = 0
+) -> DescribedPosterior:
+    """Describe the stored samples of some parameters.
+
+    Parameters
+    ----------
+    stored : StoredPosterior
+        Samples of all parameters.
+    names : sequence of str
+        The parameters to describe.
+    logarithmic : (dim,) array_like of bool
+        Which of them have a logarithmic scale.
+    max_samples : int
+        Largest number of samples. More samples are thinned: evenly, or by systematic resampling if they have weights.
+    seed : int
+        Seed of the resampling and of the fit.
+
+    Returns
+    -------
+    DescribedPosterior
+
+    Raises
+    ------
+    ValueError
+        If a parameter is unknown, has a joint prior with parameters that are not described, or is not positive on a
+        logarithmic scale; and as `fit_mixture`.
+    """
+    if missing := [name for name in names if name not in stored.prior.names]:
+        raise ValueError(
+            f"the stored samples have no parameters {', '.join(missing)}; they have {', '.join(stored.prior.names)}"
+        )
+    logarithmic = np.asarray(logarithmic, dtype=bool)
+    prior = stored.prior.subset(names)
+    values = stored.samples[:, [stored.prior.names.index(name) for name in names]]
+    if (values[:, logarithmic] <= 0.0).any():
+        positive = ", ".join(name for name, log in zip(names, logarithmic, strict=True) if log)
+        raise ValueError(f"a logarithmic scale needs positive samples of {positive}; use scale='linear'")
+    points = np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+    rng, weights = np.random.default_rng(seed), np.exp(stored.log_weights)
+    equal = np.ptp(stored.log_weights) == 0.0
+    rows = _systematic(weights, min(len(points), max_samples), rng)  # evenly spaced rows for equal weights
+    mixture = _fit(points[rows], names, stored.effective_sample_size, seed)
+    if len(points) > max_samples:
+        points, log_weights = points[rows], np.full(len(rows), -np.log(len(rows)))
+    else:
+        log_weights = np.full(len(points), -np.log(len(points))) if equal else stored.log_weights
+    size = min(stored.effective_sample_size, max_samples)
+    if len(stored.samples) > max_samples and not equal:  # resampling adds the error of as many samples
+        size = 1.0 / (1.0 / stored.effective_sample_size + 1.0 / max_samples)
+    incomplete = DescribedPosterior(
+        points, log_weights, np.zeros(len(points)), prior, logarithmic, *_components(mixture), mixture, size
+    )
+    return incomplete._replace(log_prior=incomplete.log_prior_at(points))
+
+
+def resampled_description(described: DescribedPosterior, rng: np.random.Generator) -> DescribedPosterior:
+    """A description of samples drawn with replacement from the described ones, to estimate statistical errors.
+
+    As many samples are drawn as there are effective ones. The points stay the same; their weights are the counts of
+    the draws, and the mixture is fitted to the draws, starting from the given one.
+    """
+    size = max(round(described.effective_sample_size), 1)
+    counts = rng.multinomial(size, np.exp(described.log_weights) / np.exp(described.log_weights).sum())
+    with np.errstate(divide="ignore"):
+        log_weights = np.log(counts / size)
+    mixture = described.mixture.refitted(np.repeat(described.points, counts, axis=0))
+    shares, means, covariances = _components(mixture)
+    return described._replace(
+        log_weights=log_weights, log_shares=shares, means=means, covariances=covariances, mixture=mixture
+    )
+
+
+def _fit(points: np.ndarray, names: Sequence[str], effective: float, seed: int) -> MixtureDistribution:
+    """Mixture fitted to points of equal weight, in coordinates of mean zero and standard deviation one."""
+    deviations = points.std(axis=0)
+    if constant := [name for name, each in zip(names, deviations, strict=True) if not each > 0.0]:
+        raise ValueError(f"all samples have the same value of {', '.join(constant)}: a posterior density is needed")
+    coordinates = Prior(
+        {
+            name: TruncatedNormal(mean, sd, -np.inf, np.inf)
+            for name, mean, sd in zip(names, points.mean(axis=0), deviations, strict=True)
+        }
+    )
+    return fit_mixture(points, coordinates, effective_sample_size=effective, seed=seed)
+
+
+def _components(mixture: MixtureDistribution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Logarithms of the shares, means and covariances of the components, without the standardisation."""
+    normals = list(mixture.prior.distributions.values())
+    center, scale = np.array([each.mean for each in normals]), np.array([each.sd for each in normals])
+    return np.log(mixture.weights), center + scale * mixture.means, mixture.covariances * np.outer(scale, scale)
+
+
+def _systematic(weights: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    """Rows drawn by systematic resampling: `size` evenly spaced positions in the cumulative weights."""
+    positions = (np.arange(size) + rng.random()) / size
+    cumulative = np.cumsum(weights)
+    return np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1)
