@@ -358,6 +358,23 @@ def test_own_measurements_before_and_after_the_record_are_left_out(tmp_path, mon
         own_column.read_measurements(tmp_path / "top.csv", late, record)
 
 
+def test_own_measurements_shorter_than_the_record(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tutorials")
+    own_column = importlib.import_module("own_column")
+    record = Record("base", 0.01, np.sin(0.1 * np.arange(201)))
+    table = ["time_s,top [mm]", *(f"{0.02 * k:.2f},{k % 89}" for k in range(40))]
+    (tmp_path / "top.csv").write_text("\n".join(table))
+    (tmp_path / "own.toml").write_text('[measurements]\ncolumns = {displacement = "top [mm]"}\n')
+    settings = own_column.read_settings(tmp_path / "own.toml")
+    measured = own_column.read_measurements(tmp_path / "top.csv", settings, record)
+    assert measured.description == "measurements of top.csv, displacement ends 1.22 s before the record"
+    np.testing.assert_array_equal(measured.values[0], [*(1e-3 * np.arange(40)), *[np.nan] * 61])
+    for every, n in ((1, 40), (2, 20)):
+        likelihood = own_column.make_posterior(record, measured, settings, every).likelihood
+        assert np.isfinite(likelihood.measurements.values).sum() == n
+        assert np.isfinite(likelihood.log_likelihood([1.0, 1.0, 1.0, 1.0, 1.0, 0.002]))
+
+
 def test_settings_in_the_documentation_are_those_of_the_tutorial(tmp_path, monkeypatch):
     """The example of docs/own_column.rst describes the column of the tutorial."""
     monkeypatch.syspath_prepend(ROOT / "tutorials")

@@ -106,7 +106,8 @@ def read_settings(path: Path | None) -> Settings:
 def read_measurements(path: Path, settings: Settings, record: Record) -> Measurements:
     """Read the measured channels, ``acceleration`` and ``displacement`` of the top or one, from CSV or a workbook.
 
-    Samples before and after the record are left out; the description says so.
+    Samples before and after the record are left out, and times after the last sample count as missing; the description
+    says so.
     """
     channels = {channel.name: channel for channel in RCColumn.lhpost(record, **settings.column).channels}
     options = dict(settings.measurements)
@@ -126,8 +127,8 @@ def read_measurements(path: Path, settings: Settings, record: Record) -> Measure
 
 
 def _within(measurements: Measurements, record: Record) -> Measurements:
-    """The samples between the first and the last one of the record."""
-    end, rows, starts, left_out = record.time[-1], [], [], []
+    """The samples between the first and the last one of the record, with NaN where the measurements are shorter."""
+    end, rows, starts, notes = record.time[-1], [], [], []
     for channel, values, step in zip(measurements.channels, measurements.values, measurements.steps, strict=True):
         times = measurements.times(channel.name)
         inside = np.flatnonzero((times >= -1e-6 * step) & (times <= end + 1e-6 * step))
@@ -138,12 +139,12 @@ def _within(measurements: Measurements, record: Record) -> Measurements:
                 f"the record, 0 to {end:g} s; set zero in [measurements] to the time in the file at which the base "
                 "motion begins"
             )
-        rows.append(values[inside])
+        missing = int((end - times[inside[-1]]) / step + 1e-6)
+        rows.append(np.append(values[inside], np.full(missing, np.nan)))
         starts.append(0.0 if abs(times[inside[0]]) <= 1e-6 * step else float(times[inside[0]]))
-        left_out += [f"{outside} samples of {channel.name}"] if outside else []
-    if not left_out:
-        return measurements
-    text = f"{measurements.description}, without {', '.join(left_out)} before or after the record"
+        notes += [f"without {outside} samples of {channel.name} before or after the record"] if outside else []
+        notes += [f"{channel.name} ends {missing * step:.3g} s before the record"] if missing else []
+    text = ", ".join([measurements.description, *notes])
     return Measurements(measurements.channels, measurements.steps, rows, text, starts)
 
 
