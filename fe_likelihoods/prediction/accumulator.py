@@ -126,7 +126,7 @@ class Accumulator:
                 self.retained.add(start + np.array(usable), histories)
             return
         samples = np.concatenate([members[j] for j in usable])
-        self.noise_variance.add(np.square(self.noise.deviations[samples][:, self.rows]), np.ones(len(samples)))
+        self.noise_variance.add(np.square(self.noise.deviations[samples][..., self.rows]), np.ones(len(samples)))
         if self.retained is None:
             return
         for history, j in zip(histories, usable, strict=True):

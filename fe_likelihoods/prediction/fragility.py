@@ -187,7 +187,7 @@ def fragility(
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, settings.get("noise", False))
     source = read_source(posterior_or_model)
-    thetas, _ = split_samples(source, samples, settings.get("noise", False))
+    thetas, _ = split_samples(source, samples, settings.get("noise", False), True)
     known = evaluator(quantity, source.model.channels)
     if known.rows is not None or len(known.channels) > 1:
         raise ValueError(f"fragility needs one number as quantity, such as peak(channel); got {quantity!r}")

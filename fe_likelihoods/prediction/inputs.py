@@ -4,12 +4,13 @@ This is the only module of predictions that asks foreign objects (posteriors, li
 optional members.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..probability.event_noise import EventNoise
+from ..probability.event_noise import EventNoise, find_events
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
@@ -56,18 +57,30 @@ class SampleNoise(NamedTuple):
 
     Attributes
     ----------
-    deviations : ndarray, shape (n, n_channels)
+    deviations : ndarray, shape (n, n_channels), or (n, n_events, n_channels)
         Standard deviations [SI].
     lag_one : ndarray, shape (n, n_channels), or None
         Correlation of successive errors [-], None for white noise.
+    events : tuple of slice
+        Steps of each event, for standard deviations per event. Other steps have no noise.
     """
 
     deviations: np.ndarray
     lag_one: np.ndarray | None
+    events: tuple[slice, ...] = ()
+
+    def over_time(self, levels: np.ndarray, n_steps: int) -> np.ndarray:
+        """Values at all steps, shape (n_channels, n_steps) or (n_channels, 1), from those of one sample."""
+        if not self.events:
+            return levels[:, None]
+        values = np.zeros((levels.shape[1], n_steps))
+        for level, steps in zip(levels, self.events, strict=True):
+            values[:, steps] = level[:, None]
+        return values
 
     def draw(self, sample: int, n_steps: int, rng: np.random.Generator) -> np.ndarray:
         """Draw the errors of one sample, shape (n_channels, n_steps) [SI]."""
-        errors = rng.standard_normal((self.deviations.shape[1], n_steps))
+        errors = rng.standard_normal((self.deviations.shape[-1], n_steps))
         if self.lag_one is not None:
             from scipy.signal import lfilter  # imported here because it is slow to import and rarely needed
 
@@ -75,7 +88,7 @@ class SampleNoise(NamedTuple):
                 # e_t = rho e_{t-1} + sqrt(1 - rho^2) z_t is stationary: e_0 has the same variance as the others.
                 row[1:] *= np.sqrt((1.0 - rho) * (1.0 + rho))
                 row[:] = lfilter([1.0], [1.0, -rho], row)
-        return self.deviations[sample][:, None] * errors
+        return self.over_time(self.deviations[sample], n_steps) * errors
 
 
 def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
@@ -152,7 +165,9 @@ def simulates_in_batches(model: Model) -> bool:
     return hasattr(model, "simulate_batch")
 
 
-def split_samples(source: PredictionSource, samples: Any, noise: bool) -> tuple[np.ndarray, SampleNoise | None]:
+def split_samples(
+    source: PredictionSource, samples: Any, noise: bool | str, other_record: bool = False
+) -> tuple[np.ndarray, SampleNoise | None]:
     """Split samples into structural parameters and, if wanted, the noise of each sample.
 
     Parameters
@@ -161,8 +176,10 @@ def split_samples(source: PredictionSource, samples: Any, noise: bool) -> tuple[
         The model and the noise.
     samples : (n, ndim) array_like, or named values of shape (n,)
         All parameters, or without `noise` the structural parameters alone.
-    noise : bool
-        Whether the noise is wanted.
+    noise : bool or str
+        Whether the noise is wanted; the name of an event for the noise that was calibrated with it (`EventNoise`).
+    other_record : bool
+        Whether the prediction is of another record than that of the likelihood.
 
     Returns
     -------
@@ -201,7 +218,14 @@ def split_samples(source: PredictionSource, samples: Any, noise: bool) -> tuple[
     thetas = points[:, : len(structural)]
     if not noise:
         return thetas, None
-    return thetas, _sample_noise(noise_model, points[:, len(structural) :], len(model.channels))
+    parameters = points[:, len(structural) :]
+    if isinstance(noise_model, EventNoise):
+        return thetas, _noise_of_events(noise_model, parameters, model, noise, other_record)
+    if isinstance(noise, str):
+        raise ValueError(
+            f"noise={noise!r} names an event, and {type(noise_model).__name__} has no levels per event; give noise=True"
+        )
+    return thetas, _sample_noise(noise_model, parameters, len(model.channels))
 
 
 def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -216,12 +240,37 @@ def samples_of_rows(row_of_sample: np.ndarray, n_rows: int) -> list[np.ndarray]:
     return np.split(order, np.cumsum(np.bincount(row_of_sample, minlength=n_rows))[:-1])
 
 
-def _sample_noise(noise_model: Any, parameters: np.ndarray, n_channels: int) -> SampleNoise:
-    if isinstance(noise_model, EventNoise):
+def _noise_of_events(
+    noise_model: EventNoise, parameters: np.ndarray, model: Model, noise: bool | str, other_record: bool
+) -> SampleNoise:
+    """Noise with levels per event: each at its steps, or those of one event at all steps."""
+    names = ", ".join(map(repr, noise_model.names))
+    rows = [[channel.name for channel in noise_model.channels].index(channel.name) for channel in model.channels]
+    deviations = noise_model.deviations_per_event(parameters)[:, :, rows]
+    if not (deviations[~np.isnan(deviations)] > 0.0).all() or np.isinf(deviations).any():
+        raise ValueError("the noise needs positive standard deviations; some samples have others")
+    if not isinstance(noise, str):
+        if other_record:
+            raise ValueError(
+                "the noise has levels per event, and the prediction is of another record: give the event whose levels "
+                f"hold for it, noise= one of {names}"
+            )
+        steps = [(each.start / model.dt, each.end / model.dt) for each in find_events(model).windows]
+        events = tuple(slice(math.ceil(start - 1e-6), math.floor(end + 1e-6) + 1) for start, end in steps)
+        return SampleNoise(np.nan_to_num(deviations), None, events)
+    if noise not in noise_model.names:
+        raise ValueError(f"noise={noise!r} is no event of the noise; give one of {names}")
+    chosen = deviations[:, noise_model.names.index(noise)]
+    if np.isnan(chosen).any():
+        without = [c.name for c, values in zip(model.channels, chosen.T, strict=True) if np.isnan(values).any()]
         raise ValueError(
-            "a prediction with noise needs one standard deviation per channel, and EventNoise has one per channel and "
-            "event; predict with noise=False, or calibrate with GaussianNoise or with the measurements of one event"
+            f"the channels {', '.join(without)} were not measured in {noise!r}, so their noise is not known; give "
+            f"another event of {names}, or noise=False"
         )
+    return SampleNoise(chosen, None)
+
+
+def _sample_noise(noise_model: Any, parameters: np.ndarray, n_channels: int) -> SampleNoise:
     if not hasattr(noise_model, "standard_deviations"):
         raise ValueError(
             f"{type(noise_model).__name__} cannot be drawn from: give it a method standard_deviations(parameters (n, "

@@ -66,7 +66,7 @@ def propagate(
     record: Record | None = None,
     from_state: str | None = None,
     rest: float = 10.0,
-    noise: bool = False,
+    noise: bool | str = False,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
     effective_sample_size: float | None = None,
     batch: int | None = None,
@@ -102,11 +102,12 @@ def propagate(
         a warning if the model is path dependent.
     rest : float
         Length of the pause without motion before `record`, for "end" [s].
-    noise : bool
+    noise : bool or str
         Predict measurements: the response plus the noise of each sample, with its correlation in time. For histories,
         mean and variance are exact in the noise (the law of total variance adds the mean variance of the noise), and
         quantiles use one draw of the noise per sample. For other quantities, one draw per sample is added to the
-        response.
+        response. A noise with levels per event (`EventNoise`) has those of each event in that event; under another
+        `record`, give the name of the event whose levels hold for it.
     quantiles : sequence of float
         Probabilities of the quantiles, between 0 and 1. An empty sequence for none.
     effective_sample_size : float, optional
@@ -149,7 +150,7 @@ def propagate(
     """
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     source = read_source(posterior_or_model, pool)
-    thetas, sample_noise = split_samples(source, samples, noise)
+    thetas, sample_noise = split_samples(source, samples, noise, record is not None)
     n = len(thetas)
     probabilities = _probabilities(quantiles)
     effective = check_effective_sample_size(effective_sample_size, n)
@@ -277,7 +278,7 @@ def _prediction(
     variance = accumulator.moments.variance
     error = np.sqrt(variance / effective)
     if histories and noise:
-        variance = variance + accumulator.noise_variance.mean[:, None]
+        variance = variance + accumulator.noise.over_time(accumulator.noise_variance.mean, variance.shape[1])
     probabilities, n_quantile = accumulator.probabilities, 0 if retained is None else retained.n_samples
     if probabilities and n_quantile == 0:
         logger.warning("no quantiles: all samples retained for them failed; increase memory_bytes")

@@ -61,8 +61,9 @@ class EventNoise:
 
     Notes
     -----
-    The log-likelihood is that of `GaussianNoise`, summed over the events. Predictions with ``noise=True`` need one
-    level per channel and are refused; use a likelihood of one event with `GaussianNoise` for them.
+    The log-likelihood is that of `GaussianNoise`, summed over the events. Predictions with ``noise=True`` have the
+    levels of each event in that event, and no noise in the pauses and in channels that were not measured in the event.
+    Under another record, ``noise="EQ1"`` has those of EQ1.
     """
 
     channels: tuple[Channel, ...]
@@ -130,6 +131,13 @@ class EventNoise:
     def statistic(self) -> EventSums:
         """Statistic of the residuals."""
         return EventSums(self.windows)
+
+    def deviations_per_event(self, parameters: np.ndarray) -> np.ndarray:
+        """Standard deviations (n, n_events, n_channels) from parameters (n, n_levels); NaN where there is none."""
+        found = np.full((len(parameters), len(self.names), len(self.channels)), np.nan)
+        for column, (event, row) in enumerate(self.levels):
+            found[:, event, row] = np.asarray(parameters, dtype=float)[:, column]
+        return found
 
     def with_measurements(self, measurements: Measurements) -> "EventNoise":
         """The same noise, with the same parameters, for other measurements of the same events and channels."""

@@ -21,7 +21,6 @@ from fe_likelihoods import (
     ShearFrame,
     SimulationCache,
     TruncatedNormal,
-    propagate,
 )
 
 NAMES = ("stiffness", "damping")
@@ -201,5 +200,3 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
     for arguments in ((measured,), (whole, "per event")):
         with pytest.raises(ValueError, match="need a model whose excitation is Events"):
             FELikelihood(plain, *arguments)
-    with pytest.raises(ValueError, match="one per channel and event; predict with noise=False"):
-        propagate(FELikelihood(model, measured, "per event"), np.ones((2, 6)), noise=True, progress=False)
