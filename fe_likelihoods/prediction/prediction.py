@@ -194,15 +194,50 @@ class Prediction:
             raise ValueError(f"channels {', '.join(empty)} have no sample in this part; choose another one")
         return ((below <= measured) & (measured <= above)).sum(axis=1) / samples
 
-    def plot(self, measurements: Measurements | None = None, channels: "Sequence[str] | None" = None) -> "Figure":
-        """Plot mean, band and measurements, see `fe_likelihoods.plots.predictions.plot_bands`."""
+    def plot(
+        self,
+        measurements: Measurements | None = None,
+        channels: "Sequence[str] | None" = None,
+        time_shifts: "Mapping[str, float] | None" = None,
+    ) -> "Figure":
+        """Plot mean, band and measurements, see `fe_likelihoods.plots.predictions.plot_bands`.
+
+        Parameters
+        ----------
+        measurements : Measurements, optional
+            Measurements, drawn at their own times.
+        channels : sequence of str, optional
+            Names of the channels to draw. Default: all.
+        time_shifts : mapping of str to float, optional
+            As for `rrmse`: mean and band of these channels are drawn later by these times [s], where they are compared
+            with the measurements. Needed for measured channels of `shifted`.
+
+        Returns
+        -------
+        matplotlib Figure
+        """
         from ..plots.predictions import plot_bands
 
-        return plot_bands(self, measurements, channels)
+        measured = [] if measurements is None else [channel.name for channel in measurements.channels]
+        drawn = [channel.name for channel in self.channels] if channels is None else channels
+        shifts = self._shifts([name for name in measured if name in drawn], time_shifts)
+        return plot_bands(self, measurements, channels, shifts)
 
     def _need_histories(self) -> None:
         if self.dt is None:
             raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
+
+    def _shifts(self, measured: "Sequence[str]", time_shifts: "Mapping[str, float] | None") -> dict[str, float]:
+        """Return the given time shifts; raise ValueError if one of a measured channel is missing, or is unknown."""
+        shifts, names = dict(time_shifts or {}), [channel.name for channel in self.channels]
+        if missing := [name for name in names if name in self.shifted and name in measured and name not in shifts]:
+            raise ValueError(
+                f"the channels {', '.join(missing)} have unknown time shifts: give time_shifts={{name: seconds}}, for "
+                "instance the posterior means of their parameters time_shift_<channel>"
+            )
+        if unknown := sorted(set(shifts) - set(names)):
+            raise ValueError(f"time_shifts has {', '.join(unknown)}, the prediction has {', '.join(names)}")
+        return shifts
 
     def _compared(
         self, measurements: Measurements, time_shifts: "Mapping[str, float] | None"
@@ -216,15 +251,7 @@ class Prediction:
                     f"channel {predicted.name!r} is {predicted.quantity!r} in the prediction, {measured.quantity!r} in "
                     "the measurements"
                 )
-        shifts = dict(time_shifts or {})
-        names = [channel.name for channel in self.channels]
-        if missing := [name for name in names if name in self.shifted and name not in shifts]:
-            raise ValueError(
-                f"the channels {', '.join(missing)} have unknown time shifts: give time_shifts={{name: seconds}}, for "
-                "instance the posterior means of their parameters time_shift_<channel>"
-            )
-        if unknown := sorted(set(shifts) - set(names)):
-            raise ValueError(f"time_shifts has {', '.join(unknown)}, the prediction has {', '.join(names)}")
+        shifts = self._shifts([channel.name for channel in self.channels], time_shifts)
         compared = compare_with(chosen, self.dt, self.mean.shape[1])
         return compare_shifted(chosen, compared, self.dt, self.mean.shape[1], shifts) if shifts else compared
 

@@ -62,7 +62,12 @@ class TimeShiftNoise:
 
     def __init__(self, noise: GaussianNoise | SharedGaussianNoise, time_shifts: Mapping[str, float], dt: float) -> None:
         if not isinstance(noise, GaussianNoise | SharedGaussianNoise):
-            raise ValueError(f"TimeShiftNoise expects a GaussianNoise or a SharedGaussianNoise; got {noise!r}")
+            raise ValueError(
+                f"TimeShiftNoise expects a GaussianNoise or a SharedGaussianNoise; got {noise!r}. For errors "
+                "correlated in time, and for standard deviations that are integrated out, estimate the shift with "
+                "align(response, measurements), correct it with Measurements.shift(-lag), and use the noise without "
+                "TimeShiftNoise"
+            )
         names = [channel.name for channel in noise.channels]
         unknown = sorted(set(time_shifts) - set(names))
         if unknown or not time_shifts:

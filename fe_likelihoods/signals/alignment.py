@@ -25,6 +25,8 @@ __all__ = ["Alignment", "align"]
 _FEWEST = 0.5  # share of the energy, and of the samples, of the shorter of channel and reference that must overlap
 _CANDIDATES = 8  # highest peaks on the grid of lags that are refined
 _WINDOW = 5.0  # length of the sums over lags of autocorrelations, in correlation times
+_DRIFT = 4.0  # standard errors of the drift beyond which it is stated
+_LARGEST_DRIFT = 0.01
 _GOOD = 0.7  # correlation below which the reference does not explain the channel
 
 
@@ -43,6 +45,11 @@ class Alignment(NamedTuple):
         Probability of the highest peak against the second highest one, a different lag.
     second_lag : float or None
         Lag of the second highest peak [s]; None if there is none.
+    drift : float
+        Change of the lag per time [-], from the lags of the first and the second half of the energy of the reference:
+        0.002 if the clock of the measurements gains 2 ms per second.
+    drift_error : float
+        Standard error of the drift [-]; inf if the halves are too short.
     """
 
     lag: float
@@ -50,6 +57,8 @@ class Alignment(NamedTuple):
     correlation: dict[str, float]
     probability: float
     second_lag: float | None
+    drift: float = 0.0
+    drift_error: float = math.inf
 
     @property
     def statement(self) -> str:
@@ -63,6 +72,12 @@ class Alignment(NamedTuple):
         if self.probability < 0.99:
             text += (
                 f"; NOT SURE: a lag of {self.second_lag:.5g} s is nearly as good, {self.probability:.0%} for the first"
+            )
+        if abs(self.drift) > _DRIFT * self.drift_error:
+            text += (
+                f"; NOT SURE: the lag changes by {100 * self.drift:.2g} % of the time (standard error "
+                f"{100 * self.drift_error:.1g} %), so the clocks run at different speeds, or the reference lacks a "
+                "part of the motion; correct the time step of the measurements, or align them in parts"
             )
         return text
 
@@ -185,7 +200,7 @@ def align(
     found = {p.name: _correlation(p, lag) for p in pairs}
     information = sum(_information(p, lag) for p in pairs)
     error = 1.0 / math.sqrt(information) if information > 0.0 else math.inf
-    return Alignment(lag, error, found, probability, second)
+    return Alignment(lag, error, found, probability, second, *_drift(pairs, effective, lag, step))
 
 
 def _pairs(reference: Record | Measurements, measurements: Measurements, channels: Sequence[str] | None) -> list[_Pair]:
@@ -244,7 +259,11 @@ def _shifted(pair: _Pair, lag: float) -> tuple[NDArray[np.bool_], NDArray[np.flo
 def _correlation(pair: _Pair, lag: float) -> float:
     """Correlation of a channel and its shifted reference; zero where they do not overlap."""
     inside, shifted = _shifted(pair, lag)
-    own = pair.values[inside]
+    return _coefficient(pair.values[inside], shifted)
+
+
+def _coefficient(own: NDArray[np.float64], shifted: NDArray[np.float64]) -> float:
+    """Correlation of two arrays; zero for fewer than three values, or constant ones."""
     if own.size < 3 or not np.ptp(own) > 0.0 or not np.ptp(shifted) > 0.0:
         return 0.0
     own, shifted = own - own.mean(), shifted - shifted.mean()
@@ -309,6 +328,48 @@ def _refine(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, 
 
     found = minimize_scalar(negative, bounds=(lag - step, lag + step), method="bounded", options={"xatol": 1e-6 * step})
     return float(found.x)
+
+
+def _drift(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, step: float) -> tuple[float, float]:
+    """Change of the lag per time and its standard error, from the lags of two halves of the energy of the reference."""
+    halves = [[_half(pair, lag, later) for pair in pairs] for later in (False, True)]
+    if any(half.values.size < 20 for parts in halves for half in parts):
+        return 0.0, math.inf
+    duration = max(float(np.ptp(pair.times)) for pair in pairs)
+    reach = math.ceil(0.25 * _LARGEST_DRIFT * duration / step) + 1
+    trials = lag + step * np.arange(-reach, reach + 1)
+    scores = np.zeros((2, trials.size))
+    for pair, n, *ends in zip(pairs, effective, *halves, strict=True):
+        for k, trial in enumerate(trials):
+            inside, shifted = _shifted(pair, float(trial))
+            own, places = pair.values[inside], pair.places[inside]
+            middle = int(np.searchsorted(places, ends[1].places[0]))
+            for row, part in enumerate((slice(None, middle), slice(middle, None))):
+                scores[row, k] += n * _coefficient(own[part], shifted[part]) ** 2
+    lags, centres, variances = [], [], []
+    for parts, score in zip(halves, scores, strict=True):
+        best = min(max(int(np.argmax(score)), 1), score.size - 2)
+        below, top, above = score[best - 1 : best + 2]
+        bend = below - 2.0 * top + above
+        lags.append(float(trials[best] + (step * 0.5 * (below - above) / bend if bend < 0.0 else 0.0)))
+        information = sum(_information(part, lags[-1]) for part in parts)
+        variances.append(1.0 / information if information > 0.0 else math.inf)
+        motions = [(part.times[inside], motion) for part in parts for inside, motion in [_shifted(part, lag)]]
+        centres.append(np.mean([np.average(times, weights=motion**2) for times, motion in motions]))
+    apart = float(centres[1] - centres[0])
+    # where there is no noise, the interpolation of the reference limits what can be told apart
+    error = math.sqrt(sum(variances) + (0.02 * step) ** 2)
+    return (lags[1] - lags[0]) / apart, error / apart
+
+
+def _half(pair: _Pair, lag: float, later: bool) -> _Pair:
+    """The samples within the shifted reference that have the first, or the second, half of the energy."""
+    inside, motion = _shifted(pair, lag)
+    places, values = pair.places[inside], pair.values[inside]
+    energy = np.cumsum(motion**2)
+    middle = int(np.searchsorted(energy, 0.5 * energy[-1]))
+    part = slice(middle, None) if later else slice(None, middle)
+    return pair._replace(places=places[part], values=values[part])
 
 
 def _errors(pair: _Pair, lag: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:

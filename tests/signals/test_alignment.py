@@ -71,6 +71,17 @@ def test_standard_error_is_that_of_repetitions(rng, correlation):
     assert 0.87 <= (np.abs(scores) < 1.96).mean() <= 1.0
 
 
+@pytest.mark.parametrize(("drift", "sure"), [(0.0, True), (0.002, False), (-0.002, False)])
+def test_clocks_of_different_speed(rng, drift, sure):
+    time = 0.01 * np.arange(4000)
+    long = np.sum([(1.0 - 0.1 * k) * motion(time - start, k) for k, start in enumerate((0.5, 12.0, 25.0))], axis=0)
+    values = np.interp((time - 0.2) / (1.0 + drift), time, long) + 0.2 * long.std() * rng.normal(size=time.size)
+    found = align(Record("long", 0.01, long), Measurements((BASE,), 0.01, values[None]), max_lag=1.0)
+    assert found.drift == pytest.approx(drift, abs=4.0 * found.drift_error) and 0.0 < found.drift_error < 0.0004
+    assert ("NOT SURE: the lag changes by" in found.statement) != sure
+    assert sure == (abs(found.lag - 0.2) < 4.0 * found.standard_error)
+
+
 def test_an_uncertain_lag_says_so(rng):
     sine = Record("sine", DT, np.sin(2.0 * np.pi * TIME))
     waves = Measurements((BASE,), DT, (np.sin(2.0 * np.pi * (TIME - 0.2)) + 0.5 * rng.normal(size=N_STEPS))[None])
@@ -284,9 +295,16 @@ def test_residuals_and_errors_are_at_the_shift(rng):
         lambda: fit_measures(likelihood, [point[:2]]),
         lambda: found.rrmse(data),
         lambda: found.coverage(data),
+        lambda: found.plot(data),
     ):
         with pytest.raises(ValueError, match="time shifts"):
             call()
     with pytest.raises(ValueError, match="time_shifts has base"):
         found.rrmse(data, time_shifts={"top": 0.0, "base": 0.0})
     assert found.coverage(data, time_shifts={"top": 0.0234}).shape == (2,)
+    top, drift = found.plot(data, time_shifts={"top": 0.0234}).axes
+    for axes, shift, label in ((top, 0.0234, "mean, shifted by 0.0234 s"), (drift, 0.0, "mean")):
+        mean = next(line for line in axes.lines if line.get_label().startswith("mean"))
+        assert (mean.get_label(), mean.get_xdata()[0]) == (label, shift)
+        assert axes.collections[0].get_paths()[0].vertices[:, 0].min() == pytest.approx(shift)
+    assert len(found.plot(data, ["drift"]).axes) == len(found.plot(channels=["top"]).axes) == 1
