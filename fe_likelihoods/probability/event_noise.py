@@ -216,4 +216,11 @@ def _events_of(model: Model) -> Events:
             f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]); that of this "
             f"{type(model).__name__} is not"
         )
+    missing = events.duration - (model.n_steps - 1) * model.dt
+    if missing > 1.000001 * model.dt:
+        raise ValueError(
+            f"measurements and noise per event need a response to all {events.duration:g} s of the events, and that of "
+            f"this {type(model).__name__} lacks {missing:g} s; leave out its lead, and put NaN where the measurements "
+            "of the first event are not to be compared"
+        )
     return events

@@ -200,3 +200,13 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
     for arguments in ((measured,), (whole, "per event")):
         with pytest.raises(ValueError, match="need a model whose excitation is Events"):
             FELikelihood(plain, *arguments)
+
+
+def test_response_that_begins_after_a_lead_is_refused(events, rng):
+    frame = ShearFrame({"low": 1, "top": 2}, [1, 1], [900.0, 700.0])
+    structure = LinearStructure(frame, events, lead=0.4)
+    data = {"EQ2": Measurements(structure.channels, 0.02, rng.normal(size=(2, 50)))}
+    for noise in (None, "per event"):
+        with pytest.raises(ValueError, match="this LinearStructure lacks 0.4 s; leave out its lead, and put NaN"):
+            FELikelihood(structure, data, noise)
+    assert FELikelihood(LinearStructure(frame, events), data).n_samples.samples.tolist() == [50, 50]
