@@ -148,6 +148,11 @@ def bridge_column_measurements(
     values = model.simulate([BRIDGE_COLUMN_MEANS[name] for name in model.parameter_names])
     if noise:
         rng = np.random.default_rng(seed)
+        if missing := [channel.name for channel in model.channels if channel.name not in levels]:
+            raise ValueError(
+                f"no noise level for {', '.join(missing)}: give levels={{channel: standard deviation [SI]}} for all "
+                "channels, or noise=False"
+            )
         deviations = np.array([levels[c.name] for c in model.channels])
         values = values + deviations[:, None] * rng.standard_normal(values.shape)
     if isinstance(record, Events):
@@ -210,7 +215,8 @@ def bridge_column(
         "per channel" is white noise with one sigma per channel, as in the paper. "shared" has one sigma for all
         channels, in root mean squares of the measured channels. "autoregressive" has a correlation ``rho_...`` per
         channel in addition. "marginal" is "per channel" with the sigmas integrated out (`Posterior.marginal`), which
-        leaves five parameters. The priors are in `bridge_column_prior`.
+        leaves five parameters. The priors are in `bridge_column_prior`; those of other sensors (`outputs`) have 0.3
+        times the measured root mean square as their scale.
     seed : int
         Seed of the noise of synthetic measurements.
     cache : SimulationCache or path, optional
@@ -255,7 +261,10 @@ def bridge_column(
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
     law = _make_noise("per channel" if noise == "marginal" else noise, model.channels, measurements)
-    likelihood, prior = FELikelihood(model, measurements, law, cache=cache), bridge_column_prior(law.parameter_names)
+    likelihood = FELikelihood(model, measurements, law, cache=cache)
+    sensors = [channel.name for channel in model.channels if channel.name not in BRIDGE_COLUMN_NOISE]
+    rms = SharedGaussianNoise.of(measurements.select(sensors)).scales if sensors else ()
+    prior = bridge_column_prior(law.parameter_names, dict(zip(sensors, rms, strict=True)))
     coarse = None
     intensity = np.cumsum(record.acceleration**2)
     end = int(np.searchsorted(intensity, _COARSE_SHARE * intensity[-1])) * record.dt

@@ -12,6 +12,7 @@ from scipy import stats
 
 from fe_likelihoods import problems, rrmse
 from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.probability.distributions import HalfNormal
 from fe_likelihoods.problems import (
     BRIDGE_COLUMN_MEANS,
     BRIDGE_COLUMN_NOISE,
@@ -386,3 +387,18 @@ def test_a_record_that_is_too_short_has_no_coarse_column(data):
     record = Record("two samples", data.record.dt, [0.0, 1.0])
     posterior = bridge_column(record=record)
     assert posterior.coarse is None
+
+
+def test_bridge_column_with_other_sensors():
+    record, outputs = bridge_column_data().record.trim(8.0, 9.0), ("displacement", "strain@0.1:0.4", "base_moment")
+    with pytest.raises(ValueError, match="no noise level for strain@0.1:0.4, base_moment: give levels="):
+        bridge_column_measurements(record, outputs=outputs)
+    levels = {"displacement": 0.001, "strain@0.1:0.4": 1e-5, "base_moment": 1e4}
+    data = bridge_column_measurements(record, outputs=outputs, levels=levels, n_strips=20, substeps=1)
+    for noise in ("per channel", "autoregressive"):
+        posterior = bridge_column(record=record, measurements=data, outputs=outputs, noise=noise)
+        for name in outputs[1:]:
+            rms = np.sqrt(np.mean(data.channel(name) ** 2))
+            assert posterior.prior.distributions[f"sigma_{name}"].sd == pytest.approx(0.3 * rms)
+        assert posterior.prior.distributions["sigma_displacement"] == HalfNormal(1.2 * INCH)
+        assert np.isfinite(posterior.log_prob(posterior.sample_prior(1, 1)[0]))

@@ -9,6 +9,7 @@ updating of a full-scale bridge-column using sequential Monte Carlo.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 from ..units import to_si
 from .distributions import HalfNormal, TruncatedNormal, Uniform
@@ -21,6 +22,7 @@ _NOISE_SCALE = 0.3  # half-normal prior of a sigma in root mean squares of the m
 
 def bridge_column_prior(
     noise_parameters: Sequence[str] = ("sigma_acceleration", "sigma_displacement"),
+    measured: Mapping[str, float] = MappingProxyType({}),
 ) -> Prior:
     """Make the prior of Ramancha et al. (2022).
 
@@ -33,6 +35,9 @@ def bridge_column_prior(
         Parameters of the noise. For another noise than that of the paper: a shared ``sigma`` in root mean squares of
         the measured channels is half-normal with scale 0.3, correlations ``rho_...`` are uniform between -1 and 1 (both
         assumed).
+    measured : mapping of str to float
+        Root mean squares [SI] of further measured channels, such as strains, by their names. Their noise levels are
+        half-normal with a scale of 0.3 times this value (assumed).
 
     Returns
     -------
@@ -45,7 +50,7 @@ def bridge_column_prior(
         If there is no default prior for a parameter of the noise.
     """
     structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
-    scales = {
+    scales = {f"sigma_{name}": _NOISE_SCALE * value for name, value in measured.items()} | {
         "sigma_acceleration": to_si(0.1, "g").item(),
         "sigma_displacement": to_si(1.2, "in").item(),
         "sigma": _NOISE_SCALE,
