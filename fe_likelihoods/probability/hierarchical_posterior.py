@@ -38,6 +38,7 @@ from .stored_posterior import StoredPosterior, describe
 __all__ = ["HierarchicalPosterior", "Varying"]
 
 _SCALES = ("log", "linear")
+_LARGEST = 1e100  # of a mean or a standard deviation, so that squares do not overflow
 _SMALLEST_SD = 1e-12  # of the posterior's, below which the population is a point
 
 
@@ -268,7 +269,8 @@ class HierarchicalPosterior:
         with np.errstate(divide="ignore"):
             center = np.where(self._logarithmic, np.log(np.where(self._logarithmic, center, 1.0)), center)
         factor = _correlation_factor(points[:, 2 * n : end], n)
-        return center, np.maximum(points[:, 1 : 2 * n : 2], self._smallest_sd)[:, :, None] * factor
+        deviations = np.clip(points[:, 1 : 2 * n : 2], self._smallest_sd, _LARGEST)
+        return np.clip(center, -_LARGEST, _LARGEST), deviations[:, :, None] * factor
 
     def from_scale(self, values: np.ndarray) -> np.ndarray:
         """Parameters (..., n_varying + n_common) from their values on the scales of the populations."""

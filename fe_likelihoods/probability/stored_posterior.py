@@ -86,9 +86,9 @@ class StoredPosterior:
         effective = self.effective_sample_size
         if effective is None:
             distinct = len(np.unique(points, axis=0))
-            effective = distinct if self.log_weights is None else 1.0 / np.exp(2.0 * weights).sum()
+            effective = distinct if self.log_weights is None else min(1.0 / np.exp(2.0 * weights).sum(), len(points))
         values = [0.0 if self.log_evidence is None else self.log_evidence, self.log_evidence_error, effective]
-        if not np.isfinite(values).all() or values[1] < 0.0 or not 1.0 <= round(values[2], 9) <= len(points):
+        if not np.isfinite(values).all() or values[1] < 0.0 or not 1.0 <= values[2] <= len(points):
             raise ValueError(
                 "StoredPosterior: expected a finite log_evidence, a log_evidence_error of 0 or more, and an "
                 f"effective_sample_size between 1 and the {len(points)} samples; got {values}"
