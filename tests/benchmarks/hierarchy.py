@@ -201,7 +201,8 @@ def ranks(repeats: int = 1) -> list[Row]:
     """P-values of the uniformity of ranks (Kolmogorov and Smirnov), for 200 data sets times `repeats`."""
     found = [_rank(seed) for seed in range(_DATA_SETS * repeats)]
     rows = []
-    for label, part in (("", [each[0] for each in found]), ("wrong formula: ", [each[1] for each in found])):
+    for i, label in enumerate(("", "closed form: ", "wrong formula: ")):
+        part = [each[i] for each in found]
         ranked = np.array([each[0] for each in part])
         effective = np.array([each[1] for each in part])
         note = f"{len(found)} data sets; effective share of the weighted samples {effective.min():.2f} or more, "
@@ -218,7 +219,8 @@ def ranks(repeats: int = 1) -> list[Row]:
 def _rank(seed: int) -> list[tuple[list[float], float]]:
     """Ranks of the true hyper-parameters and of the parameters of a new test, and the effective share of the samples.
 
-    For the right formula and for the wrong one.
+    For the hierarchical posterior, for the closed form (the same samples without weights, which shows what these data
+    sets give), and for the wrong formula.
     """
     rng = np.random.default_rng(seed)
     errors = np.stack([_ERRORS, _ERRORS[::-1]], axis=1)  # of two parameters
@@ -254,13 +256,13 @@ def _rank(seed: int) -> list[tuple[list[float], float]]:
     truth = [mean[0], spread[0], mean[1], spread[1]]
     results = []
     flat = Prior({name: TruncatedNormal(0.0, 1e6, -np.inf, np.inf) for name in ("a", "b")})
-    for wrong in (False, True):
-        if wrong:  # as if the prior of the stored samples were constant
+    for which in ("right", "closed form", "wrong"):
+        if which == "wrong":  # as if the prior of the stored samples were constant
             posterior.described = {
                 name: each._replace(log_prior=np.zeros(len(each.points)), prior=flat)
                 for name, each in posterior.described.items()
             }
-        difference = posterior.log_likelihood(samples) - exact
+        difference = np.zeros(len(exact)) if which == "closed form" else posterior.log_likelihood(samples) - exact
         weights = np.exp(difference - difference.max())
         weights /= weights.sum()
         ranked = [float(weights @ (samples[:, i] < truth[i])) for i in range(4)]
