@@ -28,6 +28,7 @@ a full-scale bridge-column using sequential Monte Carlo (2022): the tested colum
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -240,10 +241,10 @@ class RCColumn(ThreadedModel):
         values = (c.ec, s.es, self.a0, self.a1, c.ft, c.fc, s.fy, s.fu, s.esh, self.mass, self.penetration)
         return dict(zip(PARAMETERS, values, strict=True))
 
-    @property
+    @cached_property
     def channels(self) -> tuple[Channel, ...]:
         """Channels of the response, in order."""
-        return display_channels(self._parsed_outputs(), dict(self.units))
+        return display_channels(self._parsed_outputs, dict(self.units))
 
     @property
     def dt(self) -> float:
@@ -393,7 +394,7 @@ class RCColumn(ThreadedModel):
         return np.stack(list(run_column(self, self._prepared, theta, None).outputs.values()))
 
     def _prepare(self) -> PreparedColumn:
-        return prepare_column(self, self._parsed_outputs())
+        return prepare_column(self, self._parsed_outputs)
 
     @property
     def _time_label(self) -> str:
@@ -403,6 +404,7 @@ class RCColumn(ThreadedModel):
     def _sections(self) -> Sections:
         return Sections(self.height, 0.5 * self.diameter, self.n_elements, gauss_lobatto(self.n_points)[0])
 
+    @cached_property
     def _parsed_outputs(self) -> tuple[Output, ...]:
         names = self._channel_names if self.outputs is None else self.outputs
         return parse_outputs(names, self._sections, self._channel_names)
@@ -447,5 +449,5 @@ class RCColumn(ThreadedModel):
         if idle and not isinstance(self.loading, Record):
             raise invalid("parameters that act under imposed displacement", idle, "leave damping out of parameters")
         check_nominal(self.parameters, self.nominal)
-        self._parsed_outputs()
+        _ = self._parsed_outputs  # checks the names
         check_units(dict(self.units))

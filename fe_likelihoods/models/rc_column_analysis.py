@@ -162,7 +162,7 @@ class BaseMotion(NamedTuple):
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings))
         start = first + 1 if first else 0
-        return Analysis(HISTORY_ROWS, history[:, start:], retries, sections[start:])
+        return Analysis(HISTORY_ROWS, history[:, start:], retries, _by_section(sections[start:]))
 
 
 class ImposedMotion(NamedTuple):
@@ -275,6 +275,11 @@ def set_materials(
         steel.ultimate_strain,
         sections.steel,
     )
+
+
+def _by_section(sections: np.ndarray) -> np.ndarray:
+    """The same array with the samples of a section side by side in memory: hundreds of sensors are read faster."""
+    return np.ascontiguousarray(sections.transpose(1, 2, 0)).transpose(2, 0, 1)
 
 
 def _allocate_sections(column: Column, n_steps: int) -> np.ndarray:

@@ -80,5 +80,10 @@ class ThreadedModel(BuiltInModel):
         return self._prepare()
 
     def __getstate__(self) -> dict[str, Any]:
-        """State without the prepared inputs: each process prepares its own."""
-        return {name: value for name, value in vars(self).items() if name != "_prepared"}
+        """State without cached properties, such as the prepared inputs: each process computes its own."""
+        cls = type(self)
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(getattr(cls, name, None), cached_property)
+        }
