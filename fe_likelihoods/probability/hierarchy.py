@@ -147,8 +147,8 @@ class Hierarchy:
         Raises
         ------
         ValueError
-            If the test is unknown, no sample has a density under the population, or there are common parameters, whose
-            exact value is not among the samples: use `draw_test`.
+            If the test is unknown, or there are common parameters, whose exact value is not among the samples: use
+            `draw_test`.
         """
         self._check_name(test)
         if self.posterior.common:
@@ -167,11 +167,6 @@ class Hierarchy:
         used = np.linspace(0, len(self.samples) - 1, min(len(self.samples), _HYPER_SAMPLES)).astype(int)
         center, factor = self.posterior.population(self.samples[used])
         total = sum(sample_weights(described, center[i : i + 1], factor[i : i + 1])[0] for i in range(len(center)))
-        if not total.sum() > 0.0:
-            raise ValueError(
-                f"no stored sample of test {test!r} has a density under the population: its posterior is beside it; "
-                "check this test"
-            )
         return total / total.sum()
 
     def draw_test(self, test: str, rng: RandomState = None) -> dict[str, np.ndarray]:

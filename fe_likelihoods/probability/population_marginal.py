@@ -71,7 +71,7 @@ class Product(NamedTuple):
     means : ndarray[n, n_components, n_varying]
         Means of the products.
     factors : ndarray[n, n_components, n_varying, n_varying]
-        Cholesky factors of their covariances.
+        Matrices A with the covariances A A^T.
     """
 
     log_masses: np.ndarray
@@ -190,10 +190,23 @@ def product_with_population(described: DescribedPosterior, center: np.ndarray, f
     means = described.means[:, :varying] + np.einsum("ncdv,ncd->ncv", gain, offset)
     # the covariance C - C (C + S)^-1 C, written as S (C + S)^-1 C because the difference loses all digits for small S
     covariances = spread[:, None] @ gain[..., :varying, :]
-    covariances = 0.5 * (covariances + covariances.swapaxes(-1, -2))
-    diagonal = np.einsum("ncvv->ncv", covariances)
-    diagonal *= 1.0 + _JITTER
-    return Product(log_masses, means, np.linalg.cholesky(covariances))
+    return Product(log_masses, means, _roots(covariances, np.einsum("cvv->cv", described.covariances)[:, :varying]))
+
+
+def _roots(covariances: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Matrices A with covariance A A^T (n, c, v, v); `largest` (c, v) are upper limits of the variances.
+
+    Cholesky factors, or eigenvectors where round-off has made a covariance indefinite (correlations near 1).
+    """
+    deviations = np.sqrt(np.maximum(np.einsum("ncvv->ncv", covariances), _JITTER**2 * largest))
+    correlations = covariances / deviations[..., :, None] / deviations[..., None, :]
+    correlations = 0.5 * (correlations + correlations.swapaxes(-1, -2)) + _JITTER * np.eye(covariances.shape[-1])
+    try:
+        roots = np.linalg.cholesky(correlations)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(correlations)
+        roots = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return deviations[..., None] * roots
 
 
 def log_density(points: np.ndarray, center: np.ndarray, factor: np.ndarray) -> np.ndarray:

@@ -158,7 +158,7 @@ def _nuts(posteriors: list[Posterior], seed: int) -> tuple[dict[str, np.ndarray]
         itypes, otypes = (pt.dmatrix,), (pt.dmatrix,)
 
         def perform(self, node: Any, inputs: list, outputs: list) -> None:
-            values = evaluate(inputs[0])
+            values = np.maximum(evaluate(inputs[0]), -1e10)  # finite where the damping ratio exceeds one
             outputs[0][0] = np.stack([values[:, 1] - values[:, 2], values[:, 3] - values[:, 4]], axis=1) / (2.0 * step)
 
     class LogLikelihood(Op):

@@ -1,5 +1,8 @@
 """Hierarchical model of several tests against closed forms of normal posteriors, and what it says of its errors."""
 
+import itertools
+import warnings
+
 import emcee
 import numpy as np
 import pytest
@@ -146,6 +149,15 @@ def test_logarithmic_scale_and_weighted_samples(rng):
         assert posterior.log_likelihood({"median_k": median, "sd_log_k": spread}) == pytest.approx(expected, abs=0.2)
 
 
+def test_extreme_hyper_parameters_have_a_density(two):
+    """Walkers of a sampler go there; correlations near 1 make covariances indefinite by round-off."""
+    values = (-1e90, 0.0), (1e-300, 1e-6, 1e150), (0.0, 50.0), (1e-9, 1.0), (-1.0 + 1e-12, 0.999999999)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = two.log_likelihood(np.array(list(itertools.product(*values))))
+    assert np.isfinite(found).all()
+
+
 def test_thinned_samples_give_nearly_the_same():
     test = stored(DATA[0], ERRORS, 1500, 1)
     few, all_of_them = (describe(test, ["a", "b"], [False, False], size) for size in (500, 1500))
@@ -228,6 +240,17 @@ def test_stated_errors_are_those_of_other_samples():
             stated += [each.error for each in checks.tests.values()]
     scatter = np.sqrt(np.mean(np.var(values, axis=0, ddof=1)))
     assert 0.5 < np.mean(stated) / scatter < 2.0
+
+
+def test_test_beside_the_population_is_a_warning(one):
+    """The other tests and a prior of small spread hold the population far from T0."""
+    points = np.random.default_rng(1).normal([50.0, 0.3], [0.1, 0.01], (60, 2))
+    with pytest.warns(UserWarning, match="or beside it") as found:
+        result = Hierarchy(one, points)
+    assert len(found) == len(DATA) + 1
+    assert "give the mean of" in str(found[-1].message)
+    assert result.checks.tests["T0"].effective_samples < 2.0
+    assert np.isfinite(result.draw_test("T0", 1)["a"]).all()
 
 
 def test_prior_narrower_than_the_population_is_a_warning_that_names_the_test():
