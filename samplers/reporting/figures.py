@@ -92,6 +92,7 @@ def pair_plot(
     truth: Sequence[float] | None = None,
     max_points: int = 2000,
     grid: int = 60,
+    nominal: Sequence[float] | None = None,
 ) -> "Figure":
     """Plot the posterior of all pairs of parameters, in the style of Ramancha et al. (2022), Fig. 4.
 
@@ -106,11 +107,15 @@ def pair_plot(
     labels : sequence of str, optional
         One label per parameter, with its unit.
     truth : sequence of float, shape (ndim,), optional
-        True parameters, where they are known; marked by lines, which are inside the limits of the axes.
+        True parameters, where they are known, marked by lines. The panels are those of the samples, widened by up to
+        half of their size to show a true value near them. A value that is still outside is an arrow at the edge, with
+        the value on the diagonal. NaN: no mark.
     max_points : int
         Largest number of samples that are plotted and used for the two-dimensional densities.
     grid : int
         Number of points per side of the grids of the densities.
+    nominal : sequence of float, shape (ndim,), optional
+        Values before the update, marked in grey in the same way, without widening the panels.
 
     Returns
     -------
@@ -130,9 +135,10 @@ def pair_plot(
     shown = samples[np.linspace(0, len(samples) - 1, min(max_points, len(samples))).astype(int)]
     low, high = np.quantile(samples, [0.002, 0.998], axis=0)
     if truth is not None:
-        low, high = np.minimum(low, truth), np.maximum(high, truth)
+        low, high = _widened(low, high, np.asarray(truth, dtype=float))
     margin = np.where(high > low, 0.12 * (high - low), np.maximum(0.05 * np.abs(low), 1e-12))
     low, high = low - margin, high + margin
+    marked = [(values, colour) for values, colour in ((nominal, GREY), (truth, ORANGE)) if values is not None]
     size = max(4.0, 1.5 * ndim + 0.8)
     figure, axes = plt.subplots(ndim, ndim, figsize=(size, size), squeeze=False, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
@@ -159,10 +165,10 @@ def pair_plot(
                 if np.ptp(x) > 0.0 and np.ptp(y) > 0.0:
                     r = np.corrcoef(x, y)[0, 1]
                     ax.text(0.05, 0.95, f"r = {r:.2f}", transform=ax.transAxes, va="top", fontsize="small")
-            if truth is not None:
-                ax.axvline(truth[j], color=ORANGE, linewidth=1)
+            for level, (values, colour) in enumerate(marked):
+                _mark(ax, values[j], low[j], high[j], colour, label=i == j, level=level)
                 if i != j:
-                    ax.axhline(truth[i], color=ORANGE, linewidth=1)
+                    _mark(ax, values[i], low[i], high[i], colour, vertical=True)
             _format_axes(ax, MaxNLocator, bottom=i == ndim - 1, left=j == 0 and i > 0)
             if i == ndim - 1:
                 ax.set_xlabel(moments.names[j])
@@ -170,6 +176,31 @@ def pair_plot(
                 ax.set_ylabel(moments.names[i])
     figure.align_ylabels(axes[:, 0])
     return figure
+
+
+def _widened(low: np.ndarray, high: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Limits that contain the true values, where these are within half of the size of the panel from it."""
+    near = (truth > low - 0.5 * (high - low)) & (truth < high + 0.5 * (high - low))
+    return np.where(near, np.fmin(low, truth), low), np.where(near, np.fmax(high, truth), high)
+
+
+def _mark(ax, value, low, high, colour, label=False, vertical=False, level=0):
+    """Mark a value on one axis by a line, or by an arrow at the edge beyond which it is, on request with the value."""
+    if not np.isfinite(value):
+        return
+    if low < value < high:
+        (ax.axhline if vertical else ax.axvline)(value, color=colour, linewidth=1)
+        return
+    end, start = (0.99, 0.80) if value >= high else (0.01, 0.20)
+    across = 0.90 - 0.22 * level if label else 0.06
+    tip, tail = ((across, end), (across, start)) if vertical else ((end, across), (start, across))
+    style = {"arrowstyle": "-|>", "color": colour, "linewidth": 1.0, "shrinkA": 0.0, "shrinkB": 0.0}
+    ax.annotate("", tip, tail, xycoords="axes fraction", arrowprops=style, annotation_clip=False)
+    if label:
+        side = "right" if value >= high else "left"
+        place = (start - 0.04 if side == "right" else start + 0.04, across)
+        text = {"ha": side, "va": "center", "fontsize": "x-small", "color": colour}
+        ax.text(*place, f"{value:.4g}", transform=ax.transAxes, **text)
 
 
 def _density_contours(ax, x, y, xlim, ylim, grid):

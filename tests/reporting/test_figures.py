@@ -27,7 +27,7 @@ def close():
 
 
 def test_pair_plot_shows_samples_labels_and_truth(samples):
-    truth = [1.9, 4.0, 0.21]  # the first one is 9 standard deviations from the samples
+    truth = [1.4, 4.0, 0.21]  # the first one is 4 standard deviations from the samples
     axes = np.array(pair_plot(samples, NAMES, truth=truth, max_points=200).axes).reshape(3, 3)
     for i in range(3):
         assert axes[2, i].get_xlabel() == axes[i, 0].get_ylabel() == NAMES[i]
@@ -42,6 +42,24 @@ def test_pair_plot_shows_samples_labels_and_truth(samples):
     assert len(points.get_xdata()) == 200 and set(points.get_xdata()) <= set(samples[:, 1])
     assert axes[1, 0].texts[0].get_text() == f"r = {np.corrcoef(samples[:, 0], samples[:, 1])[0, 1]:.2f}"
     assert len(axes[1, 0].collections) > 0, "contours of the density"
+
+
+def test_pair_plot_points_to_values_outside_of_its_panels(samples):
+    truth, nominal = [1.9, 5.0, np.nan], [0.2, 5.1, 0.2]  # 9 and -8 standard deviations from the samples
+    axes = np.array(pair_plot(samples, NAMES, truth=truth, nominal=nominal).axes).reshape(3, 3)
+    assert axes[0, 0].get_xlim()[0] > 0.2 and axes[0, 0].get_xlim()[1] < 1.9, "the panels stay those of the samples"
+    values, arrows = [], []
+    for text in axes[0, 0].texts:
+        if text.get_text():
+            values.append((text.get_text(), text.get_color()))
+        else:
+            arrows.append((text.xy[0], text.arrow_patch.get_edgecolor()))
+    assert values == [("0.2", "#8a8f98"), ("1.9", "#d9822b")]
+    assert [x for x, _ in arrows] == [0.01, 0.99]
+    assert [text.xy[1] for text in axes[0, 1].texts] == [0.01, 0.99], "and upwards beside it"
+    lines = [line.get_xdata()[0] for line in axes[1, 1].lines if len(line.get_xdata()) == 2]
+    assert lines == [5.1, 5.0] and not axes[1, 1].texts
+    assert sum(len(line.get_xdata()) == 2 for line in axes[2, 2].lines) == 1, "no mark for NaN"
 
 
 def test_ladder_plot_shows_every_stage():
