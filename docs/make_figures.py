@@ -1,6 +1,6 @@
 """Make the figures of README and documentation (`make figures`): small files in docs/figures, the same on every run.
 
-Tutorial 01 makes those of the oscillator. Tutorial 02 in its reduced setting makes that of the update, which takes
+Tutorial 01 makes those of the oscillator, 02 those of the update, 10 those of damage; the last two take
 minutes. The models draw their section and their hysteresis loops.
 """
 
@@ -32,6 +32,8 @@ TARGET = ROOT / "docs" / "figures"
 FIGURES_OF_TUTORIALS = {  # script and options: name of its figure, name here
     "01_linear_oscillator.py": {name: f"oscillator_{name}" for name in ("record", "corner", "fit", "prediction")},
     "02_bridge_column.py --preset reduced": {"fig5_response": "column_response"},
+    "02_bridge_column.py --events 2 --guide --walkers 100": {"fig4_pair": "column_pair"},
+    "10_damage.py": {"damage_predicted": "column_damage", "prediction": "damage_prediction"},
 }
 WIDEST = 1100  # pixels
 

@@ -7,7 +7,7 @@ import emcee
 import h5py
 import numpy as np
 import pytest
-from fe_likelihoods.data import make_bridge_column_eq1, make_isolated_bridge
+from fe_likelihoods.data import make_bridge_column_eq1, make_bridge_column_events, make_isolated_bridge
 from scipy import stats
 
 from fe_likelihoods import problems, rrmse
@@ -16,6 +16,7 @@ from fe_likelihoods.probability.distributions import HalfNormal
 from fe_likelihoods.problems import (
     BRIDGE_COLUMN_MEANS,
     BRIDGE_COLUMN_NOISE,
+    BRIDGE_COLUMN_SENSOR_NOISE,
     bridge_column,
     bridge_column_data,
     bridge_column_measurements,
@@ -127,6 +128,58 @@ def test_synthetic_measurements(strong):
     finer = bridge_column_measurements(strong, noise=False, n_strips=400, substeps=8)
     coarse = RCColumn.lhpost(strong).simulate(TRUTH)
     assert rrmse(noiseless.values, finer.values).max() < 0.5 * rrmse(coarse, finer.values).max()
+
+
+def test_the_set_of_two_events_has_the_noise_of_sensors_on_the_response_of_a_column_that_yields(data):
+    record, measurements, attributes = bridge_column_data(events=2)
+    assert record.names == ("EQ1", "EQ2") and record.rests == (10.0,) and "NOT measured" in attributes["title"]
+    np.testing.assert_array_equal(record.records[0].acceleration, data.record.acceleration)
+    second = make_bridge_column_events.second_motion()
+    np.testing.assert_allclose(record.records[1].acceleration, second.acceleration, rtol=0, atol=1e-12 * G0)
+    np.testing.assert_array_equal(np.isfinite(measurements.values).all(axis=0), record.in_events)
+    column = RCColumn.lhpost(record, outputs=("acceleration", "displacement", "strain@0:0.525", "strain@0:-0.525"))
+    response = column.simulate(TRUTH)
+    strains = response[2:].max(axis=0)
+    yield_strain = column.steel.fy / (TRUTH[1] * column.steel.es)
+    assert strains[: record.windows[0].stop].max() < yield_strain < 0.01 < strains.max() < 0.02
+    noise = (measurements.values - response[:2])[:, record.in_events]
+    sigma = np.array(list(BRIDGE_COLUMN_SENSOR_NOISE.values()))
+    np.testing.assert_allclose(noise.std(axis=1), sigma, rtol=4.5 / np.sqrt(2 * noise.shape[1]))
+    assert attributes["truth"]["sigma_displacement"] == sigma[1]
+    with pytest.raises(ValueError, match="events=1 .EQ1. or events=2"):
+        bridge_column_data(events=3)
+    with pytest.raises(ValueError, match="events= chooses bundled data"):
+        bridge_column(events=2, record=data.record)
+
+
+@pytest.mark.slow
+def test_two_events_inform_every_parameter_and_one_does_not():
+    """Standard deviations of the normal approximation at the truth, divided by those of the prior."""
+    shares = {}
+    for events, sigma in ((1, NOISE), (2, np.array(list(BRIDGE_COLUMN_SENSOR_NOISE.values())))):
+        record = bridge_column_data(events).record
+        column = RCColumn.lhpost(record)
+        inside = record.in_events if events == 2 else slice(None)
+        rows = [
+            (column.simulate(TRUTH + step) - column.simulate(TRUTH - step))[:, inside] / (2.0 * step.max())
+            for step in 1e-3 * np.diag(TRUTH)
+        ]
+        jacobian = (np.array(rows) / sigma[:, None]).reshape(5, -1)
+        prior = np.array([0.30, 0.20, 0.60, 0.60, 0.40])
+        covariance = np.linalg.inv(jacobian @ jacobian.T + np.diag(prior**-2))
+        shares[events] = np.sqrt(np.diag(covariance)) / prior
+    assert shares[1][3] > 0.8 and shares[2].max() < 0.1 and (shares[2] < 0.1 * shares[1]).all()
+
+
+def test_the_posterior_of_two_events():
+    posterior = bridge_column(events=2, every=16)
+    assert posterior.parameter_names == ["Ec", "Es", "a0", "a1", "ft", "sigma_acceleration", "sigma_displacement"]
+    model, measured = posterior.likelihood.model, posterior.likelihood.measurements
+    assert model.n_steps == measured.n_steps and model.loading.names == ("EQ1", "EQ2")
+    simulated = model.simulate(TRUTH)
+    inside = np.isfinite(measured.values).all(axis=0)
+    np.testing.assert_array_equal(inside, model.loading.in_events)
+    assert rrmse(simulated[:, inside], measured.values[:, inside]).max() < 0.5
 
 
 # --- prior and posterior ---------------------------------------------------------------------------------------------

@@ -147,4 +147,4 @@ def _write_extent(axes: Axes, damage: DamageLike, event: int, states: Sequence[s
         y = 0.97 - 0.094 * k
         axes.text(0.0, y, label, transform=axes.transAxes, fontsize=8, va="top")
         axes.text(0.62, y, text, transform=axes.transAxes, fontsize=8, va="top", ha="left", fontweight="bold")
-        axes.text(0.62, y - 0.052, between, transform=axes.transAxes, fontsize=6, va="top", color="0.35")
+        axes.text(0.62, y - 0.056, between, transform=axes.transAxes, fontsize=6, va="top", color="0.35")

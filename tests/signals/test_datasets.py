@@ -6,6 +6,7 @@ import pytest
 
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
+from fe_likelihoods.signals.events import Events
 from fe_likelihoods.signals.records import Record
 
 TOP = Channel("top", "absolute acceleration", "g")
@@ -114,3 +115,19 @@ class TestDataset:
         for name in ("none.h5", "text.h5", "cut.h5"):
             with pytest.raises(ValueError, match=f"{name}: not a complete data set"):
                 read_dataset(tmp_path / name)
+
+    def test_events_are_events_again(self, tmp_path, measurements, rng):
+        parts = [
+            Record(name, 1 / 128, rng.normal(size=n), source=name) for name, n in (("a", 50), ("b", 30), ("c", 40))
+        ]
+        events = Events(parts, rest=[0.25, 0.0], names=["first", "second", "third"])
+        write_dataset(tmp_path / "events.h5", events, measurements)
+        back = read_dataset(tmp_path / "events.h5").record
+        assert back.windows == events.windows and back.rests == events.rests and back.source == events.source
+        assert [each.source for each in back.records] == ["a", "b", "c"]
+        np.testing.assert_array_equal(back.acceleration, events.acceleration)
+        with h5py.File(tmp_path / "events.h5", "r+") as file:
+            shifted = file["record/acceleration"].attrs["events"].replace("50", "49")
+            file["record/acceleration"].attrs["events"] = shifted
+        with pytest.raises(ValueError, match="checksum"):
+            read_dataset(tmp_path / "events.h5")
