@@ -7,7 +7,7 @@ moves until the population is nearly uncorrelated with its resampled start. The 
 
 Tempering has a limit that no setting removes: of several modes of similar mass, one that is much narrower than the
 others has little mass at small beta, and is lost unless draws of the prior happen to lie in it (Woodard, Schmidler &
-Huber 2009, doi:10.1214/EJP.v14-638). Where such modes are possible, compare runs with more walkers.
+Huber 2009, doi:10.1214/EJP.v14-638). Where such modes are possible, use more walkers, or ``runs=2``.
 """
 
 from collections.abc import Mapping
@@ -61,6 +61,10 @@ class SMCSampler(TemperedSampler):
         mode can be lost unnoticed, and recycling often fails.
     recycling : RecyclingSettings, default RecyclingSettings()
         Constants of the recycling.
+    runs : int, default 1
+        Number of runs of recycling from the same draws of the prior. Their points are used together at the end, and a
+        difference in the evidence, a mean or the share of a mode is reported. Two runs cost up to twice the
+        evaluations of the annealing, and lose a mode only if both do.
     guided : GuidedSettings, default GuidedSettings()
         Constants of the rounds of a guide; with `guide` only.
     ess_ratio : float, default 0.5

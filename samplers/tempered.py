@@ -190,7 +190,10 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         self._usual_moves: MoveSchedule | None = None  # those that the moves of a guide have replaced
         self._fast, self._first_moves = fast, copy.deepcopy(followed)
         self._budget.fast = self._optional.fast_parameters
-        refuse_unused(given, recycle, followed != own_moves, self.unused_settings, guide is not None)
+        unused = dict(self.unused_settings)
+        if coarse_log_prob_fn is not None:
+            unused["runs"] = "the runs begin with draws of the prior, not with a coarse model: pass one of them"
+        refuse_unused(given, recycle, followed != own_moves, unused, guide is not None)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
 

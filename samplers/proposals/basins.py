@@ -45,7 +45,7 @@ from .covariance import invert_roots
 from .mixture import Mixture, log_components, to_component_space
 from .support_bounds import log_abs_det_jacobian
 
-__all__ = ["cover_basins"]
+__all__ = ["cover_basins", "find_basins", "with_components"]
 
 # Points whose log-density is this far below the highest, per dimension, are left out. The only points of a narrow mode
 # may be low on its flank.
@@ -103,6 +103,36 @@ def cover_basins(
 
     Parameters
     ----------
+    mixture, coords, log_target, most, share
+        As for `find_basins`.
+
+    Returns
+    -------
+    Mixture
+        The mixture itself if it covers all points.
+    """
+    return with_components(mixture, find_basins(mixture, coords, log_target, most, share))
+
+
+def with_components(mixture: Mixture, found: Mixture | None) -> Mixture:
+    """A mixture with the components of `find_basins` added, or the mixture itself if there are none."""
+    if found is None:
+        return mixture
+    return mixture._replace(
+        weights=np.concatenate([(1.0 - found.weights.sum()) * mixture.weights, found.weights]),
+        means=np.concatenate([mixture.means, found.means]),
+        roots=np.concatenate([mixture.roots, found.roots]),
+        inverses=np.concatenate([mixture.inverses, found.inverses]),
+    )
+
+
+def find_basins(
+    mixture: Mixture, coords: np.ndarray, log_target: np.ndarray, most: int = 3, share: float = 0.1
+) -> Mixture | None:
+    """Components for parts of the target that a mixture does not cover.
+
+    Parameters
+    ----------
     mixture : Mixture
         A mixture fitted to the points.
     coords : ndarray, shape (n, ndim)
@@ -110,37 +140,37 @@ def cover_basins(
     log_target : ndarray, shape (n,)
         Logarithm of the target, scaled so that its integral is about 1; -inf is allowed.
     most : int
-        Largest number of components that are added.
+        Largest number of components.
     share : float
-        Smallest weight of an added component. It is larger, up to 0.25, if the estimated mass of the basin is.
+        Smallest weight of a component. It is larger, up to 0.25, if the estimated mass of the basin is.
 
     Returns
     -------
-    Mixture
-        The mixture itself if it covers all points.
+    Mixture or None
+        The components, in the component space of the mixture. The sum of their weights, at most 0.5, is the share of
+        the draws that they should receive. None if the mixture covers all points.
     """
     ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)
     target = np.round(log_target[kept] * GRID) / GRID
     if mixture.bounds is not None:
         target = target - log_abs_det_jacobian(mixture.bounds, coords[kept])
-    found = _find_basins(mixture, to_component_space(mixture, coords[kept]), target, most)
+    found = _basins_of_points(mixture, to_component_space(mixture, coords[kept]), target, most)
     if not found:
-        return mixture
+        return None
     found = sorted(found, key=lambda item: -item[1].log_mass)[:most]
     shares = np.array([max(share, min(math.exp(min(basin.log_mass, 0.0)), LARGEST_SHARE)) for _, basin in found])
     shares *= min(1.0, LARGEST_SHARE_OF_ALL / shares.sum())
-    means = np.array([mixture.means[k] + mixture.roots[k] @ basin.mean for k, basin in found])
     roots = np.array([mixture.roots[k] @ basin.root / math.sqrt(variance) for k, basin in found])
     return mixture._replace(
-        weights=np.concatenate([(1.0 - shares.sum()) * mixture.weights, shares]),
-        means=np.concatenate([mixture.means, means]),
-        roots=np.concatenate([mixture.roots, roots]),
-        inverses=np.concatenate([mixture.inverses, invert_roots(roots)]),
+        weights=shares,
+        means=np.array([mixture.means[k] + mixture.roots[k] @ basin.mean for k, basin in found]),
+        roots=roots,
+        inverses=invert_roots(roots),
     )
 
 
-def _find_basins(mixture: Mixture, points: np.ndarray, target: np.ndarray, most: int) -> list[tuple[int, _Basin]]:
+def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray, most: int) -> list[tuple[int, _Basin]]:
     """Basins among points (n, d) of the component space, each with the component in whose coordinates it is given."""
     ndim, variance = points.shape[1], mixture.dof / (mixture.dof - 2.0)
     owner = log_components(mixture, points).argmax(axis=1)

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..proposals.basins import cover_basins
+from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
 from .budget import BudgetExhausted
@@ -39,7 +39,12 @@ from .settings import RecyclingSettings
 from .stopping import StoppedEarly
 from .weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
 
-__all__ = ["Recycled", "StartingDensity", "recycle"]
+__all__ = ["Archive", "Recycled", "StartingDensity", "recycle", "starting_mixture", "stopped_at"]
+
+# Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
+EXPECTED_GROWTH = 3.0
+# Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
+LARGEST_SHARE_KEPT = 0.9
 
 
 class StartingDensity(NamedTuple):
@@ -47,14 +52,35 @@ class StartingDensity(NamedTuple):
 
     Attributes
     ----------
-    made : int
+    made : float
         Number of draws made from it, including those outside the support of the prior.
     log_density : callable
         Function of points (n, ndim) and their records (n,) that returns the logarithm of the density (n,).
     """
 
-    made: int
+    made: float
     log_density: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def starting_mixture(n_prior: int, proposals: Sequence[tuple[float, Mixture]]) -> StartingDensity:
+    """Density of draws of the prior and of proposals together, by their numbers.
+
+    Parameters
+    ----------
+    n_prior : int
+        Number of draws of the prior.
+    proposals : sequence of (int, Mixture)
+        Numbers of draws, including those outside the support of the prior, and what they were drawn from.
+    """
+    made = n_prior + sum(count for count, _ in proposals)
+
+    def log_start(points: np.ndarray, records: np.ndarray) -> np.ndarray:
+        total = np.log(n_prior / made) + records["log_prior"]
+        for count, mixture in proposals:
+            total = np.logaddexp(total, np.log(count / made) + log_density(mixture, points))
+        return total
+
+    return StartingDensity(made, log_start)
 
 
 class Recycled(NamedTuple):
@@ -75,8 +101,8 @@ class Recycled(NamedTuple):
         Log-evidence from all points but those of the check, and its standard error.
     check : EvidenceCheck, optional
         The check with fresh draws; None if beta = 1 was not reached, or no check was wanted.
-    proposals : sequence of (int, Mixture)
-        The proposals in order, and how many draws were made from each.
+    archive : Archive, optional
+        All evaluated points with all proposals; None without draws.
     log_evidence_below_one : float
         Log-evidence at the last beta below 1; 0 without such a stage.
     evaluations_below_one : int
@@ -90,9 +116,14 @@ class Recycled(NamedTuple):
     log_evidence: float
     log_evidence_error: float
     check: EvidenceCheck | None
-    proposals: Sequence[tuple[int, Mixture]] = ()
+    archive: "Archive | None" = None
     log_evidence_below_one: float = 0.0
     evaluations_below_one: int = 0
+
+    @property
+    def proposals(self) -> Sequence[tuple[int, Mixture]]:
+        """The proposals in order, and how many draws were made from each."""
+        return () if self.archive is None else self.archive.proposals
 
     @property
     def trusted(self) -> bool:
@@ -100,8 +131,21 @@ class Recycled(NamedTuple):
         return not self.doubt
 
 
-class _Archive:
-    """All points, their records, and the logarithm of the mixture of all densities that they were drawn from."""
+class Archive:
+    """All points, their records, and the logarithm of the mixture of all densities that they were drawn from.
+
+    Parameters
+    ----------
+    coords, records : (n, ndim) float, (n,) structured array
+        Starting points and their records.
+    start : StartingDensity
+        What they were drawn from.
+
+    Attributes
+    ----------
+    proposals : list of (int, Mixture)
+        The proposals in order, and how many draws were made from each.
+    """
 
     def __init__(self, coords: np.ndarray, records: np.ndarray, start: StartingDensity):
         self.coords, self.records, self._start = coords, records, start
@@ -110,7 +154,7 @@ class _Archive:
         self._log_start = start.log_density(coords, records)
         self._log_mixture = self._log_made + self._log_start
 
-    def add(self, mixture: Mixture, made: int, coords: np.ndarray, records: np.ndarray) -> None:
+    def add(self, mixture: Mixture, made: float, coords: np.ndarray, records: np.ndarray) -> None:
         """Add the draws (n, ndim) inside the support, of `made` draws from a mixture."""
         log_start = self._start.log_density(coords, records)
         log_mixture = self._log_made + log_start
@@ -180,10 +224,12 @@ def recycle(
     Recycled
     """
     ndim, size = coords.shape[1], len(coords) if size is None else size
+    # another starting density was fitted by a search of its own
+    search, basin_rounds = _Search(settings.search_draws * len(coords) if start is None else 0.0), 0
     start = StartingDensity(len(coords), lambda _, records: records["log_prior"]) if start is None else start
     target = max(settings.target_share * len(coords), settings.points_per_dimension * (ndim + 1.0))
     enough_fresh = settings.fresh_share * target
-    archive = _Archive(coords, records, start)
+    archive = Archive(coords, records, start)
     bounds = find_support_bounds(density.inside, coords)
     beta, fresh, yields, checks = 0.0, 0.0, [], 0
     increments: list[float] = []
@@ -197,7 +243,9 @@ def recycle(
         log_weights, last_beta = archive.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
         if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= enough_fresh):
-            beta, fresh = next_beta(archive.log_ratio, beta, target, log_weights), 0.0
+            # more draws shall not make larger steps: it is their number per step that finds narrow modes
+            kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
+            beta, fresh = next_beta(archive.log_ratio, beta, kept, log_weights), 0.0
             log_weights = archive.log_weights(beta)
             effective = effective_sample_size(log_weights)
         log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
@@ -222,18 +270,29 @@ def recycle(
         fitted = fit_mixture(archive.coords, coarse_weights(log_weights), settings.max_components, bounds)
         mixture = _with_even_share(fitted, settings.even_share)
         finished = beta == 1.0 and effective >= size
-        if settings.max_basins > 0 and not finished:
+        basins = None
+        if settings.max_basins > 0 and (not finished or basin_rounds < settings.max_basin_rounds):
             log_target = archive.log_target(beta) - log_evidence
-            mixture = cover_basins(mixture, archive.coords, log_target, settings.max_basins, settings.basin_share)
-        new, made = draw_inside(
-            mixture, size if finished else int(round(settings.draws_per_target * target)), random, density.inside
-        )
+            basins = find_basins(mixture, archive.coords, log_target, settings.max_basins, settings.basin_share)
+        exploring = finished and basins is not None
+        if exploring:
+            mixture, basin_rounds = _with_even_share(basins, 1.0), basin_rounds + 1
+            wanted = settings.draws_per_basin * len(basins.weights)
+        else:
+            mixture = with_components(mixture, basins)
+            wanted = size if finished else settings.draws_per_target * target
+        if last_beta < beta < 1.0:
+            wanted = search.enlarge(wanted, beta)
+        new, made = draw_inside(mixture, int(round(wanted)), random, density.inside)
         try:
             new_records = density.evaluate(new)
         except BudgetExhausted as stop:
             if (few := len(stop.records)) > 0:
                 archive.add(mixture, made * few / len(new), new[:few], stop.records)
-            raise _stopped(archive, beta, sum(increments), inherited) from None
+            raise stopped_at(archive, beta, sum(increments), inherited) from None
+        if exploring:
+            archive.add(mixture, made, new, new_records)
+            continue
         new_weights = _weights_against(mixture, new_records, new, start, beta)
         fresh_size = effective_sample_size(new_weights)
         fresh += fresh_size
@@ -256,14 +315,51 @@ def recycle(
                 log_evidence,
                 error,
                 check,
-                archive.proposals,
+                archive,
                 sum(increments),
                 evaluations_below_one,
             )
 
 
-def _stopped(archive: _Archive, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
-    """All points, weighted by the posterior over the mixture of their densities."""
+class _Search:
+    """Draws beyond those that the annealing needs, spread over its stages.
+
+    Parameters
+    ----------
+    left : float
+        Number of draws.
+
+    Attributes
+    ----------
+    increase : float
+        Draws of the latest stage, as a multiple of those that the annealing needs.
+    """
+
+    def __init__(self, left: float) -> None:
+        self._left, self.increase = left, 1.0
+
+    def enlarge(self, draws: float, beta: float) -> float:
+        """The draws of a stage, with an equal share of those left for each of the stages that are still expected."""
+        share = self._left / (1.0 - np.log(beta) / np.log(EXPECTED_GROWTH))
+        self._left -= share
+        self.increase = 1.0 + share / draws
+        return draws + share
+
+
+def stopped_at(archive: Archive, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
+    """All points, weighted by the posterior over the mixture of their densities.
+
+    Parameters
+    ----------
+    archive : Archive
+        The points.
+    beta : float
+        Tempering exponent that was reached.
+    of_stages : float
+        Part of the log-evidence that is in stages already reported.
+    inherited : float
+        Variance of the log-evidence from the weights by which the proposals were chosen.
+    """
     log_weights = archive.log_weights(1.0)
     n, effective = len(log_weights), effective_sample_size(log_weights)
     known = Population(1.0, archive.coords, archive.records, effective, (), log_weights)

@@ -17,22 +17,24 @@ showing are up to the consumer.
 
 import logging
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from .adaptive_importance import Recycled, StartingDensity, recycle
+from .adaptive_importance import Recycled, StartingDensity, recycle, stopped_at
 from .budget import BudgetExhausted
 from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, fits_poorly, warn
 from .evidence_check import pareto_shape
 from .genealogy import trace_founders
-from .guided import Guidance, RoundsOfGuide, draw_rounds, start_from_guide
+from .guided import Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
 from .multilevel import draw_start
 from .mutation import MoveSchedule, Mutated, grow_chains, move_together
 from .population import Density, Doubt, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from .population_check import check_population
+from .repeated_runs import check_agreement, pool_runs
 from .resampling import systematic
 from .settings import Settings
-from .stopping import NothingToReport, StoppedEarly, stop_at, usable
+from .stopping import NothingToReport, StoppedEarly, stop_at
 from .watched_density import WatchedDensity
 from .weights import (
     WHERE_TO_LOOK,
@@ -121,7 +123,7 @@ def _without_limit(
         try:
             yield from _without_limit(population, density, random, schedule, settings, coarse, None)
         except StoppedEarly as stop:
-            raise _better(stop, found) from None
+            raise better_of(stop, found) from None
         return
     if coarse is not None and (yield from _from_coarse(population, density, coarse, random, schedule, settings)):
         return
@@ -129,7 +131,8 @@ def _without_limit(
         population = population._replace(records=_evaluate_all(population.coords, density))
     recycled = None
     if settings.recycle:
-        recycled = yield from _by_recycling(population, density, random, schedule, settings)
+        by_recycling = _by_recycling if settings.runs == 1 else _by_runs
+        recycled = yield from by_recycling(population, density, random, schedule, settings)
         if recycled.trusted:
             return
     yield from _by_moves(population, density, random, schedule, settings, recycled)
@@ -189,7 +192,7 @@ def _from_guide(
     size = len(population.coords)
     found = yield from draw_rounds(population, density, random, guidance, settings.guided)
     if found.stopped:
-        raise _stopped_rounds(found)
+        raise stopped_rounds(found)
     if not found.doubt:
         weights = normalised_weights(found.pooled.log_weights)
         ancestors = systematic(weights, random, size)
@@ -227,11 +230,11 @@ def _from_guide(
     try:
         started, start = start_from_guide(found.last, population, density, guidance.guide)
     except BudgetExhausted:
-        raise _stopped_rounds(found) from None
+        raise stopped_rounds(found) from None
     try:
         recycled = yield from _by_recycling(started, density, random, schedule, settings, start, size, found)
     except StoppedEarly as stop:
-        raise _better(stop, found) from None
+        raise better_of(stop, found) from None
     return None if recycled.trusted else found
 
 
@@ -241,7 +244,7 @@ def _check_prior(found: RoundsOfGuide, population: Population, density: Density,
     try:
         records = density.evaluate(few)
     except BudgetExhausted:
-        raise _stopped_rounds(found) from None
+        raise stopped_rounds(found) from None
     if np.max(records["log_prob"]) == -np.inf:
         raise ValueError(
             f"none of {len(found.pooled.coords)} draws of the guide and of {len(few)} draws of the prior has a finite "
@@ -259,31 +262,6 @@ def _disagreement(population: Population, found: RoundsOfGuide, log_evidence: fl
             "Use a better guide, or more walkers without one"
         )
         yield population, Doubt(message, True)
-
-
-def _better(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
-    """Of the points known at a stop and the rounds of the guide before it, those that are worth more.
-
-    The rounds if they are usable, since each has a proposal of its own, and no mode is lost from one to the next.
-    """
-    rounds, pooled = _stopped_rounds(found), found.pooled
-    rounds.log_evidence_of_stages = stop.log_evidence_of_stages
-    ndim, effective = pooled.coords.shape[1], pooled.effective_sample_size
-    if stop.complete:
-        return stop
-    if usable(effective, pooled.pareto_shape, pooled.log_evidence_error, ndim):
-        return rounds
-    return stop if stop.effective_sample_size >= effective else rounds
-
-
-def _stopped_rounds(found: RoundsOfGuide) -> StoppedEarly:
-    """All rounds of a guide, as the points from which the limit of simulations makes a population."""
-    if found.pooled is None:
-        nothing = Population(1.0, np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))
-        return StoppedEarly(nothing, float("-inf"), float("inf"), 1.0, from_guide=True)
-    pooled = found.pooled
-    known = Population(1.0, pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights)
-    return StoppedEarly(known, pooled.log_evidence, pooled.log_evidence_error, 1.0, from_guide=True)
 
 
 def _by_moves(
@@ -408,6 +386,32 @@ def _by_recycling(
     )
     if mutated.stopped:
         raise StoppedEarly(mutated.population, 0.0, 0.0, 1.0, complete=True)
+    return found
+
+
+def _by_runs(
+    population: Population, density: Density, random: np.random.RandomState, schedule: MoveSchedule, settings: Settings
+) -> Generator[tuple[Population, Report], None, Recycled]:
+    """Several runs of recycling, then one that begins with all their points; they are compared at the end."""
+    coords, records = population.coords, population.records
+    runs: list[Recycled] = []
+    for _ in range(settings.runs):
+        try:
+            run = yield from _only_sweeps(recycle(coords, records, density, random, settings.recycling, finish=False))
+        except StoppedEarly as stop:
+            raise (stopped_at(runs[0].archive, 1.0, 0.0, 0.0) if runs else stop) from None
+        if not run.trusted:
+            yield population, Restart(run.doubt)
+            return run
+        runs.append(run)
+    coords, records, start = pool_runs(runs, len(coords))
+    pooled = Population(0.0, coords, records, float(len(coords)))
+    share = settings.recycling.target_share * len(population.coords) / len(coords)
+    settings = replace(settings, recycling=replace(settings.recycling, target_share=share))
+    found = yield from _by_recycling(pooled, density, random, schedule, settings, start, len(population.coords))
+    if found.trusted:
+        for doubt in check_agreement(runs, found.proposals[-1][1], 1.0 / (share * len(coords))):
+            yield population, doubt
     return found
 
 

@@ -20,9 +20,18 @@ from .guide import AdaptedGuide, GuideSession
 from .population import Density, GuidedRound, GuideTick, Population, Report
 from .rounds import PooledRounds, Round, pool_rounds
 from .settings import GuidedSettings
-from .stopping import LARGEST_SHAPE
+from .stopping import LARGEST_SHAPE, StoppedEarly, usable
 
-__all__ = ["Guidance", "RoundsOfGuide", "draw_rounds", "lend", "start_from_guide", "trusted"]
+__all__ = [
+    "Guidance",
+    "RoundsOfGuide",
+    "better_of",
+    "draw_rounds",
+    "lend",
+    "start_from_guide",
+    "stopped_rounds",
+    "trusted",
+]
 
 FEW_DRAWS = 100
 # mean effective sample size of rounds below which the guide is given up
@@ -291,3 +300,28 @@ def start_from_guide(
         return np.logaddexp(log_share + guide.log_density(points), log_rest + records["log_prior"])
 
     return Population(0.0, coords, records, float(made)), StartingDensity(made, log_density)
+
+
+def better_of(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
+    """Of the points known at a stop and the rounds of the guide before it, those that are worth more.
+
+    The rounds if they are usable, since each has a proposal of its own, and no mode is lost from one to the next.
+    """
+    rounds, pooled = stopped_rounds(found), found.pooled
+    rounds.log_evidence_of_stages = stop.log_evidence_of_stages
+    ndim, effective = pooled.coords.shape[1], pooled.effective_sample_size
+    if stop.complete:
+        return stop
+    if usable(effective, pooled.pareto_shape, pooled.log_evidence_error, ndim):
+        return rounds
+    return stop if stop.effective_sample_size >= effective else rounds
+
+
+def stopped_rounds(found: RoundsOfGuide) -> StoppedEarly:
+    """All rounds of a guide, as the points from which the limit of simulations makes a population."""
+    if found.pooled is None:
+        nothing = Population(1.0, np.empty((0, 0)), np.empty(0), 0.0, (), np.empty(0))
+        return StoppedEarly(nothing, float("-inf"), float("inf"), 1.0, from_guide=True)
+    pooled = found.pooled
+    known = Population(1.0, pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights)
+    return StoppedEarly(known, pooled.log_evidence, pooled.log_evidence_error, 1.0, from_guide=True)

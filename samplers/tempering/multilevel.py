@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ..proposals.mixture import Mixture, log_density
-from .adaptive_importance import StartingDensity
+from ..proposals.mixture import Mixture
+from .adaptive_importance import StartingDensity, starting_mixture
 from .evidence_check import draw_inside
 
 __all__ = ["check_coarse", "draw_start"]
@@ -80,13 +80,4 @@ def draw_start(
         drawn, made = draw_inside(mixture, count, random, inside)
         coords.append(drawn)
         parts.append((made, mixture))
-    n_prior = len(coords[0])
-    made = n_prior + sum(count for count, _ in parts)
-
-    def log_start(points: np.ndarray, records: np.ndarray) -> np.ndarray:
-        total = np.log(n_prior / made) + records["log_prior"]
-        for count, mixture in parts:
-            total = np.logaddexp(total, np.log(count / made) + log_density(mixture, points))
-        return total
-
-    return np.concatenate(coords), StartingDensity(made, log_start)
+    return np.concatenate(coords), starting_mixture(len(coords[0]), parts)

@@ -9,6 +9,7 @@ from scipy.stats import multivariate_normal
 
 from samplers import RecyclingSettings, SMCSampler, TMCMCSampler
 from samplers.moves.kernels import MixtureMove
+from tests.benchmarks import truth, truth_targets
 
 NDIM = 10
 WIDTHS = np.array([0.01, 0.0125])  # a ratio of volumes of 9
@@ -100,3 +101,24 @@ def test_moves_without_components_for_basins_lose_it(monkeypatch):
     posterior = TwoModes(2)
     _, share = finish(TMCMCSampler(500, NDIM, posterior, vectorize=True, seed=2), posterior)
     assert share < 0.05
+
+
+@pytest.mark.parametrize(("rounds", "found"), [(4, True), (0, False)])
+def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found):
+    """One draw of the last round before the check hits the flank of the narrow mode."""
+    recycling = RecyclingSettings(search_draws=0.0, max_basin_rounds=rounds)
+    result = truth.run(truth.Cell("two", 100.0, "SMC", 500), 4, 1, {"recycling": recycling})
+    assert (min(result["shares"]) > 0.15) == found
+
+
+def test_search_draws_are_spread_over_the_stages():
+    posterior = truth_targets.gaussian(1)
+    runs = []
+    for share in (0.0, 3.0):
+        recycling = RecyclingSettings(search_draws=share)
+        sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True, seed=1, recycling=recycling)
+        sampler.run_mcmc(None, 0)
+        runs.append((len(sampler.ladder), sampler.evaluations))
+    (stages, evaluations), (more_stages, more_evaluations) = runs
+    assert abs(more_stages - stages) <= 2  # more draws make no larger steps
+    assert 2.0 * 500 < more_evaluations - evaluations <= 3.6 * 500

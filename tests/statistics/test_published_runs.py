@@ -80,7 +80,7 @@ def test_published_tmcmc_fails_with_a_warning(targets, name, seed):
 
 # most evaluations, largest error of the mean in posterior sd (rms), of the mode's weight, of the log-evidence
 DEFAULTS = {
-    ("SMC", "T1"): (13e3, 0.07, 0.0, 0.15),
+    ("SMC", "T1"): (14e3, 0.07, 0.0, 0.15),
     ("SMC", "T2"): (15e3, 0.08, 0.05, 0.25),
     ("SMC", "T3"): (9e3, 0.08, 0.0, 0.15),
     ("SMC", "T4"): (8e3, 0.06, 0.04, 0.1),
