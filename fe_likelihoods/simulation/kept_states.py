@@ -136,12 +136,12 @@ def simulate_last_part(
     reasons = [""] * len(thetas)
     new = [row for row, state in enumerate(states) if state is None]
     starts = _latest_states(before, thetas[new], memory)
-    for row, (_, state, reason) in zip(new, _run(before, thetas[new], starts, pool), strict=True):
+    for row, (_, state, reason) in zip(new, _run(before, thetas[new], starts, pool, False), strict=True):
         states[row], reasons[row] = state, reason
         if not reason:
             memory.add(key_before, before.n_steps, thetas[row], state)
     rows = [row for row, reason in enumerate(reasons) if not reason]
-    ends = _run(model, thetas[rows], [states[row] for row in rows], pool)
+    ends = _run(model, thetas[rows], [states[row] for row in rows], pool, True)
     for row, (response, state, reason) in zip(rows, ends, strict=True):
         reasons[row] = reason
         if not reason:
@@ -182,20 +182,20 @@ def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> lis
 
 
 def _run(
-    model: Model, thetas: np.ndarray, states: list[np.ndarray | None], pool: Any
+    model: Model, thetas: np.ndarray, states: list[np.ndarray | None], pool: Any, responses: bool
 ) -> list[tuple[np.ndarray | None, np.ndarray | None, str]]:
-    """Response, state at the end and reason of the failure of each simulation."""
+    """Response (if `responses` are wanted), state at the end and reason of the failure of each simulation."""
     items = [(theta.copy(), state) for theta, state in zip(thetas, states, strict=True)]
     if pool is not None:
-        outcomes = list(pool.map(partial(_continue_sent, SentModel(model)), items)) if items else []
+        outcomes = list(pool.map(partial(_continue_sent, responses, SentModel(model)), items)) if items else []
     elif getattr(model, "runs_on_threads", False):
-        outcomes = run_on_threads(partial(_continue, model), items)
+        outcomes = run_on_threads(partial(_continue, responses, model), items)
     else:
-        outcomes = [_continue(model, item) for item in items]
+        outcomes = [_continue(responses, model, item) for item in items]
     return [(*(found or (None, None)), reason) for found, reason in outcomes]
 
 
-def _continue(model: Model, item: tuple[np.ndarray, np.ndarray | None]) -> tuple[tuple | None, str]:
+def _continue(responses: bool, model: Model, item: tuple[np.ndarray, np.ndarray | None]) -> tuple[tuple | None, str]:
     """Run one simulation from a state; returns response and state with an empty reason, or None and the reason."""
     theta, state = item
     try:
@@ -206,8 +206,10 @@ def _continue(model: Model, item: tuple[np.ndarray, np.ndarray | None]) -> tuple
     except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
         return None, reason_of(error)
     reason = not_finite(model, response)
-    return (None, reason) if reason else ((response, np.array(end)), "")
+    return (None, reason) if reason else ((response if responses else None, np.array(end)), "")
 
 
-def _continue_sent(sent: SentModel, item: tuple[np.ndarray, np.ndarray | None]) -> tuple[tuple | None, str]:
-    return _continue(sent.model, item)
+def _continue_sent(
+    responses: bool, sent: SentModel, item: tuple[np.ndarray, np.ndarray | None]
+) -> tuple[tuple | None, str]:
+    return _continue(responses, sent.model, item)
