@@ -30,7 +30,7 @@ def carried_state(repeats: int = 3) -> list[Row]:
     for case, theta in {"nominal": np.ones(5), "paper's means": _PAPER}.items():
         for factor in (2.0, 1.0, 0.5):
             rows += _differences(column, factor, theta, case)
-    short = column.with_record(eq1.trim(5.0, 25.0))
+    short = column.with_record(eq1.trim(5.0, 15.0))
     later = [short.loading.scale(factor) for factor in (0.5, 1.0, 1.5)]
     samples = np.random.default_rng(1).normal(1.0, 0.1, (_SAMPLES, 5))
     means = {}
