@@ -1,7 +1,7 @@
 """Hierarchical model of several tests from stored posteriors: against NUTS on the whole model, and ranks of the truth.
 
-``hierarchy``: eight tests of linear oscillators, whose stiffness and damping have a log-normal population. Each test is
-sampled alone, the population from the stored samples. PyMC samples the whole model at once by NUTS (8 x 2 parameters
+``hierarchy``: six tests of linear oscillators, whose stiffness and damping have a log-normal population. Each test is
+sampled alone, the population from the stored samples. PyMC samples the whole model at once by NUTS (6 x 2 parameters
 and four hyper-parameters; gradients by central differences of the same likelihoods). PyMC is not a requirement of the
 tests: without it there is a row that says so.
 
@@ -43,8 +43,8 @@ from .rows import Row
 
 __all__ = ["hierarchy", "ranks"]
 
-_TESTS, _WALKERS = 8, 1000
-_DRAWS, _TUNE, _CHAINS = 1500, 1000, 2
+_TESTS, _WALKERS = 6, 500
+_DRAWS, _TUNE, _CHAINS = 500, 400, 2
 _NAMES = ("stiffness", "damping")
 _POPULATION = {"stiffness": (1.1, 0.08), "damping": (0.9, 0.30)}  # median and standard deviation of the logarithm
 _STORED_PRIOR = (LogNormal(1.0, 0.6), LogNormal(1.0, 1.0))
@@ -69,7 +69,7 @@ def _against_nuts(seed: int) -> list[Row]:
     posteriors = []
     for k in range(_TESTS):
         theta = [median * np.exp(sd * rng.standard_normal()) for median, sd in _POPULATION.values()]
-        model = LinearOscillator(Record(f"EQ{k}", 0.02, rng.standard_normal(400)), period=0.6)
+        model = LinearOscillator(Record(f"EQ{k}", 0.02, rng.standard_normal(250)), period=0.6)
         response = model.simulate(theta)
         level = 0.4 * response.std(axis=1, keepdims=True)
         measured = Measurements(model.channels, model.dt, response + level * rng.standard_normal(response.shape))
