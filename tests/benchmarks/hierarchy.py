@@ -1,9 +1,7 @@
 """Hierarchical model of several tests from stored posteriors: against NUTS on the whole model, and ranks of the truth.
 
-``hierarchy``: six tests of linear oscillators, whose stiffness and damping have a log-normal population. Each test is
-sampled alone, the population from the stored samples. PyMC samples the whole model at once by NUTS (6 x 2 parameters
-and four hyper-parameters; gradients by central differences of the same likelihoods). PyMC is not a requirement of the
-tests: without it there is a row that says so.
+``hierarchy``: one parameter of six tests with normal errors. PyMC samples the whole model at once by NUTS. PyMC is not
+a requirement of the tests: without it there is a row that says so.
 
 ``hierarchy_ranks``: simulation-based calibration. In 200 data sets, the hyper-parameters are drawn from their prior,
 and so are tests with normal errors, whose posteriors have a closed form. If the hierarchical posterior is right, the
@@ -16,23 +14,15 @@ with simulation-based calibration, arXiv:1804.06788.
 """
 
 import importlib.util
-import time
-from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from fe_likelihoods import (
-    FELikelihood,
     HalfNormal,
     HierarchicalPosterior,
     Hierarchy,
-    LinearOscillator,
-    LogNormal,
-    Measurements,
-    Posterior,
     Prior,
-    Record,
     StoredPosterior,
     TruncatedNormal,
     Varying,
@@ -43,158 +33,46 @@ from .rows import Row
 
 __all__ = ["hierarchy", "ranks"]
 
-_TESTS, _WALKERS = 6, 500
-_DRAWS, _TUNE, _CHAINS = 500, 400, 2
-_NAMES = ("stiffness", "damping")
-_POPULATION = {"stiffness": (1.1, 0.08), "damping": (0.9, 0.30)}  # median and standard deviation of the logarithm
-_STORED_PRIOR = (LogNormal(1.0, 0.6), LogNormal(1.0, 1.0))
-_VARYING = {
-    "stiffness": Varying(LogNormal(1.0, 0.5), HalfNormal(0.3)),
-    "damping": Varying(LogNormal(1.0, 0.5), HalfNormal(0.5)),
-}
 _DATA_SETS, _HYPER_SAMPLES = 200, 400
 _ERRORS = np.array([0.3, 0.5, 0.2, 0.4, 0.3, 0.6])  # standard errors of six tests
 _CENTER, _SPREAD, _STORED = 0.5, 0.3, 1.0  # standard deviations of the priors of mean, spread and stored samples
 
 
 def hierarchy(repeats: int = 1) -> list[Row]:
-    """Means and standard deviations against those of NUTS, for `repeats` data sets."""
+    """Means and standard deviations against those of NUTS for one parameter of six tests with normal errors."""
     if importlib.util.find_spec("pymc") is None:
         return [Row("hierarchy against NUTS", "", None, "", "not installed: pip install '.[clients]'")]
-    return [row for seed in range(repeats) for row in _against_nuts(seed)]
-
-
-def _against_nuts(seed: int) -> list[Row]:
-    rng = np.random.default_rng(seed)
-    posteriors = []
-    for k in range(_TESTS):
-        theta = [median * np.exp(sd * rng.standard_normal()) for median, sd in _POPULATION.values()]
-        model = LinearOscillator(Record(f"EQ{k}", 0.02, rng.standard_normal(250)), period=0.6)
-        response = model.simulate(theta)
-        level = 0.4 * response.std(axis=1, keepdims=True)
-        measured = Measurements(model.channels, model.dt, response + level * rng.standard_normal(response.shape))
-        sigmas = {f"sigma_{c.name}": HalfNormal(2.0 * s) for c, s in zip(model.channels, level[:, 0], strict=True)}
-        prior = dict(zip(_NAMES, _STORED_PRIOR, strict=True)) | sigmas
-        posteriors.append(Posterior(FELikelihood(model, measured), prior).marginal())
-    start = time.perf_counter()
-    tests = {}
-    for k, posterior in enumerate(posteriors):
-        sampler = SMCSampler(_WALKERS, posterior.ndim, posterior, vectorize=True, seed=k)
-        sampler.run_mcmc(None, 1, progress=False)
-        tests[f"EQ{k}"] = StoredPosterior(
-            sampler.get_chain(flat=True),
-            posterior.prior,
-            log_evidence=sampler.log_evidence,
-            log_evidence_error=sampler.log_evidence_error,
-            effective_sample_size=_WALKERS,
-        )
-    middle = time.perf_counter()
-    simulations = sum(posterior.report()["simulations"] for posterior in posteriors)
-    population = HierarchicalPosterior(tests, _VARYING)
-    sampler = SMCSampler(_WALKERS, population.ndim, population, vectorize=True, seed=seed)
-    sampler.run_mcmc(None, 4, progress=False)
-    result = Hierarchy(population, sampler.get_chain(flat=True))
-    end = time.perf_counter()
-    ours = dict(zip(population.parameter_names, result.samples.T, strict=True))
-    for name, draws in result.new_test(len(result.samples), rng=1).items():
-        ours[f"{name} of a new test"] = np.log(draws)
-    for k, (test, stored) in enumerate(tests.items()):
-        weights = result.weights(test)
-        rows = rng.choice(len(weights), 4 * _WALKERS, p=weights)
-        for i, name in enumerate(_NAMES):
-            ours[f"{name} of EQ{k}"] = stored.samples[rows, i]
-    theirs, evaluations, seconds, warned = _nuts(posteriors, seed)
-    case = f"seed {seed}, {_TESTS} tests"
-    note = (
-        f"{simulations} simulations in {middle - start:.0f} s, then none in {end - middle:.0f} s; NUTS: {evaluations} "
-    )
-    note += f"simulations in {seconds:.0f} s, {warned}"
-    rows = [Row("largest error of a mean by the checks", case, max(result.checks.mean_errors.values()), "sd", note)]
-    shifts = {}
-    for name, reference in theirs.items():
-        shifts[name] = (
-            (ours[name].mean() - reference.mean()) / reference.std(),
-            ours[name].std() / reference.std(),
-        )
-    for name in [*population.parameter_names, *(f"{each} of a new test" for each in _NAMES)]:
-        shift, ratio = shifts[name]
-        note = f"sd ratio {ratio:.3f}; NUTS {theirs[name].mean():.4f} +- {theirs[name].std():.4f}"
-        rows.append(Row(f"shift of the mean of {name}", case, float(shift), "sd", note))
-    of_tests = np.array([each for name, each in shifts.items() if " of EQ" in name])
-    alone = np.array([
-        (tests[f"EQ{k}"].samples[:, i].mean() - theirs[f"{name} of EQ{k}"].mean()) / theirs[f"{name} of EQ{k}"].std()
-        for k in range(_TESTS)
-        for i, name in enumerate(_NAMES)
-    ])  # fmt: skip
-    note = f"sd ratios {of_tests[:, 1].min():.3f} to {of_tests[:, 1].max():.3f}; of the tests alone "
-    note += f"{np.abs(alone).max():.2f} sd"
-    return [*rows, Row("largest shift of a test's parameter", case, float(np.abs(of_tests[:, 0]).max()), "sd", note)]
-
-
-def _nuts(posteriors: list[Posterior], seed: int) -> tuple[dict[str, np.ndarray], int, float, str]:
-    """Samples of the whole model by NUTS under our names, simulations, seconds, and a note on convergence."""
-    import arviz
     import pymc
-    import pytensor.tensor as pt
-    from pytensor.graph.op import Op
 
-    step = 1e-4
-    offsets = step * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    counted = [0]
-    cache: dict[bytes, np.ndarray] = {}
-
-    def evaluate(logs: np.ndarray) -> np.ndarray:
-        """Log-likelihoods at the points of central differences, (n_tests, 5), for logarithms (n_tests, 2)."""
-        key = logs.tobytes()
-        if key not in cache:
-            cache.clear()
-            cache[key] = np.stack(
-                [p.log_likelihood(np.exp(row + offsets)) for p, row in zip(posteriors, logs, strict=True)]
-            )
-            counted[0] += cache[key].size
-        return cache[key]
-
-    class Gradient(Op):
-        itypes, otypes = (pt.dmatrix,), (pt.dmatrix,)
-
-        def perform(self, node: Any, inputs: list, outputs: list) -> None:
-            values = np.maximum(evaluate(inputs[0]), -1e10)  # finite where the damping ratio exceeds one
-            outputs[0][0] = np.stack([values[:, 1] - values[:, 2], values[:, 3] - values[:, 4]], axis=1) / (2.0 * step)
-
-    class LogLikelihood(Op):
-        itypes, otypes = (pt.dmatrix,), (pt.dscalar,)
-
-        def perform(self, node: Any, inputs: list, outputs: list) -> None:
-            outputs[0][0] = np.array(evaluate(inputs[0])[:, 0].sum())
-
-        def L_op(self, inputs: list, outputs: list, gradients: list) -> list:  # noqa: N802, the name in pytensor
-            return [gradients[0] * Gradient()(inputs[0])]
-
-    start = time.perf_counter()
-    with pymc.Model():
-        columns = []
-        for name in _NAMES:
-            each = _VARYING[name]
-            median = pymc.LogNormal(f"median_{name}", np.log(each.location.median), each.location.log_sd)
-            spread = pymc.HalfNormal(f"sd_log_{name}", each.sd.sd)
-            scores = pymc.Normal(f"scores_{name}", 0.0, 1.0, shape=_TESTS)
-            columns.append(pymc.Deterministic(f"log_{name}", pt.log(median) + spread * scores))
-        pymc.Potential("log_likelihood", LogLikelihood()(pt.stack(columns, axis=1)))
-        trace = pymc.sample(
-            _DRAWS, tune=_TUNE, chains=_CHAINS, cores=1, random_seed=seed, progressbar=False, target_accept=0.9
-        )
-    seconds = time.perf_counter() - start
-    hyper = [f"{kind}_{name}" for name in _NAMES for kind in ("median", "sd_log")]
-    samples = {name: trace.posterior[name].to_numpy().ravel() for name in hyper}
-    rng = np.random.default_rng(seed)
-    for name in _NAMES:
-        median, spread = samples[f"median_{name}"], samples[f"sd_log_{name}"]
-        samples[f"{name} of a new test"] = np.log(median) + spread * rng.standard_normal(len(median))
-        logs = trace.posterior[f"log_{name}"].to_numpy().reshape(-1, _TESTS)
-        samples |= {f"{name} of EQ{k}": np.exp(logs[:, k]) for k in range(_TESTS)}
-    divergent = int(trace.sample_stats["diverging"].to_numpy().sum())
-    effective = min(float(arviz.ess(trace.posterior[name].to_numpy())) for name in hyper)
-    return samples, counted[0], seconds, f"{divergent} divergences, effective sample size {effective:.0f}"
+    rows = []
+    for seed in range(repeats):
+        rng = np.random.default_rng(seed)
+        data = 0.5 + 0.4 * rng.standard_normal(len(_ERRORS)) + _ERRORS * rng.standard_normal(len(_ERRORS))
+        prior, tests = Prior({"a": TruncatedNormal(0.0, _STORED, -np.inf, np.inf)}), {}
+        for k, (value, error) in enumerate(zip(data, _ERRORS, strict=True)):
+            variance = 1.0 / (1.0 / error**2 + 1.0 / _STORED**2)
+            draws = variance * value / error**2 + np.sqrt(variance) * rng.standard_normal((1000, 1))
+            tests[f"T{k}"] = StoredPosterior(draws, prior)
+        varying = Varying(TruncatedNormal(0.0, _CENTER, -np.inf, np.inf), HalfNormal(_SPREAD), "linear")
+        posterior = HierarchicalPosterior(tests, {"a": varying})
+        sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True, seed=seed)
+        sampler.run_mcmc(None, 4, progress=False)
+        result = Hierarchy(posterior, sampler.get_chain(flat=True))
+        with pymc.Model():
+            mean, spread = pymc.Normal("mean_a", 0.0, _CENTER), pymc.HalfNormal("sd_a", _SPREAD)
+            values = mean + spread * pymc.Normal("scores", 0.0, 1.0, shape=len(data))
+            pymc.Deterministic("values", values)
+            pymc.Normal("data", values, _ERRORS, observed=data)
+            trace = pymc.sample(1000, tune=1000, chains=2, cores=1, random_seed=seed, progressbar=False)
+        pairs = {name: (result.samples[:, i], trace.posterior[name]) for i, name in enumerate(("mean_a", "sd_a"))}
+        for k, test in enumerate(tests):
+            pairs[f"a of {test}"] = result.draw_test(test, seed)["a"], trace.posterior["values"][..., k]
+        for name, (ours, reference) in pairs.items():
+            theirs = reference.to_numpy().ravel()
+            shift = float((ours.mean() - theirs.mean()) / theirs.std())
+            note = f"sd ratio {ours.std() / theirs.std():.3f}; NUTS {theirs.mean():.4f} +- {theirs.std():.4f}"
+            rows.append(Row(f"shift of the mean of {name}", f"normal errors, seed {seed}", shift, "sd", note))
+    return rows
 
 
 def ranks(repeats: int = 1) -> list[Row]:
