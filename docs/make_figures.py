@@ -36,14 +36,17 @@ FIGURES_OF_TUTORIALS = {  # script and options: name of its figure, name here
     "10_damage.py": {"damage_predicted": "column_damage", "prediction": "damage_prediction"},
 }
 WIDEST = 1100  # pixels
+LARGEST = 145 * 1024  # bytes
 
 
 def shrink(source: Path, name: str) -> None:
     """Save a figure in docs/figures with 128 colours, which look the same and need a third of the space."""
-    picture = Image.open(source).convert("RGB")
-    picture.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
-    picture = picture.quantize(128, dither=Image.Dither.NONE)
-    picture.save(TARGET / f"{name}.png", optimize=True)
+    path, widest = TARGET / f"{name}.png", WIDEST
+    while widest == WIDEST or path.stat().st_size > LARGEST:
+        picture = Image.open(source).convert("RGB")
+        picture.thumbnail((widest, widest), Image.Resampling.LANCZOS)
+        picture.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+        widest = round(0.9 * widest)
 
 
 def model_figures() -> dict:

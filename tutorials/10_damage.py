@@ -75,8 +75,9 @@ first, second = (
 )
 events = Events([first, second, second.scale(-1.3), second.scale(1.6)], PAUSE, ["EQ1", "EQ2", "EQ3", "EQ4"])
 
-PARAMETERS = ("Ec", "Es", "a0", "a1", "ft", "fy")
-TRUTH = np.array([0.8, 1.05, 0.7, 1.3, 1.25, 1.06])
+LIKELY = {"Ec": 0.8, "Es": 1.05, "a0": 0.7, "a1": 1.3, "ft": 1.25, "fy": 1.06}  # the truth, as multiples
+PARAMETERS = ("Ec", "ft", "fy") if fast else tuple(LIKELY)  # the others have their nominal values
+TRUTH = np.array([LIKELY[name] for name in PARAMETERS])
 column = RCColumn.lhpost(events, parameters=PARAMETERS)
 NOISE = np.array([problems.BRIDGE_COLUMN_NOISE[channel.name] for channel in column.channels])
 prior = dict(problems.bridge_column_prior().distributions) | {"fy": TruncatedNormal(1.0, 0.08)}
@@ -245,8 +246,8 @@ seconds = time.perf_counter() - begin
 (args.out / "tables.txt").write_text("\n\n".join([table, comparison, *(d.table() for d in damages.values())]) + "\n")
 result = {
     "truth": dict(zip(PARAMETERS, TRUTH.tolist(), strict=True)),
-    "mean": {name: x[:, :6].mean(axis=0).tolist() for name, (_, x) in posteriors.items()},
-    "sd": {name: x[:, :6].std(axis=0).tolist() for name, (_, x) in posteriors.items()},
+    "mean": {name: x[:, : len(PARAMETERS)].mean(axis=0).tolist() for name, (_, x) in posteriors.items()},
+    "sd": {name: x[:, : len(PARAMETERS)].std(axis=0).tolist() for name, (_, x) in posteriors.items()},
     "coverage": {
         f"{name}, {state}, {event}": values[0].tolist()
         for (name, state), found in predictions.items()

@@ -192,7 +192,7 @@ def _mark(ax, value, low, high, colour, label=False, vertical=False, level=0):
         (ax.axhline if vertical else ax.axvline)(value, color=colour, linewidth=1)
         return
     end, start = (0.99, 0.80) if value >= high else (0.01, 0.20)
-    across = 0.90 - 0.22 * level if label else 0.06
+    across = 0.90 - 0.22 * level if label else (0.94 if value >= high else 0.30) if vertical else 0.06
     tip, tail = ((across, end), (across, start)) if vertical else ((end, across), (start, across))
     style = {"arrowstyle": "-|>", "color": colour, "linewidth": 1.0, "shrinkA": 0.0, "shrinkB": 0.0}
     ax.annotate("", tip, tail, xycoords="axes fraction", arrowprops=style, annotation_clip=False)
