@@ -685,7 +685,7 @@ def test_four_earthquakes_damage_a_column(tmp_path):
         carried, virgin = (np.array(summary["rrmse"][f"EQ1, {state}, {event}"]) for state in ("end", "virgin"))
         assert (carried < 0.6 * virgin).all()
         carried, virgin = (np.array(summary["coverage"][f"EQ1, {state}, {event}"]) for state in ("end", "virgin"))
-        assert (carried > 0.5).all() and (virgin < 0.5).all()
+        assert (carried > 2.0 * virgin).all() and (virgin < 0.3).all()
     for state, true in summary["presence"]["truth"].items():
         assert set(true) <= {0.0, 1.0} and true == sorted(true) or state == "large residual drift"
     assert summary["presence"]["truth"]["bar yield"] == [0.0, 1.0, 1.0, 1.0] == summary["presence"]["EQ1"]["bar yield"]
