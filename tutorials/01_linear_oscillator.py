@@ -47,7 +47,7 @@ from fe_likelihoods import (
 )
 from samplers import SMCSampler, TMCMCSampler, comparison_table, to_arviz
 
-FAST = bool(os.environ.get("FAST"))  # this tutorial is quick: FAST=1 only hides the progress bars
+FAST = bool(os.environ.get("FAST"))  # a shorter chain of emcee, fewer walkers of TMCMC, no progress bars
 parser = argparse.ArgumentParser(description="Ten-minute introduction; writes figures and summary.json to a folder.")
 parser.add_argument("--seed", type=int, default=1, help="seed of the noise and of the samplers")
 parser.add_argument("--out", type=Path, default=Path("results-oscillator"), help="folder of the results")
@@ -141,8 +141,8 @@ print(f"log-probability at the nominal values {posterior(nominal):.1f}, at the t
 # walkers of emcee start in a small ball around the best of 500 draws from the prior, and the first third of the chain
 # is discarded.
 
-WALKERS = {emcee.EnsembleSampler: 48, SMCSampler: 500, TMCMCSampler: 500}
-SWEEPS = {emcee.EnsembleSampler: 1000, SMCSampler: 4, TMCMCSampler: 4}
+WALKERS = {emcee.EnsembleSampler: 48, SMCSampler: 500, TMCMCSampler: 300 if FAST else 500}
+SWEEPS = {emcee.EnsembleSampler: 500 if FAST else 1000, SMCSampler: 4, TMCMCSampler: 4}
 discard = SWEEPS[emcee.EnsembleSampler] // 3
 prior_draws = posterior.sample_prior(500, args.seed)
 best = prior_draws[np.argmax(posterior(prior_draws))]

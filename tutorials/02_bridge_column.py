@@ -26,7 +26,7 @@ EQ2 follows EQ1, and the data inform every parameter.
 The last line is for a test of your own: measured acceleration and displacement of the top of a column
 (:doc:`/own_column` describes the files).
 
-With ``FAST=1`` the script keeps one sample in 16 and uses 60 walkers. It then shows how the tutorial works; its numbers
+With ``FAST=1`` the script keeps one sample in 16 and uses 24 walkers. It then shows how the tutorial works; its numbers
 are not results.
 """
 
@@ -71,7 +71,7 @@ from samplers import (
 PRESETS = {
     "default": (500, 1, 10, False, {}),
     "reduced": (100, 4, 4, True, {}),
-    "fast": (60, 16, 4, False, {"max_moves": 3}),
+    "fast": (24, 16, 2, False, {"max_moves": 3}),
     "ramancha2022": (1000, 1, 1, False, RAMANCHA_2022_LITERAL),
     "ramancha2022-constant": (1000, 1, 1, False, RAMANCHA_2022_CONSTANT),
 }

@@ -19,7 +19,7 @@ stochastic table motion, plus white noise of 5 % of the root mean square of each
     python tutorials/03_isolated_bridge.py --preset published    # TMCMC as published, and its warnings
     python tutorials/03_isolated_bridge.py --data means          # data that do not distinguish the piers: two modes
 
-With ``FAST=1`` the script uses 50 walkers and steps of 1 ms. It then shows how the tutorial works; its numbers are
+With ``FAST=1`` the script uses 50 walkers and steps of 2.5 ms. It then shows how the tutorial works; its numbers are
 not results.
 """
 
@@ -68,7 +68,7 @@ from samplers import (
 PRESETS = {
     "default": (1000, 2, 0.5e-3, 1000, {}),
     "published": (1000, 1, 0.5e-3, 1000, CHING_CHEN_2007),
-    "fast": (50, 4, 1.0e-3, 50, {"max_moves": 3}),
+    "fast": (50, 2, 2.5e-3, 30, {"max_moves": 3}),
 }
 
 parser = argparse.ArgumentParser(
@@ -331,7 +331,7 @@ constant = problems.isolated_bridge(
     parameters=("fmin_1", "fmin_2", "Kd_1", "C0_1", "Kd_2", "C0_2"),
 )
 cheap = {"max_moves": 3} if args.preset == "fast" else {}
-rival = SMCSampler(500 if walkers >= 500 else 30, constant.ndim, constant, vectorize=True, seed=args.seed, **cheap)
+rival = SMCSampler(500 if walkers >= 500 else 24, constant.ndim, constant, vectorize=True, seed=args.seed, **cheap)
 rival.run_mcmc(None, 1, progress=True)
 comparison = compare_models({"friction depends on velocity": sampler, "constant friction": rival})
 print(comparison.table())

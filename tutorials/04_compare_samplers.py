@@ -53,10 +53,10 @@ from samplers import CHING_CHEN_2007, SamplingWarning, SMCSampler, TMCMCSampler,
 FAST = bool(os.environ.get("FAST"))
 parser = argparse.ArgumentParser(description="Compare SMC, TMCMC and emcee; write tables and figures to a folder.")
 parser.add_argument("--problem", choices=("column", "bridge", "means"), action="append", help="default: all three")
-parser.add_argument("--walkers", type=int, default=40 if FAST else 500, help="walkers of SMC and TMCMC")
+parser.add_argument("--walkers", type=int, default=24 if FAST else 500, help="walkers of SMC and TMCMC")
 parser.add_argument("--max-simulations", type=int, default=1500, help="limit of simulations of SMC with a guide")
 parser.add_argument("--cache", type=Path, help="file of the simulation cache; created if it does not exist")
-parser.add_argument("--steps", type=int, default=40 if FAST else 1500, help="steps of emcee")
+parser.add_argument("--steps", type=int, default=30 if FAST else 1500, help="steps of emcee")
 parser.add_argument("--seed", type=int, default=1, help="seed of the samplers")
 parser.add_argument("--out", type=Path, default=Path("results-comparison"), help="folder of the results")
 args = parser.parse_args()
@@ -87,10 +87,11 @@ class Problem(NamedTuple):
 
 
 def bridge(data: str) -> Problem:
-    """The isolated bridge with time steps of 1 ms."""
+    """The isolated bridge with time steps of 1 ms (fast: 2.5 ms)."""
     truth = [*problems.ISOLATED_BRIDGE_TRUTH[data].values(), problems.ISOLATED_BRIDGE_NOISE[data]]
+    step = 2.5e-3 if FAST else 1e-3
     return Problem(
-        lambda: problems.isolated_bridge(data=data, step=1e-3, cache=args.cache), np.array(truth), ("df_1", "df_2")
+        lambda: problems.isolated_bridge(data=data, step=step, cache=args.cache), np.array(truth), ("df_1", "df_2")
     )
 
 
@@ -109,7 +110,7 @@ SAMPLERS = {
     "TMCMC as published": (TMCMCSampler, CHING_CHEN_2007),
 }
 EMCEE_WALKERS = 24 if FAST else 64
-GUIDED_WALKERS = 40 if FAST else 100
+GUIDED_WALKERS = 24 if FAST else 100
 GUIDED = "SMC with a guide"
 COLOURS = {"SMC": "#1f5a8c", "TMCMC": "#d9822b", "TMCMC as published": "#b03a48", GUIDED: "#d4007a"}
 COLOURS |= {"emcee": "#5b8c5a", "emcee from the prior": "#7b5ea7"}

@@ -259,7 +259,9 @@ def main() -> None:
             f"{report['failure_count']} failed, "
             f"{results[name]['seconds']:.1f} s"
         )
-    few = with_few_simulations(make_posterior(models(args.out)["function"], data, None, cache), 100, args.seed)
+    guided_walkers = 24 if os.environ.get("FAST") else 100
+    function = make_posterior(models(args.out)["function"], data, None, cache)
+    few = with_few_simulations(function, guided_walkers, args.seed)
     print(f"with a guide: log evidence {few.log_evidence:.2f} +- {few.log_evidence_error:.2f}\n{few.verdict}")
     for thing in to_close:
         thing.close()

@@ -10,7 +10,8 @@ from .problem import CRITICAL, PRIOR, exact, make_posterior, reference_log_prob
 from .runs import CLIENTS
 from .scoring import Found, check
 
-SLOW = {"pymc-smc", "pymc-mcmc", "pocomc", "uqpy"}
+# bilby runs the same dynesty; test_adapters compares its priors and its likelihood with the posterior
+SLOW = {"bilby", "pymc-smc", "pymc-mcmc", "pocomc", "uqpy"}
 
 
 def test_quadrature_has_converged_and_is_of_this_posterior(answer):

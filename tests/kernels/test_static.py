@@ -29,7 +29,9 @@ def push(column, targets, tolerance=TOLERANCE, max_iterations=100, halvings=6, g
     history = np.full((9, len(targets)), np.nan)
     load = golden.gravity(column.elements.state.shape[0]) if gravity is None else gravity
     iteration = Iteration(tolerance, max_iterations, halvings)
-    return impose_displacement(column, load, np.asarray(targets), iteration, history, NO_SECTIONS), history
+    targets = np.array(targets)
+    targets.flags.writeable = False  # the type that the models pass; another one would be compiled again
+    return impose_displacement(column, load, targets, iteration, history, NO_SECTIONS), history
 
 
 def cases(arrays):

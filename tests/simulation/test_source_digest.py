@@ -1,5 +1,6 @@
 """A cache key depends on the source files that the response depends on, and on no others."""
 
+import functools
 import shutil
 import sys
 
@@ -84,9 +85,15 @@ def keys(*models, statistic=None):
     return {name: simulation_keys(simulation_fingerprint(MODELS[name](), statistic), thetas)[0] for name in models}
 
 
+@functools.cache
+def keys_of_unchanged_files(*models, statistic=None):
+    """The keys before any edit: the files are those of the library, wherever they are copied to."""
+    return keys(*models, statistic=statistic)
+
+
 def changed(edit, file, *models, statistic=None):
     """Models whose keys change with a file."""
-    before = keys(*models, statistic=statistic)
+    before = keys_of_unchanged_files(*models, statistic=statistic)
     edit(file)
     after = keys(*models, statistic=statistic)
     return {name for name in models if before[name] != after[name]}

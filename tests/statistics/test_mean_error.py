@@ -1,4 +1,6 @@
-"""Monte Carlo error of posterior means from one run, compared with independent draws and with errors over many runs."""
+"""Monte Carlo errors of posterior means and of the evidence from one run, compared with those over many runs."""
+
+from functools import cache
 
 import numpy as np
 import pytest
@@ -82,10 +84,19 @@ def scores(posterior, samplers, stated):
     return np.sum(np.abs(error) < 2 * stated, axis=0), np.sqrt(np.mean((error / stated) ** 2, axis=0))
 
 
+@cache
+def scores_of_forty_runs(mode, target, nwalkers, seed):
+    """Of 40 short runs: the scores of their means, their log-evidences, and the stated errors of these."""
+    posterior = target()
+    samplers = runs(posterior, seed, count=40, nwalkers=nwalkers, nsteps=2, **MODES[mode])
+    of_means = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
+    return of_means, *np.array([[s.log_evidence, s.log_evidence_error] for s in samplers]).T
+
+
 @pytest.mark.parametrize(
     "mode, target, nwalkers, low",
     [
-        *((mode, Gaussian, 120, 0.6) for mode in ("default", "moves", "literal", "tmcmc")),
+        *((mode, Gaussian, 150, 0.6) for mode in ("default", "moves", "literal", "tmcmc")),
         ("moves", TwoModes, 120, 0.6),
         # recycling draws evenly from the modes: the error is smaller than stated, which is that of independent draws
         ("default", TwoModes, 250, 0.4),
@@ -94,11 +105,19 @@ def scores(posterior, samplers, stated):
 )
 def test_mean_error_covers(mode, target, nwalkers, low, seed):
     """Two standard errors cover the truth in nearly 95 % of 40 short runs, and are not too wide."""
-    posterior = target()
-    samplers = runs(posterior, seed, count=40, nwalkers=nwalkers, nsteps=2, **MODES[mode])
-    covered, ratio = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
+    (covered, ratio), *_ = scores_of_forty_runs(mode, target, nwalkers, seed)
     assert np.all(covered >= stats.binom(40, 0.93).ppf(1e-3))
     assert np.all((low < ratio) & (ratio < 1.6))
+
+
+@pytest.mark.parametrize("mode", ["default", "moves", "literal", "tmcmc"])
+def test_evidence_error_covers(mode, seed):
+    """Two standard errors cover the truth in nearly 95 % of the same runs, and are not idly wide."""
+    _, log_evidence, stated = scores_of_forty_runs(mode, Gaussian, 150, seed)
+    error = log_evidence - Gaussian().log_evidence
+    covered = int(np.sum(np.abs(error) < 2 * stated))
+    assert covered >= stats.binom(40, 0.93).ppf(1e-3)
+    assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < 1.6
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
