@@ -533,8 +533,9 @@ def test_comparison_run_twice_simulates_once(times, tmp_path):
 # 05
 
 
-@pytest.mark.parametrize("pool", [pytest.param("local", marks=pytest.mark.slow), "dask"])
+@pytest.mark.parametrize("pool", ["local", pytest.param("dask", marks=pytest.mark.slow)])
 def test_own_models_agree_and_are_simulated_once(pool, tmp_path):
+    """Workers of dask are tested in `tests/faults/test_executors_faults.py` as well."""
     if pool == "dask":
         pytest.importorskip("distributed", reason="NO DISTRIBUTED: install it to test this executor")
     results = []

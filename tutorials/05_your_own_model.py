@@ -228,7 +228,7 @@ def plot_loop(theta: np.ndarray, path: Path) -> None:
 
 def main() -> None:
     """Sample the posterior of each model, compare and plot."""
-    args = parse_arguments()
+    args, fast = parse_arguments(), bool(os.environ.get("FAST"))
     args.out.mkdir(parents=True, exist_ok=True)
     cache = args.cache or args.out / "simulations.db"
     data = measurements(args.seed)
@@ -237,9 +237,9 @@ def main() -> None:
     for name, model in models(args.out).items():
         posterior = make_posterior(model, data, pool, cache)
         start = time.perf_counter()
-        few = {"max_moves": 3} if args.walkers < 250 else {}  # with more walkers recycling replaces the moves
+        few = {"max_moves": 2 if fast else 3} if args.walkers < 250 else {}  # with more, recycling replaces the moves
         sampler = SMCSampler(args.walkers, posterior.ndim, posterior, vectorize=True, seed=args.seed, **few)
-        sampler.run_mcmc(None, 4, progress=not os.environ.get("FAST"))
+        sampler.run_mcmc(None, 1 if fast else 4, progress=not fast)
         draws[name] = sampler.get_chain(flat=True)
         report = posterior.report()
         moments = summary(draws[name], posterior.parameter_names)
@@ -259,7 +259,7 @@ def main() -> None:
             f"{report['failure_count']} failed, "
             f"{results[name]['seconds']:.1f} s"
         )
-    guided_walkers = 24 if os.environ.get("FAST") else 100
+    guided_walkers = 24 if fast else 100
     function = make_posterior(models(args.out)["function"], data, None, cache)
     few = with_few_simulations(function, guided_walkers, args.seed)
     print(f"with a guide: log evidence {few.log_evidence:.2f} +- {few.log_evidence_error:.2f}\n{few.verdict}")

@@ -1,5 +1,6 @@
 """Noise for real measurements: correlated errors, known sensor noise, effective samples, compared with white noise."""
 
+import functools
 import math
 import warnings
 
@@ -317,7 +318,11 @@ def test_coverage_of_each_noise_for_correlated_errors(rng, period):
         dt, n_steps, fingerprint = oscillator.dt, STEPS, "stiffness alone"
 
         def simulate(self, theta):
-            return oscillator.simulate([theta[0], 1.0])[1:]
+            return respond(theta[0]).copy()
+
+    @functools.cache  # all data sets are compared with the same responses
+    def respond(stiffness):
+        return oscillator.simulate([stiffness, 1.0])[1:]
 
     model = OneChannel()
     clean = model.simulate([1.0])
