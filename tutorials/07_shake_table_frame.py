@@ -59,7 +59,7 @@ FREE_VIBRATION = (70.0, 100.0)  # [s] after the last shaking
 
 parser = argparse.ArgumentParser(description="Update a frame on a shake table, and predict.")
 real_data.add_common_options(parser, "results-shake-table")
-parser.add_argument("--walkers", type=int, default=40 if FAST else 300, help="number of particles")
+parser.add_argument("--walkers", type=int, default=80 if FAST else 300, help="number of particles")
 args = parser.parse_args()
 path = real_data.find_file(args.data, "Flexible_3_story__Northridge.csv", SOURCE)
 if FAST:
