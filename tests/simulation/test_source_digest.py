@@ -1,5 +1,6 @@
 """A cache key depends on the source files that the response depends on, and on no others."""
 
+import ast
 import functools
 import shutil
 import sys
@@ -62,9 +63,13 @@ MODELS = {
 }
 
 
+parse_once = functools.cache(ast.parse)  # by the content of a file, of which an edit changes one
+
+
 @pytest.fixture
 def edit(tmp_path, monkeypatch):
     """Append a comment to a file of a copy of the library, which is then the one that is read."""
+    monkeypatch.setattr(ast, "parse", parse_once)
     copy = tmp_path / "fe_likelihoods"
     shutil.copytree(source_digest.ROOT, copy, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(source_digest, "ROOT", copy)
