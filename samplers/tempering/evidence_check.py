@@ -23,6 +23,9 @@ from scipy.stats import chi2
 from ..proposals.mixture import Mixture, draw
 from .weights import effective_sample_size, log_mean_weight
 
+# Levels of a normal distribution one and two standard deviations above its median.
+ONE_AND_TWO_SD = (0.8413, 0.9772)
+
 __all__ = ["EvidenceCheck", "draw_inside", "evidence_from_weights", "expected_yield", "pareto_shape"]
 
 LARGEST_SHAPE = 0.7
@@ -97,12 +100,24 @@ def draw_inside(
 
 
 def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
-    """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws."""
+    """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws.
+
+    The sample variance of n weights is too small where n draws rarely contain the largest ones. Rough likelihoods have
+    nearly log-normal weights, whose variance follows from the spread s of their logarithms, exp(s²) - 1 in units of the
+    squared mean. The error is that of the larger variance. The spread is the distance of the quantiles that are one
+    and two standard deviations above the median of a normal distribution, so that draws far out in the tails of the
+    proposal, whose weights are small, do not count.
+    """
     full = np.full(made, -np.inf)
     full[: len(log_weights)] = log_weights
     effective = effective_sample_size(full)
     log_evidence = log_mean_weight(full)
-    error = float(np.sqrt(max(1.0 / effective - 1.0 / made, 0.0))) if effective > 0.0 else float("inf")
+    if effective == 0.0:
+        return EvidenceCheck(log_evidence, float("inf"), effective, pareto_shape(log_weights), len(log_weights))
+    one, two = np.quantile(full, ONE_AND_TWO_SD, method="lower")
+    # one effective point has the relative variance 1, which no set of weights exceeds
+    log_normal = np.expm1(min((two - one) ** 2, np.log1p(made))) / made if one > -np.inf else 0.0
+    error = float(np.sqrt(max(1.0 / effective - 1.0 / made, log_normal)))
     return EvidenceCheck(log_evidence, error, effective, pareto_shape(log_weights), len(log_weights))
 
 
