@@ -78,11 +78,6 @@ class FELikelihood(CachedSimulations):
         Indices of the parameters whose change needs no simulation: those of the noise.
     simulations : int
         Simulations run by this object in this process.
-    verifications : int
-        Rows of the cache on disk that were compared with a further simulation (see
-        `fe_likelihoods.simulation.verification`).
-    unverified : int
-        Rows that could not be compared, because the further simulation was stopped.
     cache_hits : int
         Rows whose statistics were cached, in memory or on disk.
     disk_hits : int

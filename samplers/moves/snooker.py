@@ -1,15 +1,15 @@
 """The snooker move of differential evolution, in place of that of emcee.
 
 A walker x moves along the line through x and another walker z, by a multiple of the difference of two more walkers
-projected on this line. With the unit vector e = (x - z) / |x - z|, the proposal is
+projected on this line. With the distance r of x from z and the unit vector e = (x - z) / r, the proposal is
 
     x' = x + gamma e (e . (z1 - z2)),
 
-and the acceptance probability contains the factor (|x' - z| / |x - z|)^(ndim - 1), since the density of the direction
-changes with the distance from z.
+and the acceptance probability contains the factor (r' / r)^(ndim - 1) with the distance r' of x' from z, since the
+density of the direction changes with the distance from z.
 
 Two things differ from ``emcee.moves.DESnookerMove`` of emcee 3.1.6 and earlier. That move divides by the root of
-|x - z| instead of |x - z|, and halves the exponent, so that its stationary distribution is not the target: for three
+r instead of r, and halves the exponent, so that its stationary distribution is not the target: for three
 independent standard normal parameters, it gives a variance of 0.79 instead of 1. It also divides by zero where x and z
 are copies of one point, as they often are after resampling. Here, such a proposal is rejected. This keeps detailed
 balance, since a line through two different points leads to neither x = z nor x' = z with a positive probability.
