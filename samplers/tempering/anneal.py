@@ -399,6 +399,7 @@ def _by_runs(
         try:
             run = yield from _only_sweeps(recycle(coords, records, density, random, settings.recycling, finish=False))
         except StoppedEarly as stop:
+            stop.log_evidence_of_stages = 0.0  # the stages of these runs are not reported
             raise (stopped_at(runs[0].archive, 1.0, 0.0, 0.0) if runs else stop) from None
         if not run.trusted:
             yield population, Restart(run.doubt)

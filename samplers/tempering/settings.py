@@ -5,7 +5,7 @@ Every default is written here, once. A setting that cannot act on the chosen pat
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,10 @@ def as_whole_number(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ValueError(f"{name} must be a whole number (int); got {value!r}")
     return int(value)
+
+
+# Larger numbers of draws in one batch are a mistake: annealing by moves needs fewer evaluations.
+MOST_SEARCH_DRAWS = 1000.0
 
 
 @dataclass(frozen=True)
@@ -152,8 +156,11 @@ class RecyclingSettings:
         object.__setattr__(self, "closing_sweeps", bool(self.closing_sweeps))
         if not self.draws_per_target > 0.0:
             raise ValueError(f"draws_per_target must be positive; got {self.draws_per_target}")
-        if not self.search_draws >= 0.0:
-            raise ValueError(f"search_draws must not be negative; got {self.search_draws}")
+        if not isinstance(self.search_draws, Real) or not 0.0 <= self.search_draws <= MOST_SEARCH_DRAWS:
+            raise ValueError(
+                f"search_draws is a multiple of the number of walkers from 0 to {MOST_SEARCH_DRAWS:g}; got "
+                f"{self.search_draws!r}"
+            )
         if not self.points_per_dimension > 0.0:
             raise ValueError(f"points_per_dimension must be positive; got {self.points_per_dimension}")
         if not self.max_evidence_difference >= 0.0:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from emcee.backends import HDFBackend
 
-from samplers import SamplingWarning, SMCSampler
+from samplers import RecyclingSettings, SamplingWarning, SMCSampler
 from tests.benchmarks import truth, truth_targets
 
 
@@ -41,12 +41,19 @@ def test_runs_that_agree_are_not_doubted(posterior):
     assert np.max(np.abs(z)) < 4.5
 
 
-def test_a_limit_in_the_second_run_leaves_the_first():
+@pytest.mark.parametrize("limit", [0.7, 1.2])
+def test_a_limit_in_one_of_the_runs(limit):
+    """In the first run, its points are weighted; in the second, those of the first, which has reached beta = 1."""
     posterior = truth_targets.gaussian(1)
-    whole, _ = finish(posterior, 1)
-    sampler, messages = finish(posterior, 2, max_simulations=int(0.75 * whole.evaluations))
-    assert any("max_simulations" in message for message in messages)
-    assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
+    whole = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=1, recycling=RecyclingSettings())
+    whole.run_mcmc(None, 0)
+    to_one = whole.evaluations - 250 - 250  # without the check and the last draws before it
+    sampler, messages = finish(posterior, 2, max_simulations=int(limit * to_one))
+    assert any("limit of simulations" in message for message in messages)
+    if sampler.verdict.status != "not usable":
+        assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
+    error = sampler.log_evidence_ladder - posterior.log_evidence
+    assert abs(error) < 4.0 * max(sampler.ladder[-1].log_evidence_error, 0.1)
 
 
 def test_an_interrupted_second_run_goes_on(tmp_path):

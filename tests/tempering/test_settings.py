@@ -161,6 +161,8 @@ def test_every_constant_of_the_recycling_changes_the_run(name):
         {"max_basins": -1},
         {"basin_share": 1.1},
         {"search_draws": -1.0},
+        {"search_draws": np.inf},
+        {"search_draws": "3"},
         {"max_basin_rounds": 0.5},
         {"draws_per_basin": 0},
         {"points_per_dimension": 0.0},
