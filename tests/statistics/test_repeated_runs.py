@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from emcee.backends import HDFBackend
 
-from samplers import RecyclingSettings, SamplingWarning, SMCSampler
+from samplers import SamplingWarning, SMCSampler
 from tests.benchmarks import truth, truth_targets
 
 
@@ -41,19 +41,14 @@ def test_runs_that_agree_are_not_doubted(posterior):
     assert np.max(np.abs(z)) < 4.5
 
 
-@pytest.mark.parametrize("limit", [0.7, 1.2])
+@pytest.mark.parametrize("limit", [1100, 1900], ids=["first", "second"])
 def test_a_limit_in_one_of_the_runs(limit):
     """In the first run, its points are weighted; in the second, those of the first, which has reached beta = 1."""
-    posterior = truth_targets.gaussian(1)
-    whole = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=1, recycling=RecyclingSettings())
-    whole.run_mcmc(None, 0)
-    to_one = whole.evaluations - 250 - 250  # without the check and the last draws before it
-    sampler, messages = finish(posterior, 2, max_simulations=int(limit * to_one))
+    posterior = truth_targets.gaussian(1, 2)
+    sampler, messages = finish(posterior, 2, max_simulations=limit)
     assert any("limit of simulations" in message for message in messages)
-    if sampler.verdict.status != "not usable":
-        assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
-    error = sampler.log_evidence_ladder - posterior.log_evidence
-    assert abs(error) < 4.0 * max(sampler.ladder[-1].log_evidence_error, 0.1)
+    assert sampler.verdict.status == "usable" and sampler.log_evidence_error < 0.3
+    assert abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
 
 
 def test_an_interrupted_second_run_goes_on(tmp_path):
