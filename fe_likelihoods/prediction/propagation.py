@@ -22,6 +22,7 @@ Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -156,10 +157,8 @@ def propagate(
     effective = check_effective_sample_size(effective_sample_size, n)
     if batch is not None and not (isinstance(batch, (int, np.integer)) and batch >= 1):
         raise ValueError(f"batch must be a whole number of simulations, 1 or more; got {batch!r}")
-    if memory_bytes is not None and not memory_bytes >= 0:
-        raise ValueError(f"memory_bytes must be a number of bytes, or None for no limit; got {memory_bytes!r}")
-    if state_bytes is not None and not state_bytes >= 0:
-        raise ValueError(f"state_bytes must be a number of bytes, or None for no limit; got {state_bytes!r}")
+    _check_bytes("memory_bytes", memory_bytes)
+    _check_bytes("state_bytes", state_bytes)
     if record is not None:
         under_record(source.model, record)  # errors come before the warning about the state
     state = chosen_state(source.model, record, from_state)
@@ -323,3 +322,10 @@ def _probabilities(quantiles: Sequence[float]) -> tuple[float, ...]:
     if not all(0.0 < p < 1.0 for p in probabilities) or len(set(probabilities)) != len(probabilities):
         raise ValueError(f"quantiles must be different probabilities between 0 and 1; got {quantiles!r}")
     return probabilities
+
+
+def _check_bytes(name: str, value: object) -> None:
+    """Raise ValueError unless a limit of memory is a number, zero or more, or None."""
+    if value is None or (isinstance(value, Real) and not isinstance(value, bool) and value >= 0):
+        return
+    raise ValueError(f"{name} must be a number of bytes, or None for no limit; got {value!r}")

@@ -16,18 +16,25 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .changed_model import SentModel
 from .code_digest import describe_code
 from .faults import ChangedModel, reason_of
-from .model import Model, SimulationBatch, first_part, not_finite, real_response, simulate_batch
+from .model import Model, SimulationBatch, SimulationFailed, first_part, not_finite, real_response, simulate_batch
 from .source_digest import LIBRARY
 from .threads import run_on_threads
 
 __all__ = ["KEPT_STATES", "StateMemory", "simulate_last_part"]
+
+
+class _Start(NamedTuple):
+    """State after the first `n_done` samples of a response; none at the beginning."""
+
+    n_done: int
+    state: np.ndarray | None
 
 
 class StateMemory:
@@ -141,7 +148,7 @@ def simulate_last_part(
         if not reason:
             memory.add(key_before, before.n_steps, thetas[row], state)
     rows = [row for row, reason in enumerate(reasons) if not reason]
-    ends = _run(model, thetas[rows], [states[row] for row in rows], pool, True)
+    ends = _run(model, thetas[rows], [_Start(first, states[row]) for row in rows], pool, True)
     for row, (response, state, reason) in zip(rows, ends, strict=True):
         reasons[row] = reason
         if not reason:
@@ -169,23 +176,25 @@ def _identity(model: Model) -> str:
     return f"{model.fingerprint} {describe_code([cls], strict=False, user=cls).steady}"
 
 
-def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> list[np.ndarray | None]:
+def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> list[_Start]:
     """For every theta, the state after the longest first part of the excitation for which one is kept."""
-    states: list[np.ndarray | None] = [None] * len(thetas)
+    starts = [_Start(0, None)] * len(thetas)
     for n_steps in memory.lengths() if len(thetas) else []:
-        if 2 <= n_steps < model.n_steps and any(state is None for state in states):
+        if 2 <= n_steps < model.n_steps and any(start.state is None for start in starts):
             shorter = _model_before(model, n_steps)
             if shorter is not None:
-                kept = [memory.get(_identity(shorter), theta) for theta in thetas]
-                states = [known if known is not None else new for known, new in zip(states, kept, strict=True)]
-    return states
+                for row, theta in enumerate(thetas):
+                    kept = memory.get(_identity(shorter), theta) if starts[row].state is None else None
+                    if kept is not None:
+                        starts[row] = _Start(n_steps, kept)
+    return starts
 
 
 def _run(
-    model: Model, thetas: np.ndarray, states: list[np.ndarray | None], pool: Any, responses: bool
+    model: Model, thetas: np.ndarray, starts: list[_Start], pool: Any, responses: bool
 ) -> list[tuple[np.ndarray | None, np.ndarray | None, str]]:
     """Response (if `responses` are wanted), state at the end and reason of the failure of each simulation."""
-    items = [(theta.copy(), state) for theta, state in zip(thetas, states, strict=True)]
+    items = [(theta.copy(), start) for theta, start in zip(thetas, starts, strict=True)]
     if pool is not None:
         outcomes = list(pool.map(partial(_continue_sent, responses, SentModel(model)), items)) if items else []
     elif getattr(model, "runs_on_threads", False):
@@ -195,12 +204,20 @@ def _run(
     return [(*(found or (None, None)), reason) for found, reason in outcomes]
 
 
-def _continue(responses: bool, model: Model, item: tuple[np.ndarray, np.ndarray | None]) -> tuple[tuple | None, str]:
+def _continue(responses: bool, model: Model, item: tuple[np.ndarray, _Start]) -> tuple[tuple | None, str]:
     """Run one simulation from a state; returns response and state with an empty reason, or None and the reason."""
-    theta, state = item
+    theta, (n_done, state) = item
     try:
-        response, end = model.simulate_from(theta, state)
-        response = real_response(response, model.channels, np.shape(response)[-1])
+        # a model may write into its argument, and the kept state serves later predictions
+        response, end = model.simulate_from(theta, None if state is None else np.array(state))
+        expected = (len(model.channels), model.n_steps - n_done)
+        if np.shape(response) != expected:
+            part = "of the whole excitation" if state is None else f"after the first {n_done} samples"
+            raise SimulationFailed(
+                f"simulate_from of {type(model).__name__} returned a response of shape {np.shape(response)}, expected "
+                f"(n_channels, n_steps) = {expected}, the response {part}"
+            )
+        response = real_response(response, model.channels, expected[1])
     except ChangedModel:
         raise
     except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
@@ -209,7 +226,5 @@ def _continue(responses: bool, model: Model, item: tuple[np.ndarray, np.ndarray 
     return (None, reason) if reason else ((response if responses else None, np.array(end)), "")
 
 
-def _continue_sent(
-    responses: bool, sent: SentModel, item: tuple[np.ndarray, np.ndarray | None]
-) -> tuple[tuple | None, str]:
+def _continue_sent(responses: bool, sent: SentModel, item: tuple[np.ndarray, _Start]) -> tuple[tuple | None, str]:
     return _continue(responses, sent.model, item)

@@ -1,5 +1,6 @@
 """States at the end of an excitation: the bits of one simulation of the whole, and no event is run twice."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -40,6 +41,26 @@ class Slip:
         steps[0] += slip
         slips = np.cumsum(steps)
         return ContinuedResponse(slips[None], np.array([self.n_steps - 1, slips[-1]]))
+
+
+class InPlace(Slip):
+    """A class that updates the state that it receives."""
+
+    def simulate_from(self, theta, state=None):
+        found = super().simulate_from(theta, state)
+        if state is not None:
+            state[:] = found.state
+        return found
+
+
+class Cut(Slip):
+    """A class that returns a part of the response after a state."""
+
+    part = np.s_[:, -1:]
+
+    def simulate_from(self, theta, state=None):
+        found = super().simulate_from(theta, state)
+        return found if state is None else found._replace(response=found.response[self.part])
 
 
 class Doubled(Slip):
@@ -197,6 +218,23 @@ def test_memory_stays_within_its_limit(eq):
     assert (memory.n_bytes, len(memory)) == (0, 0)
 
 
-def test_limit_that_is_no_number_of_bytes_is_refused(eq):
-    with pytest.raises(ValueError, match="state_bytes must be a number of bytes, or None for no limit; got -1"):
-        propagate(Slip(eq[0]), [[0.2]], record=eq[1], state_bytes=-1, **SETTINGS)
+@pytest.mark.parametrize("limit", [-1, np.nan, "1 GB"])
+def test_limit_that_is_no_number_of_bytes_is_refused(eq, limit):
+    with pytest.raises(ValueError, match=f"state_bytes must be a number of bytes, or None for no limit; got {limit!r}"):
+        propagate(Slip(eq[0]), [[0.2]], record=eq[1], state_bytes=limit, **SETTINGS)
+
+
+def test_a_model_may_write_into_the_state_that_it_receives(eq):
+    model, expected = InPlace(eq[0]), whole(Slip(eq[0]), Events(eq[:2], 0.5), np.array([0.2]))
+    for _ in range(3):
+        np.testing.assert_array_equal(propagate(model, [[0.2]], record=eq[1], **SETTINGS).mean, expected)
+
+
+@pytest.mark.parametrize(
+    ("part", "shape"), [(np.s_[:, -1:], r"\(1, 1\)"), (np.s_[:, :-1], r"\(1, 41\)"), (0, r"\(42,\)")]
+)
+def test_a_response_of_another_length_is_a_failed_simulation(eq, monkeypatch, part, shape):
+    monkeypatch.setattr(Cut, "part", part)
+    joined = Cut(Events(eq[:2], 0.5))
+    (reason,) = simulate_last_part(joined, joined.n_steps - 42, np.array([[0.2]])).reasons
+    assert re.search(rf"simulate_from of Cut returned a response of shape {shape}, expected .* = \(1, 42\)", reason)
