@@ -84,6 +84,12 @@ class ReinforcedSection:
         return 0.5 * self.diameter - self.cover - self.hoops.diameter - 0.5 * self.bars.diameter
 
     @property
+    def outermost_bars(self) -> tuple[float, float]:
+        """Positions of the outermost bars at the negative and the positive side, in the direction of loading [m]."""
+        y = self.fibers()[2][:, 0]  # the second axis of the element points against the direction of loading
+        return float(-y.max()), float(-y.min())
+
+    @property
     def steel_ratio(self) -> float:
         """Area of the longitudinal bars divided by the area of the core."""
         return self.bars.number * self.bars.area_each / (0.25 * math.pi * self.core_diameter**2)

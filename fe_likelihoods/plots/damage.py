@@ -81,9 +81,8 @@ def plot_damage(damage: DamageLike, events: Sequence[str] | None = None) -> Figu
     bar = figure.colorbar(
         ScalarMappable(Normalize(0.0, 1.0), colours), ax=panels[:, :-1], location="bottom", aspect=50, pad=0.02
     )
-    bar.set_label(
-        f"probability, from {damage.effective_sample_size:.0f} effective samples; {damage.uncertainty}", fontsize=7
-    )
+    label = f"probability, from {damage.effective_sample_size:.0f} effective samples; {damage.uncertainty}"
+    bar.set_label(label + (f"\n{damage.failures}" if damage.failures else ""), fontsize=7)
     bar.ax.tick_params(labelsize=7)
     return figure
 

@@ -142,6 +142,7 @@ class DamageLike(Protocol):
     heights: np.ndarray
     height: float
     effective_sample_size: float
+    failures: str
     uncertainty: str
 
 

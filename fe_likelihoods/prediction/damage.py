@@ -39,13 +39,18 @@ _UNITS = {"dissipated energy": (1e-3, "kJ"), "period": (1.0, "s")}
 """Factor and unit in which a measure is printed; the others are numbers."""
 
 
+_DECREASING = ("stiffness ratio",)
+"""Measures that damage decreases: their limit states are reached below the limit."""
+
+
 class LimitState(NamedTuple):
     """A limit of a measure of damage.
 
     Attributes
     ----------
     name : str
-        Name of the state that is reached when the measure exceeds the limit.
+        Name of the state that is reached when the measure exceeds the limit. For "stiffness ratio", which damage
+        decreases, it is reached when the measure is below the limit.
     measure : str
         Name of the measure, such as "bar tension" or "residual drift".
     limit : float or ndarray, shape (n_samples,)
@@ -103,6 +108,11 @@ class Damage(NamedTuple):
         How the measures are defined, with the constants of the Park-Ang index.
     effective_sample_size : float
         Effective number of independent samples.
+    n_samples : int
+        Number of samples that are counted.
+    n_failed : int
+        Number of samples whose simulation failed. They are not counted, so that the probabilities are too low if
+        simulations fail where the damage is large.
     from_state : str
         State of the structure at the beginning, "virgin" or "end".
     uncertainty : str
@@ -121,8 +131,18 @@ class Damage(NamedTuple):
     diameter: float
     measures: DamageMeasures
     effective_sample_size: float
+    n_samples: int
+    n_failed: int
     from_state: str
     uncertainty: str
+
+    @property
+    def failures(self) -> str:
+        """How many samples failed, as a sentence; an empty text if none."""
+        if not self.n_failed:
+            return ""
+        total = self.n_samples + self.n_failed
+        return f"{self.n_failed} of {total} samples failed and are not counted: probabilities may be too low"
 
     def table(self) -> str:
         """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
@@ -130,20 +150,23 @@ class Damage(NamedTuple):
         A probability of 0 or 1 is given with the bound of its interval, others with their Monte Carlo error. Strains
         are those of the place with the largest quantile.
         """
-        width = max(len(name) for name in (*self.presence, *self.extent, "probability of")) + 10
-        head = "".join(f"{event[:23]:>25}" for event in self.events)
-        lines = [f"{'probability of':<{width}}{head}"]
+        events = [event[:23] for event in self.events]
+        rows = [("probability of", events)]
         for name, each in self.presence.items():
-            cells = [_stated(*values) for values in zip(*each[1:5], strict=True)]
-            lines.append(f"{name:<{width}}" + "".join(f"{cell:>25}" for cell in cells))
+            rows.append((name, [_stated(*values) for values in zip(*each[1:5], strict=True)]))
         if self.probabilities:
-            lines += ["", f"{'quantiles ' + ', '.join(f'{p:g}' for p in self.probabilities):<{width}}{head}"]
+            quantiles = "quantiles " + ", ".join(f"{p:g}" for p in self.probabilities)
+            rows += [("", []), (quantiles, events)]
         for name, values in self.extent.items():
             factor, unit = _UNITS.get(name, (1.0, ""))
             largest = values.reshape(*values.shape[:2], -1).max(axis=2) * factor
             cells = [" ".join(f"{v:.3g}" for v in column) for column in largest.T]
-            lines.append(f"{name + (f' [{unit}]' if unit else ''):<{width}}" + "".join(f"{c:>25}" for c in cells))
-        return "\n".join([*lines, "", f"The probabilities contain {self.uncertainty}."])
+            rows.append((name + (f" [{unit}]" if unit else ""), cells))
+        first = max(len(name) for name, _ in rows)
+        width = max([20, *(len(cell) for _, cells in rows for cell in cells)]) + 2
+        lines = [(f"{name:<{first}}" + "".join(f"{c:>{width}}" for c in cells)).rstrip() for name, cells in rows]
+        closing = [f"The probabilities contain {self.uncertainty}."]
+        return "\n".join([*lines, "", *closing, *([f"{self.failures}."] if self.n_failed else [])])
 
     def plot(self, events: Sequence[str] | None = None) -> Figure:
         """Draw the column with its probabilities, see `fe_likelihoods.plots.damage.plot_damage`."""
@@ -203,7 +226,7 @@ def damage(
     ------
     ValueError
         If the prediction is of another quantity, contains noise or has no values of the samples, or a limit is of an
-        unknown measure, is not positive, or does not have one value or one for each sample.
+        unknown measure, is no `LimitState`, is not positive, or does not have one value or one for each sample.
 
     Notes
     -----
@@ -220,7 +243,7 @@ def damage(
         raise ValueError("the noise of sensors does no damage: propagate the measures with noise=False")
     if prediction.values is None:
         raise ValueError("damage needs the values of the samples: propagate with memory_bytes=None")
-    states = limit_states(measures) if limits is None else tuple(limits)
+    states = limit_states(measures) if limits is None else _checked_states(limits)
     names = [state.name for state in states]
     if len(set(names)) != len(names):
         raise ValueError(f"limit states need different names; got {', '.join(names)}")
@@ -234,7 +257,8 @@ def damage(
                 "damage_measures(measures=...) chooses them"
             )
         found, limit = values[state.measure], _limit_per_sample(state, prediction)
-        ratio = found / limit.reshape(-1, *(1,) * (found.ndim - 1))
+        limit_of_row = limit.reshape(-1, *(1,) * (found.ndim - 1))
+        ratio = limit_of_row / found if state.measure in _DECREASING else found / limit_of_row
         reported = state.limit if np.ndim(state.limit) == 0 else limit.mean()
         largest = ratio.max(axis=(2, 3)) if ratio.ndim == 4 else ratio
         presence[state.name] = _exceeded(largest, reported, effective, level)
@@ -254,6 +278,8 @@ def damage(
         diameter=measures.diameter,
         measures=measures,
         effective_sample_size=float(effective),
+        n_samples=int(prediction.n_samples),
+        n_failed=int(prediction.n_failed),
         from_state=prediction.from_state,
         uncertainty="the uncertainty of the parameters, not the error of the model or of the limits",
     )
@@ -270,11 +296,30 @@ def _names(measures: DamageMeasures) -> tuple[str, ...]:
     return measures.measures + (STRAIN_MEASURES if measures.sensors.strains else ())
 
 
+def _checked_states(limits: Sequence[LimitState]) -> tuple[LimitState, ...]:
+    alone = isinstance(limits, str | LimitState) or not np.iterable(limits)
+    states = () if alone else tuple(limits)
+    if alone or not all(isinstance(state, LimitState) for state in states):
+        raise ValueError(
+            'limits must be a sequence of LimitState, such as [LimitState("cracks", "bar tension", 0.015)]; got '
+            f"{limits!r}"
+        )
+    return states
+
+
 def _limit_per_sample(state: LimitState, prediction: Prediction) -> np.ndarray:
     """Limits of the samples that did not fail, shape (n,) or (1,)."""
-    limit = np.asarray(state.limit, dtype=float)
     n = prediction.n_samples + prediction.n_failed
-    if limit.shape not in ((), (n,)) or not np.isfinite(limit).all() or not (limit > 0.0).all():
+    try:
+        limit = np.asarray(state.limit, dtype=float)
+    except (TypeError, ValueError):
+        limit = np.array(np.nan)
+    if (
+        isinstance(state.limit, str)
+        or limit.shape not in ((), (n,))
+        or not np.isfinite(limit).all()
+        or not (limit > 0.0).all()
+    ):
         raise ValueError(
             f"the limit of {state.name!r} must be a positive number, or one for each of the {n} samples; got "
             f"{state.limit!r}"

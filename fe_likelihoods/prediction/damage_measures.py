@@ -16,11 +16,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..signals.events import Events
+from ..signals.records import Record
+from ..signals.sampling import same_step
 from .park_ang import ParkAng, park_ang_constants
 
 __all__ = ["SIDES", "STRAIN_MEASURES", "DamageMeasures", "Sensors", "damage_measures", "damage_outputs"]
@@ -172,7 +175,7 @@ class DamageMeasures:
             work = np.concatenate([[0.0], np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(u))])
             energy = found["dissipated energy"] = np.array([work[w.rest - 1] for w in self.windows])
             if self.park_ang is not None:
-                largest = np.maximum.accumulate(found["peak drift"]) * self.height
+                largest = np.array([np.abs(u[: w.rest]).max() for w in self.windows])  # pauses included
                 found["Park-Ang index"] = self.park_ang.index(largest, energy)
         if self.sensors.acceleration:
             acceleration = response[self.rows[self.sensors.acceleration]]
@@ -203,7 +206,8 @@ def damage_outputs(column: Any) -> tuple[str, ...]:
     -------
     tuple of str
         Displacement and acceleration of the top, base shear, and at every section (`RCColumn.section_heights`) the
-        strains of the outermost bars and of the surface at both sides.
+        strains of the outermost bars of each side (at their positions, which differ between the sides for an odd number
+        of bars) and of the surface at both sides.
 
     Examples
     --------
@@ -242,7 +246,8 @@ def damage_measures(
     height : float
         Length by which displacements of another model are divided [m]. 1: they remain displacements.
     events : Events, optional
-        Excitation of another model, for measures after each event. Default: one event. That of a column is its loading.
+        Excitation of another model, for measures after each event. Default: ``model.record``, if the model has it; one
+        event otherwise. That of a column is its loading.
     park_ang : ParkAng, optional
         Constants of the damage index. Default for a column: `park_ang_constants` at nominal parameters.
     settle : float
@@ -256,12 +261,12 @@ def damage_measures(
     Raises
     ------
     ValueError
-        If a measure is unknown or needs a channel that the model lacks, the column is not under a `Record`, or a
-        setting is out of range.
+        If a measure is unknown or needs a channel that the model lacks, the column is not under a `Record`, `events` is
+        not the excitation of the model, or a setting is out of range.
     """
     from ..models.rc_column import RCColumn
 
-    if not 0.0 < settle < math.inf or not 0.0 < height < math.inf:
+    if not all(isinstance(x, Real) and 0.0 < x < math.inf for x in (settle, height)):
         raise ValueError(f"settle and height must be positive; got {settle!r} s and {height!r} m")
     names = {channel.name for channel in model.channels}
     if isinstance(model, RCColumn):
@@ -275,6 +280,7 @@ def damage_measures(
         wanted = tuple(name for name, kinds in _NEEDED.items() if all(getattr(sensors, kind) for kind in kinds))
         wanted = tuple(name for name in wanted if name != "Park-Ang index" or park_ang is not None)
         diameter = yield_strain = math.nan
+        events = _excitation(model, events)
     chosen = wanted if measures is None else _checked_measures(measures)
     required = _required(chosen, sensors)
     lacking = [name for name in required if name not in names]
@@ -314,15 +320,36 @@ def damage_measures(
     )
 
 
+def _excitation(model: Any, events: Any) -> Any:
+    """Excitation whose events are the windows; ValueError if `events` is not that of the model."""
+    own = getattr(model, "record", None)
+    own = own if isinstance(own, Record) else None
+    if events is None:
+        return own
+    if not isinstance(events, Record):
+        raise ValueError(f"events must be the Events that the model runs; got {events!r}")
+    if own is not None and not (same_step(own.dt, events.dt) and np.array_equal(own.acceleration, events.acceleration)):
+        raise ValueError(
+            f"events={events.name!r} ({events.n_steps} samples, {events.dt:g} s) are not the excitation of the model, "
+            f"{own.name!r} ({own.n_steps} samples, {own.dt:g} s): leave events= out, or use model.with_record(events)"
+        )
+    length = (model.n_steps - 1) * model.dt
+    if own is None and abs(events.duration - length) > max(events.dt, model.dt):
+        raise ValueError(
+            f"the events last {events.duration:g} s and the response of the model {length:g} s: give the Events that "
+            "the model runs"
+        )
+    return events
+
+
 def _column_sensors(column: Any) -> Sensors:
     from ..models.rc_column import RCColumn
-    from ..signals.records import Record
 
     if not isinstance(column, RCColumn) or not isinstance(column.loading, Record):
         raise ValueError(f"expected an RCColumn under a Record; got {type(column).__name__}")
     heights = np.unique(np.round(column.section_heights, 9))
-    bar, surface = column.bar_circle_radius, 0.5 * column.diameter
-    places = [tuple(f"strain@{z:.10g}:{x:.10g}" for x in (-bar, -surface, bar, surface)) for z in heights]
+    (left, right), surface = column.section.outermost_bars, 0.5 * column.diameter
+    places = [tuple(f"strain@{z:.10g}:{x:.10g}" for x in (left, -surface, right, surface)) for z in heights]
     return Sensors("displacement", "base_shear", "acceleration", heights, tuple(places))
 
 

@@ -72,10 +72,11 @@ class ParkAng(NamedTuple):
 def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: float = 0.05) -> ParkAng:
     """Find the constants of the damage index by pushing the column to failure.
 
-    The top is displaced in one direction. The yield force is the lateral force at the first yield of a bar. The
-    ultimate displacement is reached at the first of three events: a bar in the base section reaches the ultimate strain
-    of the steel; the core, at the hoops, reaches the strain at which the hoops fracture (`RCColumn.confinement`); or
-    the lateral force has decreased to 80 % of its largest value.
+    The top is displaced in the positive direction. The yield force is the lateral force at the yield of the outermost
+    bar at the negative side, which is in tension. The ultimate displacement is reached at the first of three events:
+    this bar, in the base section, reaches the ultimate strain of the steel; the core, at the hoops, reaches the strain
+    at which the hoops fracture (`RCColumn.confinement`); or the lateral force has decreased to 80 % of its largest
+    value.
 
     Parameters
     ----------
@@ -98,13 +99,15 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
     SimulationFailed
         If the analysis does not converge.
     """
+    from ..models.rc_column_analysis import expect_fracture
+
     values = np.ones(len(column.parameters)) if theta is None else np.asarray(theta, dtype=float)
     if values.shape != (len(column.parameters),):
         raise ValueError(f"expected one value for each of {', '.join(column.parameters)}; got shape {values.shape}")
     kept = [name not in ("a0", "a1") for name in column.parameters]  # damping does not act in a static analysis
     names = tuple(name for name, keep in zip(column.parameters, kept, strict=True) if keep)
-    bar, core = column.bar_circle_radius, 0.5 * column.core_diameter
-    outputs = ("force", f"strain@0:{-bar:.10g}", f"strain@0:{core:.10g}")
+    bar, core = column.section.outermost_bars[0], 0.5 * column.core_diameter
+    outputs = ("force", f"strain@0:{bar:.10g}", f"strain@0:{core:.10g}")
     physical = {**column.nominal, **{n: column.nominal[n] * v for n, v in zip(column.parameters, values, strict=True)}}
     limits = column.steel.ultimate_strain, column.section.confinement(physical["fc"]).ultimate_strain
     yield_strain = physical["fy"] / physical["Es"]
@@ -112,6 +115,7 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
         push = DisplacementHistory("monotonic", np.linspace(0.0, drift * column.height, _STEPS + 1))
         # with a parameter that does not change the column, if all parameters were those of damping
         static = replace(column, loading=push, outputs=outputs, units=(), parameters=names or ("Ec",))
+        expect_fracture(static)
         force, tension, compression = static.simulate(values[kept] if names else np.ones(1))
         after = np.arange(force.size) > np.argmax(force)
         low = _LOSS * force.max()

@@ -10,9 +10,9 @@ __all__ = ["ClockTime", "is_clock", "is_date", "parse_clock", "seconds_since_mid
 
 _DATE = r"(\d{4})-(\d{2})-(\d{2})"
 _TIME = r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?"
-_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}(?: ?(?:Z|UTC|[-+]\d{{2}}:?\d{{2}}))?", re.IGNORECASE)
+_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}(?: ?(?:[AP]M|Z|UTC|[-+]\d{{2}}:?\d{{2}}))?", re.IGNORECASE)
 _DAY_ONLY = re.compile(r"\d{1,4}([-/.])\d{1,2}\1\d{1,4}")
-_DAY = 86400
+_HOUR, _DAY = 3600, 86400
 
 
 class ClockTime(NamedTuple):
@@ -50,7 +50,13 @@ def parse_clock(cell: str, where: str) -> ClockTime:
         raise ValueError(
             f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', got {cell[:100]!r}"
         )
+    if cell[-1] in "Mm":
+        raise ValueError(
+            f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}: write it without AM and PM"
+        )
     year, month, day, hour, minute, second, fraction = found.groups()
+    if int(hour) > 24:
+        raise ValueError(f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}")
     number = None
     if year is not None:
         try:
@@ -69,7 +75,7 @@ def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[fl
     Raises
     ------
     ValueError
-        If some times have a date and others have none.
+        If some times have a date and others have none, or 1 o'clock follows 12 o'clock, as on a clock of 12 hours.
     """
     known = [time for time in times if time is not None]
     dates = {time.day is None for time in known}
@@ -80,6 +86,11 @@ def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[fl
         if time is None:
             found.append(float("nan"))
             continue
+        if 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
+            raise ValueError(
+                f"{where}: the clock times go back from 12 to 1 o'clock, as on a clock of 12 hours; write hours from 0 "
+                "to 23"
+            )
         if time.day is not None:
             day = time.day - known[0].day
         elif time.seconds < last - _DAY / 2:

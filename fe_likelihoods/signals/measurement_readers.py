@@ -76,8 +76,9 @@ def read_columns(
         Time in the file at which the excitation begins [s]. For clock times, which count from midnight, it may be a
         clock time, such as ``"03:19:53.37"`` or ``"2019-07-06T03:19:53.37"``.
     missing : sequence of float, optional
-        Numbers that stand for missing samples; they are read as NaN. By default, -9999, -999.25, 1e30 and 9.97e36
-        are refused unless other numbers lie within 1 % of them; ``()`` takes all numbers as measured.
+        Numbers that stand for missing samples; they are read as NaN. A warning names those that none of the columns
+        has. Others of -9999, -999.25, 1e30 and 9.97e36 are refused unless further numbers lie within 1 % of them;
+        ``()`` takes all numbers as measured.
 
     Returns
     -------
@@ -94,6 +95,7 @@ def read_columns(
     with named_format(path, "read_columns"):
         table = tables.read_table(path, skip, time_unit)
     values = _channel_values(table, channels, columns, units, missing)
+    tables.warn_if_absent(table, [tables.value_column(table, column) for column in columns], missing, stacklevel=2)
     step = tables.table_step(table, dt)
     return Measurements(tuple(channels), step, values, description, tables.table_start(table, step, zero))
 
@@ -147,6 +149,8 @@ def read_imposed_test(
     imposed = Channel(displacement, "displacement", displacement_unit or "m")
     (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit, missing)
     values = _channel_values(table, channels, columns, units, missing)
+    places = [tables.value_column(table, column) for column in (displacement, *columns)]
+    tables.warn_if_absent(table, places, missing, stacklevel=2)
     measurements = Measurements(tuple(channels), 1.0, values, description)
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
 

@@ -209,7 +209,7 @@ def read_record(
         return {"read_v2": read_v2, "read_geonet": read_geonet}[reader](path, channel)
     if reader is not None:
         return {"read_smc": read_smc, "read_knet": read_knet, "read_esm": read_esm}[reader](path)
-    return read_csv(path, units, column=channel, missing=missing)
+    return _read_csv(path, units, column=channel, missing=missing)
 
 
 def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:
@@ -291,9 +291,9 @@ def read_csv(
     skip : int, optional
         Number of lines above the table, if they are not found.
     missing : sequence of float, optional
-        Numbers that stand for missing samples; they are read as NaN, which an excitation must not have. By default,
-        -9999, -999.25, 1e30 and 9.97e36 are refused unless other numbers lie within 1 % of them; ``()`` takes all
-        numbers as measured.
+        Numbers that stand for missing samples; they are read as NaN, which an excitation must not have. A warning
+        names those that the column does not have. Others of -9999, -999.25, 1e30 and 9.97e36 are refused unless further
+        numbers lie within 1 % of them; ``()`` takes all numbers as measured.
 
     Returns
     -------
@@ -306,6 +306,19 @@ def read_csv(
         If the file or the column does not exist, unit or step are missing or contradictory, a cell is not a finite
         number or is empty, or a time step is irregular (the message names the first one).
     """
+    return _read_csv(path, units, dt, column, time_unit, skip, missing)
+
+
+def _read_csv(
+    path: str | Path,
+    units: str | None,
+    dt: float | None = None,
+    column: str | None = None,
+    time_unit: str | None = None,
+    skip: int | None = None,
+    missing: Sequence[float] | None = None,
+) -> Record:
+    """`read_csv`, at the depth of calls that its warnings expect below a public reader."""
     with named_format(path, "read_csv"):
         series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt, missing)
     return _record(series, units, path, Path(path).stem)

@@ -3,8 +3,11 @@
 The functions return plain numbers, with the units and the step that the file states. They convert nothing but times.
 """
 
+import math
 import re
+import warnings
 from collections.abc import Sequence
+from numbers import Real
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +29,7 @@ __all__ = [
     "table_start",
     "table_step",
     "value_column",
+    "warn_if_absent",
 ]
 
 _LONGEST_UNIT = 100
@@ -237,21 +241,46 @@ def table_step(table: Table, dt: float | None = None) -> float:
 def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return the numbers of a column, with NaN for those equal to a number of `missing`.
 
-    If `missing` is None, ValueError is raised for a number that usually stands for missing samples, unless the column
-    has other numbers within 1 % of it.
+    ValueError is raised for a number that usually stands for missing samples and is not in `missing`, unless the column
+    has other numbers within 1 % of it, or `missing` is empty.
     """
     values = table.values[:, place]
+    listed = _listed(missing)
     if missing is not None:
-        return np.where(np.isin(values, np.asarray(missing, dtype=float)), np.nan, values)
+        values = np.where(np.isin(values, listed), np.nan, values)
+        if not listed.size:
+            return values
     for sentinel in _SENTINELS:
         found = np.flatnonzero(values == sentinel)
         if found.size and np.count_nonzero(np.abs(values - sentinel) <= 0.01 * abs(sentinel)) == found.size:
+            numbers = ", ".join(f"{number:g}" for number in (*listed, sentinel))
             raise ValueError(
                 f"{table.file}, line {table.lines[found[0]]}: expected a measured number, got {sentinel:g} in "
-                f"{found.size} rows, which usually stands for a missing sample; give missing=({sentinel:g},) to read "
-                "it as NaN, or missing=() if it was measured"
+                f"{found.size} rows, which usually stands for a missing sample; give missing=({numbers},) to read it "
+                "as NaN, or missing=() if it was measured"
             )
     return values
+
+
+def warn_if_absent(table: Table, places: Sequence[int], missing: Sequence[float] | None, stacklevel: int) -> None:
+    """Warn where a number of `missing` is in none of the columns: the file may write it in another way."""
+    listed = _listed(missing)
+    absent = listed[~np.isin(listed, table.values[:, list(places)])]
+    if absent.size:
+        warnings.warn(
+            f"{table.file}: missing={', '.join(f'{number:g}' for number in absent)} is in none of the columns that "
+            "were read: check how the file writes missing samples, or leave it out",
+            UserWarning,
+            stacklevel=stacklevel + 1,
+        )
+
+
+def _listed(missing: Sequence[float] | None) -> NDArray[np.float64]:
+    """Numbers that stand for missing samples; ValueError if they are not finite numbers."""
+    given = [] if missing is None else [missing] if np.ndim(missing) == 0 else list(missing)
+    if not all(isinstance(number, Real) and math.isfinite(number) for number in given):
+        raise ValueError(f"missing must be finite numbers, such as (-9999,), or () for none; got {missing!r}")
+    return np.array(given, dtype=float)
 
 
 def csv_series(
@@ -268,6 +297,7 @@ def csv_series(
     if comment and unit is not None:
         unit = agree_on_unit(unit, comment[1], "acceleration", f"{table.file} (column and comment)")
     values = column_values(table, place, missing)
+    warn_if_absent(table, [place], missing, stacklevel=4)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
         raise ValueError(

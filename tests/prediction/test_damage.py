@@ -1,5 +1,6 @@
 """Damage: measures against closed forms and the histories of the column, limit states, and what is refused."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -155,6 +156,7 @@ def test_a_limit_may_differ_between_the_samples_of_which_some_failed():
     found = propagate(model, amplitudes, quantity=measures, progress=False)
     limits = [LimitState("reached", "peak drift", np.array([0.015, 1.0, 0.05, 0.03]))]  # peaks: 0.02, -, 0.03, 0.04
     assert damage(found, limits).presence["reached"].probability == pytest.approx(2.0 / 3.0)
+    assert "\n1 of 4 samples failed and are not counted: probabilities may be too low." in damage(found, limits).table()
     with pytest.raises(ValueError, match="one for each of the 4 samples"):
         damage(found, [LimitState("reached", "peak drift", np.ones(3))])
     with pytest.raises(ValueError, match="measures are peak drift, residual drift"):
@@ -247,3 +249,91 @@ def test_figure_has_the_probabilities_of_each_section(prediction):
     assert "not the error of the model" in figure.axes[-1].get_xlabel()
     with pytest.raises(ValueError, match="EQ9"):
         found.plot(["EQ9"])
+    assert "failed" not in found.table()
+    figure = found._replace(n_failed=3).plot(["EQ1"])
+    assert "3 of 15 samples failed" in figure.axes[-1].get_xlabel()
+
+
+class Free:
+    """A model of two events whose displacement is largest in the pause between them."""
+
+    parameter_names = ("factor",)
+    channels = (Channel("u", "relative displacement", "m"), Channel("f", "lateral force", "N"))
+    record = Events([Record("A", 0.1, np.ones(11)), Record("B", 0.1, np.ones(11))], rest=1.0)
+    dt, n_steps, fingerprint = record.dt, record.n_steps, "free"
+
+    def simulate(self, theta):
+        time = self.dt * np.arange(self.n_steps)
+        return theta[0] * np.stack([0.01 + 0.09 * (time == 1.5), np.ones_like(time)])
+
+
+def test_the_index_contains_the_largest_displacement_in_a_pause():
+    model = Free()
+    measures = damage_measures(model, displacement="u", force="f", park_ang=ParkAng(0.2, 8e3, 0.0), settle=0.3)
+    assert measures.events == ("A", "B")  # the events that the model runs
+    found = measures.split(measures(model.simulate([1.0])))
+    np.testing.assert_allclose(found["peak drift"], 0.01)
+    np.testing.assert_allclose(found["Park-Ang index"], 0.1 / 0.2)
+
+
+def test_events_that_the_model_does_not_run_are_refused():
+    model = Free()
+    for others in (model.record.scale(2.0), model.record.resample(0.05), Events(model.record.records, rest=1.1)):
+        with pytest.raises(ValueError, match="are not the excitation of the model, 'A, B'"):
+            damage_measures(model, displacement="u", events=others)
+    with pytest.raises(ValueError, match="events must be the Events that the model runs; got 'A'"):
+        damage_measures(model, displacement="u", events="A")
+    assert damage_measures(model, displacement="u", events=model.record).events == ("A", "B")
+    with pytest.raises(ValueError, match="the events last 3.1 s and the response of the model 8 s"):
+        damage_measures(Loop(), displacement="u", events=model.record)
+
+
+@pytest.mark.parametrize(("number", "first_angle"), [(5, 0.0), (6, np.pi / 6), (8, 0.0)])
+def test_bars_are_judged_at_their_places(column, number, first_angle):
+    bars = replace(column.bars, number=number, first_angle=first_angle)
+    other = replace(column, bars=bars)
+    places = -other.bar_circle_radius * np.cos(first_angle + 2.0 * np.pi * np.arange(number) / number)
+    at_base = [float(name.split(":")[1]) for name in damage_outputs(other) if name.startswith("strain@0:")]
+    assert at_base[::2] == pytest.approx([places.min(), places.max()])
+
+
+def test_constants_of_the_index_are_those_of_a_real_bar(column, caplog):
+    bars, steel = replace(column.bars, number=6, first_angle=np.pi / 6), replace(column.steel, ultimate_strain=0.04)
+    other = replace(column, bars=bars, steel=steel, mesh=10)
+    constants = park_ang_constants(other)
+    assert "bars at their ultimate strain" in constants.source and not caplog.records
+    push = DisplacementHistory("push", np.linspace(0.0, constants.ultimate_displacement, 120))
+    outputs = ("force", f"strain@0:{-other.bar_circle_radius * np.cos(np.pi / 6):.10g}")
+    force, tension = replace(other, loading=push, outputs=outputs, units=(), parameters=("Ec",)).simulate(np.ones(1))
+    assert tension[-1] == pytest.approx(0.04, rel=5e-3)
+    assert constants.yield_force == pytest.approx(np.interp(steel.fy / steel.es, tension, force), rel=2e-3)
+
+
+def test_a_stiffness_ratio_reaches_its_limit_from_above(prediction):
+    ratio = prediction.quantity.split(prediction.values)["stiffness ratio"]
+    limit = float(np.median(ratio[:, 1]))
+    found = damage(prediction, [LimitState("softer", "stiffness ratio", limit)]).presence["softer"]
+    np.testing.assert_array_equal(found.probability, (ratio < limit).mean(axis=0))
+    assert found.probability[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    "limits", [LimitState("x", "peak drift", 0.1), "bar yield", [("x", "peak drift", 0.1)], 0.1, [0.1]]
+)
+def test_limits_that_are_no_limit_states_are_refused(prediction, limits):
+    with pytest.raises(ValueError, match="limits must be a sequence of LimitState"):
+        damage(prediction, limits)
+
+
+def test_settings_of_another_type_are_refused(column, prediction):
+    with pytest.raises(ValueError, match="settle and height must be positive; got '2 s'"):
+        damage_measures(column, park_ang=CONSTANTS, settle="2 s")
+    with pytest.raises(ValueError, match="the limit of 'x' must be a positive number.*got '0.2 %'"):
+        damage(prediction, [LimitState("x", "peak drift", "0.2 %")])
+
+
+def test_columns_of_the_table_are_separated(prediction):
+    found = damage(prediction)
+    wide = {name: 1.23456e-5 * np.ones_like(values) for name, values in found.extent.items()}
+    for line in found._replace(extent=wide).table().split("\n\n")[1].splitlines():
+        assert len(re.split(r" {2,}", line)) == 4, line

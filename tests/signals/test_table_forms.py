@@ -109,6 +109,9 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
         ("12:00:00.00,1\n,2\n12:00:00.02,3\n", "line 3: expected a time, got an empty cell"),
         ("2019-02-30T12:00:00,1\n2019-02-30T12:00:01,2\n", "line 2: expected a date, got '2019-02-30T12:00:00'"),
         ("2019-02-03T12:00:00,1\n12:00:01,2\n", "expected a date in all clock times or in none"),
+        ("12:59:59.99,1\n1:00:00.00,2\n1:00:00.01,3\n", "back from 12 to 1 o'clock, as on a clock of 12 hours"),
+        ("11:59:59 PM,1\n12:00:00 AM,2\n", "line 2: .*hours from 0 to 23; got '11:59:59 PM': write it without AM"),
+        ("99:00:00,1\n99:00:01,2\n", "line 2: .*hours from 0 to 23; got '99:00:00'"),
     ],
 )
 def test_clock_times_that_are_refused(path, text, message):
@@ -149,6 +152,23 @@ def test_numbers_for_missing_samples_in_a_record(path):
     with pytest.raises(ValueError, match="an excitation needs all samples, 1 are missing"):
         read_record(path, missing=(-9999.0,))
     assert read_record(path, missing=()).acceleration[1] == -9999 * G0
+    with pytest.raises(ValueError, match=r"got -9999 in 1 rows.* missing=\(-999, -9999,\)"):
+        read_record(path, missing=(-999.0,))  # known and not listed
+    with pytest.raises(ValueError, match="missing must be finite numbers"):
+        read_record(path, missing=["-9999"])
+
+
+def test_a_number_for_missing_samples_that_does_not_occur(path):
+    path.write_text("time_s,acc_g\n0.00,1\n0.01,-9999.9\n0.02,4\n")
+    reads = (
+        lambda: read_csv(path, missing=(-9999,)),
+        lambda: read_record(path, missing=(-9999,)),
+        lambda: read_columns(path, (TOP,), ("acc_g",), missing=(-9999,)),
+    )
+    for read in reads:
+        with pytest.warns(UserWarning, match="missing=-9999 is in none of the columns") as caught:
+            read()
+        assert [warning.filename for warning in caught] == [__file__]
 
 
 def test_clock_times_of_a_workbook(tmp_path):
