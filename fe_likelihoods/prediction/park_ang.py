@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from numbers import Real
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -56,11 +57,11 @@ class ParkAng(NamedTuple):
     source: str = ""
 
     def check(self) -> None:
-        """Raise ValueError if a constant is not positive and finite; `beta` may be zero."""
+        """Raise ValueError if a constant is no positive and finite number; `beta` may be zero."""
         for name, value in (("ultimate_displacement", self[0]), ("yield_force", self[1])):
-            if not 0.0 < value < math.inf:
+            if not isinstance(value, Real) or not 0.0 < value < math.inf:
                 raise ValueError(f"{name} of ParkAng must be positive [SI]; got {value!r}")
-        if not 0.0 <= self.beta < math.inf:
+        if not isinstance(self.beta, Real) or not 0.0 <= self.beta < math.inf:
             raise ValueError(f"beta of ParkAng must be zero or more; got {self.beta!r}")
 
     def index(self, peak: ArrayLike, energy: ArrayLike) -> np.ndarray:

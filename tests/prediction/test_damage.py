@@ -328,6 +328,8 @@ def test_limits_that_are_no_limit_states_are_refused(prediction, limits):
 def test_settings_of_another_type_are_refused(column, prediction):
     with pytest.raises(ValueError, match="settle and height must be positive; got '2 s'"):
         damage_measures(column, park_ang=CONSTANTS, settle="2 s")
+    with pytest.raises(ValueError, match="ultimate_displacement of ParkAng must be positive .*got '0.3 m'"):
+        damage_measures(column, park_ang=ParkAng("0.3 m", 5e5))
     with pytest.raises(ValueError, match="the limit of 'x' must be a positive number.*got '0.2 %'"):
         damage(prediction, [LimitState("x", "peak drift", "0.2 %")])
 
