@@ -11,7 +11,7 @@ from .runs import CLIENTS
 from .scoring import Found, check
 
 # bilby runs the same dynesty; test_adapters compares its priors and its likelihood with the posterior
-SLOW = {"bilby", "pymc-smc", "pymc-mcmc", "pocomc", "uqpy"}
+SLOW = {"bilby", "nautilus", "pymc-smc", "pymc-mcmc", "pocomc", "uqpy"}
 
 
 def test_quadrature_has_converged_and_is_of_this_posterior(answer):

@@ -56,7 +56,7 @@ def test_all_moves_of_emcee_are_here():
 
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler], ids=lambda s: s.__name__)
-@pytest.mark.parametrize("name", MOVES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "WalkMove" else n for n in MOVES])
 def test_every_move_of_emcee(name, Sampler, seed):
     samplers = runs(POSTERIOR, seed, count=6, nwalkers=100, Sampler=Sampler, moves=MOVES[name], max_moves=12)
     assert is_right(samplers)

@@ -97,9 +97,9 @@ def scores_of_forty_runs(mode, target, nwalkers, seed):
     "mode, target, nwalkers, low",
     [
         *((mode, Gaussian, 150, 0.6) for mode in ("default", "moves", "literal", "tmcmc")),
-        ("moves", TwoModes, 120, 0.6),
+        pytest.param("moves", TwoModes, 120, 0.6, marks=pytest.mark.slow),
         # recycling draws evenly from the modes: the error is smaller than stated, which is that of independent draws
-        ("default", TwoModes, 250, 0.4),
+        pytest.param("default", TwoModes, 250, 0.4, marks=pytest.mark.slow),
     ],
     ids=lambda value: getattr(value, "__name__", str(value)),
 )
