@@ -23,11 +23,10 @@ from scipy.stats import chi2
 from ..proposals.mixture import Mixture, draw
 from .weights import effective_sample_size, log_mean_weight
 
-# Levels of a normal distribution one and two standard deviations above its median.
-ONE_AND_TWO_SD = (0.8413, 0.9772)
-
 __all__ = ["EvidenceCheck", "draw_inside", "evidence_from_weights", "expected_yield", "pareto_shape"]
 
+# Levels of a normal distribution one and two standard deviations above its median.
+ONE_AND_TWO_SD = (0.8413, 0.9772)
 LARGEST_SHAPE = 0.7
 FEW_WEIGHTS = 10.0
 ROUNDS = 50

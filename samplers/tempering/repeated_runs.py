@@ -17,12 +17,11 @@ import numpy as np
 from ..proposals.mixture import Mixture, log_responsibilities
 from .adaptive_importance import Recycled, StartingDensity, starting_mixture
 from .population import Doubt
+from .population_check import LARGE_DIFFERENCE
 from .weights import normalised_weights
 
 __all__ = ["check_agreement", "pool_runs"]
 
-# Difference of two shares of a component from which on it is reported, if it also exceeds three standard errors.
-LARGE_DIFFERENCE = 0.1
 # Differences of evidences and shares, and of means in many parameters, are reported beyond this many standard errors.
 FAR, FAR_MEANS = 3.0, 4.0
 ADVICE = (
