@@ -205,6 +205,7 @@ class ResponseTarget:
         check_quadratic(self.statistic, self.measured)
         self._logarithmic = list(self._prior.logarithmic[: self.n_structural])
         self._median = self._prior.from_normal(np.zeros(self.ndim))
+        self._noise_prior = self._prior_of_noise()
         self.archive = Archive()
 
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
@@ -249,6 +250,25 @@ class ResponseTarget:
         full = np.zeros((len(coords), self.ndim))
         full[:, : self.n_structural] = coords
         return self._prior.from_normal(full)[:, : self.n_structural]
+
+    def _prior_of_noise(self) -> Any:
+        """Prior of the noise parameters; None without any, or if they have a joint distribution with structural ones.
+
+        The noise is fitted thousands of times, and the map of all parameters takes most of that time.
+        """
+        names = self._prior.names[self.n_structural :]
+        try:
+            return self._prior.subset(names) if names else None
+        except ValueError:
+            return None
+
+    def _noise_parameters(self, coords: np.ndarray) -> np.ndarray:
+        """Noise parameters (n, n_noise) at coordinates (n, n_noise)."""
+        if self._noise_prior is not None:
+            return self._noise_prior.from_normal(coords)
+        full = np.zeros((len(coords), self.ndim))
+        full[:, self.n_structural :] = coords
+        return self._prior.from_normal(full)[:, self.n_structural :]
 
     def structural_coordinates(self, thetas: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) of structural parameters (n, n_structural)."""
@@ -316,9 +336,7 @@ class ResponseTarget:
 
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
-        full = np.zeros((len(coords), self.ndim))
-        full[:, self.n_structural :] = coords
-        parameters = self._prior.from_normal(full)[:, self.n_structural :] if self.n_noise else coords
+        parameters = self._noise_parameters(coords) if self.n_noise else coords
         return self.noise.log_likelihood(statistics, self.n_samples, parameters)
 
     def _noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:

@@ -67,8 +67,10 @@ def quantile_of_normal(
     """
     x = np.empty_like(z)
     low = z <= 0.0
-    x[low] = _lower_half(z[low], mean, sd, lower, upper, log_mass)
-    x[~low] = -_lower_half(-z[~low], -mean, sd, -upper, -lower, log_mass)
+    if low.any():
+        x[low] = _lower_half(z[low], mean, sd, lower, upper, log_mass)
+    if not low.all():
+        x[~low] = -_lower_half(-z[~low], -mean, sd, -upper, -lower, log_mass)
     return x
 
 
@@ -106,10 +108,14 @@ def _lower_half(z: np.ndarray, mean: float, sd: float, lower: float, upper: floa
         return x
     area = np.exp(log_share + 0.5 * a * a + _HALF_LOG_TWO_PI)
     near = area * max(1.0, abs(a)) < 1.2  # contains the whole half z <= 0 if a >= 0
+    if not near.any():
+        return x
     distance = area[near]
     for _ in range(8):  # Newton's method; the area is a concave function of d if a > 0, so it cannot overshoot
-        slope = np.exp(-distance * (a + 0.5 * distance))
+        before, slope = distance, np.exp(-distance * (a + 0.5 * distance))
         distance = distance - (_area(distance, a) - area[near]) / slope
+        if np.array_equal(distance, before):  # all further iterations would return the same numbers
+            break
     x[near] = lower + sd * distance
     return x
 

@@ -18,6 +18,7 @@ Schwarz, G. (1978), Estimating the dimension of a model, Annals of Statistics 6(
 """
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -89,19 +90,24 @@ class Mixture(NamedTuple):
 
 def _distances(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distances (n, K)."""
-    distances = np.empty((len(coords), len(mixture.means)))
-    for k, (mean, inverse) in enumerate(zip(mixture.means, mixture.inverses, strict=True)):
-        z = (coords - mean) @ inverse.T
-        distances[:, k] = np.einsum("ij,ij->i", z, z)
-    return distances
+    z = (coords - mixture.means[:, None]) @ mixture.inverses.transpose(0, 2, 1)
+    return np.einsum("kij,kij->ik", z, z, order="C")
 
 
 def _component_log_densities(mixture: Mixture, distances: np.ndarray) -> np.ndarray:
     """Log of weight times density (n, K) of each component, from squared Mahalanobis distances (n, K)."""
     ndim, dof = mixture.means.shape[1], mixture.dof
-    constant = gammaln(0.5 * (dof + ndim)) - gammaln(0.5 * dof) - 0.5 * ndim * math.log(dof * math.pi)
-    log_root = np.sum(np.log(np.diagonal(mixture.roots, axis1=1, axis2=2)), axis=1)
-    return np.log(mixture.weights) + constant - log_root - 0.5 * (dof + ndim) * np.log1p(distances / dof)
+    log_root = np.log(np.diagonal(mixture.roots, axis1=1, axis2=2)).sum(axis=1)
+    powers = distances / dof
+    np.log1p(powers, out=powers)
+    powers *= 0.5 * (dof + ndim)
+    return np.log(mixture.weights) + _log_constant(ndim, dof) - log_root - powers
+
+
+@cache
+def _log_constant(ndim: int, dof: float) -> float:
+    """Log density of the standard multivariate Student t at its location."""
+    return float(gammaln(0.5 * (dof + ndim)) - gammaln(0.5 * dof)) - 0.5 * ndim * math.log(dof * math.pi)
 
 
 def log_responsibilities(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
@@ -333,14 +339,12 @@ def _components(
     alive = mass * effective >= 1.0
     if not alive.any():
         alive = mass == mass.max()
-    owned, stretch, mass = owned[:, alive], stretch[:, alive], mass[alive]
-    pulled = owned * stretch
-    means = (pulled.T @ white) / pulled.sum(axis=0)[:, None]
-    scales = np.empty((len(mass), ndim, ndim))
-    for k, mean in enumerate(means):
-        centred = white - mean
-        scales[k] = (centred * pulled[:, k, None]).T @ centred / mass[k]
-    pooled = np.tensordot(mass / mass.sum(), scales, axes=1) + RIDGE * np.eye(ndim)
+    mass = mass[alive]
+    pulled = owned.T[alive] * stretch.T[alive]
+    means = (pulled @ white) / pulled.sum(axis=1)[:, None]
+    centred = white - means[:, None]
+    scales = (centred * pulled[:, :, None]).transpose(0, 2, 1) @ centred / mass[:, None, None]
+    pooled = (mass / mass.sum() @ scales.reshape(len(mass), -1)).reshape(ndim, ndim) + RIDGE * np.eye(ndim)
     counts = (effective * mass)[:, None, None]
     roots = np.linalg.cholesky((counts * scales + ndim * pooled) / (counts + ndim))
     return Mixture(mass / mass.sum(), means, roots, invert_roots(roots), dof)
