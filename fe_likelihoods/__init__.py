@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
     from . import problems
-    from .adapters import nautilus_prior, to_bilby, to_pints, to_pymc
+    from .adapters import UMBridgeServer, nautilus_prior, serve, to_bilby, to_pints, to_pymc
     from .data.make_isolated_bridge import table_motion
     from .emulation.emulator import ResponseEmulator
     from .emulation.guide import ResponseGuide
@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .models.rc_column_curves import MaterialCurve, MomentCurvature, material_curves, moment_curvature
     from .models.rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
     from .models.steel_coupon import SteelCoupon
+    from .models.umbridge import UMBridgeModel
     from .plots.damage import plot_damage
     from .plots.histories import plot_histories, plot_loop
     from .plots.materials import plot_material, plot_moment_curvature
@@ -159,6 +160,8 @@ __all__ = [
     "TransientReason",
     "TruncatedMultivariateNormal",
     "TruncatedNormal",
+    "UMBridgeModel",
+    "UMBridgeServer",
     "Uniform",
     "Varying",
     "align",
@@ -208,6 +211,7 @@ __all__ = [
     "residual_checks",
     "response_spectrum",
     "rrmse",
+    "serve",
     "table_motion",
     "to_bilby",
     "to_pints",
@@ -218,7 +222,9 @@ __all__ = [
 
 _EXPORTS = {
     "adapters": (
+        "UMBridgeServer",
         "nautilus_prior",
+        "serve",
         "to_bilby",
         "to_pints",
         "to_pymc",
@@ -262,6 +268,7 @@ _EXPORTS = {
         "Steel",
     ),
     "models.steel_coupon": ("SteelCoupon",),
+    "models.umbridge": ("UMBridgeModel",),
     "plots.damage": ("plot_damage",),
     "plots.histories": (
         "plot_histories",

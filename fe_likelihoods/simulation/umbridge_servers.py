@@ -1,0 +1,310 @@
+"""Servers of UM-Bridge, seen from a model: requests, faults of the network, and which server is asked.
+
+UM-Bridge (L. Seelinger, V. Cheng-Seelinger, A. Davis, M. Parno and A. Reinarz, *UM-Bridge: Uncertainty quantification
+and modeling bridge*, Journal of Open Source Software 8(83), 4748, 2023, doi:10.21105/joss.04748) sends the parameters
+of a model as JSON over HTTP and receives its output in the same way. The protocol is small enough for the standard
+library. The Python client of UM-Bridge has no time limit, and cannot tell a lost connection from an error of the model.
+
+Requests are sent directly, without the proxy of ``http_proxy``, so that servers on this machine are found.
+"""
+
+import json
+import logging
+import re
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from typing import Any
+from urllib.parse import urlsplit
+
+__all__ = ["SIMULATION_FAILED", "TRANSIENT_FAILURE", "ServerError", "ServerTimeout", "UMBridgeServers", "Unavailable"]
+
+logger = logging.getLogger(__name__)
+
+TRANSIENT_FAILURE = "TransientFailure"
+"""Type of error with which `fe_likelihoods.serve` reports a failure whose cause is not the model."""
+
+SIMULATION_FAILED = "SimulationFailed"
+"""Type of error with which it reports other failures."""
+
+_CONNECT_SECONDS = 10.0  # longest time until a server accepts a connection
+_LONGEST_WAIT = 60.0  # [s] between two attempts
+_RECENT = 30.0  # [s] after a fault during which other servers are preferred
+_BUSY = {429, 502, 503, 504}  # HTTP status of a load balancer without a free or living server
+
+
+class Unavailable(RuntimeError):
+    """No server could be reached, or each connection was lost; the message says what happened."""
+
+
+class ServerTimeout(RuntimeError):
+    """A server accepted a request and did not answer within the time limit."""
+
+
+class ServerError(RuntimeError):
+    """A server answered with an error.
+
+    Parameters
+    ----------
+    kind : str
+        Type of the error, as in ``"InvalidInput"``; ``"HTTP 500"`` for an error that is not in the form of UM-Bridge.
+    message : str
+        Its text.
+    """
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(f"{kind}: {message}" if message else kind)
+        self.kind, self.message = kind, message
+
+
+class _Refused(Exception):
+    """The server did not accept the request."""
+
+
+class _Lost(Exception):
+    """The connection was lost after the server had received the request."""
+
+
+class UMBridgeServers:
+    """Servers of the same models; each request goes to the one that is least busy.
+
+    Threads can share the object. Servers that had a fault in the last 30 s are asked last.
+
+    Parameters
+    ----------
+    urls : sequence of str
+        Addresses, as in ``"http://localhost:4242"``.
+    retries : int
+        Number of further attempts after a fault. An attempt ends when every server has refused the request, or when
+        one has accepted it and the connection was lost.
+    retry_wait : float
+        Time between the first two attempts [s]; it is doubled each time, up to 60 s.
+
+    Raises
+    ------
+    ValueError
+        If an address is not one of http or https, or is given twice, or a number is negative.
+    """
+
+    def __init__(self, urls: Sequence[str], retries: int, retry_wait: float) -> None:
+        self.urls = tuple(_address(url) for url in urls)
+        if not self.urls or len(set(self.urls)) != len(self.urls):
+            raise ValueError(f"UM-Bridge: expected one or more different addresses; got {', '.join(self.urls) or urls}")
+        if isinstance(retries, bool) or not isinstance(retries, int) or retries < 0:
+            raise ValueError(f"UM-Bridge: retries must be a whole number, 0 or more; got {retries!r}")
+        if isinstance(retry_wait, bool) or not isinstance(retry_wait, int | float) or not 0.0 <= retry_wait < 1e6:
+            raise ValueError(f"UM-Bridge: retry_wait must be a number of seconds, 0 or more; got {retry_wait!r}")
+        self.retries, self.retry_wait = retries, float(retry_wait)
+        self._start()
+
+    def __getstate__(self) -> dict:
+        return {"urls": self.urls, "retries": self.retries, "retry_wait": self.retry_wait}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        self._start()
+
+    def _start(self) -> None:
+        self._running: Counter[str] = Counter()
+        self._fault_times: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    def evaluate(self, request: dict[str, Any], time_limit: float | None = None) -> Any:
+        """Answer of one of the servers to an evaluation.
+
+        Parameters
+        ----------
+        request : dict
+            Content of the request.
+        time_limit : float or None
+            Longest time until the answer [s], without the attempts before.
+
+        Returns
+        -------
+        object
+            The vectors of the output, as read from JSON; not checked.
+
+        Raises
+        ------
+        ServerError
+            If the server answers with an error.
+        ServerTimeout
+            If it does not answer within the time limit.
+        Unavailable
+            If all attempts have failed.
+        """
+        faults = 0
+        while True:
+            try:
+                return self._attempt(request, time_limit)
+            except Unavailable as error:
+                faults += 1
+                if faults > self.retries:
+                    attempts = f"{faults} attempts" if faults > 1 else "1 attempt"
+                    raise Unavailable(f"{error} ({attempts})") from error
+            time.sleep(min(self.retry_wait * 2.0 ** (faults - 1), _LONGEST_WAIT))
+
+    def _attempt(self, request: dict[str, Any], time_limit: float | None) -> Any:
+        """Answer of the first server that accepts a request."""
+        asked: list[str] = []
+        while len(asked) < len(self.urls):
+            with self._least_busy(asked) as url:
+                asked.append(url)
+                try:
+                    answer = _ask(url, "/Evaluate", request, time_limit)
+                    if "output" not in answer:
+                        raise _Refused("the answer has no output")
+                except (_Refused, _Lost) as error:
+                    self._had_fault(url, error)
+                    text = f"{url}: {error}"
+                    if isinstance(error, _Lost):  # perhaps because of the parameters: no other server for now
+                        raise Unavailable(text) from error
+                else:
+                    self._is_well(url)
+                    return answer["output"]
+        raise Unavailable(text if len(self.urls) == 1 else f"none of {len(self.urls)} servers is available; {text}")
+
+    @contextmanager
+    def _least_busy(self, asked: Sequence[str]) -> Iterator[str]:
+        """The server with the fewest requests among those that were not asked."""
+        with self._lock:
+            now = time.monotonic()
+            left = [url for url in self.urls if url not in asked]
+            url = min(left, key=lambda u: (now - self._fault_times.get(u, -_RECENT) < _RECENT, self._running[u]))
+            self._running[url] += 1
+        try:
+            yield url
+        finally:
+            with self._lock:
+                self._running[url] -= 1
+
+    def _had_fault(self, url: str, error: Exception) -> None:
+        with self._lock:
+            first = url not in self._fault_times
+            self._fault_times[url] = time.monotonic()
+        if first:
+            logger.warning("UM-Bridge server %s: %s. The request is repeated", url, error)
+
+    def _is_well(self, url: str) -> None:
+        with self._lock:
+            returned = self._fault_times.pop(url, None) is not None
+        if returned:
+            logger.warning("UM-Bridge server %s answers again", url)
+
+    def sizes(self, url: str, name: str, config: dict[str, Any]) -> tuple[list[int], list[int]]:
+        """Sizes of the inputs and of the outputs of a model on one of the servers.
+
+        Parameters
+        ----------
+        url : str
+            One of `urls`.
+        name : str
+            Name of the model.
+        config : dict
+            Its configuration.
+
+        Returns
+        -------
+        (list of int, list of int)
+
+        Raises
+        ------
+        ServerError
+            If the server has no such model, the model cannot be evaluated, or the sizes are not those of vectors.
+        Unavailable
+            If the server cannot be reached.
+        """
+        try:
+            info = _ask(url, "/Info")
+            version, models = info.get("protocolVersion"), info.get("models", [])
+            if version != 1:
+                raise ServerError("protocol", f"expected version 1.0 of the protocol of UM-Bridge; got {version!r}")
+            if name not in models:
+                raise ServerError("ModelNotFound", f"expected one of its models {', '.join(map(repr, models))}")
+            support = _ask(url, "/ModelInfo", {"name": name}).get("support", {})
+            if not support.get("Evaluate"):
+                raise ServerError("UnsupportedFeature", "the model cannot be evaluated")
+            request = {"name": name, "config": config}
+            sizes = [
+                _ask(url, f"/{what[0].upper()}{what[1:]}", request).get(what) for what in ("inputSizes", "outputSizes")
+            ]
+        except (_Refused, _Lost, ServerTimeout) as error:
+            raise Unavailable(f"{url}: {error}") from error
+        for given in sizes:
+            if not isinstance(given, list) or not all(isinstance(size, int) and size >= 0 for size in given):
+                raise ServerError("sizes", f"expected lists of the lengths of vectors; got {sizes[0]!r}, {sizes[1]!r}")
+        return sizes[0], sizes[1]
+
+
+def _address(url: str) -> str:
+    """Address without a slash at its end; ValueError if it is not one of http or https."""
+    try:
+        parts = urlsplit(url)
+        usable = parts.scheme in ("http", "https") and bool(parts.hostname) and not parts.query and parts.port != 0
+    except (AttributeError, TypeError, ValueError):
+        usable = False
+    if not usable:
+        raise ValueError(f"UM-Bridge: expected the address of a server, such as 'http://localhost:4242'; got {url!r}")
+    return url.rstrip("/")
+
+
+def _ask(url: str, path: str, content: Any = None, time_limit: float | None = _CONNECT_SECONDS) -> dict[str, Any]:
+    """JSON object that a server answers; GET without `content`."""
+    status, body = _exchange(url, path, content, time_limit)
+    if status in _BUSY:
+        raise _Refused(f"HTTP {status}, no server is free")
+    text = body.decode(errors="replace")
+    answer = None
+    with suppress(ValueError):
+        answer = json.loads(text)
+    error = answer.get("error") if isinstance(answer, dict) else None
+    if isinstance(error, dict):
+        raise ServerError(str(error.get("type", "error")), str(error.get("message", "")))
+    if status == 200 and isinstance(answer, dict):
+        return answer
+    beginning = " ".join(text[:200].split())
+    if status == 500:  # what servers in Python answer if the model raises an exception
+        raise ServerError("HTTP 500", beginning)
+    if status == 200 and answer is None and re.search(r"\b(nan|inf)\b", text):  # Python's text of such numbers
+        raise ServerError("not finite", "the output contains nan or inf")
+    raise _Refused(f"HTTP {status}, not an answer of UM-Bridge: {beginning}")
+
+
+def _exchange(url: str, path: str, content: Any, time_limit: float | None) -> tuple[int, bytes]:
+    """Status and body of the answer to one request, on a connection of its own."""
+    parts = urlsplit(url)
+    kind = HTTPSConnection if parts.scheme == "https" else HTTPConnection
+    body = None if content is None else json.dumps(content, allow_nan=False)
+    connection = kind(parts.hostname, parts.port, timeout=_CONNECT_SECONDS)
+    try:
+        try:
+            connection.connect()
+            _notice_lost_machine(connection.sock)
+            connection.sock.settimeout(time_limit)
+        except OSError as error:
+            raise _Refused(f"no connection ({error})") from error
+        try:
+            headers = {} if body is None else {"Content-Type": "application/json"}
+            connection.request("POST" if body else "GET", parts.path + path, body, headers)
+            response = connection.getresponse()
+            return response.status, response.read()
+        except TimeoutError as error:
+            if time_limit is None:  # the other machine has vanished
+                raise _Lost(f"the connection was lost ({error})") from error
+            raise ServerTimeout(f"stopped at the time limit of {time_limit:g} s") from error
+        except (OSError, HTTPException) as error:
+            raise _Lost(f"the connection was lost ({type(error).__name__}: {error})") from error
+    finally:
+        connection.close()
+
+
+def _notice_lost_machine(connection: socket.socket) -> None:
+    """Let the system end a connection within minutes after the other machine has vanished without a word."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
+        if hasattr(socket, option):  # not on every system
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
