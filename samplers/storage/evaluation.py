@@ -17,6 +17,7 @@ import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
 
 from ..tempering.budget import Budget, BudgetExhausted
+from ..tempering.flights import Flight, submit_and_wait
 from .checkpoint import Checkpoint
 from .first_evaluations import POINTS
 from .journal import EvaluatedBatch, merge_batches
@@ -296,6 +297,21 @@ class Evaluator:
             are evaluated.
         """
         return self.evaluate_observed(coords, None)
+
+    @property
+    def workers(self) -> int:
+        """0: `submit` waits for its points."""
+        return 0
+
+    def submit(self, coords: np.ndarray) -> Flight:
+        """Evaluate points (n, ndim), of which the limit of simulations may allow the first few only."""
+        return submit_and_wait(self, coords)
+
+    def wait(self, most: int) -> None:
+        """Nothing runs after `submit`."""
+
+    def close(self) -> None:
+        """Nothing runs after `submit`."""
 
     def evaluate_observed(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None) -> np.ndarray:
         """As `evaluate`, but `observe` is called with the points directly before they are evaluated.

@@ -31,8 +31,8 @@ import numpy as np
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
-from .budget import BudgetExhausted
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights
+from .flights import Flight
 from .population import Density, Population, Report, Stage, Sweep
 from .rounds import tail_variance
 from .settings import RecyclingSettings
@@ -132,41 +132,61 @@ class Recycled(NamedTuple):
 
 
 class Archive:
-    """All points, their records, and the logarithm of the mixture of all densities that they were drawn from.
+    """All points that have arrived, and the logarithm of the mixture of all densities that they were drawn from.
+
+    The mixture counts every draw that was submitted, whether it has arrived or not. While some are running, the sum of
+    the weights is therefore smaller than the evidence, by the part of the latest draws that is missing.
 
     Parameters
     ----------
-    coords, records : (n, ndim) float, (n,) structured array
-        Starting points and their records.
+    flight : Flight
+        Starting points.
     start : StartingDensity
         What they were drawn from.
 
     Attributes
     ----------
+    coords, records : (n, ndim) float, (n,) structured array
+        The points that had arrived at the last `update`, and their records.
     proposals : list of (int, Mixture)
         The proposals in order, and how many draws were made from each.
     """
 
-    def __init__(self, coords: np.ndarray, records: np.ndarray, start: StartingDensity):
-        self.coords, self.records, self._start = coords, records, start
+    def __init__(self, flight: Flight, start: StartingDensity):
+        self._flights, self._start = [flight], start
         self.proposals: list[tuple[int, Mixture]] = []
         self._log_made = np.log(start.made)
-        self._log_start = start.log_density(coords, records)
-        self._log_mixture = self._log_made + self._log_start
+        self._log_start_of_all = start.log_density(flight.coords, flight.base)
+        self._log_mixture_of_all = self._log_made + self._log_start_of_all
+        self.update()
 
-    def add(self, mixture: Mixture, made: float, coords: np.ndarray, records: np.ndarray) -> None:
-        """Add the draws (n, ndim) inside the support, of `made` draws from a mixture."""
-        log_start = self._start.log_density(coords, records)
+    def add(self, mixture: Mixture, made: float, flight: Flight) -> None:
+        """Add the draws inside the support, of `made` draws from a mixture."""
+        coords = flight.coords
+        log_start = self._start.log_density(coords, flight.base)
         log_mixture = self._log_made + log_start
         for count, earlier in self.proposals:
             log_mixture = np.logaddexp(log_mixture, np.log(count) + log_density(earlier, coords))
         self.proposals.append((made, mixture))
-        self.coords = np.concatenate([self.coords, coords])
-        self.records = np.concatenate([self.records, records])
-        self._log_start = np.concatenate([self._log_start, log_start])
-        self._log_mixture = np.logaddexp(
-            np.concatenate([self._log_mixture, log_mixture]), np.log(made) + log_density(mixture, self.coords)
+        self._flights.append(flight)
+        self._log_start_of_all = np.concatenate([self._log_start_of_all, log_start])
+        coords_of_all = np.concatenate([flight.coords for flight in self._flights])
+        self._log_mixture_of_all = np.logaddexp(
+            np.concatenate([self._log_mixture_of_all, log_mixture]), np.log(made) + log_density(mixture, coords_of_all)
         )
+        self.update()
+
+    def update(self) -> None:
+        """Take in what has arrived."""
+        parts = [flight.landed_part() for flight in self._flights]
+        parts = [part for part in parts if len(part[0]) > 0] or parts[:1]
+        self.coords = np.concatenate([coords for coords, _ in parts])
+        self.records = np.concatenate([records for _, records in parts])
+        if len(self.coords) == len(self._log_start_of_all):
+            self._log_start, self._log_mixture = self._log_start_of_all, self._log_mixture_of_all
+        else:
+            arrived = np.concatenate([flight.arrived for flight in self._flights])
+            self._log_start, self._log_mixture = self._log_start_of_all[arrived], self._log_mixture_of_all[arrived]
 
     @property
     def log_ratio(self) -> np.ndarray:
@@ -184,8 +204,7 @@ class Archive:
 
 
 def recycle(
-    coords: np.ndarray,
-    records: np.ndarray,
+    flight: Flight,
     density: Density,
     random: np.random.RandomState,
     settings: RecyclingSettings,
@@ -197,8 +216,8 @@ def recycle(
 
     Parameters
     ----------
-    coords, records : (n, ndim) float, (n,) structured array
-        Starting points and their records.
+    flight : Flight
+        Starting points, most of which have arrived.
     density : Density
         Evaluates points.
     random : RandomState
@@ -223,42 +242,49 @@ def recycle(
     -------
     Recycled
     """
-    ndim, size = coords.shape[1], len(coords) if size is None else size
+    n, ndim = flight.coords.shape
+    size = n if size is None else size
     # another starting density was fitted by a search of its own
-    search, basin_rounds = _Search(settings.search_draws * len(coords) if start is None else 0.0), 0
-    start = StartingDensity(len(coords), lambda _, records: records["log_prior"]) if start is None else start
-    target = max(settings.target_share * len(coords), settings.points_per_dimension * (ndim + 1.0))
+    search, basin_rounds = _Search(settings.search_draws * n if start is None else 0.0), 0
+    start = StartingDensity(n, lambda _, records: records["log_prior"]) if start is None else start
+    target = max(settings.target_share * n, settings.points_per_dimension * (ndim + 1.0))
     enough_fresh = settings.fresh_share * target
-    archive = Archive(coords, records, start)
-    bounds = find_support_bounds(density.inside, coords)
-    beta, fresh, yields, checks = 0.0, 0.0, [], 0
+    archive = Archive(flight, start)
+    bounds = find_support_bounds(density.inside, flight.coords)
+    beta, yields, checks = 0.0, [], 0
     increments: list[float] = []
-    evaluations_before, evaluations_below_one = density.evaluations - len(coords), 0
-    final: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    evaluations_before, evaluations_below_one = density.evaluations - int(flight.arrived.sum()), 0
+    drawn: list[_Drawn] = []  # at the present beta
     alive = effective_sample_size(archive.log_weights(0.0))
+    if alive < target and not flight.complete:
+        density.wait(0)
+        archive.update()
+        alive = effective_sample_size(archive.log_weights(0.0))
     if alive < target:
-        doubt = f"only {alive:.0f} of {len(coords)} starting points have a likelihood above zero"
-        return Recycled(doubt, coords, records, np.zeros(len(coords)), float("-inf"), float("inf"), None)
+        density.wait(0)
+        doubt = f"only {alive:.0f} of {n} starting points have a likelihood above zero"
+        return Recycled(doubt, *flight.landed_part(), np.zeros(n), float("-inf"), float("inf"), None)
     while True:
+        archive.update()
+        fresh = sum(effective_sample_size(draws.log_weights(start, beta)) for draws in drawn)
         log_weights, last_beta = archive.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
         if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= enough_fresh):
             # more draws shall not make larger steps: it is their number per step that finds narrow modes
             kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
-            beta, fresh = next_beta(archive.log_ratio, beta, kept, log_weights), 0.0
+            beta, drawn = next_beta(archive.log_ratio, beta, kept, log_weights), []
             log_weights = archive.log_weights(beta)
             effective = effective_sample_size(log_weights)
-        log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
         # proposals were chosen by weights with an effective sample size of `target`: this error stays in what follows
         inherited = 1.0 / target if yields else 0.0
-        error = float(np.sqrt(max(1.0 / effective - 1.0 / len(log_weights), 0.0) + inherited))
+        log_evidence, error = _evidence(log_weights, inherited)
         if last_beta < beta < 1.0:
             increments.append(log_evidence - sum(increments))
             evaluations_below_one = density.evaluations - evaluations_before
             stage = Stage(
                 beta=beta,
                 effective_sample_size=effective,
-                acceptance=yields[-1] if yields else effective / len(coords),
+                acceptance=yields[-1] if yields else effective / n,
                 moves=0,
                 distinct_ancestors=int(effective),
                 log_evidence_increment=increments[-1],
@@ -284,34 +310,42 @@ def recycle(
         if last_beta < beta < 1.0:
             wanted = search.enlarge(wanted, beta)
         new, made = draw_inside(mixture, int(round(wanted)), random, density.inside)
-        try:
-            new_records = density.evaluate(new)
-        except BudgetExhausted as stop:
-            if (few := len(stop.records)) > 0:
-                archive.add(mixture, made * few / len(new), new[:few], stop.records)
-            raise stopped_at(archive, beta, sum(increments), inherited) from None
+        flight = density.submit(new)
+        if flight.refused:
+            density.wait(0)
+            archive.update()
+            if (few := len(flight.coords)) > 0:
+                archive.add(mixture, made * few / len(new), flight)
+            raise stopped_at(archive, beta, sum(increments), inherited)
+        draws = _Drawn(mixture, made, flight)
         if exploring:
-            archive.add(mixture, made, new, new_records)
+            density.wait(most_running(density, len(new)))
+            archive.add(mixture, made, flight)
             continue
-        new_weights = _weights_against(mixture, new_records, new, start, beta)
+        drawn.append(draws)
+        density.wait(0 if finished else most_running(density, len(new)))
+        new_weights = draws.log_weights(start, beta)
         fresh_size = effective_sample_size(new_weights)
         fresh += fresh_size
-        yields.append(fresh_size / max(len(new), 1))
-        archive.add(mixture, made, new, new_records)
-        if beta == 1.0:
-            final.append((new, new_records, _of_round(new_weights)))
+        yields.append(fresh_size / max(len(new_weights), 1))
         checks += finished
+        if finished:  # every point has arrived
+            archive.update()
+            log_evidence, error = _evidence(archive.log_weights(beta), inherited)
         check = evidence_from_weights(new_weights, made) if finished else None
         doubt = _doubt(settings, check, log_evidence, beta, yields)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
         reached = not finish and beta == 1.0 and effective >= target and fresh >= enough_fresh
         if (finished and (not doubt or checks == settings.max_checks)) or (doubt and not finished) or reached:
-            columns = (
-                np.concatenate(column) for column in zip(*final or [(new, new_records, new_weights)], strict=True)
-            )
+            if not finished:
+                density.wait(0)
+                archive.update()
+                log_evidence, error = _evidence(archive.log_weights(beta), inherited)
+            archive.add(mixture, made, flight)
+            parts = [_part_of_result(draws, start, beta) for draws in (drawn if beta == 1.0 else [draws])]
             return Recycled(
                 doubt,
-                *columns,
+                *(np.concatenate(column) for column in zip(*parts, strict=True)),
                 log_evidence,
                 error,
                 check,
@@ -319,6 +353,52 @@ def recycle(
                 sum(increments),
                 evaluations_below_one,
             )
+        archive.add(mixture, made, flight)
+
+
+class _Drawn(NamedTuple):
+    """Draws of a mixture.
+
+    Attributes
+    ----------
+    mixture : Mixture
+        What they were drawn from.
+    made : int
+        Number of draws, including those outside the support of the prior.
+    flight : Flight
+        The draws inside.
+    """
+
+    mixture: Mixture
+    made: int
+    flight: Flight
+
+    def log_weights(self, start: StartingDensity, beta: float) -> np.ndarray:
+        """Log-weights (m,) of the draws that have arrived, against the mixture that they were drawn from."""
+        coords, records = self.flight.landed_part()
+        return _weights_against(self.mixture, records, coords, start, beta)
+
+
+def _part_of_result(draws: _Drawn, start: StartingDensity, beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, records and log-weights of draws that have all arrived, as in `Recycled`."""
+    log_weights = draws.log_weights(start, beta)
+    return *draws.flight.landed_part(), _of_round(log_weights) if beta == 1.0 else log_weights
+
+
+def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
+    """Log-evidence from the weights of an archive, and its standard error; `inherited`: variance of earlier choices."""
+    n, effective = len(log_weights), effective_sample_size(log_weights)
+    log_evidence = float(log_mean_weight(log_weights) + np.log(n))
+    return log_evidence, float(np.sqrt(max(1.0 / effective - 1.0 / n, 0.0) + inherited))
+
+
+def most_running(density: Density, submitted: int) -> int:
+    """How many points may still run when the next proposal is made: as many as there are workers.
+
+    Then no point waits for a worker, and each that ends leaves one idle. Half of the points that were submitted last
+    must have arrived, since there would be too little to learn from otherwise.
+    """
+    return min(density.workers, submitted // 2)
 
 
 class _Search:

@@ -21,10 +21,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from .adaptive_importance import Recycled, StartingDensity, recycle, stopped_at
+from .adaptive_importance import Recycled, StartingDensity, most_running, recycle, stopped_at
 from .budget import BudgetExhausted
 from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, fits_poorly, warn
 from .evidence_check import pareto_shape
+from .flights import Flight
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
 from .multilevel import draw_start
@@ -127,24 +128,28 @@ def _without_limit(
         return
     if coarse is not None and (yield from _from_coarse(population, density, coarse, random, schedule, settings)):
         return
-    if population.records is None:
-        population = population._replace(records=_evaluate_all(population.coords, density))
+    flight = _submit_all(population, density, settings)
     recycled = None
     if settings.recycle:
         by_recycling = _by_recycling if settings.runs == 1 else _by_runs
-        recycled = yield from by_recycling(population, density, random, schedule, settings)
+        recycled = yield from by_recycling(population, flight, density, random, schedule, settings)
         if recycled.trusted:
             return
+    population = population._replace(records=flight.landed_part()[1])
     yield from _by_moves(population, density, random, schedule, settings, recycled)
 
 
-def _evaluate_all(coords: np.ndarray, density: Density) -> np.ndarray:
-    """Records of draws of the prior."""
-    try:
-        return density.evaluate(coords)
-    except BudgetExhausted as stop:
-        few = coords[: len(stop.records)]
-        raise stop_at(Population(0.0, few, stop.records, float(len(few))), 0.0, 0.0) from None
+def _submit_all(population: Population, density: Density, settings: Settings) -> Flight:
+    """Evaluate draws of the prior, if that has not been done; before recycling, some of them may be running."""
+    coords = population.coords
+    if population.records is not None:
+        return Flight.landed(coords, population.records)
+    flight = density.submit(coords)
+    density.wait(0 if flight.refused or not settings.recycle else most_running(density, len(coords)))
+    if flight.refused:
+        few, records = flight.landed_part()
+        raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0)
+    return flight
 
 
 def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
@@ -232,7 +237,8 @@ def _from_guide(
     except BudgetExhausted:
         raise stopped_rounds(found) from None
     try:
-        recycled = yield from _by_recycling(started, density, random, schedule, settings, start, size, found)
+        flight = Flight.landed(started.coords, started.records)
+        recycled = yield from _by_recycling(started, flight, density, random, schedule, settings, start, size, found)
     except StoppedEarly as stop:
         raise better_of(stop, found) from None
     return None if recycled.trusted else found
@@ -335,6 +341,7 @@ def _by_moves(
 
 def _by_recycling(
     population: Population,
+    flight: Flight,
     density: Density,
     random: np.random.RandomState,
     schedule: MoveSchedule,
@@ -345,10 +352,11 @@ def _by_recycling(
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Adaptive importance sampling, resampled to `size` points (the number of points by default) and moved.
 
-    Its evidence is compared with that of `earlier` rounds of a guide, if there were any.
+    `flight`: the points of the population, some of which may be running. The evidence is compared with that of
+    `earlier` rounds of a guide, if there were any.
     """
     size = len(population.coords) if size is None else size
-    found = yield from recycle(population.coords, population.records, density, random, settings.recycling, start, size)
+    found = yield from recycle(flight, density, random, settings.recycling, start, size)
     if not found.trusted:
         logger.info("recycling is not trusted here, because %s", found.doubt)
         yield population, Restart(found.doubt)
@@ -390,14 +398,18 @@ def _by_recycling(
 
 
 def _by_runs(
-    population: Population, density: Density, random: np.random.RandomState, schedule: MoveSchedule, settings: Settings
+    population: Population,
+    flight: Flight,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Several runs of recycling, then one that begins with all their points; they are compared at the end."""
-    coords, records = population.coords, population.records
     runs: list[Recycled] = []
     for _ in range(settings.runs):
         try:
-            run = yield from _only_sweeps(recycle(coords, records, density, random, settings.recycling, finish=False))
+            run = yield from _only_sweeps(recycle(flight, density, random, settings.recycling, finish=False))
         except StoppedEarly as stop:
             stop.log_evidence_of_stages = 0.0  # the stages of these runs are not reported
             raise (stopped_at(runs[0].archive, 1.0, 0.0, 0.0) if runs else stop) from None
@@ -405,11 +417,12 @@ def _by_runs(
             yield population, Restart(run.doubt)
             return run
         runs.append(run)
-    coords, records, start = pool_runs(runs, len(coords))
+    coords, records, start = pool_runs(runs, len(population.coords))
     pooled = Population(0.0, coords, records, float(len(coords)))
     share = settings.recycling.target_share * len(population.coords) / len(coords)
     settings = replace(settings, recycling=replace(settings.recycling, target_share=share))
-    found = yield from _by_recycling(pooled, density, random, schedule, settings, start, len(population.coords))
+    flight = Flight.landed(coords, records)
+    found = yield from _by_recycling(pooled, flight, density, random, schedule, settings, start, len(population.coords))
     if found.trusted:
         for doubt in check_agreement(runs, found.proposals[-1][1], 1.0 / (share * len(coords))):
             yield population, doubt
@@ -428,8 +441,8 @@ def _from_coarse(
     coords = population.coords
     n, ndim = coords.shape
     few = min(n, max(FEWEST_TO_START, n // 2, START_PER_DIMENSION * (ndim + 1)))
-    records = coarse.evaluate(coords[:few])
-    found = yield from _only_sweeps(recycle(coords[:few], records, coarse, random, settings.recycling, finish=False))
+    flight = coarse.submit(coords[:few])
+    found = yield from _only_sweeps(recycle(flight, coarse, random, settings.recycling, finish=False))
     if found.doubt:
         warn(
             f"annealing on the coarse model failed ({found.doubt}), so the fine model alone is used. Check the coarse "
@@ -439,7 +452,8 @@ def _from_coarse(
     coarse_cost = few + sum(made for made, _ in found.proposals)
     drawn, start = draw_start(found.proposals, coords, few, random, density.inside)
     population = population._replace(coords=drawn, records=_evaluate_start(drawn, start, density))
-    found = yield from _by_recycling(population, density, random, schedule, settings, start, n)
+    flight = Flight.landed(drawn, population.records)
+    found = yield from _by_recycling(population, flight, density, random, schedule, settings, start, n)
     if not found.trusted:
         warn(
             "the coarse posterior is too far from the fine one to lead to it, so annealing starts again on the fine "

@@ -11,6 +11,7 @@ import numpy as np
 from emcee.ensemble import walkers_independent
 
 from .evidence_check import EvidenceCheck
+from .flights import Flight
 
 __all__ = [
     "Density",
@@ -36,11 +37,14 @@ class Density(Protocol):
     ----------
     evaluations : int
         Number of points evaluated so far.
+    workers : int
+        Number of points that are evaluated at once, if `submit` returns without waiting; else 0.
     map : callable
         How an emcee move that evaluates points by itself maps a function over them: ``map`` or ``pool.map``.
     """
 
     evaluations: int
+    workers: int
 
     @property
     def map(self) -> Callable: ...
@@ -53,6 +57,15 @@ class Density(Protocol):
 
         Needed only for a guide with a method `observe`.
         """
+
+    def submit(self, coords: np.ndarray) -> Flight:
+        """Begin to evaluate points (n, ndim); a synchronous density returns when all are evaluated.
+
+        With a limit of simulations, the first points that fit are submitted.
+        """
+
+    def wait(self, most: int) -> None:
+        """Wait until at most this number of all submitted points is running, and let the others arrive."""
 
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior: (n,) bool."""

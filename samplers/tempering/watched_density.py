@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .flights import Flight, submit_and_wait
 from .mutation import tempered_log_prob
 from .population import Density
 
@@ -58,6 +59,18 @@ class WatchedDensity:
         records = self._density.evaluate_observed(coords, observe)
         self.add(coords, records)
         return records
+
+    @property
+    def workers(self) -> int:
+        """0: moves wait for the points that they propose."""
+        return 0
+
+    def submit(self, coords: np.ndarray) -> Flight:
+        """As `evaluate`; the points have arrived."""
+        return submit_and_wait(self, coords)
+
+    def wait(self, most: int) -> None:
+        """Nothing runs."""
 
     def add(self, coords: np.ndarray, records: np.ndarray) -> None:
         """Keep points (n, ndim) that were evaluated elsewhere; of their records (n,), log_prior and log_prob."""

@@ -6,6 +6,7 @@ import pytest
 from samplers.moves.kernels import MixtureMove
 from samplers.tempering.anneal import anneal
 from samplers.tempering.evidence_check import EvidenceCheck
+from samplers.tempering.flights import Flight
 from samplers.tempering.mutation import MoveSchedule
 from samplers.tempering.population import Population, Restart, Stage, Sweep
 from samplers.tempering.results import AnnealingResult
@@ -18,7 +19,7 @@ N = 100
 class CountedDensity:
     """The smallest object that annealing accepts."""
 
-    map = map
+    map, workers = map, 0
 
     def __init__(self, posterior):
         self.posterior, self.evaluations = posterior, 0
@@ -31,6 +32,12 @@ class CountedDensity:
         records = np.zeros(len(coords), dtype=[("log_prob", float), ("log_prior", float)])
         records["log_prob"], records["log_prior"] = self.posterior(coords), self.posterior.log_prior(coords)
         return records
+
+    def submit(self, coords):
+        return Flight.landed(coords, self.evaluate(coords))
+
+    def wait(self, most):
+        pass
 
 
 def steps_of(settings, coarse=None, n=N, seed=1):
