@@ -16,6 +16,7 @@ import copy
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -33,7 +34,7 @@ from .storage.checkpoint import Checkpoint
 from .storage.compatibility import SEED, header, warn_of_other_seed
 from .storage.emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state
 from .storage.evaluation import CallingConvention, FailureLimit
-from .storage.evaluators import make_evaluators
+from .storage.evaluators import check_asynchronous, make_evaluators
 from .storage.journal import RunStart
 from .storage.recording import record, show_progress
 from .storage.resumption import PresentCall, Resumption
@@ -194,13 +195,17 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         if coarse_log_prob_fn is not None:
             unused["runs"] = "the runs begin with draws of the prior, not with a coarse model: pass one of them"
         refuse_unused(given, recycle, followed != own_moves, unused, guide is not None)
+        if given.asynchronous:
+            check_asynchronous(functions.function, pool, vectorize)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
 
         convention = CallingConvention(vectorize, self.parameter_names if self.params_are_named else None, blobs_dtype)
         limit = FailureLimit(self.settings.max_failure_share, nwalkers, ndim)
         common = (self.log_prob_fn.args, self.log_prob_fn.kwargs), convention, self._checkpoint, limit, self._budget
-        self._evaluator, self._coarse_evaluator = make_evaluators(functions, coarse_log_prob_fn, *common)
+        self._evaluator, self._coarse_evaluator = make_evaluators(
+            functions, coarse_log_prob_fn, *common, self.settings.asynchronous
+        )
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._result, self._verdict = self._checkpoint.stored_result(), self._checkpoint.stored_verdict()
         self._seed = None if seed is None else np.ravel(seed).tolist()
@@ -453,7 +458,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse, guidance)
         unit = " sweeps" if guidance is None else " batches"
         labels = {"desc": "ladder", "unit": unit, **(bar["progress_kwargs"] or {})}
-        with get_progress_bar(bar["progress"], None, **labels) as shown:
+        with get_progress_bar(bar["progress"], None, **labels) as shown, closing(self._evaluator):
             for result, population, report in record(steps, self._evaluator, self._checkpoint):
                 self._result = result
                 if isinstance(report, Sweep | GuideTick):

@@ -108,6 +108,11 @@ class CallingConvention(NamedTuple):
     parameter_names: Mapping[str, Any] | None = None
     blobs_dtype: Any = None
 
+    def as_points(self, coords: np.ndarray) -> Any:
+        """Points (n, ndim) as functions take them: rows of an array, or dictionaries."""
+        named = self.parameter_names
+        return coords if named is None else ndarray_to_list_of_dicts(coords, named)
+
     def call(
         self, function: Callable, coords: np.ndarray, pool: Any = None, note: Callable[[list], None] | None = None
     ) -> Any:
@@ -115,8 +120,7 @@ class CallingConvention(NamedTuple):
 
         A function of a batch has no first results, and neither has a pool whose ``map`` returns a list.
         """
-        named = self.parameter_names
-        points = coords if named is None else ndarray_to_list_of_dicts(coords, named)
+        points = self.as_points(coords)
         if self.vectorize:
             return function(points)
         results, noted = [], time.perf_counter()

@@ -57,11 +57,13 @@ class Flight:
 
     def arrive(self, rows: np.ndarray, records: np.ndarray) -> None:
         """Enter the records (m,) of points that have arrived, by their rows (m,)."""
-        if self._records is None and len(rows) == len(self.coords):
+        if len(rows) == len(self.coords):
             self._records = records
         else:
-            if self._records is None:
-                self._records = np.zeros(len(self.coords), records.dtype)
+            if self._records is None or self._records.dtype != records.dtype:  # the first blobs change the type
+                earlier, self._records = self._records, np.zeros(len(self.coords), records.dtype)
+                for name in () if earlier is None else earlier.dtype.names:
+                    self._records[name] = earlier[name]
             self._records[rows] = records
         self.arrived[rows] = True
 

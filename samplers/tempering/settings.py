@@ -279,6 +279,10 @@ class Settings:
     max_failure_share : float
         The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
         (a returned -inf is not a failure); 0 stops at the first failure.
+    asynchronous : bool
+        Whether points are evaluated without waiting for the slowest of each batch, for long runs of unequal length on
+        many workers. Recycling then proposes the next points while the last ones run. The result depends on the order
+        of arrival, in the choice of the proposals; every estimate is made of complete batches. Moves wait as before.
     """
 
     ess_ratio: float = 0.5
@@ -298,8 +302,12 @@ class Settings:
     guided: GuidedSettings = GuidedSettings()
     check_draws: int | None = None
     max_failure_share: float = 0.5
+    asynchronous: bool = False
 
     def __post_init__(self):
+        if not isinstance(self.asynchronous, bool | np.bool_):
+            raise ValueError(f"asynchronous must be True or False; got {self.asynchronous!r}")
+        object.__setattr__(self, "asynchronous", bool(self.asynchronous))
         for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps", "check_draws"):
             if name != "check_draws" or self.check_draws is not None:
                 object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
@@ -457,6 +465,8 @@ def refuse_unused(
     elif not guided:
         reasons.setdefault("recycling", "the annealing is by moves: pass recycle=True")
         reasons.setdefault("runs", "it belongs to recycling, and the annealing is by moves: pass recycle=True")
+    if not recycles and not guided:
+        reasons.setdefault("asynchronous", "moves wait for all points that they propose: pass recycle=True")
     for name in changed_settings(settings):
         if name in reasons:
             raise ValueError(f"{name}={vars(settings)[name]!r} cannot act here: {reasons[name]}")

@@ -1,0 +1,189 @@
+"""Evaluation of points that arrive in any order, so that no worker waits for the slowest point of a batch.
+
+Points are submitted to a queue as soon as they are proposed. What has arrived is entered in the journal, and at each
+decision of the sampler (`AsynchronousEvaluator.wait`) also which points had arrived by then. The decisions depend on
+the order of arrival; a run that is continued repeats them from the journal, and goes on to the last bit as the one that
+was interrupted. Points that were running when the process ended are submitted again.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..tempering.flights import Flight
+from .evaluation import Evaluator
+from .journal import EvaluatedBatch, merge_batches
+
+__all__ = ["AsynchronousEvaluator", "EvaluationQueue"]
+
+# Finite values that the check of the first evaluations needs.
+FIRST_VALUES = 8
+
+
+class EvaluationQueue(Protocol):
+    """Where points are evaluated, such as ``posterior.evaluation_queue()`` or `samplers.storage.pool_queue.PoolQueue`.
+
+    Attributes
+    ----------
+    workers : int or None
+        Number of points that are evaluated at once, if it is known.
+    """
+
+    workers: int | None
+
+    def submit(self, coords: np.ndarray) -> list[int]:
+        """Begin to evaluate points (n, ndim) without waiting; returns a number for each, which is never used again."""
+
+    def collect(self) -> list[tuple[int, Any]]:
+        """Wait until a point is finished; returns numbers and values of all that are, in the order of completion."""
+
+    def close(self) -> None:
+        """Cancel the points that have not been started."""
+
+
+class AsynchronousEvaluator(Evaluator):
+    """An evaluator whose `submit` returns without waiting.
+
+    Parameters
+    ----------
+    *args, **kwargs
+        As for `samplers.storage.evaluation.Evaluator`.
+    open_queue : callable
+        Called without arguments before the first point is submitted; returns an `EvaluationQueue`.
+    """
+
+    def __init__(self, *args: Any, open_queue: Callable[[Any], EvaluationQueue], **kwargs: Any):
+        self._open_queue = open_queue
+        super().__init__(*args, **kwargs)
+
+    def __getstate__(self) -> dict:
+        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}}
+
+    def reset(self) -> None:
+        """Forget evaluations and failures; nothing runs afterwards."""
+        super().reset()
+        self._queue: EvaluationQueue | None = None
+        self._submitted = 0
+        self._running: dict[int, tuple[Flight, int]] = {}  # by number: points that have not arrived at a decision
+        self._tickets: dict[int, int] = {}  # number of the point by ticket of the queue
+        self._known: dict[int, tuple[EvaluatedBatch, int]] = {}  # values of points that are still in `_running`
+
+    def _opened(self) -> EvaluationQueue:
+        if self._queue is None:
+            self._queue = self._open_queue(self.pool)
+        return self._queue
+
+    @property
+    def workers(self) -> int:
+        """Number of points that are evaluated at once."""
+        return self._opened().workers or 1
+
+    def submit(self, coords: np.ndarray) -> Flight:
+        """Begin to evaluate points (n, ndim), of which the limit of simulations may allow the first few only."""
+        if not np.all(np.isfinite(coords)):
+            raise ValueError("At least one parameter value was infinite or NaN")
+        log_base = self.log_base(coords)
+        inside = log_base > -np.inf
+        points = np.flatnonzero(inside)
+        parts = [(slice(None), None)] if self._checkpoint is None else self._checkpoint.find(coords[points])
+        numbers, refused, end = [], False, len(coords)
+        for rows, known in parts:
+            wanted = points[rows]
+            if known is None:
+                fitting = self.budget.fitting(coords[wanted])
+                fitting = fitting if fitting == len(wanted) or self.evaluates_parts else 0
+                if fitting < len(wanted):
+                    refused, end, wanted = True, int(wanted[fitting]), wanted[:fitting]
+            else:
+                self._check = None  # the interrupted run has checked its first batch
+            self.budget.count(coords[wanted])
+            numbers.append((known, wanted))
+            if refused:
+                break
+        flight = Flight(coords[:end], log_base[:end], refused)
+        outside = np.flatnonzero(~inside[:end])
+        if len(outside) > 0:
+            flight.arrive(outside, flight.base[outside])
+        for known, wanted in numbers:
+            first = self._submitted
+            self._submitted += len(wanted)
+            for place, row in enumerate(wanted):
+                self._running[first + place] = flight, int(row)
+                if known is not None:
+                    self._known[first + place] = known, place
+            if known is None and len(wanted) > 0:
+                tickets = self._opened().submit(coords[wanted])
+                self._tickets.update(zip(tickets, range(first, self._submitted), strict=True))
+        return flight
+
+    def wait(self, most: int) -> None:
+        """Wait until at most this number of all submitted points is running, and let the others arrive."""
+        if not self._running:
+            return
+        if self._checkpoint is None:
+            arrived = self._gather(most)
+        else:
+            remembered = self._checkpoint.remember(
+                "arrived", lambda: [self._gather(most)], lambda: self.budget.of_guides
+            )
+            arrived = remembered[0]
+        by_flight: dict[int, list[int]] = {}
+        for number in arrived.tolist():
+            by_flight.setdefault(id(self._running[number][0]), []).append(number)
+        for numbers in by_flight.values():
+            self._land(numbers)
+
+    def _land(self, numbers: list[int]) -> None:
+        """Let points of one flight arrive, and count them."""
+        flight = self._running[numbers[0]][0]
+        rows = np.array([self._running.pop(number)[1] for number in numbers])
+        batch = merge_batches([_single(*self._known.pop(number)) for number in numbers])
+        if self._limit is not None:
+            self._limit.check(batch, self.evaluations, self.failures.count)
+        self.count(batch)
+        log_base = flight.base["log_prior"][rows]
+        flight.arrive(rows, self._records.pack_batch(log_base, np.ones(len(rows), dtype=bool), batch))
+
+    def _gather(self, most: int) -> np.ndarray:
+        """Numbers (m,) of the points that have arrived by the time when `most` others are running."""
+        held: list[EvaluatedBatch] = []  # not stored before the first values are checked
+        while len(self._running) - len(self._known) > most:
+            collected = self._opened().collect()
+            numbers = [self._tickets.pop(ticket) for ticket, _ in collected]
+            coords = np.array([self._running[number][0].coords[self._running[number][1]] for number in numbers])
+            batch = self._as_batch(coords, [value for _, value in collected])
+            for place, number in enumerate(numbers):
+                self._known[number] = batch, place
+            self.new_evaluations += len(numbers)
+            held.append(batch)
+            if self._check is None or sum(np.isfinite(b.log_prob).sum() for b in held) >= FIRST_VALUES:
+                self._store(held)
+        self._store(held)
+        return np.array(sorted(self._known), dtype=np.int64)
+
+    def _store(self, held: list[EvaluatedBatch]) -> None:
+        """Check the first values, and enter arrivals in the journal."""
+        if not held:
+            return
+        batch = merge_batches(held)
+        held.clear()
+        if self._check is not None:
+            self._check(self, batch)
+            self._check = None
+        if self._checkpoint is not None:
+            self._checkpoint.evaluated(batch)
+
+    def close(self) -> None:
+        """End the evaluation of points that are running."""
+        queue, self._queue, self._submitted = self._queue, None, 0
+        self._running, self._known, self._tickets = {}, {}, {}
+        if queue is not None:
+            queue.close()
+
+
+def _single(batch: EvaluatedBatch, row: int) -> EvaluatedBatch:
+    """One point of a batch."""
+    blobs = None if batch.blobs is None else batch.blobs[row : row + 1]
+    reasons = {0: batch.reasons[row]} if row in batch.reasons else {}
+    return EvaluatedBatch(batch.coords[row : row + 1], batch.log_prob[row : row + 1], blobs, reasons)

@@ -1,0 +1,174 @@
+"""Asynchronous runs: killed anywhere, they go on; the journal repeats them to the last bit without an evaluation."""
+
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SMCSampler
+from samplers.storage.journal import MAGIC
+from tests.contract.targets import Gaussian, WithBlobs
+from tests.faults.test_prefixes import ends, journal_of
+from tests.simulated_cluster import SimulatedCluster
+
+N, NDIM, STEPS = 40, 2, 2
+COMPARED = N + 1  # evaluations by which a run that is continued compares the posterior with that of the file
+
+pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+
+
+class Fragile(WithBlobs):
+    """Blobs, and NaN for some points."""
+
+    def __call__(self, x):
+        values = super().__call__(x)
+        values[x[:, 1] > 1.5, 0] = np.nan
+        return values
+
+
+def make(path, workers=5, order=0, **settings):
+    """A sampler with a file; `order` is the seed of the run lengths, and so of the order of arrival."""
+    lengths = np.random.default_rng(order)
+    cluster = SimulatedCluster(Fragile(ndim=NDIM, sd=0.05), workers, lambda x: lengths.exponential(size=len(x)))
+    backend = emcee.backends.HDFBackend(str(path))
+    settings = {"seed": 5, "recycle": True, "asynchronous": True, **settings}
+    return SMCSampler(N, NDIM, cluster, vectorize=True, backend=backend, **settings), cluster
+
+
+def finished(path, **settings):
+    sampler, cluster = make(path, **settings)
+    sampler.run_mcmc(None, STEPS)
+    sampler.backend.close()
+    return sampler, cluster
+
+
+def state_of(sampler):
+    """Everything that two runs are compared by."""
+    ladder = [stage._replace(seconds=0) for stage in sampler.ladder]
+    failures = sorted((failure["parameters"].tobytes(), failure["reason"]) for failure in sampler.failures)
+    blobs = sampler.get_blobs().tobytes()
+    return sampler.get_chain().tobytes(), blobs, ladder, sampler.log_evidence, sampler.evaluations, failures
+
+
+def kinds(data):
+    """Kind and start of every block of a journal."""
+    places = [len(MAGIC), *ends(data)]
+    return [(data[place : place + 4], place) for place in places[1:-1]]
+
+
+def replayed(path, folder, order):
+    """The run of a journal that is cut before its first step, and the number of evaluations that it took."""
+    data = journal_of(path).read_bytes()
+    first = next(place for kind, place in kinds(data) if kind == b"STEP")
+    copy = folder / "replayed.h5"
+    journal_of(copy).write_bytes(data[:first])
+    copy.unlink(missing_ok=True)
+    return finished(copy, order=order)
+
+
+def test_a_run_depends_on_the_order_of_arrival_and_on_nothing_else(tmp_path):
+    """The control: other lengths give another chain, so that a replay that ignored the order would be noticed."""
+    chains = [finished(tmp_path / f"{i}.h5", order=order)[0].get_chain() for i, order in enumerate((1, 1, 2))]
+    assert np.array_equal(chains[0], chains[1]) and not np.array_equal(chains[0], chains[2])
+
+
+def test_killed_anywhere_a_run_goes_on_and_its_journal_repeats_it(tmp_path):
+    """Cut after every third block, and continued with other lengths: nothing known is evaluated again."""
+    whole, cluster = finished(tmp_path / "whole.h5", order=1)
+    assert whole.failures and cluster.evaluations == whole.evaluations
+    data = journal_of(tmp_path / "whole.h5").read_bytes()
+    places = [place for _, place in kinds(data)][::3]
+    assert len(places) > 20
+    for number, place in enumerate(places):
+        path = tmp_path / "killed.h5"
+        journal_of(path).write_bytes(data[:place])
+        path.unlink(missing_ok=True)
+        resumed, cluster = finished(path, order=number)
+        again, nothing = replayed(path, tmp_path, order=99)
+        assert state_of(again) == state_of(resumed)
+        assert nothing.evaluations == COMPARED + (STEPS - 1) * N  # of the sweeps after the first step
+    assert state_of(replayed(tmp_path / "whole.h5", tmp_path, order=98)[0]) == state_of(whole)
+
+
+def test_one_worker_goes_on_as_if_it_had_not_been_killed(tmp_path):
+    """Points of one worker arrive in the order of their submission, so that the run can be compared to the last bit."""
+    whole, _ = finished(tmp_path / "whole.h5", workers=1)
+    data = journal_of(tmp_path / "whole.h5").read_bytes()
+    for _, place in kinds(data)[::40]:
+        path = tmp_path / "killed.h5"
+        journal_of(path).write_bytes(data[:place])
+        path.unlink(missing_ok=True)
+        assert state_of(finished(path, workers=1)[0]) == state_of(whole)
+
+
+class Waits(Gaussian):
+    """Takes longer where the first parameter is large: the order of arrival depends on the parameters."""
+
+    def __call__(self, x):
+        time.sleep(0.002 * np.exp(float(np.clip(x[0], -2.0, 2.0))))
+        return super().__call__(x)
+
+
+def run_with_threads(path):
+    with ThreadPoolExecutor(3) as pool:
+        backend = emcee.backends.HDFBackend(str(path))
+        posterior = Waits(NDIM, sd=0.05)
+        settings = {"seed": 5, "recycle": True, "asynchronous": True}
+        sampler = SMCSampler(N, NDIM, posterior, pool=pool, backend=backend, **settings)
+        sampler.run_mcmc(None, STEPS)
+    return sampler
+
+
+def test_killed_by_signal_9(tmp_path, rng):
+    """A real process with threads; whatever the place, the run goes on and every stored evaluation is used."""
+    path = tmp_path / "killed.h5"
+    context, sizes = multiprocessing.get_context("spawn"), [3_000, 12_000]
+    for size in sizes:
+        process = context.Process(target=run_with_threads, args=(path,))
+        process.start()
+        while not journal_of(path).exists() or journal_of(path).stat().st_size < size:
+            assert process.is_alive()
+            time.sleep(0.002)
+        process.kill()
+        process.join()
+    known = journal_of(path).stat().st_size
+    sampler = run_with_threads(path)
+    assert sampler.iteration == STEPS and journal_of(path).stat().st_size > known
+    assert abs(sampler.log_evidence - Gaussian(NDIM, sd=0.05).log_evidence) < 4 * sampler.log_evidence_error
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes", "pool"])
+def test_pools_that_take_single_points(kind):
+    """Each point goes to the pool by itself; the result is that of the posterior."""
+    opened = {"threads": lambda: ThreadPoolExecutor(2), "pool": lambda: multiprocessing.get_context("spawn").Pool(2)}
+    opened["processes"] = lambda: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))
+    posterior = Gaussian(NDIM, sd=0.05)
+    with opened[kind]() as pool:
+        sampler = SMCSampler(N, NDIM, posterior, pool=pool, seed=3, recycle=True, asynchronous=True)
+        sampler.run_mcmc(None, 1)
+    assert abs(sampler.log_evidence - posterior.log_evidence) < 4 * sampler.log_evidence_error
+    mean, sd = sampler.get_chain(flat=True).mean(axis=0), posterior.sd / np.sqrt(N)
+    assert np.all(np.abs(mean - posterior.mean) < 4 * sd)
+
+
+def test_a_limit_of_simulations_counts_points_that_are_running(tmp_path):
+    """No more than the limit is submitted, all of that is used, and a larger limit goes on."""
+    sampler, cluster = make(tmp_path / "run.h5", max_simulations=150)
+    sampler.run_mcmc(None, 1)
+    assert cluster.evaluations == 150 == sampler.simulations
+    more, further = make(tmp_path / "run.h5", max_simulations=5000, order=3)
+    more.run_mcmc(None, 1)
+    assert more.verdict.status != "not usable" and further.evaluations == COMPARED + more.evaluations - 150
+
+
+def test_what_cannot_be_asynchronous_is_refused():
+    posterior = Gaussian(NDIM)
+    with pytest.raises(ValueError, match="evaluation_queue"):
+        SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=True)
+    with pytest.raises(ValueError, match="moves wait"), ThreadPoolExecutor(1) as pool:
+        SMCSampler(N, NDIM, posterior, pool=pool, recycle=False, asynchronous=True)
+    with pytest.raises(ValueError, match="True or False"):
+        SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=1)
