@@ -92,6 +92,11 @@ class SMCSampler(TemperedSampler):
     max_failure_share : float, default 0.5
         The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
         (a returned -inf is not a failure); 0 stops at the first failure.
+    asynchronous : bool, default False
+        With recycling, propose the next points while the last ones run, so that no worker waits for the slowest point
+        of a batch; for long runs of unequal length. Needs a `Posterior` of fe_likelihoods with a pool of its own and
+        ``vectorize=True``, or a `pool` that takes single points. Proposals then depend on the order in which points
+        arrive, which the journal of a file repeats; estimates are made of complete batches only.
     settings : samplers.Settings, optional
         These settings as one object; keywords take precedence.
 

@@ -99,6 +99,7 @@ class TMCMCSampler(TemperedSampler):
             **dict.fromkeys(("ess_ratio", "ess_rule", "ess_floor"), _COV),
             "recycling": _NO_RECYCLING + ", or pass guide=",
             "runs": _NO_RECYCLING,
+            "asynchronous": "moves wait for all points that they propose: use SMCSampler",
         }
     )
 

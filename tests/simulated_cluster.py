@@ -40,6 +40,7 @@ class SimulatedCluster:
     def __init__(self, target, workers: int, length: Callable[[np.ndarray], np.ndarray]):
         self._target, self.workers, self._length = target, workers, length
         self.ndim, self.log_prior, self.sample_prior = target.ndim, target.log_prior, target.sample_prior
+        self.fast_parameters = getattr(target, "fast_parameters", ())
         self.now = self.busy = 0.0
         self.evaluations = 0
         self._free = [0.0] * workers

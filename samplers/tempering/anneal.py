@@ -28,7 +28,7 @@ from .evidence_check import pareto_shape
 from .flights import Flight
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
-from .multilevel import draw_start
+from .multilevel import draw_start, submit_start
 from .mutation import MoveSchedule, Mutated, grow_chains, move_together
 from .population import Density, Doubt, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from .population_check import check_population
@@ -451,8 +451,7 @@ def _from_coarse(
         return False
     coarse_cost = few + sum(made for made, _ in found.proposals)
     drawn, start = draw_start(found.proposals, coords, few, random, density.inside)
-    population = population._replace(coords=drawn, records=_evaluate_start(drawn, start, density))
-    flight = Flight.landed(drawn, population.records)
+    population, flight = population._replace(coords=drawn), submit_start(drawn, start, density)
     found = yield from _by_recycling(population, flight, density, random, schedule, settings, start, n)
     if not found.trusted:
         warn(
@@ -466,16 +465,6 @@ def _from_coarse(
             "coarse model may be worth its cost"
         )
     return found.trusted
-
-
-def _evaluate_start(coords: np.ndarray, start: StartingDensity, density: Density) -> np.ndarray:
-    """Records of draws of a starting density."""
-    try:
-        return density.evaluate(coords)
-    except BudgetExhausted as stop:
-        records, few = stop.records, coords[: len(stop.records)]
-        log_start = start.log_density(few, records)
-        raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0, log_start=log_start) from None
 
 
 def _only_sweeps(

@@ -465,8 +465,10 @@ def refuse_unused(
     elif not guided:
         reasons.setdefault("recycling", "the annealing is by moves: pass recycle=True")
         reasons.setdefault("runs", "it belongs to recycling, and the annealing is by moves: pass recycle=True")
-    if not recycles and not guided:
-        reasons.setdefault("asynchronous", "moves wait for all points that they propose: pass recycle=True")
+    if guided:
+        reasons["asynchronous"] = "the rounds of a guide wait for all their draws: pass one of them"
+    elif not recycles:
+        reasons["asynchronous"] = "moves wait for all points that they propose: pass recycle=True"
     for name in changed_settings(settings):
         if name in reasons:
             raise ValueError(f"{name}={vars(settings)[name]!r} cannot act here: {reasons[name]}")

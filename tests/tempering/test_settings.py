@@ -19,6 +19,7 @@ from samplers import (
     TMCMCSampler,
 )
 from tests.contract.targets import Box, Gaussian
+from tests.simulated_cluster import SimulatedCluster
 
 PATHS = {
     "recycling": (SMCSampler, {"recycle": True}),
@@ -50,17 +51,18 @@ CHANGES = {
     "guided": (GuidedSettings(trusted_share=0.6), {}),
     "check_draws": (0, {}),
     "max_failure_share": (0.0, {}),
+    "asynchronous": (True, {}),
 }
 ACTS = {
-    "recycling": {"fast_sweeps", "recycle", "recycling", "runs", "check_draws"},
+    "recycling": {"fast_sweeps", "recycle", "recycling", "runs", "check_draws", "asynchronous"},
     "closing sweeps": {"min_moves", "max_moves", "max_correlation", "fast_sweeps"}
-    | {"recycling", "runs", "check_draws"},
+    | {"recycling", "runs", "check_draws", "asynchronous"},
     "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
     | {"fast_sweeps", "recycle", "check_draws"},
     "equal chains": {"coefficient_of_variation", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
     | {"burn_in", "fast_sweeps", "check_draws"},
     "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "fast_sweeps", "check_draws"},
-    "leaders, recycling": {"burn_in", "fast_sweeps", "recycling", "runs", "check_draws"},
+    "leaders, recycling": {"burn_in", "fast_sweeps", "recycling", "runs", "check_draws", "asynchronous"},
 }
 
 
@@ -189,6 +191,8 @@ def test_a_setting_changes_the_run_or_is_refused(name, path):
     value, needed = CHANGES[name]
     value = not given.get("recycle", False) if name == "recycle" else value
     posterior = Target(sd=0.02, fails=name == "max_failure_share")
+    if name == "asynchronous":  # on five workers, of which the one with the longest run is the last
+        posterior = SimulatedCluster(posterior, 5, lambda x: 2.0 + np.cos(50.0 * x[:, 0]))
     if name in needed or given.get(name) == value:
         pytest.skip("the path has this value")
     try:
