@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
     from . import problems
-    from .adapters import UMBridgeServer, nautilus_prior, serve, to_bilby, to_pints, to_pymc
+    from .adapters import nautilus_prior, serve, to_bilby, to_pints, to_pymc
     from .data.make_isolated_bridge import table_motion
     from .emulation.emulator import ResponseEmulator
     from .emulation.guide import ResponseGuide
@@ -161,7 +161,6 @@ __all__ = [
     "TruncatedMultivariateNormal",
     "TruncatedNormal",
     "UMBridgeModel",
-    "UMBridgeServer",
     "Uniform",
     "Varying",
     "align",
@@ -222,7 +221,6 @@ __all__ = [
 
 _EXPORTS = {
     "adapters": (
-        "UMBridgeServer",
         "nautilus_prior",
         "serve",
         "to_bilby",

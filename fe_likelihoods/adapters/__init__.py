@@ -10,6 +10,6 @@ from .bilby import to_bilby
 from .nautilus import nautilus_prior
 from .pints import to_pints
 from .pymc import to_pymc
-from .umbridge import UMBridgeServer, serve
+from .umbridge import serve
 
-__all__ = ["UMBridgeServer", "nautilus_prior", "serve", "to_bilby", "to_pints", "to_pymc"]
+__all__ = ["nautilus_prior", "serve", "to_bilby", "to_pints", "to_pymc"]

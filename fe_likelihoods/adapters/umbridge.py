@@ -81,7 +81,8 @@ def serve(
     Returns
     -------
     UMBridgeServer or None
-        Without `block`, the server, which runs in threads of this process until `UMBridgeServer.close`.
+        Without `block`, the server, which runs in threads of this process until `UMBridgeServer.close`. Until then
+        do not evaluate `served` elsewhere in this process: posteriors are not made for several threads.
 
     Raises
     ------

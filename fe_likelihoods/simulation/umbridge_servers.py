@@ -293,7 +293,7 @@ def _exchange(url: str, path: str, content: Any, time_limit: float | None) -> tu
             response = connection.getresponse()
             return response.status, response.read()
         except TimeoutError as error:
-            if time_limit is None:  # the other machine has vanished
+            if time_limit is None or error.errno is not None:  # the other machine has vanished
                 raise _Lost(f"the connection was lost ({error})") from error
             raise ServerTimeout(f"stopped at the time limit of {time_limit:g} s") from error
         except (OSError, HTTPException) as error:

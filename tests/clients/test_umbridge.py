@@ -225,6 +225,7 @@ def test_served_model_with_a_pool():
         assert np.array_equal(*(likelihood.misfit(THETAS[:3]) for likelihood in likelihoods))
 
 
+@pytest.mark.slow
 def test_serve_ends_with_ctrl_c(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
