@@ -1,10 +1,10 @@
-"""Watch over the workers of a dask cluster while a map waits for them."""
+"""Watch over the workers of a dask cluster while simulations wait for them."""
 
 import contextlib
 import logging
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 __all__ = ["LONGEST_WITHOUT_WORKER", "WorkerWatch"]
@@ -18,7 +18,7 @@ LONGEST_WITHOUT_WORKER = 3600.0
 
 
 class WorkerWatch:
-    """Context in which a cluster is kept from losing its workers for good, and a wait without workers ends.
+    """Keeps a cluster from losing its workers for good, and ends a wait without workers.
 
     A cluster of dask closes the nanny of a worker that is absent at the instant 15 s after it was lost
     (``distributed.deploy.lost-worker-timeout``), and never starts it again: on a busy machine the new process may need
@@ -29,32 +29,35 @@ class WorkerWatch:
     ----------
     client : dask.distributed.Client
         The client.
-    futures : sequence of Future
-        What is waited for; cancelled after `LONGEST_WITHOUT_WORKER` without any worker.
+    futures : callable
+        Returns the futures that are waited for; they are cancelled after `LONGEST_WITHOUT_WORKER` without any worker.
 
-    Raises
-    ------
-    RuntimeError
-        On exit, if the wait was ended for want of a worker.
+    Attributes
+    ----------
+    gave_up : bool
+        Whether the futures were cancelled for want of a worker.
     """
 
-    def __init__(self, client: Any, futures: Sequence[Any]):
+    def __init__(self, client: Any, futures: Callable[[], Sequence[Any]]):
         self._client, self._futures = client, futures
-        self._ends, self._gave_up = threading.Event(), False
+        self._ends, self.gave_up = threading.Event(), False
         self._asked: tuple[set, float] = (set(), 0.0)
-        self._thread = threading.Thread(target=self._watch, name="watch of dask workers", daemon=True)
 
-    def __enter__(self) -> "WorkerWatch":
-        self._thread.start()
-        return self
+    @property
+    def error(self) -> RuntimeError:
+        """The error where `gave_up`."""
+        return RuntimeError(
+            f"the dask cluster has had no worker for {LONGEST_WITHOUT_WORKER:g} s: start workers or scale the "
+            "cluster, and run again. Evaluations that are stored are not repeated"
+        )
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: Any) -> None:
+    def start(self) -> None:
+        """Begin to watch, in a thread."""
+        threading.Thread(target=self._watch, name="watch of dask workers", daemon=True).start()
+
+    def stop(self) -> None:
+        """End the watch."""
         self._ends.set()
-        if self._gave_up and isinstance(error, Exception):
-            raise RuntimeError(
-                f"the dask cluster has had no worker for {LONGEST_WITHOUT_WORKER:g} s: start workers or scale the "
-                "cluster, and run again. Evaluations that are stored are not repeated"
-            ) from error
 
     def _watch(self) -> None:
         last_seen = time.monotonic()
@@ -64,9 +67,9 @@ class WorkerWatch:
                 if self._client.nthreads():
                     last_seen = time.monotonic()
             if time.monotonic() - last_seen > LONGEST_WITHOUT_WORKER:
-                self._gave_up = True
+                self.gave_up = True
                 with contextlib.suppress(Exception):
-                    self._client.cancel(self._futures, force=True)
+                    self._client.cancel(self._futures(), force=True)
                 return
 
     def _restart_lost_workers(self, cluster: Any) -> None:

@@ -3,18 +3,24 @@
 When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Here each worker
 has a pipe of its own, so it is known which item every process was running. Only that item is run again, and it is given
 up after the third time.
+
+A thread of this process sends the items and receives the results, so that workers get their next item while the main
+thread computes. It lives as long as there are items.
 """
 
 import math
 import os
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, CancelledError, Future
+from concurrent.futures import wait as wait_for
+from multiprocessing import Pipe
 from multiprocessing.connection import wait
 from typing import Any
 
-from .faults import raise_if_refused
-from .processes import PickledFunction, RunFailed, Worker
+from .faults import ChangedModel, raise_if_refused
+from .processes import PickledFunction, RunFailed, Worker, WorkerReply
 
 __all__ = ["LocalPool", "Outcome"]
 
@@ -23,6 +29,16 @@ _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
 """Result and an empty reason, or None and the reason of a failure; mapped functions return this."""
+
+
+class _Job(Future):
+    """An item with its function; the future of its result."""
+
+    def __init__(self, function: PickledFunction, source: Any, item: Any) -> None:
+        super().__init__()
+        self.function, self.source, self.item = function, source, item
+        self.deaths = 0
+        self.given_up = False
 
 
 def _is_positive_whole(value: Any) -> bool:
@@ -35,12 +51,13 @@ def _is_positive_whole(value: Any) -> bool:
 class LocalPool:
     """Pool of processes of this machine.
 
-    The processes start with the first `map`. They end with `close`, when this object is garbage-collected, or when this
+    The processes start with the first item. They end with `close`, when this object is garbage-collected, or when this
     process exits, even if it is killed. A process that dies is replaced and its item run again; the other items are not
     affected. Linear algebra and numba use one thread per process, unless environment variables such as
     OMP_NUM_THREADS say otherwise.
 
-    A pool can be shared by several likelihoods, and can be the ``pool=`` of samplers.
+    A pool can be shared by several likelihoods, and can be the ``pool=`` of samplers. Its methods may be called from
+    several threads.
 
     Parameters
     ----------
@@ -57,6 +74,7 @@ class LocalPool:
     """
 
     other_processes = True
+    submits = True
 
     def __init__(self, workers: int, runs_per_process: int | None = None) -> None:
         if not _is_positive_whole(workers):
@@ -73,8 +91,21 @@ class LocalPool:
         self._environment = {
             f"{library}_NUM_THREADS": "1" for library in _THREADS if f"{library}_NUM_THREADS" not in os.environ
         }
+        self._set_up()
+
+    def _set_up(self) -> None:
+        self._owner, self._lock = os.getpid(), threading.RLock()
+        self._waiting: deque[_Job] = deque()
+        self._running: dict[Worker, _Job | None] = {}  # each worker's job, None while it loads a function
         self._free: list[Worker] = []
-        self._lock = threading.Lock()
+        self._deaths_loading: Counter[bytes] = Counter()  # in succession, by function
+        self._thread: threading.Thread | None = None
+        self._woken, self._wake = Pipe(duplex=False)
+        self._finished: list[tuple[_Job, Any, BaseException | None]] = []  # with a result or an error, not yet set
+        self._is_woken = self._gives_up = (
+            False  # the thread has been sent a message; jobs that were started are given up
+        )
+        self._last: tuple[Any, PickledFunction | None] = None, None  # the function that was submitted last
 
     def __enter__(self) -> "LocalPool":
         return self
@@ -91,13 +122,17 @@ class LocalPool:
         return self.workers
 
     def close(self) -> None:
-        """End the processes; another `map` starts new ones."""
+        """Give up all items and end the processes; another item starts new ones."""
+        self._notice_fork()
+        with self._lock:
+            left = [*self._waiting, *filter(None, self._running.values())]
+        self.give_up(left)
         with self._lock:
             while self._free:
                 self._free.pop().kill()
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """Results of a function for every item, in their order.
+        """Results of a function for every item, in their order; they run before items that were submitted.
 
         An item whose process died three times gets the `Outcome` ``(None, reason)``.
 
@@ -110,77 +145,234 @@ class LocalPool:
         Exception
             The first exception that `function` raises; no further items are started.
         """
-        pickled, items = PickledFunction.of(function), list(items)
-        results: list[Any] = [None] * len(items)
-        waiting, deaths = deque(range(len(items))), Counter()
-        running: dict[Worker, int | None] = {}  # index of each worker's item, None while it loads the function
-        with self._lock:
-            try:
-                while waiting or running:
-                    while len(running) < self.workers and len(running) < len(waiting) + sum(
-                        index is not None for index in running.values()
-                    ):
-                        worker = self._take()
-                        running[worker] = None
-                        if worker.key == pickled.key:
-                            self._next(worker, running, waiting, items)
-                        else:
-                            worker.load(pickled)
-                    wait([worker.connection for worker in running], timeout=1.0)
-                    for worker, index in list(running.items()):
-                        try:
-                            reply = worker.receive()
-                        except RunFailed as error:
-                            del running[worker]
-                            self._died(index, error.reason, deaths, waiting, results)
-                            continue
-                        if reply is None:
-                            continue
-                        if reply.kind == "unusable":
-                            raise_if_refused(reply.value)
-                            raise ValueError(f"{function!r} cannot be loaded in a worker process: {reply.value}")
-                        if reply.kind == "raised":
-                            raise reply.value
-                        if index is None:
-                            deaths[None] = 0  # the function can be loaded
-                        else:
-                            results[index] = reply.value
-                        if worker.runs >= (self.runs_per_process or math.inf):
-                            del running[worker]
-                            worker.kill()  # another one is started if items are waiting
-                        else:
-                            self._next(worker, running, waiting, items)
-            except BaseException:
-                for worker in running:
-                    worker.kill()
-                raise
-        return results
+        jobs = self._enqueue(PickledFunction.of(function), function, list(items), first=True)
+        try:
+            for job in wait_for(jobs, return_when=FIRST_EXCEPTION).done:
+                job.result()
+            return [job.result() for job in jobs]
+        except BaseException:
+            self.give_up(jobs)
+            raise
 
-    def _take(self) -> Worker:
-        """An idle process, or a new one."""
+    def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
+        """Future of the result of a function for one item, as `map` gives it.
+
+        ``cancel()`` of the future has an effect until the item is sent to a process.
+        """
+        return self.submit_all(function, [item])[0]
+
+    def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
+        """Futures as of `submit` for several items.
+
+        The function is pickled again if it is another object than in the last call.
+
+        Raises
+        ------
+        ValueError
+            If the function cannot be sent to the processes.
+        """
+        last, pickled = self._last
+        if pickled is None or last is not function:
+            pickled = PickledFunction.of(function)
+            self._last = function, pickled
+        return self._enqueue(pickled, function, items)
+
+    def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
+        """Cancel items; with `running`, the processes of those that run are killed. Results that are there are kept."""
+        self._notice_fork()
+        for job in futures:
+            if not job.cancel() and running:
+                job.given_up = True
+        with self._lock:
+            if self._thread is None:
+                return
+            self._gives_up = True
+            self._wake_thread()
+        if threading.current_thread() is not self._thread:
+            wait_for([job for job in futures if job.given_up])
+
+    def _notice_fork(self) -> None:
+        """In a forked process: forget the parent's workers and thread."""
+        if self._owner != os.getpid():
+            self._set_up()
+
+    def _enqueue(
+        self, pickled: PickledFunction, function: Any, items: Sequence[Any], first: bool = False
+    ) -> list[_Job]:
+        self._notice_fork()
+        pickled.script()  # raises here what would be raised in the thread
+        jobs = [_Job(pickled, function, item) for item in items]
+        if not jobs:
+            return jobs
+        with self._lock:
+            if first:
+                self._waiting.extendleft(reversed(jobs))
+            else:
+                self._waiting.extend(jobs)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._serve, name="LocalPool", daemon=True)
+                self._thread.start()
+            else:
+                self._wake_thread()
+        return jobs
+
+    def _wake_thread(self) -> None:
+        """End the thread's wait for replies; one message at a time, so that the pipe cannot be full."""
+        if not self._is_woken:
+            self._is_woken = True
+            self._wake.send_bytes(b"")
+
+    # in the thread ------------------------------------------------------------------------------------------------
+
+    def _serve(self) -> None:
+        """Send items and receive results until there are none."""
+        try:
+            while True:
+                with self._lock:
+                    self._start_jobs()
+                    finished, self._finished = self._finished, []
+                    ends = not self._running
+                    if ends:
+                        self._thread = None
+                    connections = [self._woken, *(worker.connection for worker in self._running)]
+                for job, result, error in finished:
+                    _fail(job, error) if error is not None else job.set_result(result)
+                if ends:
+                    return
+                woken = self._woken in wait(connections, timeout=1.0)
+                with self._lock:
+                    if woken:
+                        self._woken.recv_bytes()
+                        self._is_woken = False
+                    self._receive()
+        except BaseException as error:  # such as an operating system that starts no process
+            with self._lock:
+                self._thread = None
+                left = [job for job, _, _ in self._finished]
+                left += [*self._waiting, *filter(None, self._running.values())]
+                for worker in self._running:
+                    worker.kill()
+                self._finished = []
+                self._waiting.clear()
+                self._running.clear()
+            for job in left:
+                _fail(job, error)
+
+    def _start_jobs(self) -> None:
+        """Give free workers their next items, and start as many workers as there are items for."""
+        loading = sum(job is None for job in self._running.values())
+        while len(self._running) < self.workers and loading < len(self._waiting):
+            if self._waiting[0].cancelled():
+                self._waiting.popleft()
+                continue
+            function = self._waiting[0].function
+            worker = self._take(function.key)
+            if worker.key == function.key:
+                self._next(worker)
+            else:
+                self._running[worker] = None
+                worker.load(function)
+                loading += 1
+
+    def _take(self, key: bytes) -> Worker:
+        """An idle process, preferably with the function of a key, or a new one."""
+        self._free.sort(key=lambda worker: worker.key == key)
         while self._free:
             worker = self._free.pop()
             if worker.alive:
                 return worker
         return Worker(self._environment)
 
-    def _next(self, worker: Worker, running: dict, waiting: deque, items: list) -> None:
-        """Send the next item to a worker that has loaded the function, or make it idle."""
-        if waiting:
-            running[worker] = index = waiting.popleft()
-            worker.submit(items[index])
-        else:
-            del running[worker]
-            self._free.append(worker)
+    def _next(self, worker: Worker) -> None:
+        """Send the next item to a worker that has loaded its function, or make the worker idle."""
+        self._running.pop(worker, None)
+        if worker.runs >= (self.runs_per_process or math.inf):
+            worker.kill()  # another one is started if items are waiting
+            return
+        for place, job in enumerate(self._waiting):
+            if job.function.key != worker.key or job.cancelled():
+                continue
+            if job.running() or job.set_running_or_notify_cancel():
+                del self._waiting[place]
+                try:
+                    worker.submit(job.item)
+                except Exception as error:  # the item cannot be pickled
+                    self._finished.append((job, None, error))
+                    worker.kill()
+                else:
+                    self._running[worker] = job
+                return
+        self._free.append(worker)
 
-    @staticmethod
-    def _died(index: int | None, reason: str, deaths: Counter, waiting: deque, results: list) -> None:
+    def _receive(self) -> None:
+        """Take what the workers have answered, and the results of those that have died."""
+        if self._gives_up:  # jobs that wait for another attempt cannot be cancelled
+            self._gives_up = False
+            self._finished += [(job, None, CancelledError()) for job in self._waiting if job.given_up]
+            self._waiting = deque(job for job in self._waiting if not job.given_up)
+        for worker, job in list(self._running.items()):
+            if job is not None and job.given_up:
+                self._end(worker)
+                self._finished.append((job, None, CancelledError()))
+                continue
+            try:
+                reply = worker.receive()
+            except RunFailed as error:
+                del self._running[worker]
+                self._died(worker.key, job, error.reason)
+                continue
+            except BaseException as error:  # a reply whose unpickling raises
+                reply = WorkerReply("raised", error)
+            if reply is None:
+                continue
+            if job is not None:
+                failed = reply.kind == "raised"
+                self._finished.append((job, None, reply.value) if failed else (job, reply.value, None))
+            elif reply.kind == "loaded":
+                self._deaths_loading[worker.key] = 0
+            else:
+                self._end(worker)
+                self._drop(worker.key, lambda job, reply=reply: _unusable(job.source, reply))
+                continue
+            self._next(worker)
+
+    def _end(self, worker: Worker) -> None:
+        del self._running[worker]
+        worker.kill()
+
+    def _died(self, key: bytes, job: _Job | None, reason: str) -> None:
         """Count the death of a worker: put its item first in the queue, or give it up."""
-        deaths[index] += 1
-        if index is None:
-            if deaths[index] == MAX_ATTEMPTS:
-                raise RuntimeError(f"{reason} while loading the model; see its output on stderr")
-        elif deaths[index] == MAX_ATTEMPTS:
-            results[index] = None, reason
+        if job is None:
+            self._deaths_loading[key] += 1
+            if self._deaths_loading[key] == MAX_ATTEMPTS:
+                del self._deaths_loading[key]
+                text = f"{reason} while loading the model; see its output on stderr"
+                self._drop(key, lambda _: RuntimeError(text))
+            return
+        job.deaths += 1
+        if job.deaths == MAX_ATTEMPTS:
+            self._finished.append((job, (None, reason), None))
+        elif job.given_up:
+            self._finished.append((job, None, CancelledError()))
         else:
-            waiting.appendleft(index)
+            self._waiting.appendleft(job)
+
+    def _drop(self, key: bytes, error: Callable[[_Job], Exception]) -> None:
+        """Remove the waiting items of a function that cannot be used."""
+        self._finished += [(job, None, error(job)) for job in self._waiting if job.function.key == key]
+        self._waiting = deque(job for job in self._waiting if job.function.key != key)
+
+
+def _fail(job: _Job, error: BaseException) -> None:
+    """Set the exception of a job, whether it was started or not."""
+    if job.running() or (not job.cancelled() and job.set_running_or_notify_cancel()):
+        job.set_exception(error)
+
+
+def _unusable(function: Any, reply: WorkerReply) -> Exception:
+    """The error for a function that cannot be loaded in a worker."""
+    try:
+        raise_if_refused(str(reply.value))
+    except ChangedModel as error:
+        return error
+    return ValueError(f"{function!r} cannot be loaded in a worker process: {reply.value}")

@@ -15,7 +15,7 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.probability.failures import TooManyFailures
-from fe_likelihoods.simulation import dask_workers, executors, processes
+from fe_likelihoods.simulation import dask_executor, dask_workers, executors, processes
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -183,25 +183,46 @@ class Cluster:
 
     def map(self, function, groups, pure):
         self.workers = {}
-        self.answers = [function(group) for group in groups]
-        return self.answers
+        self.futures = [Waiting(function(group)) for group in groups]
+        threading.Thread(target=self._end, daemon=True).start()
+        return self.futures
+
+    def _end(self):
+        assert self.ended.wait(10.0), "the map waits for ever"
+        for future in self.futures:
+            future.end("cancelled" if self.cancelled else "finished")
 
     def gather(self, futures):
-        assert self.ended.wait(10.0), "the map waits for ever"
-        if self.cancelled:
-            raise OSError("cancelled")
-        return self.answers
+        return [future.answer for future in futures]
 
-    def cancel(self, futures, force):
+    def cancel(self, futures, force=False):
         self.cancelled = futures
         self.ended.set()
+
+
+class Waiting:
+    """A future of such a cluster."""
+
+    def __init__(self, answer):
+        self.answer, self.status, self.callbacks = answer, "pending", []
+
+    def add_done_callback(self, callback):
+        self.callbacks.append(callback)
+
+    def end(self, status):
+        self.status = status
+        for callback in self.callbacks:
+            callback(self)
+
+    def result(self):
+        raise OSError("cancelled")
 
 
 @pytest.mark.parametrize("restarts", [True, False])
 def test_a_map_never_waits_for_workers_that_dask_has_given_up(restarts, monkeypatch):
     monkeypatch.setattr(dask_workers, "SECONDS_BETWEEN_CHECKS", 0.01)
     monkeypatch.setattr(dask_workers, "LONGEST_WITHOUT_WORKER", 10.0 if restarts else 0.1)
-    monkeypatch.setattr(executors, "wait_for_nanny", lambda: None)
+    monkeypatch.setattr(dask_executor, "wait_for_nanny", lambda: None)
     client = Cluster(restarts)
     pool = executors.DaskExecutor(client)
     if restarts:

@@ -20,7 +20,7 @@ from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation import executors
+from fe_likelihoods.simulation import dask_executor, sent_functions
 from fe_likelihoods.simulation.executors import DaskExecutor, LocalPool, PoolExecutor, as_executor
 from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
 from tests.faults import treacherous
@@ -38,7 +38,7 @@ class Recorder:
     def map(self, function, items):
         for item in items:
             if self.forget:
-                executors.loaded_functions.clear()
+                sent_functions.loaded_functions.clear()
             task = pickle.dumps((function, item))
             self.bytes.append(len(task))
             function, item = pickle.loads(task)
@@ -47,7 +47,7 @@ class Recorder:
 
 @pytest.fixture(autouse=True)
 def nothing_known():
-    executors.loaded_functions.clear()
+    sent_functions.loaded_functions.clear()
 
 
 @pytest.fixture
@@ -108,6 +108,15 @@ def test_kind_of_executor():
 def test_dask_sends_short_runs_in_groups_and_long_ones_one_by_one(monkeypatch):
     """A client that runs the tasks itself and records their sizes."""
 
+    class Ended:
+        status = "finished"
+
+        def __init__(self, answer):
+            self.answer = answer
+
+        def add_done_callback(self, callback):
+            callback(self)
+
     class Client:
         def __init__(self):
             self.tasks = []
@@ -118,16 +127,16 @@ def test_dask_sends_short_runs_in_groups_and_long_ones_one_by_one(monkeypatch):
         def map(self, function, groups, pure):
             assert not pure
             self.tasks.append([len(group) for group in groups])
-            return [function(group) for group in groups]
+            return [Ended(function(group)) for group in groups]
 
         def gather(self, futures):
-            return futures
+            return [future.answer for future in futures]
 
     def slow(item):
         time.sleep(0.35)
         return item, ""
 
-    monkeypatch.setattr(executors, "wait_for_nanny", lambda: None)
+    monkeypatch.setattr(dask_executor, "wait_for_nanny", lambda: None)
     client = Client()
     executor = as_executor(client)
     items = list(range(64))
@@ -171,7 +180,7 @@ def test_a_sent_function_is_private_and_its_digest_is_checked(tmp_path):
     assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
     evil = tmp_path / "evil"
     path.write_bytes(b"cos\nmkdir\n(V" + str(evil).encode() + b"\ntR.")  # a pickle that makes a folder
-    executors.loaded_functions.clear()
+    sent_functions.loaded_functions.clear()
     with pytest.raises(RuntimeError, match="the pickled function has been changed after it was sent"):
         simulate_batch(model, thetas, executor)
     assert not evil.exists()
@@ -186,7 +195,7 @@ def test_bytes_sent_with_each_item(forget, monkeypatch):
     executor = as_executor(recorder)
     treacherous.LOADED.clear()
     if forget:  # as on another machine without the folder: the model is sent with the items
-        monkeypatch.setattr(executors.Path, "read_bytes", _absent_file)
+        monkeypatch.setattr(sent_functions.Path, "read_bytes", _absent_file)
     for _ in range(2):
         batch = simulate_batch(model, thetas, executor)
         assert batch.reasons == [""] * 20
@@ -203,7 +212,7 @@ def test_a_worker_keeps_a_bounded_number_of_functions():
         model = Treacherous()
         model.ballast = ballast
         simulate_batch(model, np.array([[0.1, 0.2]]), executor)
-    assert len(executors.loaded_functions) == executors.MAX_LOADED_FUNCTIONS
+    assert len(sent_functions.loaded_functions) == sent_functions.MAX_LOADED_FUNCTIONS
 
 
 def test_temporary_files_are_removed_with_the_executor():

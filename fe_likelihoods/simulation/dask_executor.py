@@ -1,0 +1,282 @@
+"""Executor for the cluster of a ``dask.distributed.Client``, for work on several machines."""
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future
+from concurrent.futures import wait as wait_for
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+from .dask_workers import WorkerWatch
+from .faults import TransientReason
+from .local_pool import Outcome
+from .pool_executor import PoolExecutor, resolve
+from .sent_functions import FunctionReference, Missing, Unusable
+
+__all__ = ["DaskExecutor", "wait_for_nanny"]
+
+logger = logging.getLogger(__name__)
+
+MAX_ATTEMPTS = 3  # attempts of dask, each of which ends with the death of a number of workers
+SECONDS_FOR_MESSAGES = 0.2  # within which dask reports all tasks that it has given up with a worker
+_DIED = TransientReason("the worker process died in every attempt of dask")
+
+
+class _Item(Future):
+    """Future of one item, with the function."""
+
+    def __init__(self, item: Any, references: tuple[FunctionReference, FunctionReference]) -> None:
+        super().__init__()
+        self.item, self.references, self.carried = item, references, False
+        self.deaths = 0  # attempts of dask that ended with the death of the worker
+
+    @property
+    def reference(self) -> FunctionReference:
+        return self.references[self.carried]
+
+
+class _Group:
+    """Items that are one task of dask."""
+
+    def __init__(self, items: list[_Item], losses_before: int) -> None:
+        self.items, self.losses_before = items, losses_before
+        self.inner: Any = None  # dask's future
+
+
+class _Answer(NamedTuple):
+    """Outcomes of a group of items, and their total duration [s]."""
+
+    outcomes: list
+    seconds: float
+
+
+class DaskExecutor(PoolExecutor):
+    """Executor for the cluster of a ``dask.distributed.Client``.
+
+    A task costs dask about 2 ms of all processors, so short simulations are sent in groups. The groups are large at
+    first and single items at last, so that the workers finish together. No group takes longer than about a second, by
+    the duration of earlier simulations, so that little is repeated if a worker dies. dask retries a group whose worker
+    died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). It counts the death also
+    against other tasks on that worker. An item is the cause, and gets ``(None, reason)``, if it was a task of its own
+    and dask has given up no other task meanwhile, or after the third time. Otherwise the items are run again, alone and
+    one after the other, beside those that are not suspected. Workers that the cluster has given up are started again,
+    and nothing waits for ever (`WorkerWatch`).
+
+    Parameters
+    ----------
+    pool : dask.distributed.Client
+    """
+
+    other_processes = True
+    submits = True
+
+    def __init__(self, pool: Any) -> None:
+        super().__init__(pool)
+        self._seconds: float | None = None  # mean duration of an item in the last map or stream
+        self._total, self._done = 0.0, 0
+        self._lock = threading.RLock()
+        self._sent: set[_Group] = set()
+        self._ended: deque[_Group] = deque()  # of which dask has reported the end
+        self._suspects: deque[_Item] = deque()
+        self._suspect: _Group | None = None  # the one that runs
+        self._losses = 0  # tasks that dask has given up
+        self._watch: WorkerWatch | None = None
+
+    @property
+    def n_workers(self) -> int | None:
+        """Number of threads of all workers that the cluster has at present."""
+        return sum(self.pool.nthreads().values()) or None
+
+    def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
+        """As `PoolExecutor.map`."""
+        futures = self._enqueue(self._references(function), list(items))
+        try:
+            for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
+                future.result()
+            return [future.result() for future in futures]
+        except BaseException:
+            self.give_up(futures)
+            raise
+
+    def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
+        """As `PoolExecutor.submit_all`; short simulations of one call may be one task."""
+        if self._last is None or self._last[0] is not function:
+            self._last = function, *self._references(function)
+        return self._enqueue(self._last[1:], items)
+
+    def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
+        """Cancel items; with `running`, also those that a worker has received."""
+        with self._lock:
+            wanted = set(futures)
+            at_work = set() if running else {key for keys in self.pool.processing().values() for key in keys}
+            self._suspects = deque(item for item in self._suspects if item not in wanted)
+            groups = [
+                group
+                for group in self._sent
+                if wanted.issuperset(group.items) and getattr(group.inner, "key", None) not in at_work
+            ]
+            left = {item for group in self._sent for item in group.items}
+            self._forget(groups)
+        if groups:
+            self.pool.cancel([group.inner for group in groups])
+        cancelled = {item for group in groups for item in group.items}
+        for future in futures:
+            if future in cancelled or future not in left:
+                future.cancel()
+
+    # sending ------------------------------------------------------------------------------------------------------
+
+    def _enqueue(self, references: tuple, items: Sequence[Any]) -> list[_Item]:
+        futures = [_Item(item, references) for item in items]
+        if not futures:
+            return futures
+        n_workers = self.n_workers if len(items) > 1 or not self._sent else 1
+        if not n_workers:
+            logger.warning(
+                "The dask cluster has no worker; %d simulations wait for one. Start workers or scale the cluster",
+                len(items),
+            )
+        with self._lock:
+            if self._done:
+                self._seconds = self._total / self._done
+            if not self._sent:
+                self._total, self._done = 0.0, 0
+            largest = 1 if self._seconds is None else int(1.0 / max(self._seconds, 1e-3))
+            self._send(_groups(futures, n_workers or 1, largest))
+        return futures
+
+    def _send(self, groups: list[list[_Item]]) -> list[_Group]:
+        """Send groups of items with the same function; the lock is held."""
+        sent = [_Group(items, self._losses) for items in groups]
+        if not self._sent:
+            self._watch = WorkerWatch(self.pool, lambda: [group.inner for group in self._sent])
+            self._watch.start()
+        self._sent.update(sent)
+        function = partial(_run_group, groups[0][0].reference)
+        try:
+            inner = self.pool.map(function, [[item.item for item in items] for items in groups], pure=False)
+        except BaseException:
+            self._forget(sent)
+            raise
+        for group, future in zip(sent, inner, strict=True):
+            group.inner = future
+        for group in sent:
+            group.inner.add_done_callback(partial(self._report, group))
+        return sent
+
+    def _forget(self, groups: Iterable[_Group]) -> None:
+        """Groups have ended; the lock is held."""
+        self._sent.difference_update(groups)
+        if self._suspect is not None and self._suspect not in self._sent:
+            self._suspect = None
+        if not self._sent and self._watch is not None:
+            self._watch.stop()
+
+    # receiving, in a thread of dask -------------------------------------------------------------------------------
+
+    def _report(self, group: _Group, inner: Any) -> None:
+        """Receive a group that has ended, and others with it."""
+        self._ended.append(group)
+        ended = []
+        while self._ended:
+            ended.append(self._ended.popleft())
+        finished = [group for group in ended if group.inner.status == "finished"]
+        try:
+            answers = self.pool.gather([group.inner for group in finished]) if finished else []
+        except Exception:  # a worker was lost with its results: dask has repeated them, with another end
+            answers = [None] * len(finished)
+        known = dict(zip(finished, answers, strict=True))
+        for group in ended:
+            if group in self._sent:
+                self._receive(group, known.get(group))
+
+    def _receive(self, group: _Group, answer: _Answer | None) -> None:
+        try:
+            answer = group.inner.result() if answer is None else answer
+        except BaseException as error:
+            with self._lock:
+                gave_up = self._watch.gave_up
+                if type(error).__name__ == "KilledWorker":
+                    self._lose(group)
+                    return
+                self._forget([group])
+                self._try_next_suspect()
+            if gave_up:
+                error = self._watch.error
+            elif not isinstance(error, Exception) or type(error).__name__ == "FutureCancelledError":
+                error = RuntimeError(f"dask has cancelled a simulation ({error}); run again with a new client")
+            for item in group.items:
+                resolve(item, error=error)
+            return
+        with self._lock:
+            self._forget([group])
+            self._total, self._done = self._total + answer.seconds, self._done + len(answer.outcomes)
+            missing = [
+                item for item, outcome in zip(group.items, answer.outcomes, strict=True) if _again(item, outcome)
+            ]
+            if missing:
+                for item in missing:
+                    item.carried = True
+                self._send([[item] for item in missing])
+            self._try_next_suspect()
+        for item, outcome in zip(group.items, answer.outcomes, strict=True):
+            if isinstance(outcome, Unusable):
+                resolve(item, error=outcome.error)
+            elif item not in missing:
+                resolve(item, outcome)
+
+    def _lose(self, group: _Group) -> None:
+        """Give up the item of a task whose worker died in every attempt, or suspect the items."""
+        time.sleep(SECONDS_FOR_MESSAGES)
+        others = self._losses > group.losses_before or any(
+            other is not group and other.inner is not None and other.inner.status == "error" for other in self._sent
+        )
+        self._losses += 1
+        for item in group.items:
+            item.deaths += 1
+            if item.deaths == MAX_ATTEMPTS or (len(group.items) == 1 and not others):
+                resolve(item, (None, _DIED))
+            else:
+                self._suspects.append(item)
+        self._forget([group])
+        self._try_next_suspect()
+
+    def _try_next_suspect(self) -> None:
+        while self._suspect is None and self._suspects:
+            item = self._suspects.popleft()
+            if not item.cancelled():
+                (self._suspect,) = self._send([[item]])
+
+
+def _again(item: _Item, outcome: Any) -> bool:
+    """Whether an item has to be sent again, together with the function."""
+    return isinstance(outcome, Missing) and not item.carried and not item.cancelled()
+
+
+def _run_group(function: Callable, items: list) -> _Answer:
+    """Run the items of a group one after the other; called in the worker."""
+    wait_for_nanny()
+    start = time.perf_counter()
+    return _Answer([function(item) for item in items], time.perf_counter() - start)
+
+
+@cache
+def wait_for_nanny() -> None:
+    """Wait once per process, because dask's nanny does not replace a worker that dies before its start is reported.
+
+    An item that kills every new worker at once would otherwise leave a cluster without workers, and the run would hang.
+    """
+    time.sleep(0.5)
+
+
+def _groups(items: list, n_workers: int, largest: int) -> list[list]:
+    """Groups of items: each is half of a worker's share of the remaining items, at least one and at most `largest`."""
+    groups, start = [], 0
+    while start < len(items):
+        size = min(max(1, (len(items) - start) // (2 * n_workers)), max(1, largest))
+        groups.append(items[start : start + size])
+        start += size
+    return groups
