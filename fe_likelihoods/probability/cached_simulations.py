@@ -1,17 +1,15 @@
-"""Simulations of a model and their statistics against measurements: counted, cached, and run in chunks.
+"""Simulations of a model and their statistics against measurements: counted and cached.
 
 `CachedSimulations.statistics` and, where responses are needed, `CachedSimulations.simulate` are the only places where a
 likelihood requests simulations. Both look for results in this order: statistics in memory, statistics on disk,
 responses in memory, responses on disk. From a response, which is cached in double precision, the statistics are
-computed; they have the same bits as those of a new simulation. What is left is simulated, counted and cached.
+computed; they have the same bits as those of a new simulation. What is left is simulated by the base class.
 """
 
 import hashlib
 import os
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,34 +19,27 @@ from ..signals.comparison import Comparison, compare_with
 from ..simulation.changed_model import ModelGuard
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
-from ..simulation.faults import ChangedModel
 from ..simulation.fingerprint import read_attributes_again, simulation_fingerprint
 from ..simulation.memory_cache import MemoryCache, ResponseMemory, distinct_keys
 from ..simulation.model import (
     Model,
     SimulationBatch,
     Statistic,
-    has_batch_method,
-    misfit_batch,
     misfit_of_responses,
-    simulate_batch,
     statistic_width,
 )
 from ..simulation.repeated_points import RepeatedPoints
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .inputs import as_rows, check_statistic, name_of_statistic
-from .requested_simulations import Requested, Simulated
+from .new_simulations import NewSimulations
+from .requested_simulations import Requested
 from .sample_counts import count_samples
 
 __all__ = ["CachedSimulations"]
 
-_SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
-_ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
-_RESPONSE_VALUES = 2**23  # responses held at once where they are cached: 64 MiB
 
-
-class CachedSimulations:
+class CachedSimulations(NewSimulations):
     """Base of `FELikelihood`, which documents the attributes: a model's simulations, each of which is run once.
 
     Parameters
@@ -96,10 +87,10 @@ class CachedSimulations:
         self.chunk_size = 1
         self.simulations = self.cache_hits = self.disk_hits = 0
         self.seconds = 0.0
-        self._outcomes = 0  # simulations of which is known whether they failed: run here, read from disk, or recalled
+        self._outcomes = 0
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"pool": None}
+        return self.__dict__ | {"pool": None, "_running": None}
 
     @property
     def verifications(self) -> int:
@@ -260,6 +251,34 @@ class CachedSimulations:
                 if reasons[row]:
                     self._failures.add(thetas[row], reasons[row])
 
+    def look_up(self, keys: list[bytes], distinct: list[int], on_disk: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Statistics that are cached, without a new simulation of others.
+
+        Parameters
+        ----------
+        keys : list of n bytes
+            Distinct, see `distinct_keys`.
+        distinct : list of int
+            Index of the key of every row that was requested, for the counts.
+        on_disk : bool
+            Whether to look in the cache on disk as well. Some of its rows may be simulated again for verification.
+
+        Returns
+        -------
+        misfit : (n, n_numbers) float
+            NaN where nothing is cached and where the simulation failed.
+        cached : (n,) bool
+        """
+        misfit, known = self.memory_cache.look_up(keys, self._width)
+        known, counts = np.array(known, dtype=bool), np.bincount(distinct, minlength=len(keys))
+        if on_disk and not known.all():
+            requested = self._requested([key for key, is_known in zip(keys, known, strict=True) if not is_known])
+            self._read(requested)
+            self.disk_hits += int(counts[~known][requested.on_disk].sum())
+            misfit[~known], known[~known] = requested.misfit, requested.cached
+        self.cache_hits += int(counts[known].sum())
+        return misfit, known
+
     def _statistics(self, thetas: np.ndarray) -> np.ndarray:
         """Statistics of finite rows; few calls of numpy, because a cached row has to cost less than 10 microseconds."""
         keys, distinct = distinct_keys(thetas)
@@ -303,6 +322,16 @@ class CachedSimulations:
 
     def _obtain(self, requested: Requested) -> None:
         """Fill in what was requested, from the caches or by simulation."""
+        self._read(requested)
+        for rows, batch in self._run(requested, np.flatnonzero(~requested.cached)):
+            requested.misfit[rows] = batch.misfit
+            for row, reason in zip(np.atleast_1d(rows), batch.reasons, strict=True):
+                requested.reasons[row] = reason
+            if requested.response is not None:
+                requested.response[rows] = batch.response
+
+    def _read(self, requested: Requested) -> None:
+        """Fill in what the caches have."""
         self._read_statistics(requested)
         failed = requested.known & ~np.isfinite(requested.misfit).all(axis=1)
         # a failure needs no response
@@ -313,12 +342,6 @@ class CachedSimulations:
         for start in range(0, len(left), size):
             self._read_responses(requested, left[start : start + size])
         self._read_failures(requested, np.flatnonzero(~requested.cached & ~requested.known))
-        for rows, batch in self._chunks(requested, np.flatnonzero(~requested.cached)):
-            requested.misfit[rows] = batch.misfit
-            for row, reason in zip(rows, batch.reasons, strict=True):
-                requested.reasons[row] = reason
-            if requested.response is not None:
-                requested.response[rows] = batch.response
 
     def _read_statistics(self, requested: Requested) -> None:
         """Fill in statistics from the cache on disk; they are then cached in memory, and failures recorded."""
@@ -413,83 +436,3 @@ class CachedSimulations:
         outcomes = self.response_memory.look_up(self.model.fingerprint, [requested.keys[row] for row in rows])
         for row, outcome in zip(rows, outcomes, strict=True):
             requested.reasons[row] = outcome if isinstance(outcome, str) else "the simulation failed before"
-
-    def _chunks(self, requested: Requested, left: np.ndarray) -> Iterator[tuple[np.ndarray, Simulated]]:
-        """Simulate the rows `left` in chunks that are stored one by one; yields their indices and results."""
-        responses = requested.response is not None
-        smallest, largest = self._chunk_limits(len(left), responses) if len(left) else (0, 0)
-        while len(left):
-            size = max(smallest, min(largest, self.chunk_size))
-            rows, left = left[:size], left[size:]
-            start = time.perf_counter()
-            batch = self._simulate([requested.keys[row] for row in rows], requested.thetas[rows], responses)
-            # the size grows by steps: the first simulations may be failures that took no time
-            self.chunk_size = min(4 * size, 1 + int(_SECONDS_PER_CHUNK * len(rows) / (time.perf_counter() - start)))
-            yield rows, batch
-
-    @property
-    def _most_responses(self) -> int:
-        """Number of responses that are held at once where they are cached."""
-        return max(1, _RESPONSE_VALUES // (self._response_shape[0] * self._response_shape[1]))
-
-    def _chunk_limits(self, n: int, responses: bool) -> tuple[int, int]:
-        """Smallest (all workers are busy) and largest number of simulations, of n, between two writes to disk."""
-        if self.cache is None:
-            return n, n
-        largest = self._most_responses if responses or self.cache.responses else n
-        if self.pool is not None:
-            workers = self.pool.n_workers or n
-        elif has_batch_method(self.model):
-            workers = os.cpu_count() or 1
-        else:
-            return 1, largest
-        return min(_ROUNDS_PER_CHUNK * workers, largest), largest
-
-    def _check_model(self, check: Callable, *arguments: Any) -> None:
-        """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
-        run = VerifyingRun(self.model, self.pool, self.measured, self._statistic, self._width)
-        try:
-            check(self.model, partial(self._repeated_points.agree, run, self.cache), *arguments)
-        except ChangedModel:
-            self.memory_cache.clear()
-            self.response_memory.clear()
-            if self.cache is not None and self._guard.unchecked:
-                unchecked = np.concatenate(self._guard.unchecked)
-                self.cache.discard(unchecked, self._key, simulation_fingerprint(self.model))
-            raise
-
-    def _simulate(self, keys: list[bytes], thetas: np.ndarray, responses: bool) -> Simulated:
-        """Results of new simulations, which are counted, recorded if they fail, and cached in memory and on disk."""
-        # checked before a batch and not after it, so that finished simulations are stored
-        self._failures.check(self._outcomes)
-        self._check_model(self._guard.before)
-        start = time.perf_counter()
-        batch = None
-        if responses or (self.cache is not None and self.cache.responses):
-            batch = simulate_batch(self.model, thetas, self.pool)
-            misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self._statistic)
-        else:
-            misfit, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self._statistic)
-        seconds = time.perf_counter() - start
-        self.seconds += seconds
-        self.simulations += len(thetas)
-        self._outcomes += len(thetas)
-        for theta, reason in zip(thetas, reasons, strict=True):
-            if reason:
-                self._failures.add(theta, reason)
-        self._check_model(self._guard.after, thetas, self.pool is None, seconds)
-        self._repeated_points.add(thetas, misfit, reasons, unchanged=not self._guard.unchecked)
-        self.memory_cache.store(keys, misfit)
-        if responses:
-            outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
-            self.response_memory.store(self.model.fingerprint, keys, outcomes)
-        if self.cache is not None:
-            if batch is not None:
-                # before the statistics, which are computed from them if the program is killed in between
-                self.cache.store_responses(self.model, thetas, batch.response)
-            self.cache.store(self._key, thetas, self.measurements.n_steps, misfit, reasons, seconds)
-            self.cache.store_failures(self.model, thetas, reasons)
-            self._verified_cache.add_own(thetas, self._key, simulation_fingerprint(self.model))
-        if responses:
-            batch.response[[bool(reason) for reason in reasons]] = np.nan
-        return Simulated(misfit, reasons, batch.response if responses else None)

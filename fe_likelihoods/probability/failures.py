@@ -100,12 +100,18 @@ class FailureLog:
             known.add(reason)
         self.reasons[reason if reason in known else _OTHER_FAULTS if transient else _OTHER_REASONS] += 1
 
-    def check(self, n_simulations: int) -> None:
-        """Raise `TooManyFailures` if too large a share of `n_simulations` simulations (20 or more) failed."""
+    def check(self, n_simulations: int, running: int = 0) -> None:
+        """Raise `TooManyFailures` if too large a share of `n_simulations` simulations (20 or more) failed.
+
+        Simulations that are `running` count as successes, because failures often end sooner.
+        """
+        n_simulations += running
         if n_simulations >= _MIN_SIMULATIONS and self.count > self.max_share * n_simulations:
             (reason, count), *_ = self.reasons.most_common(1)
+            running_too = f" ({running} of them still run)" if running else ""
             raise TooManyFailures(
-                f"{self.count} of {n_simulations} simulations failed, {count} of them with the reason {reason!r}; the "
+                f"{self.count} of {n_simulations} simulations{running_too} failed, {count} of them with the reason "
+                f"{reason!r}; the "
                 f"largest share allowed is {self.max_share:g}. See failures and report(); then correct the model, "
                 "narrow the prior or raise max_failure_share"
             )

@@ -148,7 +148,7 @@ class JointLikelihood:
         """
         points = as_points(x, self.parameter_names)
         rows = np.atleast_2d(points)
-        parts = [(likelihood, rows[:, self._columns[key]]) for key, likelihood in self.likelihoods.items()]
+        parts = [(likelihood, rows[:, columns]) for likelihood, columns in self.parts()]
         left = np.all([likelihood.possible(part) for likelihood, part in parts], axis=0)
         total = np.where(left, 0.0, -np.inf)
         for likelihood, part in parts:
@@ -156,6 +156,10 @@ class JointLikelihood:
                 total[left] += likelihood.log_likelihood(part[left])
                 left = total > -np.inf
         return total if points.ndim == 2 else float(total[0])
+
+    def parts(self) -> list[tuple[FELikelihood, list[int]]]:
+        """The likelihoods in the order of their evaluation, with the indices of their parameters."""
+        return [(likelihood, self._columns[key]) for key, likelihood in self.likelihoods.items()]
 
     def fault(self, x: Any) -> str:
         """Reason of a failed simulation whose cause is not the model, as `FELikelihood.fault`; empty if none failed."""

@@ -257,19 +257,38 @@ class FELikelihood(CachedSimulations):
         """
         points = as_points(x, self.parameter_names)
         rows = np.atleast_2d(points)
-        thetas, noise = np.split(rows, [self._n_structural], axis=1)
-        n_samples = self.n_samples
         possible = self.possible(rows)
         result = np.full(len(rows), -np.inf)
         if possible.any():
-            misfit = self.statistics(thetas[possible])
-            values = self.noise.log_likelihood(misfit, n_samples, noise[possible])
-            usable = values < np.inf  # neither NaN nor infinite
-            simulated = np.isfinite(misfit).all(axis=1)
-            for row in np.flatnonzero(simulated & ~usable):
-                self._failures.add(thetas[possible][row], f"the log-likelihood of the noise is {values[row]}")
-            result[possible] = np.where(simulated & usable, values, -np.inf)
+            misfit = self.statistics(rows[possible, : self._n_structural])
+            result[possible] = self.of_statistics(rows[possible], misfit)
         return result if points.ndim == 2 else float(result[0])
+
+    def of_statistics(self, rows: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+        """Log-likelihood of points with possible noise parameters, from the statistics of their simulations.
+
+        Parameters
+        ----------
+        rows : (n, ndim) float
+            Structural parameters, then noise parameters.
+        misfit : (n, n_numbers) float
+            What `statistics` returns for them.
+
+        Returns
+        -------
+        (n,) float
+            -inf where the simulation failed.
+        """
+        values = self.noise.log_likelihood(misfit, self.n_samples, rows[:, self._n_structural :])
+        usable = values < np.inf  # neither NaN nor infinite
+        simulated = np.isfinite(misfit).all(axis=1)
+        for row in np.flatnonzero(simulated & ~usable):
+            self._failures.add(rows[row, : self._n_structural], f"the log-likelihood of the noise is {values[row]}")
+        return np.where(simulated & usable, values, -np.inf)
+
+    def parts(self) -> list[tuple["FELikelihood", list[int]]]:
+        """This likelihood with the indices of its parameters, as `JointLikelihood.parts`."""
+        return [(self, list(range(self.ndim)))]
 
     def possible(self, rows: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) is finite and has possible noise parameters; nothing is simulated."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .distributions import Distribution, RandomState
+from .evaluation_queue import EvaluationQueue
 from .inputs import as_points, complete_repr
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
@@ -272,6 +273,26 @@ class Posterior:
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
         return ResponseGuide(self, starts)
+
+    def evaluation_queue(self) -> EvaluationQueue:
+        """A queue of points whose log-probabilities are returned in the order in which their simulations end.
+
+        Samplers that propose points while others still run keep all workers of a pool busy with it. The values are
+        those of `log_prob`.
+
+        Returns
+        -------
+        EvaluationQueue
+            Its own points only; every queue of a posterior uses the same caches and the same pool.
+
+        Examples
+        --------
+        >>> with posterior.evaluation_queue() as queue:
+        ...     tickets = queue.submit(posterior.sample_prior(100))
+        ...     for ticket, log_prob in queue.collect():    # the first that have ended
+        ...         print(ticket, log_prob)
+        """
+        return EvaluationQueue(self.likelihood, self.prior)
 
     def fault(self, x: Any) -> str:
         """As `FELikelihood.fault`: samplers record the reason where they evaluate points in other processes.

@@ -94,8 +94,14 @@ class ModelGuard:
             self._not_before = time.monotonic() + pause
 
     def after(
-        self, model: Any, repeats: Callable[[], bool | None], thetas: np.ndarray, in_process: bool, seconds: float
-    ) -> None:
+        self,
+        model: Any,
+        repeats: Callable[[], bool | None],
+        thetas: np.ndarray,
+        in_process: bool,
+        seconds: float,
+        last: bool = True,
+    ) -> bool:
         """Compare after simulations at `thetas` (n, n_structural), if they were compared before them or took long.
 
         A model that ran in this process may have changed its own values. It then says so, with its method
@@ -110,7 +116,14 @@ class ModelGuard:
         in_process : bool
             Whether the simulations ran in this process.
         seconds : float
-            Their wall time [s].
+            Their wall time [s]; with a pool that runs without interruption, the time since the last comparison.
+        last : bool
+            Whether no other simulations run. While some do, a comparison before them is no reason for one.
+
+        Returns
+        -------
+        bool
+            Whether the model was compared.
 
         Raises
         ------
@@ -118,13 +131,14 @@ class ModelGuard:
             As for `before`.
         """
         self.unchecked.append(thetas)
-        if not self._is_due and (in_process or _SHARE_OF_TIME * seconds < self._seconds):
-            return
+        if not (self._is_due and last) and (in_process or _SHARE_OF_TIME * seconds < self._seconds):
+            return False
         if in_process and self._difference(model) is not None:
             self._state = state_of_user(model)
             if hasattr(model, "accept_own_changes"):
                 model.accept_own_changes()
         self._require_same(model, repeats)
+        return True
 
     def _require_same(self, model: Any, repeats: Callable[[], bool | None]) -> None:
         """Raise `ChangedModel` if the model differs in more than values that it may change itself."""

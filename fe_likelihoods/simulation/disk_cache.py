@@ -321,15 +321,31 @@ class SimulationCache(RowDeletion):
                 return StoredSimulation(theta, misfit, row[5].decode("utf-8", "replace"))
         return None
 
-    def is_stored(self, fingerprint: str, theta: np.ndarray) -> bool:
-        """Whether a simulation, a response or a failure is stored for one set of structural parameters."""
-        keys = simulation_keys(fingerprint, theta[None])
+    def are_stored(self, fingerprints: Sequence[str], thetas: np.ndarray) -> np.ndarray:
+        """Whether a simulation, a response or a failure is stored, under one of several fingerprints.
 
-        def count(connection: sqlite3.Connection) -> int:
-            tables = ("simulations", "responses", "failures")
-            return sum(len(select_rows(connection, keys, f"key FROM {table}")) for table in tables)
+        Parameters
+        ----------
+        fingerprints : sequence of str
+            As for `look_up`.
+        thetas : (n, n_structural) float
+            Structural parameters.
 
-        return bool(self._try("read", count, 0))
+        Returns
+        -------
+        (n,) bool
+            The rows are neither verified nor checked for damage, and not counted.
+        """
+        tables, stored = ("simulations", "responses", "failures"), np.zeros(len(thetas), dtype=bool)
+        for fingerprint in fingerprints:
+            keys = simulation_keys(fingerprint, thetas)
+
+            def find(connection: sqlite3.Connection, keys: list[bytes] = keys) -> set:
+                return {row for table in tables for (row,) in select_rows(connection, keys, f"key FROM {table}")}
+
+            found = self._try("read", find, set())
+            stored |= [key in found for key in keys]
+        return stored
 
     def info(self) -> CacheInfo:
         """State of the cache, and counts of this object."""

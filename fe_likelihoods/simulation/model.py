@@ -37,6 +37,7 @@ __all__ = [
     "misfit_of_responses",
     "not_finite",
     "real_response",
+    "sent_simulation",
     "simulate_batch",
     "split_seconds",
     "statistic_width",
@@ -270,6 +271,31 @@ def misfit_batch(
         if batch is not None:
             return MisfitBatch(*batch)
     return MisfitBatch(*_run_each(partial(_misfit, measured, reduce), model, thetas, shape, pool))
+
+
+def sent_simulation(
+    model: Model, measured: np.ndarray | Comparison | None = None, statistic: Statistic | None = None
+) -> Callable[[np.ndarray], tuple[np.ndarray | None, str]]:
+    """A function that runs one simulation in a worker of a pool, to be submitted to an executor.
+
+    Parameters
+    ----------
+    model : Model
+    measured : (n_channels, n_steps) float, or Comparison, optional
+        Measured response [SI]. Without it, the result is the response.
+    statistic : Statistic, optional
+        As for `misfit_batch`.
+
+    Returns
+    -------
+    callable
+        Takes parameters (n_parameters,); returns the result with an empty reason, or None and the reason of a failure,
+        as in `misfit_batch` or `simulate_batch`.
+    """
+    reduce = _sums_of_squares if statistic is None else statistic
+    return partial(
+        _attempt_sent, _response if measured is None else partial(_misfit, measured, reduce), SentModel(model)
+    )
 
 
 def misfit_of_responses(

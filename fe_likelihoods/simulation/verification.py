@@ -270,7 +270,7 @@ class VerifiedCache:
             self._notice_changes(fingerprint, run)
             if schedule.stale is not None:
                 differing, error = schedule.stale
-                if self.cache.is_stored(differing, error.theta):
+                if self.cache.are_stored([differing], error.theta[None])[0]:
                     raise StaleCache(str(error), error.theta)
                 schedule.stale = None
             if schedule.rows_in_pause < ROWS_PER_VERIFICATION and time.monotonic() < schedule.pause_ends:

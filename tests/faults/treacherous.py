@@ -87,6 +87,19 @@ class DiesOnce(Treacherous):
         return line(theta)
 
 
+class Gated(Treacherous):
+    """A run with an offset in (0.9, 1) takes until a folder has the file ``go``; every run leaves a file there."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        (self.folder / f"started {theta[0]!r}").touch()
+        while 0.9 < theta[0] < 1.0 and not (self.folder / "go").exists():
+            time.sleep(0.005)
+        return treacherous(theta)
+
+
 class DiesLoading:
     """A function whose first, second and fourth process dies while it loads it, and the third at its first item."""
 

@@ -295,7 +295,7 @@ def test_a_damaged_response_is_simulated_again(path, thetas):
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
         def simulate(self, theta):
@@ -315,7 +315,7 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkey
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
     expected = likelihood_of(Line()).simulate(thetas)
-    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
     batch = likelihood_of(Line(), cache=path).simulate(thetas)
     np.testing.assert_array_equal(batch.response, expected.response)
     assert batch.reasons == expected.reasons
@@ -334,7 +334,7 @@ def test_too_many_failures(thetas):
 @pytest.mark.parametrize("source", ["disk", "disk, responses", "recalled"])
 def test_known_failures_are_compared_with_all_known_simulations(source, path, thetas, monkeypatch):
     """Failures of an earlier run must not stop a run that has simulated little itself."""
-    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
     thetas = np.concatenate([thetas, thetas + [10.0, 0.4], thetas + [20.0, 0.4]])
     new = np.column_stack([np.arange(40.0), np.full(40, 0.5)])
     first = likelihood_of(Line(), cache=None if source == "recalled" else path)

@@ -383,7 +383,7 @@ def test_invalid_bounds(path, name, value):
 
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
     for model in (Line(), Batched()):
         likelihood = likelihood_of(model, path.with_name(type(model).__name__))
         np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(type(model)()).misfit(thetas))
@@ -392,7 +392,7 @@ def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
         def simulate(self, theta):
@@ -427,7 +427,7 @@ class Pool:
     ids=str,
 )
 def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attributes, sizes):
-    monkeypatch.setattr("fe_likelihoods.probability.cached_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
     pool = Pool(**attributes)
     likelihood_of(Line(), path, pool=pool).misfit(thetas[:100])
     assert pool.sizes == sizes

@@ -22,7 +22,7 @@ from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import dask_executor, sent_functions
 from fe_likelihoods.simulation.executors import DaskExecutor, LocalPool, PoolExecutor, as_executor
-from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
+from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simulate_batch
 from tests.faults import treacherous
 from tests.faults.treacherous import Absent, Large, Treacherous, Unpicklable, posterior_of
 
@@ -84,6 +84,15 @@ def test_same_bits_on_every_executor(make, oscillator, thetas, rng):
         result = misfit_batch(oscillator, thetas[:n], measured, executor)
         np.testing.assert_array_equal(result.misfit, expected.misfit[:n])
         assert result.reasons == expected.reasons[:n]
+    function = sent_simulation(oscillator, measured)
+    if executor is not None and executor.submits:
+        outcomes = [future.result() for future in executor.submit_all(function, list(thetas))]
+        np.testing.assert_array_equal([x for x, why in outcomes if not why], np.delete(expected.misfit, 5, axis=0))
+        assert [why for _, why in outcomes] == expected.reasons
+        assert executor.submit(function, thetas[5]).result() == (None, expected.reasons[5])
+    elif executor is not None:
+        with pytest.raises(ValueError, match="Recorder has map, and neither submit nor apply_async"):
+            executor.submit(function, thetas[0])
     responses = simulate_batch(oscillator, thetas, executor)
     np.testing.assert_array_equal(responses.response, simulate_batch(oscillator, thetas).response)
     for end in ("terminate", "shutdown", "close"):

@@ -1,0 +1,317 @@
+"""Evaluation of a posterior without barriers: points go out when they are submitted, and come back when they are done.
+
+A sampler that proposes points while others still run keeps all workers of a pool busy, however different the durations
+of the simulations are. A point passes through the parts of a `JointLikelihood` one after the other, as in a call of the
+posterior, and a part is not simulated where an earlier one is -inf.
+"""
+
+import logging
+import os
+import threading
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import as_completed
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from ..simulation.memory_cache import distinct_keys
+from ..simulation.model import has_batch_method
+from .inputs import as_points
+from .joint import JointLikelihood
+from .likelihood import FELikelihood
+from .new_simulations import RunningSimulation, take_all
+from .priors import Prior
+
+__all__ = ["EvaluationQueue"]
+
+logger = logging.getLogger(__name__)
+
+
+class _Point:
+    """A submitted point, and the sum of its log-likelihoods so far."""
+
+    __slots__ = ("log_likelihood", "log_prior", "row", "ticket")
+
+    def __init__(self, ticket: int, row: np.ndarray, log_prior: float) -> None:
+        self.ticket, self.row, self.log_prior = ticket, row, log_prior
+        self.log_likelihood = 0.0
+
+
+class _Part:
+    """The points that wait for the simulations of one likelihood.
+
+    Parameters
+    ----------
+    likelihood : FELikelihood
+    columns : list of int
+        Indices of its parameters among those of the posterior.
+    """
+
+    def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
+        self.likelihood, self.columns = likelihood, columns
+        self.running: dict[RunningSimulation, list[_Point]] = {}
+        self.unstarted: deque[list[_Point]] = deque()  # without a pool, or stored on disk, or after an error
+        self._cache_keys = () if likelihood.cache is None else likelihood.cache_keys
+
+    def thetas(self, points: Sequence[_Point]) -> np.ndarray:
+        """Structural parameters (n, n_structural)."""
+        n_structural = len(self.likelihood.model.parameter_names)
+        return np.concatenate([point.row[:, self.columns] for point in points])[:, :n_structural]
+
+    def are_stored(self, thetas: np.ndarray) -> np.ndarray:
+        """Whether the cache on disk has rows (n,), which are not read yet, since that may take a verification."""
+        if self.likelihood.cache is None:
+            return np.zeros(len(thetas), dtype=bool)
+        return self.likelihood.cache.are_stored(self._cache_keys, thetas)
+
+    def value(self, point: _Point, misfit: np.ndarray) -> float:
+        """Log-likelihood of a point from the statistics (n_numbers,) of its simulation."""
+        return float(self.likelihood.of_statistics(point.row[:, self.columns], misfit[None])[0])
+
+
+class EvaluationQueue:
+    """Queue of points of a posterior, see `Posterior.evaluation_queue`.
+
+    Its methods are called from one thread. With a pool of the likelihood, each simulation is sent to it when the point
+    is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `collect`
+    evaluates the points of one `submit` as a batch.
+
+    Parameters
+    ----------
+    likelihood : FELikelihood or JointLikelihood
+    prior : Prior
+        Of the same parameters.
+    """
+
+    def __init__(self, likelihood: FELikelihood | JointLikelihood, prior: Prior) -> None:
+        self._prior = prior
+        self._parts = [_Part(part, columns) for part, columns in likelihood.parts()]
+        self._arrived: SimpleQueue = SimpleQueue()
+        self._taken: list[RunningSimulation] = []  # from the queue of arrivals
+        self._finished: list[tuple[int, float]] = []
+        self._tickets = self._pending = 0
+        self._error: Exception | None = None
+        self._closed = False
+
+    def __enter__(self) -> "EvaluationQueue":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    @property
+    def workers(self) -> int | None:
+        """Number of evaluations that run at once; None if a pool does not say."""
+        pools = {id(part.likelihood.pool): part.likelihood.pool for part in self._parts}
+        sizes = [getattr(pool, "n_workers", None) for pool in pools.values() if pool is not None]
+        if not sizes:
+            return (os.cpu_count() or 1) if any(has_batch_method(part.likelihood.model) for part in self._parts) else 1
+        return None if None in sizes else sum(sizes)
+
+    def submit(self, coords: Any) -> list[int]:
+        """Submit points, without waiting for them.
+
+        Parameters
+        ----------
+        coords : (n, ndim) array_like
+            Points. Those outside the support of the prior, with impossible noise parameters, or whose simulations are
+            cached in memory, are finished at once.
+
+        Returns
+        -------
+        list of n int
+            Tickets, each of which `collect` returns once.
+
+        Raises
+        ------
+        ValueError
+            If the array has another shape.
+        RuntimeError
+            If the queue is closed.
+        """
+        self._require_open()
+        names = self._prior.names
+        rows = np.array(as_points(coords, names))
+        if rows.ndim != 2:
+            raise ValueError(f"submit: expected points of shape (n, {len(names)}); got shape {rows.shape}")
+        # row by row, so that the values are those of single points to the last bit
+        log_prior = [float(np.atleast_1d(self._prior.logpdf(row[None]))[0]) for row in rows]
+        first, self._tickets = self._tickets, self._tickets + len(rows)
+        self._pending += len(rows)
+        points = [_Point(first + place, rows[[place]], value) for place, value in enumerate(log_prior)]
+        possible = np.array(log_prior) > -np.inf
+        for part in self._parts:
+            if possible.any():
+                possible[possible] = part.likelihood.possible(rows[possible][:, part.columns])
+        for point, is_possible in zip(points, possible, strict=True):
+            if not is_possible:
+                self._finish(point, -np.inf)
+        self._advance(0, [point for point, is_possible in zip(points, possible, strict=True) if is_possible])
+        return [point.ticket for point in points]
+
+    def collect(self) -> list[tuple[int, float]]:
+        """Wait until at least one point is finished that was not collected.
+
+        Returns
+        -------
+        list of (int, float)
+            Ticket and log-probability of the finished points, in the order in which they were finished: what `log_prob`
+            returns for the point alone, to the last bit.
+
+        Raises
+        ------
+        RuntimeError
+            If no point is pending, or the queue is closed.
+        TooManyFailures, StaleCache, ChangedModel, ...
+            What ends a call of the posterior as well. Points that were finished before are returned first. Simulations
+            that have ended are cached.
+        """
+        self._require_open()
+        if not self._pending:
+            raise RuntimeError("no point is pending: submit points before collect()")
+        try:
+            self._receive(wait=False)
+            while not self._finished:
+                if self._error is not None:
+                    raise self._error
+                if not self._evaluate_unstarted():
+                    self._receive(wait=True)
+        except BaseException:
+            self._write()
+            raise
+        finished, self._finished = self._finished, []
+        self._pending -= len(finished)
+        if not self._pending:
+            self._write()
+        return finished
+
+    def close(self) -> None:
+        """Stop waiting: points that the pool has not started are cancelled, those that run are cached when they end.
+
+        Without effect if the queue is closed.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        for part in self._parts:
+            left = part.likelihood.leave_simulations(list(part.running), self._arrived, running=False)
+            if left:
+                threading.Thread(target=_cache_rest, args=(part.likelihood, left), daemon=True).start()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("the queue is closed: make another one with posterior.evaluation_queue()")
+
+    def _write(self) -> None:
+        for part in self._parts:
+            part.likelihood.write_simulations()
+
+    def _finish(self, point: _Point, log_likelihood: float) -> None:
+        self._finished.append((point.ticket, point.log_prior + log_likelihood))
+
+    def _advance(self, stage: int, points: list[_Point]) -> None:
+        """Evaluate points in one of the parts: at once if they are cached in memory."""
+        if not points:
+            return
+        part = self._parts[stage]
+        unknown = self._look_up(stage, points, on_disk=False)
+        if not unknown:
+            return
+        thetas = part.thetas(unknown)
+        if not part.likelihood.streams or self._error is not None:
+            part.unstarted.append(unknown)
+            return
+        stored = part.are_stored(thetas)
+        if stored.any():
+            part.unstarted.append([point for point, is_stored in zip(unknown, stored, strict=True) if is_stored])
+        self._start(part, [point for point, is_stored in zip(unknown, stored, strict=True) if not is_stored])
+
+    def _look_up(self, stage: int, points: list[_Point], on_disk: bool) -> list[_Point]:
+        """Pass points on whose simulations are cached; returns the others."""
+        part = self._parts[stage]
+        keys, distinct = distinct_keys(part.thetas(points))
+        misfit, cached = part.likelihood.look_up(keys, distinct, on_disk)
+        for point, place in zip(points, distinct, strict=True):
+            if cached[place]:
+                self._pass_on(stage, point, misfit[place])
+        return [point for point, place in zip(points, distinct, strict=True) if not cached[place]]
+
+    def _start(self, part: _Part, points: list[_Point]) -> None:
+        """Send the simulations of points to the pool."""
+        if not points:
+            return
+        thetas = part.thetas(points)
+        keys, distinct = distinct_keys(thetas)
+        first = [distinct.index(place) for place in range(len(keys))]
+        try:
+            started = part.likelihood.start_simulations(keys, thetas[first], False, self._arrived)
+        except Exception as error:  # raised by `collect`, as in a call of the posterior
+            self._error = self._error or error
+            part.unstarted.append(points)
+            return
+        for point, place in zip(points, distinct, strict=True):
+            part.running.setdefault(started[place], []).append(point)
+
+    def _evaluate_unstarted(self) -> bool:
+        """Evaluate points that were not sent to a pool, or read them from the disk; returns whether there were any."""
+        for stage, part in enumerate(self._parts):
+            if part.unstarted:
+                points = part.unstarted[0]
+                try:
+                    if part.likelihood.streams:
+                        unknown = self._look_up(stage, points, on_disk=True)
+                    else:
+                        misfit, unknown = part.likelihood.statistics(part.thetas(points)), []
+                        for point, row in zip(points, misfit, strict=True):
+                            self._pass_on(stage, point, row)
+                except Exception as error:
+                    self._error = self._error or error
+                    return True
+                part.unstarted.popleft()
+                self._start(part, unknown)
+                return True
+        return False
+
+    def _receive(self, wait: bool) -> None:
+        """Take simulations that have ended; with `wait`, at least one."""
+        self._taken += take_all(self._arrived, wait and not self._taken)
+        for stage, part in enumerate(self._parts):
+            ended = [running for running in self._taken if running in part.running]
+            if not ended:
+                continue
+            try:
+                part.likelihood.receive_simulations(ended)
+                if any(running not in ended for running in part.running):
+                    part.likelihood.check_failures()
+            except Exception as error:
+                self._error = self._error or error
+            for running in ended:
+                points = part.running.pop(running)
+                if running.result is not None:
+                    for point in points:
+                        self._pass_on(stage, point, running.result.misfit)
+                else:
+                    self._error = self._error or running.error
+        self._taken.clear()
+
+    def _pass_on(self, stage: int, point: _Point, misfit: np.ndarray) -> None:
+        """Pass a point on to the next part, from the statistics of its simulation."""
+        point.log_likelihood += self._parts[stage].value(point, misfit)
+        if point.log_likelihood == -np.inf or stage + 1 == len(self._parts):
+            self._finish(point, point.log_likelihood)
+        else:
+            self._advance(stage + 1, [point])
+
+
+def _cache_rest(likelihood: FELikelihood, left: list[RunningSimulation]) -> None:
+    """Cache simulations of a closed queue when they end; in a thread."""
+    running = {each.future: each for each in left}
+    try:
+        for future in as_completed(running):
+            likelihood.receive_simulations([running[future]])
+    except Exception as error:
+        logger.warning("simulations of a closed queue are not stored: %s", error)
+    finally:
+        likelihood.write_simulations()

@@ -1,0 +1,370 @@
+"""Points that are submitted and collected: the bits of a call of the posterior, and nothing waits for a long run."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.pool import ThreadPool
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.probability.distributions import HalfNormal, Uniform
+from fe_likelihoods.probability.failures import TooManyFailures
+from fe_likelihoods.probability.joint import JointLikelihood
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.signals.channels import Measurements
+from fe_likelihoods.signals.records import Record
+from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.simulation.executors import LocalPool
+from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.verification import StaleCache
+from tests.faults import treacherous as bad
+from tests.faults.treacherous import DiesOnce, Gated, Treacherous, line, posterior_of
+
+SECONDS = 60.0  # after which a test gives up
+LONG = np.array([[0.95, 0.1, 0.5], [0.96, 0.1, 0.5]])
+SHORT = np.column_stack([np.linspace(0.1, 0.8, 12), np.full(12, 0.1), np.full(12, 0.5)])
+ROOT = Path(__file__).parents[2]
+
+
+def wait_until(condition):
+    stop = time.monotonic() + SECONDS
+    while not condition():
+        assert time.monotonic() < stop, "it does not happen"
+        time.sleep(0.01)
+
+
+def collect(queue, tickets):
+    """Values of points in the order of their tickets."""
+    values = {}
+    while len(values) < len(tickets):
+        values.update(queue.collect())
+    return np.array([values[ticket] for ticket in tickets])
+
+
+def one_by_one(posterior, x):
+    return np.array([posterior(row[None])[0] for row in x])
+
+
+def points(posterior, n=40):
+    """Draws of the prior, a duplicate, points outside the prior, and one with an impossible noise."""
+    x = posterior.sample_prior(n, 1)
+    x[4] = x[3]
+    x[5, 0], x[6, 2], x[7, 1] = 99.0, -1.0, np.nan
+    return x
+
+
+class Mapping:
+    """A pool with ``map`` only."""
+
+    def map(self, function, items):
+        return [function(item) for item in items]
+
+
+POOLS = {
+    "None": lambda: None,
+    "local": lambda: LocalPool(2),
+    "threads": lambda: ThreadPoolExecutor(2),
+    "ThreadPool": lambda: ThreadPool(2),
+    "multiprocessing": lambda: multiprocessing.get_context("spawn").Pool(1),
+    "map only": Mapping,
+}
+
+
+@pytest.mark.parametrize("make", POOLS.values(), ids=POOLS)
+def test_values_are_those_of_single_points_on_every_pool(make, tmp_path):
+    x = points(posterior_of(Treacherous(), top=1.2))
+    expected = one_by_one(posterior_of(Treacherous(), top=1.2), x)
+    assert np.isneginf(expected).sum() >= 4  # runs that fail among them
+    pool = make()
+    posterior = posterior_of(Treacherous(), top=1.2, pool=pool, cache=tmp_path / "cache.sqlite")
+    with posterior.evaluation_queue() as queue:
+        assert queue.workers in (1, 2, None)
+        tickets = queue.submit(x[:25]) + queue.submit(x[25:])
+        np.testing.assert_array_equal(collect(queue, tickets), expected)
+        with pytest.raises(RuntimeError, match="no point is pending"):
+            queue.collect()
+        known = queue.submit(x)
+        np.testing.assert_array_equal(collect(queue, known), expected)  # from memory
+        assert not set(known) & set(tickets)
+    assert posterior.likelihood.simulations == 36
+    np.testing.assert_array_equal(posterior(x), expected)
+    synchronous = posterior_of(Treacherous(), top=1.2, pool=pool, cache=tmp_path / "other.sqlite")
+    np.testing.assert_array_equal(synchronous(x), expected)
+    assert synchronous.report()["failure_reasons"] == posterior.report()["failure_reasons"]
+    assert synchronous.likelihood.cache.info().simulations == posterior.likelihood.cache.info().simulations == 36
+    again = posterior_of(Treacherous(), top=1.2, pool=pool, cache=tmp_path / "cache.sqlite")
+    with again.evaluation_queue() as queue:
+        np.testing.assert_array_equal(collect(queue, queue.submit(x)), expected)  # from the disk
+    assert (again.likelihood.simulations, again.likelihood.disk_hits, again.likelihood.verifications) == (0, 37, 2)
+    for end in ("terminate", "shutdown", "close"):
+        if hasattr(pool, end):
+            getattr(pool, end)()
+            break
+
+
+@pytest.mark.parametrize("asynchronous", [True, False], ids=["queue", "call"])
+def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path):
+    """Two workers, of which one runs the first point for as long as the test wants."""
+    path = tmp_path / "cache.sqlite"
+    x = np.concatenate([LONG[:1], SHORT])
+    expected = posterior_of(Treacherous())(x)
+    with LocalPool(2) as pool:
+        posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
+        thetas, key = x[:, :2], posterior.likelihood.simulation_key
+        stored = SimulationCache(path)
+        if asynchronous:
+            with posterior.evaluation_queue() as queue:
+                tickets, first = queue.submit(x), []
+                while len(first) < len(SHORT):
+                    first += queue.collect()
+                assert {ticket for ticket, _ in first} == set(tickets[1:])
+                # also where nobody calls the queue any more
+                wait_until(lambda: stored.are_stored([key], thetas).tolist() == [False] + [True] * len(SHORT))
+                (tmp_path / "go").touch()
+                values = dict(first + queue.collect())
+                assert [values[ticket] for ticket in tickets] == expected.tolist()
+        else:
+            results = []
+            thread = threading.Thread(target=lambda: results.append(posterior(x)))
+            thread.start()
+            wait_until(lambda: stored.are_stored([key], thetas).tolist() == [False] + [True] * len(SHORT))
+            assert not results
+            (tmp_path / "go").touch()
+            thread.join(SECONDS)
+            np.testing.assert_array_equal(results[0], expected)
+        assert stored.are_stored([key], thetas).all()
+
+
+def test_items_that_kill_their_process(tmp_path):
+    x = np.column_stack([[bad.KILLED + 0.5, 0.5, bad.CRASHES + 0.5], [0.1] * 3, [0.5] * 3])
+    with LocalPool(2) as pool:
+        posterior = posterior_of(Treacherous(), top=20.0, pool=pool)
+        with posterior.evaluation_queue() as queue:
+            values = collect(queue, queue.submit(x))
+        assert np.isfinite(values).tolist() == [False, True, False]
+        assert [failure["transient"] for failure in posterior.report()["failures"]] == [True, True]
+        again = posterior_of(DiesOnce(tmp_path), top=20.0, pool=pool)
+        with again.evaluation_queue() as queue:
+            assert np.isfinite(collect(queue, queue.submit(x[:1]))).all()
+
+
+def test_points_come_back_while_others_are_submitted(tmp_path):
+    """New points go to the free worker, and duplicates of a running point are simulated once."""
+    with LocalPool(2) as pool:
+        posterior = posterior_of(Gated(tmp_path), pool=pool)
+        with posterior.evaluation_queue() as queue:
+            (long,) = queue.submit(LONG[:1])
+            for row in SHORT[:3]:
+                (ticket,) = queue.submit(row[None])
+                assert [done for done, _ in queue.collect()] == [ticket]
+            other = LONG[:1] * [1.0, 1.0, 1.1]  # another noise
+            same = queue.submit(np.concatenate([LONG[:1], other]))
+            (tmp_path / "go").touch()
+            values = {}
+            while len(values) < 3:
+                values.update(queue.collect())
+        assert posterior.likelihood.simulations == 4
+        assert values[long] == values[same[0]] == posterior(LONG[0])
+        assert values[same[1]] == posterior(other[0])
+
+
+def oscillator(seed, **options):
+    model = LinearOscillator(Record("noise", 0.02, np.random.default_rng(seed).normal(size=100)), period=0.6)
+    return FELikelihood(model, Measurements(model.channels, 0.02, np.ones((2, 100))), **options)
+
+
+@pytest.mark.parametrize("pooled", [(True, True), (True, False), (False, False)], ids=str)
+def test_a_joint_likelihood_simulates_later_parts_where_earlier_ones_are_possible(pooled):
+    def posterior_with(pools):
+        parts = {key: oscillator(seed, pool=pool) for seed, (key, pool) in enumerate(zip("ab", pools, strict=True))}
+        joint = JointLikelihood(parts)
+        priors = {name: Uniform(0.1, 30.0) for name in joint.parameter_names[:2]}
+        priors |= {name: HalfNormal(1.0) for name in joint.parameter_names[2:]}
+        return Posterior(joint, priors)
+
+    reference = posterior_with([None, None])
+    x = reference.sample_prior(30, 3)
+    x[:, :2] = np.where(np.arange(30)[:, None] % 3 == 0, 25.0, 1.0 + 0.01 * np.arange(30)[:, None])  # some fail
+    expected = one_by_one(reference, x)
+    assert 0 < np.isneginf(expected).sum() < 30
+    with ThreadPoolExecutor(2) as one, ThreadPoolExecutor(1) as two:
+        posterior = posterior_with([pool if use else None for pool, use in zip((one, two), pooled, strict=True)])
+        with posterior.evaluation_queue() as queue:
+            assert queue.workers == {2: 3, 1: 2, 0: 1}[sum(pooled)]
+            np.testing.assert_array_equal(collect(queue, queue.submit(x)), expected)
+    assert posterior.report()["simulations"] == reference.report()["simulations"]
+
+
+def test_the_same_failures_end_a_run_as_in_a_call(tmp_path):
+    """Failures that come early are no reason, because successes may take longer."""
+    x = np.concatenate([LONG, SHORT, SHORT + [0.0, 0.01, 0.0]])
+    x[2:13, 0] += bad.RAISES  # 11 of 26
+    with ThreadPoolExecutor(3) as pool:
+        posterior = posterior_of(Gated(tmp_path), top=20.0, pool=pool, max_failure_share=0.3)
+        with posterior.evaluation_queue() as queue:
+            queue.submit(x)
+            values = {}
+            with pytest.raises(
+                TooManyFailures, match=r"of 26 simulations \(\d+ of them still run\) failed"
+            ):
+                while True:
+                    values.update(queue.collect())
+            assert 8 <= np.isneginf(list(values.values())).sum() <= 11
+            with pytest.raises(TooManyFailures):
+                queue.collect()
+            (tmp_path / "go").touch()
+        posterior = posterior_of(Gated(tmp_path), top=20.0, pool=pool, max_failure_share=0.5)
+        with posterior.evaluation_queue() as queue:
+            np.testing.assert_array_equal(collect(queue, queue.submit(x)), posterior_of(Treacherous(), top=20.0)(x))
+
+
+class Scaled(Treacherous):
+    """A model whose fingerprint does not contain its factor."""
+
+    def __init__(self, factor):
+        self.factor = factor
+
+    def simulate(self, theta):
+        return self.factor * line(theta)
+
+
+def test_stored_simulations_of_another_model_end_the_run(tmp_path):
+    path = tmp_path / "cache.sqlite"
+    posterior_of(Scaled(1.0), cache=path)(SHORT[:6])
+    with ThreadPoolExecutor(2) as pool:
+        posterior = posterior_of(Scaled(1.01), cache=path, pool=pool)
+        with posterior.evaluation_queue() as queue:
+            queue.submit(SHORT)
+            done = []
+            with pytest.raises(StaleCache):
+                while True:
+                    done += queue.collect()
+            assert {ticket for ticket, _ in done} <= set(range(6, 12))
+
+
+class Changing(Treacherous):
+    """A model whose fingerprint can be computed again."""
+
+    factor = 1.0
+
+    def current_fingerprint(self):
+        return f"{self.factor}"
+
+    fingerprint = property(current_fingerprint)
+
+
+def test_a_model_that_has_changed_ends_the_run():
+    with ThreadPoolExecutor(2) as pool:
+        posterior = posterior_of(Changing(), pool=pool)
+        with posterior.evaluation_queue() as queue:
+            collect(queue, queue.submit(SHORT[:2]))
+            posterior.likelihood.model.factor = 2.0
+            queue.submit(SHORT[2:])
+            with pytest.raises(ChangedModel):
+                for _ in SHORT:
+                    queue.collect()
+
+
+def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path):
+    path = tmp_path / "cache.sqlite"
+    with LocalPool(1) as pool:
+        posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
+        queue = posterior.evaluation_queue()
+        queue.submit(np.concatenate([LONG[:1], SHORT]))
+        wait_until(lambda: (tmp_path / f"started {LONG[0, 0]!r}").exists())
+        queue.close()
+        queue.close()
+        for call in (queue.collect, lambda: queue.submit(SHORT)):
+            with pytest.raises(RuntimeError, match="the queue is closed"):
+                call()
+        (tmp_path / "go").touch()
+        stored, key = SimulationCache(path), posterior.likelihood.simulation_key
+        wait_until(lambda: stored.are_stored([key], LONG[:1, :2]).all())
+        assert not stored.are_stored([key], SHORT[:, :2]).any()
+        assert posterior.likelihood.simulations == 1
+        np.testing.assert_array_equal(posterior(SHORT), posterior_of(Treacherous())(SHORT))
+
+
+@pytest.mark.parametrize("asynchronous", [True, False], ids=["queue", "call"])
+def test_an_interrupt_loses_no_run_that_has_ended(asynchronous, tmp_path):
+    path = tmp_path / "cache.sqlite"
+    with LocalPool(2) as pool:
+        posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
+        stored, key = SimulationCache(path), posterior.likelihood.simulation_key
+
+        def interrupt():
+            wait_until(lambda: stored.are_stored([key], SHORT[:, :2]).all())
+            os.kill(os.getpid(), signal.SIGINT)
+
+        x = np.concatenate([LONG[:1], SHORT])
+        thread = threading.Thread(target=interrupt)
+        thread.start()
+        with posterior.evaluation_queue() as queue:
+            with pytest.raises(KeyboardInterrupt):
+                if asynchronous:
+                    tickets, values = queue.submit(x), {}
+                    while len(values) < len(x):
+                        values.update(queue.collect())
+                else:
+                    posterior(x)
+            thread.join()
+            if asynchronous:  # it can go on
+                (tmp_path / "go").touch()
+                while len(values) < len(x):
+                    values.update(queue.collect())
+                np.testing.assert_array_equal([values[ticket] for ticket in tickets], posterior(x))
+        assert posterior.likelihood.simulations == len(x) - (not asynchronous)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+import numpy as np
+from tests.faults.treacherous import Gated, posterior_of
+from tests.probability.test_evaluation_queue import LONG, SHORT
+
+folder = Path(sys.argv[1])
+if __name__ == "__main__":
+    posterior = posterior_of(Gated(folder), pool=2, cache=folder / "cache.sqlite")
+    x = np.concatenate([LONG[:1], SHORT])
+    if sys.argv[2] == "call":
+        posterior(x)
+    queue = posterior.evaluation_queue()
+    queue.submit(x)
+    for _ in x:
+        queue.collect()
+"""
+
+
+@pytest.mark.parametrize("kind", ["queue", "call"])
+def test_a_killed_process_loses_what_runs_and_the_last_second(kind, tmp_path):
+    """SIGKILL after the short runs are stored: the next process simulates the long one only."""
+    script = tmp_path / "script.py"
+    script.write_text(KILLED)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    posterior = posterior_of(Gated(tmp_path), cache=tmp_path / "cache.sqlite")
+    stored, key = SimulationCache(tmp_path / "cache.sqlite"), posterior.likelihood.simulation_key
+    with subprocess.Popen([sys.executable, script, str(tmp_path), kind], env=environment) as process:
+        try:
+            wait_until(lambda: process.poll() is not None or stored.are_stored([key], SHORT[:, :2]).all())
+        finally:
+            process.kill()
+    (tmp_path / "go").touch()
+    posterior(np.concatenate([LONG[:1], SHORT]))
+    assert (posterior.likelihood.simulations, posterior.likelihood.disk_hits) == (1, len(SHORT))
+
+
+def test_wrong_shapes_are_refused():
+    queue = posterior_of(Treacherous()).evaluation_queue()
+    with pytest.raises(ValueError, match=r"expected points of shape \(n, 3\); got shape \(3,\)"):
+        queue.submit(SHORT[0])
+    assert queue.submit(np.empty((0, 3))) == []
