@@ -18,7 +18,7 @@ update: $(READY) ## update the bridge column on the bundled data (reduced settin
 	$(BIN)/python tutorials/02_bridge_column.py --preset reduced --out results
 
 test: $(READY)   ## run the quick tests on all cores
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 test-slow: $(READY) ## run the slow tests
 	$(BIN)/python -m pytest -m slow --timeout 7200

@@ -3,7 +3,7 @@
 Linear algebra uses one thread per process, also in the scripts that tests start. The workers of pytest-xdist occupy all
 cores, and threads of OpenBLAS that wait for each other on small matrices take three times the processor time.
 
-The longest tests come first, so that no worker waits for another one at the end.
+The longest tests come first, and `make test` distributes tests by stealing: no worker waits for another one at the end.
 """
 
 import os
