@@ -213,9 +213,7 @@ def test_the_same_failures_end_a_run_as_in_a_call(tmp_path):
         with posterior.evaluation_queue() as queue:
             queue.submit(x)
             values = {}
-            with pytest.raises(
-                TooManyFailures, match=r"of 26 simulations \(\d+ of them still run\) failed"
-            ):
+            with pytest.raises(TooManyFailures, match=r"of 26 simulations \(\d+ of them still run\) failed"):
                 while True:
                     values.update(queue.collect())
             assert 8 <= np.isneginf(list(values.values())).sum() <= 11
