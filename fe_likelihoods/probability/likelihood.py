@@ -63,12 +63,14 @@ class FELikelihood(CachedSimulations):
         pickled. The default holds 1300 responses of two channels of 12 800 samples, more than a run with a guide needs.
     cache : SimulationCache or path, optional
         Cache on disk, used after the one in memory: simulations of earlier runs and of other processes are not run
-        again, and a killed run loses only its last few seconds. A batch is then simulated in chunks of a few seconds
-        that are stored one by one; with a pool of unknown size, in one chunk. The responses of `simulate` are stored as
-        well, up to the `max_response_bytes` of the cache.
+        again, and a killed run loses only its last few seconds. With a pool, each simulation is stored when it arrives,
+        those of a second together. Without one, or with a pool that has ``map`` only, a batch is simulated in chunks of
+        a few seconds that are stored one by one. The responses of `simulate` are stored as well, up to the
+        `max_response_bytes` of the cache.
     max_failure_share : float
         Largest share of failed simulations, in [0, 1]. If more have failed, of 20 or more, the next request for a
-        simulation raises `TooManyFailures`.
+        simulation raises `TooManyFailures`; with a pool also a request of which simulations still run, if more have
+        failed even when all of these succeed.
 
     Attributes
     ----------
@@ -89,7 +91,8 @@ class FELikelihood(CachedSimulations):
     response_memory : ResponseMemory
         The responses that are cached in memory.
     chunk_size : int
-        Number of simulations after which the next results are stored on disk; adapted to their duration.
+        Number of simulations after which the next results are stored on disk, where they are simulated in chunks;
+        adapted to their duration.
 
     Raises
     ------
