@@ -251,13 +251,12 @@ class Resumption:
         position = self._checkpoint.position
         try:
             yield
-        except BaseException as error:
+        except BaseException as error:  # without an error, nothing follows in which Ctrl-C could come
+            self._runs_to_end = False
             if self._present is not None:  # between two steps
                 self._end_call(self._present, error)
             self._checkpoint.go_to_call(position)
             raise
-        finally:
-            self._runs_to_end = False
 
     def _describe_what_is_kept(self) -> str:
         try:
