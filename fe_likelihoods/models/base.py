@@ -8,6 +8,8 @@ of your own need neither: any object with the attributes of `fe_likelihoods.simu
 from __future__ import annotations
 
 import hashlib
+import logging
+import weakref
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar
 
@@ -21,7 +23,11 @@ from .validation import check_theta, invalid
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["BuiltInModel", "History", "StructuralModel", "digest"]
+__all__ = ["BuiltInModel", "History", "StructuralModel", "digest", "remark_on_range"]
+
+logger = logging.getLogger(__name__)
+
+_REMARKS: weakref.WeakKeyDictionary[BuiltInModel, str] = weakref.WeakKeyDictionary()
 
 
 def digest(*parts: str) -> str:
@@ -128,12 +134,25 @@ class BuiltInModel(StructuralModel):
                 parts.append(f"{field.name}={_text(getattr(self, field.name))}")
         return digest(*parts)
 
+    @property
+    def range_remark(self) -> str:
+        """Text of the warning about a simulation beyond the range of the laws; empty if there was none."""
+        return _REMARKS.get(self, "")
+
     def physical_values(self, theta: np.ndarray) -> dict[str, float]:
         """Physical values [SI] of all parameters at the multiples `theta` (n_parameters,) of the nominal values."""
         values = self.nominal
         for name, multiple in zip(self.parameters, theta.tolist(), strict=True):
             values[name] *= multiple
         return values
+
+
+def remark_on_range(model: BuiltInModel, text: str) -> None:
+    """Log the first warning about simulations of a model beyond the range of its laws; "" forbids further ones."""
+    if model not in _REMARKS:
+        _REMARKS[model] = text
+        if text:
+            logger.warning("%s", text)
 
 
 def _text(value: object) -> str:

@@ -17,9 +17,7 @@ Seismic Isolation Systems for Bridges, Report NCEER 94-0002, State University of
 
 from __future__ import annotations
 
-import logging
 import math
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -32,7 +30,7 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples, same_sampling, sample_window
 from ..simulation.model import ContinuedResponse
-from .base import History
+from .base import History, remark_on_range
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS, channel_matrix
 from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
 from .isolated_bridge_run import FORMS, BridgeRun, PreparedBridge, prepare_bridge, run_bridge
@@ -52,8 +50,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PARAMETERS", "BridgeHistory", "IsolatedBridge"]
 
-logger = logging.getLogger(__name__)
-
 PARAMETERS = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
 _EXCHANGED = [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]  # PARAMETERS with the devices of the two piers exchanged
 _LONGEST_STEP = {"bouc-wen": 0.25e-3, "elastic-plastic": 0.05e-3, "coulomb": 0.025e-3}  # of the default [s]
@@ -62,7 +58,6 @@ _STATE_ROWS = (
     *("deck velocity", "pier_1 velocity", "rotation_1 velocity", "pier_2 velocity", "rotation_2 velocity"),
     *("damper_1", "damper_2"),
 )
-_WARNED: weakref.WeakSet[IsolatedBridge] = weakref.WeakSet()
 
 
 @dataclass(frozen=True)
@@ -386,15 +381,13 @@ class IsolatedBridge(ThreadedModel):
         """Channels (n_channels, n_steps) of a simulation; warns once per model beyond the range of the rubber."""
         prepared = self._prepared
         largest = np.abs(prepared.linear.kinematics @ run.values[:5]).max()
-        if largest > prepared.rubber_range and self not in _WARNED:
-            _WARNED.add(self)
-            logger.warning(
-                "a bearing displacement of %.1f mm exceeds the %.1f mm for which the law of the rubber holds; the law "
-                "was continued along its tangent, at %s. This model gives no further warnings: check "
-                "history(theta).beyond_range, or extend the law (Rubber.limit)",
-                1e3 * largest,
-                1e3 * prepared.rubber_range,
-                dict(zip(self.parameters, theta.tolist(), strict=True)),
+        if largest > prepared.rubber_range:
+            at = dict(zip(self.parameters, theta.tolist(), strict=True))
+            remark_on_range(
+                self,
+                f"a bearing displacement of {1e3 * largest:.1f} mm exceeds the {1e3 * prepared.rubber_range:.1f} mm "
+                f"for which the law of the rubber holds; the law was continued along its tangent, at {at}. This model "
+                "gives no further warnings: check history(theta).beyond_range, or extend the law (Rubber.limit)",
             )
         return prepared.to_channels @ run.drivers[:, :: self.every]
 

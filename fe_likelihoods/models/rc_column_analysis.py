@@ -6,8 +6,6 @@ top is solved as a sequence of static steps (`fe_likelihoods.kernels.static`). B
 
 from __future__ import annotations
 
-import logging
-import weakref
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,7 +18,7 @@ from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from ..kernels.static import Iteration, impose_displacement
 from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
-from .base import BuiltInModel, History
+from .base import BuiltInModel, History, remark_on_range
 from .circular_section import Confinement
 from .rc_column_parts import Concrete, Steel, hardening_fault
 from .validation import check_values
@@ -36,9 +34,7 @@ __all__ = [
     "set_materials",
 ]
 
-logger = logging.getLogger(__name__)
 
-_WARNED: weakref.WeakSet[BuiltInModel] = weakref.WeakSet()
 _MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 
 IMPOSED_ROWS = (
@@ -68,8 +64,8 @@ class ColumnHistory(History):
         Number of steps that were repeated with half their size.
     beyond_range : float
         Largest strain of a bar in the base section, divided by the ultimate strain of the steel. Above 1, real bars
-        fracture, whereas the law of the steel was continued along its tangent. A warning about this is logged when the
-        column is simulated, not when a row comes from a cache.
+        fracture, whereas the law of the steel was continued along its tangent. A warning about this is logged once per
+        model, also where simulations come from a cache on disk.
     """
 
     retries: int
@@ -241,22 +237,20 @@ def checked_history(
     strain, curvature = (analysis.values[analysis.names.index(f"base {row}")] for row in ("axial strain", "curvature"))
     limit = steel.ultimate_strain
     beyond = float((np.abs(strain) + bar_radius * np.abs(curvature)).max()) / limit
-    if beyond > 1.0 and model not in _WARNED:
-        _WARNED.add(model)
-        logger.warning(
-            "a bar strain of %.3g at the base exceeds the ultimate strain of the steel, %.3g, at which bars fracture; "
-            "the law was continued along its tangent, at %s. This model gives no further warnings: check "
-            "history(theta).beyond_range, or use a weaker loading",
-            beyond * limit,
-            limit,
-            dict(zip(model.parameters, theta.tolist(), strict=True)),
+    if beyond > 1.0:
+        at = dict(zip(model.parameters, theta.tolist(), strict=True))
+        remark_on_range(
+            model,
+            f"a bar strain of {beyond * limit:.3g} at the base exceeds the ultimate strain of the steel, {limit:.3g}, "
+            f"at which bars fracture; the law was continued along its tangent, at {at}. This model gives no further "
+            "warnings: check history(theta).beyond_range, or use a weaker loading",
         )
     return ColumnHistory(analysis.names, analysis.values, analysis.retries, beyond)
 
 
 def expect_fracture(model: BuiltInModel) -> None:
     """Give no warning where bars of this model exceed the strain at which they fracture: it is pushed to failure."""
-    _WARNED.add(model)
+    remark_on_range(model, "")
 
 
 def set_materials(

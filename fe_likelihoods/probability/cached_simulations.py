@@ -28,6 +28,7 @@ from ..simulation.model import (
     misfit_of_responses,
     statistic_width,
 )
+from ..simulation.remarks import repeat_remark_of
 from ..simulation.repeated_points import RepeatedPoints
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
@@ -423,6 +424,8 @@ class CachedSimulations(NewSimulations):
     def _add_outcomes(self, requested: Requested, rows: np.ndarray) -> None:
         """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
         self._outcomes += len(rows)
+        if len(rows):
+            repeat_remark_of(self.model, self.cache)
         for row in rows:
             if requested.reasons[row]:
                 self._failures.add(requested.thetas[row], requested.reasons[row])

@@ -32,6 +32,7 @@ from ..simulation.model import (
     sent_simulation,
     simulate_batch,
 )
+from ..simulation.remarks import store_remark_of
 from ..simulation.repeated_points import RepeatedPoints
 from ..simulation.verification import VerifiedCache, VerifyingRun
 from .failures import FailureLog
@@ -418,6 +419,7 @@ class NewSimulations:
             self.cache.store_responses(self.model, rows.thetas, rows.response)
         self.cache.store(self._key, rows.thetas, self.measurements.n_steps, rows.misfit, rows.reasons, rows.seconds)
         self.cache.store_failures(self.model, rows.thetas, rows.reasons)
+        store_remark_of(self.model, self.cache)
         self._verified_cache.add_own(rows.thetas, self._key, simulation_fingerprint(self.model))
 
     def _compare_model(self, thetas: np.ndarray, seconds: float) -> None:

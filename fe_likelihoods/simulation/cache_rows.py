@@ -49,7 +49,9 @@ STORE_RESPONSE = (
     "INSERT OR REPLACE INTO responses (key, source, theta, n_channels, size, crc, response) "
     "VALUES (?, ?, ?, ?, ?, ?, ?)"
 )
-REMOVE = {table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses", "failures")}
+REMOVE = {
+    table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses", "failures", "remarks")
+}
 # counts how often a simulation was stopped at the same time limit
 STORE_FAILURE = (
     "INSERT INTO failures (key, source, reason, time_limit, crc, stops) VALUES (?, ?, ?, ?, ?, 1) "

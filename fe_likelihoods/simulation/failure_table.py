@@ -25,13 +25,13 @@ from .cache_rows import (
 )
 from .faults import TransientReason
 from .fingerprint import simulation_fingerprint
-from .guarded_file import GuardedFile
 from .model import Model
+from .remarks import RemarkTable
 
 __all__ = ["FailureTable"]
 
 
-class FailureTable(GuardedFile):
+class FailureTable(RemarkTable):
     """Base of `SimulationCache`, which documents the attributes: the table of failures of its file."""
 
     retry_failures: bool

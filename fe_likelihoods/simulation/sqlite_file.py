@@ -32,7 +32,8 @@ __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
 logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
+WITHOUT_REMARKS = 2  # layout of earlier files, to which the last table is added
 LAYOUT = (
     # the id orders rows by age
     "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
@@ -46,6 +47,9 @@ LAYOUT = (
     # simulations that failed, for any measurements; a time limit of 0 is an answer of the model
     "CREATE TABLE failures (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "reason BLOB NOT NULL, time_limit REAL NOT NULL, stops INTEGER NOT NULL, crc INTEGER NOT NULL)",
+    # what models said about their simulations
+    "CREATE TABLE remarks (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "text BLOB NOT NULL)",
 )
 CHECK_SECONDS = 2.0  # limit of the integrity check on opening; rows have checksums of their own
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -282,6 +286,7 @@ class CacheFile:
             if self._is_empty(connection):
                 self._create(connection)
             self._identify(connection)
+            self._complete(connection)
             self._execute_with_retry(connection, "PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
         except BaseException:
@@ -329,6 +334,17 @@ class CacheFile:
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         connection.execute("COMMIT")
 
+    def _complete(self, connection: sqlite3.Connection) -> None:
+        """Add the table of remarks to a file without it, in one transaction."""
+        version = "PRAGMA user_version"
+        if connection.execute(version).fetchone() == (SCHEMA_VERSION,):
+            return
+        self._execute_with_retry(connection, "BEGIN IMMEDIATE")
+        if connection.execute(version).fetchone() != (SCHEMA_VERSION,):  # another process may have done it
+            connection.execute(LAYOUT[-1])
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        connection.execute("COMMIT")
+
     def _execute_with_retry(self, connection: sqlite3.Connection, statement: str) -> None:
         """Execute a statement for which SQLite itself does not wait while another process holds a lock."""
         give_up = time.monotonic() + self.timeout
@@ -351,12 +367,14 @@ class CacheFile:
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
                 f"{APPLICATION_ID:#x}; tables and indices {', '.join(sorted(layout)) or 'none'}); give another path"
             )
-        if version != SCHEMA_VERSION:
+        if version not in (SCHEMA_VERSION, WITHOUT_REMARKS):
             raise ValueError(
                 f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}; give "
                 "another path, or remove the file"
             )
-        if sorted(layout.values()) != sorted(LAYOUT):
+        # the version was read first, so another process may have added the table since
+        allowed = [LAYOUT] if version == SCHEMA_VERSION else [LAYOUT, LAYOUT[:-1]]
+        if sorted(layout.values()) not in map(sorted, allowed):
             raise _Damaged("its tables are not those of a cache")
 
     @staticmethod

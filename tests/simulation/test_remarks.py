@@ -1,0 +1,98 @@
+"""The warning of a model about simulations beyond the range of its laws is repeated where rows come from a cache."""
+
+import multiprocessing
+import os
+import sqlite3
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import DisplacementHistory, FELikelihood, Measurements, RCColumn, SimulationCache
+from fe_likelihoods.models.rc_column_analysis import expect_fracture
+
+THETAS = np.array([[1.0], [1.1]])
+
+
+def likelihood(path, drift=0.2, cached=True):
+    """A column pushed to a drift, of which the bars fracture at 20 %."""
+    model = RCColumn.lhpost(DisplacementHistory("push", np.linspace(0.0, 1.0, 30)), parameters=("fy",))
+    model = replace(model, loading=DisplacementHistory("push", np.linspace(0.0, drift * model.height, 30)))
+    measurements = Measurements(model.channels, model.dt, np.ones((len(model.channels), model.n_steps)))
+    cache = SimulationCache(path, verify=False) if cached else None  # a verified row is simulated, with its warning
+    return FELikelihood(model, measurements, cache=cache)
+
+
+def fill(path, drift=0.2):
+    likelihood(path, drift).misfit(THETAS)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "cache.sqlite"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+@pytest.mark.parametrize(("drift", "expected"), [(0.2, 1), (0.05, 0)])
+def test_warning_of_another_process_is_repeated_once(drift, expected, path, caplog):
+    process = multiprocessing.get_context("fork").Process(target=fill, args=(path, drift))
+    process.start()
+    process.join()
+    assert process.exitcode == 0 and not caplog.records
+    for _ in range(2):
+        again = likelihood(path, drift)
+        again.misfit(THETAS[:1])
+        assert (again.simulations, again.disk_hits) == (0, 1)
+    assert len(caplog.records) == expected
+    if expected:
+        assert f"simulations of this model in {path}: a bar strain of" in caplog.text
+        assert "exceeds the ultimate strain of the steel" in caplog.text and "{'fy': " in caplog.text
+
+
+def test_a_model_that_has_warned_does_not_repeat_itself(path, caplog):
+    first = likelihood(path)
+    first.misfit(THETAS)
+    first.memory_cache.clear()
+    first.misfit(THETAS)
+    assert first.disk_hits == 2 and len(caplog.records) == 1
+
+
+def test_a_model_that_expects_fracture_has_no_remark(path, caplog):
+    pushed = likelihood(path)
+    expect_fracture(pushed.model)
+    pushed.misfit(THETAS)
+    assert pushed.cache.look_up_remark(pushed.model) == "" and not caplog.records
+
+
+def test_forgotten_with_the_rows_of_the_model(path):
+    first, other = likelihood(path), likelihood(path, 0.19)
+    first.misfit(THETAS)
+    other.misfit(THETAS)
+    assert first.cache.forget(*first.cache_keys) == 3  # two rows and the remark
+    assert first.cache.look_up_remark(first.model) == "" != other.cache.look_up_remark(other.model)
+    first.cache.clear()
+    assert other.cache.look_up_remark(other.model) == ""
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_files_of_the_earlier_layout_work(writable, path, caplog):
+    """Their rows are used; the table of remarks is added where the file can be written."""
+    first = likelihood(path)
+    first.misfit(THETAS)
+    first.cache.close()
+    with sqlite3.connect(path) as connection:
+        connection.execute("DROP TABLE remarks")
+        connection.execute("PRAGMA user_version = 2")
+    connection.close()
+    caplog.clear()
+    again = likelihood(path)
+    if not writable:
+        again.cache.file.close()
+        again.cache.file._open = again.cache.file._open_to_read
+    again.misfit(THETAS)
+    assert (again.simulations, again.disk_hits) == (0, 2) and not caplog.records
+    again.cache.store_remark(again.model, "beyond")
+    assert again.cache.look_up_remark(again.model) == ("beyond" if writable else "")
+    if writable:  # the first one stays
+        again.cache.store_remark(again.model, "farther")
+        assert again.cache.look_up_remark(again.model) == "beyond"
