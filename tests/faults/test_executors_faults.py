@@ -325,12 +325,17 @@ def test_mpi_gives_the_same_bits():
         "    if pool is not None:\n"
         "        print(posterior_of(Treacherous(), pool=pool)(x).tolist() == posterior_of(Treacherous())(x).tolist())\n"
         "        print(set(simulate_batch(Large(), x[:, :2], as_executor(pool)).response[:, 0, 0].tolist()))\n"
+        "        queue = posterior_of(Treacherous(), pool=pool).evaluation_queue()\n"
+        "        tickets, values = queue.submit(x), {}\n"
+        "        while len(values) < len(x):\n"
+        "            values.update(queue.collect())\n"
+        "        print([values[ticket] for ticket in tickets] == posterior_of(Treacherous())(x).tolist())\n"
     )
     mpiexec = Path(sys.executable).with_name("mpiexec")
     command = [mpiexec if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", "3", sys.executable, "-c", code]
     environment = os.environ | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
-    assert run.stdout.split() == ["True", "{1.0}"], run.stderr  # the model is loaded once per rank
+    assert run.stdout.split() == ["True", "{1.0}", "True"], run.stderr  # the model is loaded once per rank
 
 
 # parents that die ---------------------------------------------------------------------------------------------------
