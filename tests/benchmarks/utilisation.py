@@ -1,0 +1,119 @@
+"""How busy the workers of a cluster are, on a simulated clock: ``python -m tests.benchmarks.utilisation [--help]``.
+
+One row per sampler, number of workers and distribution of run lengths: constant, uniform from 0.2 to 2 (over 1.1),
+log-normal with a coefficient of variation of 1, and the same as a function of a parameter. If short runs were
+preferred, evidence, mean and variance would deviate from the known answers; the deviations are in standard errors over
+all seeds.
+The clock counts evaluations only; the annealing ends with beta = 1, without steps of the chain.
+"""
+
+import argparse
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from samplers import SMCSampler, TMCMCSampler
+from tests.contract.targets import Gaussian
+from tests.simulated_cluster import SimulatedCluster
+
+__all__ = ["LENGTHS", "PATHS", "Busy", "measure"]
+
+# the logarithm of a log-normal variable with a coefficient of variation of 1 has this standard deviation
+SPREAD = np.sqrt(np.log(2.0))
+FARTHEST = 3.0
+LENGTHS = ("constant", "uniform", "log-normal", "correlated")
+PATHS = {
+    "recycling": (SMCSampler, {"asynchronous": False}),
+    "recycling, asynchronous": (SMCSampler, {"asynchronous": True}),
+    "moves": (SMCSampler, {"recycle": False}),
+    "TMCMC": (TMCMCSampler, {}),
+}
+
+
+class Busy(NamedTuple):
+    """Means over seeds.
+
+    Attributes
+    ----------
+    utilisation : float
+        Share of the time of all workers in which they were busy.
+    duration : float
+        Time of the annealing, in mean run lengths.
+    evaluations : float
+        Their number.
+    deviations : (3,) float
+        Mean deviations of log-evidence, mean and variance of the first parameter, in standard errors of the mean over
+        the seeds.
+    """
+
+    utilisation: float
+    duration: float
+    evaluations: float
+    deviations: np.ndarray
+
+
+def lengths_of(name: str, target: Gaussian, random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """Run lengths (n,) of points (n, ndim), with mean 1 for the first three names."""
+
+    def correlated(coords: np.ndarray) -> np.ndarray:
+        # long runs where the first parameter is large, on the scale of the posterior
+        z = np.clip((coords[:, 0] - target.mean[0]) / target.sd[0], -FARTHEST, FARTHEST)
+        return np.exp(SPREAD * z - 0.5 * SPREAD**2)
+
+    return {
+        "constant": lambda coords: np.ones(len(coords)),
+        "uniform": lambda coords: random.uniform(0.2, 2.0, len(coords)) / 1.1,
+        "log-normal": lambda coords: random.lognormal(-0.5 * SPREAD**2, SPREAD, len(coords)),
+        "correlated": correlated,
+    }[name]
+
+
+def measure(path: str, lengths: str, workers: int, nwalkers: int, ndim: int, seeds: int) -> Busy:
+    """Anneal a sharp Gaussian with every seed."""
+    target, numbers = Gaussian(ndim, sd=0.02), []
+    Sampler, settings = PATHS[path]
+    for seed in range(seeds):
+        cluster = SimulatedCluster(target, workers, lengths_of(lengths, target, np.random.default_rng(seed)))
+        sampler = Sampler(nwalkers, ndim, cluster, vectorize=True, seed=seed, **settings)
+        x = sampler.run_mcmc(None, 0).coords[:, 0]
+        z = (x - target.mean[0]) / target.sd[0]
+        evidence = (sampler.log_evidence - target.log_evidence) / sampler.log_evidence_error
+        numbers.append((cluster.utilisation, cluster.now, cluster.evaluations, evidence, z.mean(), z.var() - 1.0))
+    numbers = np.array(numbers)
+    means = numbers.mean(axis=0)
+    errors = numbers[:, 3:].std(axis=0, ddof=1) / np.sqrt(seeds) if seeds > 1 else np.full(3, np.nan)
+    return Busy(*means[:3], means[3:] / errors)
+
+
+def table(arguments: argparse.Namespace) -> Iterator[str]:
+    """Lines of the table, each as soon as it is known."""
+    yield f"{arguments.walkers} walkers, {arguments.ndim} parameters, {arguments.seeds} seeds"
+    yield f"{'sampler':26}{'lengths':12}{'workers':>8}{'busy':>8}{'time':>8}{'evaluations':>12}   log Z, mean, var [se]"
+    for path in arguments.paths:
+        for lengths in LENGTHS:
+            for workers in arguments.workers:
+                busy = measure(path, lengths, workers, arguments.walkers, arguments.ndim, arguments.seeds)
+                deviations = ", ".join(f"{deviation:+.1f}" for deviation in busy.deviations)
+                numbers = f"{busy.utilisation:8.3f}{busy.duration:8.1f}{busy.evaluations:12.0f}"
+                yield f"{path:26}{lengths:12}{workers:8d}{numbers}   {deviations}"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.utilisation", description=__doc__)
+    parser.add_argument("--paths", nargs="+", choices=PATHS, default=list(PATHS))
+    parser.add_argument("--workers", nargs="+", type=int, default=[16, 64, 256])
+    parser.add_argument("--walkers", type=int, default=500)
+    parser.add_argument("--ndim", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=10)
+    warnings.simplefilter("ignore")
+    logging.disable(logging.WARNING)
+    for line in table(parser.parse_args()):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
