@@ -11,6 +11,7 @@ from pathlib import Path
 from . import (
     bridge,
     bridge_steps,
+    busy_workers,
     cache,
     carried_state,
     column,
@@ -47,6 +48,7 @@ BENCHMARKS = {
     "hierarchy": hierarchy.hierarchy,
     "hierarchy_ranks": hierarchy.ranks,
     "hierarchy_cases": hierarchy_cases.cases,
+    "busy_workers": busy_workers.busy_workers,
     "cache": cache.cache,
     "storage": storage.storage,
     "executors": executors.executors,
