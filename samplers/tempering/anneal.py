@@ -28,6 +28,7 @@ from .evidence_check import pareto_shape
 from .flights import Flight
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
+from .inner_steps import and_last_population, only_sweeps
 from .multilevel import draw_start, submit_start
 from .mutation import MoveSchedule, Mutated, grow_chains, move_together
 from .population import Density, Doubt, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
@@ -409,7 +410,7 @@ def _by_runs(
     runs: list[Recycled] = []
     for _ in range(settings.runs):
         try:
-            run = yield from _only_sweeps(recycle(flight, density, random, settings.recycling, finish=False))
+            run = yield from only_sweeps(recycle(flight, density, random, settings.recycling, finish=False))
         except StoppedEarly as stop:
             stop.log_evidence_of_stages = 0.0  # the stages of these runs are not reported
             raise (stopped_at(runs[0].archive, 1.0, 0.0, 0.0) if runs else stop) from None
@@ -422,7 +423,8 @@ def _by_runs(
     share = settings.recycling.target_share * len(population.coords) / len(coords)
     settings = replace(settings, recycling=replace(settings.recycling, target_share=share))
     flight = Flight.landed(coords, records)
-    found = yield from _by_recycling(pooled, flight, density, random, schedule, settings, start, len(population.coords))
+    steps = _by_recycling(pooled, flight, density, random, schedule, settings, start, len(population.coords))
+    found, population = yield from and_last_population(steps)
     if found.trusted:
         for doubt in check_agreement(runs, found.proposals[-1][1], 1.0 / (share * len(coords))):
             yield population, doubt
@@ -442,7 +444,7 @@ def _from_coarse(
     n, ndim = coords.shape
     few = min(n, max(FEWEST_TO_START, n // 2, START_PER_DIMENSION * (ndim + 1)))
     flight = coarse.submit(coords[:few])
-    found = yield from _only_sweeps(recycle(flight, coarse, random, settings.recycling, finish=False))
+    found = yield from only_sweeps(recycle(flight, coarse, random, settings.recycling, finish=False))
     if found.doubt:
         warn(
             f"annealing on the coarse model failed ({found.doubt}), so the fine model alone is used. Check the coarse "
@@ -465,19 +467,6 @@ def _from_coarse(
             "coarse model may be worth its cost"
         )
     return found.trusted
-
-
-def _only_sweeps(
-    steps: Generator[tuple[Population, Report], None, Recycled],
-) -> Generator[tuple[Population, Sweep], None, Recycled]:
-    """The sweeps of a recycling on the coarse model; its stages are not stages of the run."""
-    while True:
-        try:
-            population, report = next(steps)
-        except StopIteration as end:
-            return end.value
-        if isinstance(report, Sweep):
-            yield population, report
 
 
 def _mutate(

@@ -8,7 +8,7 @@ from samplers.tempering.anneal import anneal
 from samplers.tempering.evidence_check import EvidenceCheck
 from samplers.tempering.flights import Flight
 from samplers.tempering.mutation import MoveSchedule
-from samplers.tempering.population import Population, Restart, Stage, Sweep
+from samplers.tempering.population import Doubt, Population, Restart, Stage, Sweep
 from samplers.tempering.results import AnnealingResult
 from samplers.tempering.settings import RecyclingSettings, Settings
 from tests.contract.targets import Gaussian
@@ -113,3 +113,14 @@ def test_stages_on_the_coarse_model_are_shown_but_not_reported():
     kinds = [type(report) for _, report in steps]
     assert kinds[0] is Sweep and coarse.evaluations > 0
     assert kinds.count(Stage) < kinds.count(Sweep)
+
+
+def test_the_last_population_is_at_beta_1_where_runs_disagree(monkeypatch):
+    """A doubt about the runs comes with the result, not with the draws of the prior that they began with."""
+    doubt = Doubt("the runs disagree", True)
+    monkeypatch.setattr("samplers.tempering.anneal.check_agreement", lambda *_: [doubt])
+    steps, _ = steps_of(Settings(recycle=True, runs=2))
+    population, report = list(steps)[-1]
+    assert report is doubt and population.beta == 1.0
+    z = (population.coords - Gaussian(3, sd=0.02).mean) / Gaussian(3, sd=0.02).sd
+    assert np.max(np.abs(z)) < 6.0
