@@ -78,7 +78,8 @@ def read_columns(
     missing : sequence of float, optional
         Numbers that stand for missing samples; they are read as NaN. A warning names those that none of the columns
         has. Others of -9999, -999.25, 1e30 and 9.97e36 are refused unless further numbers lie within 1 % of them;
-        ``()`` takes all numbers as measured.
+        -999, 99999, -99999, 32767 and -32768 unless a further number has half their size. ``()`` takes all numbers as
+        measured.
 
     Returns
     -------

@@ -117,7 +117,11 @@ def _name_of(lines: list[str], start: str) -> str:
             bool(re.match(r"(un)?corrected accelerogram", first, re.IGNORECASE))
             and any(line.startswith("Site ") for line in lines[1:2]),
         ),
-        ("COSMOS V1 (raw acceleration)", bool(re.match(r"raw acc", first, re.IGNORECASE)) and "Format v0" in first),
+        ("COSMOS V0 (raw acceleration)", bool(re.match(r"raw acc", first, re.IGNORECASE)) and "Format v0" in first),
+        (
+            "COSMOS V1 (uncorrected acceleration)",
+            bool(re.match(r"uncorrected acceleration\b", first, re.IGNORECASE)) and "Format v0" in first,
+        ),
         ("CSMIP V1 (uncorrected)", bool(re.match(r"uncorrected accelerogram", first, re.IGNORECASE))),
         ("CSMIP or COSMOS V2", bool(re.match(r"corrected acc", first, re.IGNORECASE))),
         ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),

@@ -293,7 +293,8 @@ def read_csv(
     missing : sequence of float, optional
         Numbers that stand for missing samples; they are read as NaN, which an excitation must not have. A warning
         names those that the column does not have. Others of -9999, -999.25, 1e30 and 9.97e36 are refused unless further
-        numbers lie within 1 % of them; ``()`` takes all numbers as measured.
+        numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless a further number has half their
+        size. ``()`` takes all numbers as measured.
 
     Returns
     -------

@@ -34,6 +34,8 @@ __all__ = [
 
 _LONGEST_UNIT = 100
 _SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
+# the same, or the ends of a range, but also plausible as measured numbers: counts, or accelerations in gal
+_PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
 _TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 
 
@@ -241,8 +243,9 @@ def table_step(table: Table, dt: float | None = None) -> float:
 def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return the numbers of a column, with NaN for those equal to a number of `missing`.
 
-    ValueError is raised for a number that usually stands for missing samples and is not in `missing`, unless the column
-    has other numbers within 1 % of it, or `missing` is empty.
+    ValueError is raised for a number that usually stands for missing samples and is not in `missing`, unless `missing`
+    is empty or the number may have been measured: the column has others within 1 % of it, or, for -999 and the limits
+    of integers, others of half its size, as those beside a measured peak are.
     """
     values = table.values[:, place]
     listed = _listed(missing)
@@ -250,9 +253,13 @@ def column_values(table: Table, place: int, missing: Sequence[float] | None = No
         values = np.where(np.isin(values, listed), np.nan, values)
         if not listed.size:
             return values
-    for sentinel in _SENTINELS:
+    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS):
         found = np.flatnonzero(values == sentinel)
-        if found.size and np.count_nonzero(np.abs(values - sentinel) <= 0.01 * abs(sentinel)) == found.size:
+        if sentinel in _SENTINELS:
+            similar = np.abs(values - sentinel) <= 0.01 * abs(sentinel)
+        else:
+            similar = np.abs(values) >= 0.5 * abs(sentinel)
+        if found.size and np.count_nonzero(similar) == found.size:
             numbers = ", ".join(f"{number:g}" for number in (*listed, sentinel))
             raise ValueError(
                 f"{table.file}, line {table.lines[found[0]]}: expected a measured number, got {sentinel:g} in "

@@ -217,6 +217,12 @@ def _continue(responses: bool, model: Model, item: tuple[np.ndarray, _Start]) ->
                 f"simulate_from of {type(model).__name__} returned a response of shape {np.shape(response)}, expected "
                 f"(n_channels, n_steps) = {expected}, the response {part}"
             )
+        if not isinstance(end, np.ndarray) or end.dtype.hasobject:
+            found = "array of Python objects" if isinstance(end, np.ndarray) else type(end).__name__
+            raise SimulationFailed(
+                f"simulate_from of {type(model).__name__} returned a state of type {found}: expected an array of "
+                "numbers (ndarray), of which copies can be kept; put all that the model needs to go on into one array"
+            )
         response = real_response(response, model.channels, expected[1])
     except ChangedModel:
         raise

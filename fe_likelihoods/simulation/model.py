@@ -104,7 +104,7 @@ class ContinuedResponse(NamedTuple):
     response : (n_channels, n) float
         [SI] at the samples after that of the given state; at all samples if there was none.
     state : ndarray
-        What the model needs to go on after the last sample.
+        Numbers that the model needs to go on after the last sample, in one array, of which copies are kept.
     """
 
     response: np.ndarray

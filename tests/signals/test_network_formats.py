@@ -167,10 +167,16 @@ def test_other_formats_are_named(tmp_path, name):
 
 def test_formats_that_are_not_read_are_named(tmp_path):
     raw = ["Raw acceleration counts   (Format v01.20 with 13 text lines)", "x", "1 2 3"]
+    uncorrected = ["Uncorrected acceleration  (Format v01.20 with 13 text lines)", "x", "1 2 3"]
     hdf5 = tmp_path / "a.h5"
     hdf5.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
-    for path, name in ((write(tmp_path / "a.V1", raw), "COSMOS V1 .raw acceleration."), (hdf5, "HDF5")):
-        for read in (read_record, read_csv, read_at2):
+    cases = (
+        (write(tmp_path / "a.V0", raw), "COSMOS V0 .raw acceleration."),
+        (write(tmp_path / "a.V1", uncorrected), "COSMOS V1 .uncorrected acceleration."),
+        (hdf5, "HDF5"),
+    )
+    for path, name in cases:
+        for read in (read_record, read_csv, read_at2, read_v2):
             with pytest.raises(ValueError, match=f"this looks like an? {name} file, which is not read"):
                 read(path)
 

@@ -510,6 +510,18 @@ class TestColumns:
         path.write_text(f"time_s,acc_g\n0.00,1\n0.01,{number}\n0.02,{0.995 * float(number)}\n0.03,4\n")
         assert read_csv(path).n_steps == 4
 
+    @pytest.mark.parametrize("number", [-999, 99999, -99999, 32767, -32768])
+    def test_numbers_that_may_be_measured_are_refused_where_nothing_is_as_large(self, tmp_path, number):
+        path = tmp_path / "a.csv"
+        path.write_text(f"time_s,acc_gal\n0.00,120\n0.01,{number}\n0.02,{number}\n0.03,{0.49 * number}\n")
+        with pytest.raises(ValueError, match=f"line 3: expected a measured number, got {number} in 2 rows, .*missing="):
+            read_csv(path)
+        assert read_csv(path, missing=()).n_steps == 4
+        found = read_columns(path, (TOP,), ("acc_gal",), missing=(number,))
+        assert np.isnan(found.values).sum() == 2
+        path.write_text(f"time_s,acc_gal\n0.00,120\n0.01,{0.6 * number}\n0.02,{number}\n0.03,{-0.3 * number}\n")
+        assert read_csv(path).n_steps == 4  # a peak beside which the record is large as well
+
     @pytest.mark.parametrize("word", ["NA", "N/A", "NULL", "null", "-", "--"])
     def test_words_for_missing_samples(self, tmp_path, word):
         path = tmp_path / "a.csv"

@@ -63,6 +63,16 @@ class Cut(Slip):
         return found if state is None else found._replace(response=found.response[self.part])
 
 
+class OtherState(Slip):
+    """A class that returns its state as something else than an array of numbers."""
+
+    kind = list
+
+    def simulate_from(self, theta, state=None):
+        found = super().simulate_from(theta, state)
+        return found._replace(state=self.kind(found.state))
+
+
 class Doubled(Slip):
     """A class that changes the response, and inherits a method that does not know of it."""
 
@@ -228,6 +238,23 @@ def test_a_model_may_write_into_the_state_that_it_receives(eq):
     model, expected = InPlace(eq[0]), whole(Slip(eq[0]), Events(eq[:2], 0.5), np.array([0.2]))
     for _ in range(3):
         np.testing.assert_array_equal(propagate(model, [[0.2]], record=eq[1], **SETTINGS).mean, expected)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (list, "list"),
+        (lambda state: {"slip": state}, "dict"),
+        (lambda state: None, "NoneType"),
+        (lambda state: np.array([{"slip": state}]), "array of Python objects"),
+    ],
+)
+def test_a_state_that_is_no_array_of_numbers_is_a_failed_simulation(eq, monkeypatch, kind, name):
+    monkeypatch.setattr(OtherState, "kind", staticmethod(kind))
+    joined, memory = OtherState(Events(eq[:2], 0.5)), StateMemory()
+    (reason,) = simulate_last_part(joined, joined.n_steps - 42, np.array([[0.2]]), memory=memory).reasons
+    assert f"simulate_from of OtherState returned a state of type {name}: expected an array of numbers" in reason
+    assert len(memory) == 0
 
 
 @pytest.mark.parametrize(
