@@ -26,6 +26,7 @@ from fe_likelihoods import (
 from fe_likelihoods.probability.hierarchical_posterior import _correlation_factor
 from fe_likelihoods.probability.hierarchy_checks import pareto_shape
 from fe_likelihoods.probability.stored_posterior import describe
+from tests.benchmarks.hierarchy_warnings import RIGHT, WRONG, problem, solve
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests
 ERRORS = np.array([[0.04, 0.03], [0.03, 0.09]])  # their covariance
@@ -266,12 +267,41 @@ def test_prior_narrower_than_the_population_is_a_warning_that_names_the_test():
     assert "T0" in str(hierarchy.checks)
 
 
-def test_population_narrower_than_the_samples_is_a_warning_that_names_the_test(one):
-    points = np.random.default_rng(1).normal([1.1, 0.002], [0.01, 0.0002], (60, 2))
-    with pytest.warns(UserWarning, match="is narrower.*Give more samples") as found:
-        checks = Hierarchy(one, points).checks
-    assert [str(each.message).split("'")[1] for each in found] == list(checks.tests)
-    assert checks.tests["T0"].effective_samples < 20 and checks.tests["T0"].sample_share < 0.1
+@pytest.mark.parametrize(("n", "is_named"), [(40, True), (1000, False)])
+def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, is_named):
+    """The fitted mixture takes over: with 1000 samples its error does no harm, with 40 the tests are named."""
+    posterior = HierarchicalPosterior(several(DATA[:, :1], ERRORS[:1, :1], n), {"a": LINEAR})
+    points = np.random.default_rng(1).normal([1.1, 0.002], [0.1, 0.0002], (60, 2))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        checks = Hierarchy(posterior, points).checks
+    assert max(each.effective_samples for each in checks.tests.values()) < 20
+    assert checks.tests["T0"].sample_share < 0.1
+    messages = [str(each.message) for each in found]
+    expected = list(checks.tests) if is_named else []
+    assert [text.split("'")[1] for text in messages if "is narrower" in text and "Give more" in text] == expected
+    assert len(messages) == len(expected) + is_named
+    change = posterior.log_likelihood(points) - [exact(DATA[:, 0], m, 0.04 + s**2) for m, s in points]
+    weights = np.exp(change - change.max())
+    shift = abs((weights @ points[:, 0] / weights.sum() - points[:, 0].mean()) / points[:, 0].std())
+    assert (shift > 0.3) == is_named and (checks.mean_errors["mean_a"] > 0.2) == is_named
+
+
+# the seeds of problems of `python -m tests.benchmarks hierarchy_warnings`
+@pytest.mark.parametrize("seed", [328, 359, 415])
+def test_right_results_have_no_warning(seed):
+    """Weighted samples, a chain, many samples: the population is narrow, and the result right all the same."""
+    found = solve(problem(seed), seed)
+    assert found.error < RIGHT
+    assert min(each.effective_samples for each in found.checks.tests.values()) < 20
+    assert found.kinds == ()
+
+
+@pytest.mark.parametrize(("seed", "kind"), [(366, "prior"), (382, "finite"), (401, "narrow"), (410, "bound")])
+def test_wrong_results_have_a_warning(seed, kind):
+    found = solve(problem(seed), seed)
+    assert found.error > WRONG
+    assert kind in found.kinds
 
 
 def test_samples_at_a_bound_below_the_population_are_a_warning(rng):
