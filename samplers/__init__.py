@@ -9,6 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
     from . import presets
+    from .cost import (
+        CostEstimate,
+        estimate_cost,
+    )
     from .moves.guided import (
         GuideMove,
     )
@@ -80,6 +84,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
 
 __all__ = [
     "CHING_CHEN_2007",
+    "CostEstimate",
     "Diagnostics",
     "EvidenceCheck",
     "Guide",
@@ -105,6 +110,7 @@ __all__ = [
     "Verdict",
     "compare_models",
     "comparison_table",
+    "estimate_cost",
     "ladder_plot",
     "ladder_table",
     "pair_plot",
@@ -115,6 +121,10 @@ __all__ = [
 ]
 
 _EXPORTS = {
+    "cost": (
+        "CostEstimate",
+        "estimate_cost",
+    ),
     "moves.guided": ("GuideMove",),
     "moves.kernels": (
         "MixtureMove",

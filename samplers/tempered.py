@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 from emcee import EnsembleSampler, State
-from emcee.pbar import get_progress_bar
 
 from .moves.fast_parameters import with_fast_sweeps
 from .moves.guided import GuideMove
 from .moves.kernels import RandomWalkMove, calibrate_move
 from .moves.snooker import with_snooker_moves
+from .reporting.progress import Progress, get_progress_bar, show_sweeps
 from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import SEED, header, warn_of_other_seed
@@ -36,7 +36,7 @@ from .storage.emcee_internals import get_moves, get_previous_state, get_random, 
 from .storage.evaluation import CallingConvention, FailureLimit
 from .storage.evaluators import check_asynchronous, make_evaluators
 from .storage.journal import RunStart
-from .storage.recording import record, show_progress
+from .storage.recording import record
 from .storage.resumption import PresentCall, Resumption
 from .storage.script import Request, describe_options
 from .storage.user_functions import UserFunctions
@@ -47,7 +47,7 @@ from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import lend
 from .tempering.multilevel import check_coarse
 from .tempering.mutation import MoveSchedule, check_moves
-from .tempering.population import GuideTick, Population, Sweep, check_size, check_start
+from .tempering.population import Population, check_size, check_start
 from .tempering.results import AnnealingResult
 from .tempering.settings import Settings, as_whole_number, combine_settings, refuse_unused
 from .tempering.verdict import describe_halt, independent_points, judge
@@ -317,7 +317,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
             if self._checkpoint.lost_journal:
                 self._compare_last_state()
             present.find(request._replace(coords=None if is_open else request.coords))
-            bar = {name: arguments[name] for name in ("progress", "progress_kwargs")}
+            bar = {name: arguments.pop(name) for name in ("progress", "progress_kwargs")}
             if present.call is not None and present.call.complete:
                 yield from self._repeat(present, bar)
             else:
@@ -352,9 +352,12 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         self._evaluator.evaluates_parts = False
         halted, advanced, stored, new = self._result.halt is not None, None, State(state, copy=True), 0
         check = {"skip_initial_state_check": skip_check or is_known}
-        steps = () if halted else super().sample(state, iterations=iterations, **check, **arguments)
+        steps = () if halted else super().sample(state, iterations=iterations, **check, **arguments, progress=False)
+        per_step = 1 if arguments["thin"] else int(arguments["thin_by"])
+        sweeps = None if iterations is None else iterations * per_step
+        shown = self._evaluator, self._functions.function, (self.nwalkers, self.ndim)
         try:
-            for advanced in steps:
+            for advanced in show_sweeps(steps, bar, sweeps, per_step, *shown):
                 new += 1
                 set_previous_state(self, State(advanced, copy=True))  # the next call without a state goes on here
                 if self._budget.limit is not None:
@@ -456,13 +459,18 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
             guidance = lend(self._guide, get_random(self), self._checkpoint.remember, self._budget)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse, guidance)
-        unit = " sweeps" if guidance is None else " batches"
+        unit = " evaluations" if guidance is None else " batches"
         labels = {"desc": "ladder", "unit": unit, **(bar["progress_kwargs"] or {})}
-        with get_progress_bar(bar["progress"], None, **labels) as shown, closing(self._evaluator):
+        known = None if coarse is not None or self.settings.runs > 1 or guidance is not None else self.settings
+        seen = self._evaluator, labels["desc"], self._functions.function, known, (self.nwalkers, self.ndim)
+        with (
+            get_progress_bar(bar["progress"], None, **labels) as shown,
+            closing(self._evaluator),
+            Progress(shown, *seen, counts_points=guidance is None) as progress,
+        ):
             for result, population, report in record(steps, self._evaluator, self._checkpoint):
                 self._result = result
-                if isinstance(report, Sweep | GuideTick):
-                    show_progress(shown, labels["desc"], population, report, self.evaluations, self._optional.report)
+                progress.show(result, population, report)
         if coarse is not None and coarse.failures.count:
             failed = coarse.failures.count, coarse.evaluations, coarse.failures.most_common()
             logger.warning("%d of %d evaluations of the coarse model failed and count as impossible (%s)", *failed)

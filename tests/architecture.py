@@ -50,6 +50,7 @@ ORDER = {
         ("units",),
     ),
     "samplers": (
+        ("cost",),
         ("smc", "tmcmc"),
         ("tempered",),
         ("reporting",),

@@ -91,7 +91,7 @@ class CachedSimulations(NewSimulations):
         self._outcomes = 0
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"pool": None, "_running": None}
+        return self.__dict__ | {"pool": None, "_running": None, "when_simulated": None}
 
     @property
     def verifications(self) -> int:

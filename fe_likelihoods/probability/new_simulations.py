@@ -122,6 +122,8 @@ class NewSimulations:
     _key: str | None
     _outcomes: int  # simulations of which is known whether they failed: run here, read from disk, or recalled
 
+    # called with the number of simulations that have ended, in this process only
+    when_simulated: Callable[[int], None] | None = None
     _running: _Stream | None = None  # not pickled
 
     # one by one ---------------------------------------------------------------------------------------------------
@@ -351,10 +353,10 @@ class NewSimulations:
         return max(1, _RESPONSE_VALUES // (self._response_shape[0] * self._response_shape[1]))
 
     def _chunk_limits(self, n: int, responses: bool) -> tuple[int, int]:
-        """Smallest (all workers are busy) and largest number of simulations, of n, between two writes to disk."""
-        if self.cache is None:
+        """Smallest (all workers are busy) and largest number of simulations, of n, between two writes or reports."""
+        if self.cache is None and (self.when_simulated is None or self.pool is not None):
             return n, n
-        largest = self._most_responses if responses or self.cache.responses else n
+        largest = self._most_responses if self._runs_responses(responses) else n
         if self.pool is not None:
             workers = self.pool.n_workers or n
         elif has_batch_method(self.model):
@@ -398,6 +400,8 @@ class NewSimulations:
         for theta, reason in zip(thetas, reasons, strict=True):
             if reason:
                 self._failures.add(theta, reason)
+        if self.when_simulated is not None:
+            self.when_simulated(len(thetas))
         self._compare_model(thetas, seconds)
         self._repeated_points.add(thetas, misfit, reasons, unchanged=not self._guard.unchecked)
         self.memory_cache.store(keys, misfit)

@@ -8,7 +8,7 @@ density is zero.
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -293,6 +293,22 @@ class Posterior:
         ...         print(ticket, log_prob)
         """
         return EvaluationQueue(self.likelihood, self.prior)
+
+    def when_simulated(self, callback: Callable[[float], None] | None) -> None:
+        """Announce simulations as they end, also within a batch: samplers show their progress with it.
+
+        A batch without a pool and without a cache on disk is then run in parts of about 5 s.
+
+        Parameters
+        ----------
+        callback : callable, or None
+            Called with a number of points: simulations of this process that have ended, each divided by the number of
+            likelihoods of a `JointLikelihood`. It must not raise. None: no longer.
+        """
+        parts = self.likelihood.parts()
+        share = 1.0 / len(parts)
+        for likelihood, _ in parts:
+            likelihood.when_simulated = None if callback is None else lambda n: callback(n * share)
 
     def fault(self, x: Any) -> str:
         """As `FELikelihood.fault`: samplers record the reason where they evaluate points in other processes.

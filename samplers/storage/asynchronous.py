@@ -53,6 +53,8 @@ class AsynchronousEvaluator(Evaluator):
         Called without arguments before the first point is submitted; returns an `EvaluationQueue`.
     """
 
+    asynchronous = True
+
     def __init__(self, *args: Any, open_queue: Callable[[Any], EvaluationQueue], **kwargs: Any):
         self._open_queue = open_queue
         super().__init__(*args, **kwargs)
@@ -79,6 +81,11 @@ class AsynchronousEvaluator(Evaluator):
         """Number of points that are evaluated at once."""
         return self._opened().workers or 1
 
+    @property
+    def known_workers(self) -> int | None:
+        """Number of points that are evaluated at once, if the queue says so."""
+        return self._opened().workers
+
     def submit(self, coords: np.ndarray) -> Flight:
         """Begin to evaluate points (n, ndim), of which the limit of simulations may allow the first few only."""
         if not np.all(np.isfinite(coords)):
@@ -97,6 +104,8 @@ class AsynchronousEvaluator(Evaluator):
                     refused, end, wanted = True, int(wanted[fitting]), wanted[:fitting]
             else:
                 self._check = None  # the interrupted run has checked its first batch
+                if self.observer is not None:
+                    self.observer.repeated(len(wanted))
             self.budget.count(coords[wanted])
             numbers.append((known, wanted))
             if refused:
@@ -113,6 +122,8 @@ class AsynchronousEvaluator(Evaluator):
                 if known is not None:
                     self._known[first + place] = known, place
             if known is None and len(wanted) > 0:
+                if self.observer is not None:
+                    self.observer.submitted(len(wanted))
                 tickets = self._opened().submit(coords[wanted])
                 self._tickets.update(zip(tickets, range(first, self._submitted), strict=True))
         return flight
@@ -156,6 +167,8 @@ class AsynchronousEvaluator(Evaluator):
             for place, number in enumerate(numbers):
                 self._known[number] = batch, place
             self.new_evaluations += len(numbers)
+            if self.observer is not None:
+                self.observer.finished(len(numbers))
             held.append(batch)
             if self._check is None or sum(np.isfinite(b.log_prob).sum() for b in held) >= FIRST_VALUES:
                 self._store(held)

@@ -11,7 +11,7 @@ once per second, so that a process that is killed loses the last second.
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
@@ -21,9 +21,10 @@ from ..tempering.flights import Flight, submit_and_wait
 from .checkpoint import Checkpoint
 from .first_evaluations import POINTS
 from .journal import EvaluatedBatch, merge_batches
+from .pool_queue import pool_size
 from .returned_values import ErrorCapturing, log_densities, log_probabilities, outcomes
 
-__all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures"]
+__all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures", "Observer"]
 
 KEPT_FAILURES = 1000
 KEPT_REASONS = 100
@@ -114,11 +115,17 @@ class CallingConvention(NamedTuple):
         return coords if named is None else ndarray_to_list_of_dicts(coords, named)
 
     def call(
-        self, function: Callable, coords: np.ndarray, pool: Any = None, note: Callable[[list], None] | None = None
+        self,
+        function: Callable,
+        coords: np.ndarray,
+        pool: Any = None,
+        note: Callable[[list], None] | None = None,
+        observer: "Observer | None" = None,
     ) -> Any:
         """Results of a function for points (n, ndim); `note` is called with the first of them about once per second.
 
-        A function of a batch has no first results, and neither has a pool whose ``map`` returns a list.
+        The observer hears of every result. A function of a batch has no first results, and neither has a pool whose
+        ``map`` returns a list.
         """
         points = self.as_points(coords)
         if self.vectorize:
@@ -126,10 +133,28 @@ class CallingConvention(NamedTuple):
         results, noted = [], time.perf_counter()
         for result in (map if pool is None else pool.map)(function, points):
             results.append(result)
+            if observer is not None:
+                observer.finished(1)
             if note is not None and time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
                 note(results)
                 noted = time.perf_counter()
         return results
+
+
+class Observer(Protocol):
+    """What is told of points while they are evaluated, such as `samplers.reporting.progress.Progress`."""
+
+    def repeated(self, points: int) -> None:
+        """Points of the interrupted run were taken from its journal."""
+
+    def submitted(self, points: int) -> None:
+        """Points begin to be evaluated."""
+
+    def finished(self, points: int) -> None:
+        """Points have been evaluated."""
+
+    def settled(self) -> None:
+        """All points that were submitted have been evaluated."""
 
 
 class EvaluationRecords:
@@ -210,7 +235,13 @@ class Evaluator:
         Number of points that this object has evaluated itself.
     pool : object with a method map, optional
         Where functions of one point are called; set by the sampler.
+    observer : Observer, optional
+        Told of points while they are evaluated.
+    asynchronous : bool
+        Whether `submit` returns without waiting.
     """
+
+    asynchronous = False
 
     def __init__(
         self,
@@ -232,11 +263,12 @@ class Evaluator:
         self.budget = Budget() if budget is None else budget
         self.evaluates_parts = True
         self.pool: Any = None
+        self.observer: Observer | None = None
         self.new_evaluations = 0
         self.reset()
 
     def __getstate__(self):
-        return {**self.__dict__, "pool": None}
+        return {**self.__dict__, "pool": None, "observer": None}
 
     def reset(self) -> None:
         """Forget evaluations and failures; `budget` keeps its points."""
@@ -307,6 +339,11 @@ class Evaluator:
         """0: `submit` waits for its points."""
         return 0
 
+    @property
+    def known_workers(self) -> int | None:
+        """Number of points that are evaluated at once, if the pool says so."""
+        return None if self.pool is None else pool_size(self.pool)
+
     def submit(self, coords: np.ndarray) -> Flight:
         """Evaluate points (n, ndim), of which the limit of simulations may allow the first few only."""
         return submit_and_wait(self, coords)
@@ -343,6 +380,8 @@ class Evaluator:
             if len(part) > 0:
                 if known is not None:
                     self._check = None  # the interrupted run has checked its first batch
+                    if self.observer is not None:
+                        self.observer.repeated(len(part))
                 batches.append(self._compute_and_store(part) if known is None else known)
                 self.count(batches[-1])
             if len(part) < len(wanted):
@@ -368,7 +407,11 @@ class Evaluator:
             self.new_evaluations += len(part.coords)
             stored = len(results)
 
-        results = self._convention.call(self._function, coords, self.pool, store_first)
+        if self.observer is not None:
+            self.observer.submitted(len(coords))
+        results = self._convention.call(self._function, coords, self.pool, store_first, self.observer)
+        if self.observer is not None:
+            self.observer.settled()
         batch = self._as_batch(coords, results)
         if self._limit is not None:
             self._limit.check(batch, self.evaluations, self.failures.count)

@@ -7,7 +7,7 @@ from typing import Any
 
 from .returned_values import Failed
 
-__all__ = ["PoolQueue", "can_submit"]
+__all__ = ["PoolQueue", "can_submit", "pool_size"]
 
 # Names under which pools have the number of their workers.
 SIZES = ("n_workers", "_max_workers", "_processes", "size")
@@ -16,6 +16,15 @@ SIZES = ("n_workers", "_max_workers", "_processes", "size")
 def can_submit(pool: Any) -> bool:
     """Whether a pool takes single points: executors of `concurrent.futures`, of mpi4py, dask clients, `Pool`."""
     return callable(getattr(pool, "submit", None)) or callable(getattr(pool, "apply_async", None))
+
+
+def pool_size(pool: Any) -> int | None:
+    """Number of workers of a pool, if it says so."""
+    threads = getattr(pool, "nthreads", None)  # of a dask client
+    if callable(threads):
+        return sum(threads().values()) or None
+    sizes = (getattr(pool, name, None) for name in SIZES)
+    return next((size for size in sizes if isinstance(size, int) and size > 0), None)
 
 
 class PoolQueue:
@@ -40,11 +49,7 @@ class PoolQueue:
     @property
     def workers(self) -> int | None:
         """Number of points that are evaluated at once, if the pool says so."""
-        threads = getattr(self._pool, "nthreads", None)  # of a dask client
-        if callable(threads):
-            return sum(threads().values()) or None
-        sizes = (getattr(self._pool, name, None) for name in SIZES)
-        return next((size for size in sizes if isinstance(size, int) and size > 0), None)
+        return pool_size(self._pool)
 
     def submit(self, coords: Any) -> list[int]:
         """Begin to evaluate points (n, ndim) without waiting; returns a number for each."""

@@ -1,8 +1,7 @@
-"""Recording of an annealing while it runs: wall time, evaluations and storage of its stages, and the progress bar."""
+"""Recording of an annealing while it runs: wall time, evaluations and storage of its stages."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 from ..tempering.diagnostics import check_evidence, warn
 from ..tempering.evidence_check import EvidenceCheck
@@ -10,19 +9,17 @@ from ..tempering.population import (
     Doubt,
     GuidedRound,
     GuidedStart,
-    GuideTick,
     Halt,
     Population,
     Report,
     Restart,
     Stage,
-    Sweep,
 )
 from ..tempering.results import AnnealingResult
 from .checkpoint import Checkpoint
 from .evaluation import Evaluator
 
-__all__ = ["record", "show_progress"]
+__all__ = ["record"]
 
 
 def record(
@@ -79,46 +76,3 @@ def record(
             warn(doubt.message)
             result = result._replace(doubts=(*result.doubts, doubt))
             yield result, population, doubt
-
-
-def show_progress(
-    bar: Any,
-    label: str,
-    population: Population,
-    tick: Sweep | GuideTick,
-    evaluations: int,
-    report: Callable[[], Mapping[str, Any]] | None,
-) -> None:
-    """Advance a progress bar by one sweep, or by one batch of a guide.
-
-    Parameters
-    ----------
-    bar : tqdm bar, or emcee's silent one
-        The bar.
-    label : str
-        Its description in sweeps; that of a guide is its phase.
-    population, tick : Population, Sweep or GuideTick
-        What to show.
-    evaluations : int
-        Number of evaluations so far.
-    report : callable, optional
-        Method ``report`` of the posterior; its number of simulations is shown, if it has one.
-    """
-    if not hasattr(bar, "set_postfix"):  # emcee's silent bar has only update
-        return
-    if isinstance(tick, GuideTick):
-        figures = {"simulations": f"{tick.simulations:.6g}"}
-        figures["ESS"] = f"{population.effective_sample_size:.0f}/{tick.target}"
-        bar.set_description_str(f"guide: {tick.phase}", refresh=False)
-        bar.set_postfix(figures, refresh=not tick.finished)  # shown before the first batch, which may take minutes
-        if tick.finished:
-            bar.update(1)
-    else:
-        figures = {"beta": f"{population.beta:.3g}", "ESS": f"{population.effective_sample_size:.0f}"}
-        figures |= {"acceptance": f"{tick.acceptance:.2f}", "evaluations": str(evaluations)}
-        simulations = None if report is None else report().get("simulations")
-        if simulations is not None:
-            figures["simulations"] = str(simulations)
-        bar.set_description_str(label, refresh=False)
-        bar.set_postfix(figures, refresh=False)
-        bar.update(1)

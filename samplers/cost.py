@@ -1,0 +1,272 @@
+"""What a run will take, from a few timed evaluations before it.
+
+The number of evaluations comes from `samplers.tempering.expected_cost`, with the spread of the log-likelihood at the
+timed draws of the prior, which says where the tempering begins. The wall time follows from it by list scheduling:
+evaluations are started in order, each on the first worker that is free. Their durations are log-normal, with the mean
+and the spread of the timed ones. A synchronous run waits for the end of every batch.
+"""
+
+import heapq
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .reporting.progress import as_duration
+from .smc import SMCSampler
+from .tempered import TemperedSampler
+from .tempering.expected_cost import Expected, expected_left, first_beta
+from .tempering.settings import Settings, as_whole_number
+
+__all__ = ["CostEstimate", "estimate_cost"]
+
+# Below this duration [s], the start of workers and the compilation of kernels may dominate the first evaluations.
+SHORT = 5.0
+REPETITIONS = 5  # of a scheduled batch
+SIMULATIONS_OF_A_GUIDE = 500
+
+
+class CostEstimate(NamedTuple):
+    """What a run with default settings will take, until beta = 1 is reached.
+
+    Attributes
+    ----------
+    sampler : str
+        Name of the sampler.
+    nwalkers, ndim, workers : int
+        Numbers of walkers, of parameters, and of evaluations that run at once.
+    seconds : (runs,) float
+        Durations of the timed evaluations [s].
+    failures : int
+        How many of all evaluations that were made returned -inf.
+    evaluations : Expected
+        Evaluations of the posterior: the low and the high end of a range, and a number between. Sweeps over fast
+        parameters, which need no simulation, do not count. Steps at beta = 1 come on top, with `nwalkers` each.
+    synchronous : Expected
+        Wall time [s] where every batch is waited for.
+    asynchronous : Expected or None
+        Wall time [s] with ``asynchronous=True``; None for a sampler that does not recycle.
+    guide : str
+        Duration of a run of 500 simulations with ``guide=posterior.guide()``; how many it needs is known only after its
+        search. Empty for a posterior without a guide.
+    """
+
+    sampler: str
+    nwalkers: int
+    ndim: int
+    workers: int
+    seconds: np.ndarray
+    failures: int
+    evaluations: Expected
+    synchronous: Expected
+    asynchronous: Expected | None
+    guide: str
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        first, last = self.seconds.min(), self.seconds.max()
+        rows = [
+            (f"{self.sampler}, {self.nwalkers} walkers, {self.ndim} parameters", ""),
+            (
+                f"one evaluation ({len(self.seconds)} timed)",
+                f"mean {self.seconds.mean():.3g} s, {first:.3g} to {last:.3g} s",
+            ),
+            ("evaluations", f"about {_rounded(self.evaluations.low)} to {_rounded(self.evaluations.high)}"),
+            (f"wall time, {self.workers} worker{'s' if self.workers > 1 else ''}", _range(self.synchronous)),
+        ]
+        if self.asynchronous is not None:
+            rows.append(("the same, asynchronous=True", _range(self.asynchronous)))
+        if self.guide:
+            rows.append(("with guide=posterior.guide()", self.guide))
+        if self.failures:
+            rows.append(("failed evaluations", f"{self.failures}"))
+        width = max(len(name) for name, _ in rows)
+        return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
+
+
+def _rounded(number: float) -> int:
+    return int(float(f"{number:.2g}"))
+
+
+def _range(seconds: Expected) -> str:
+    return as_duration(seconds.low, seconds.high)
+
+
+def estimate_cost(
+    posterior: Callable,
+    nwalkers: int = 500,
+    sampler: type[TemperedSampler] = SMCSampler,
+    workers: int | None = None,
+    runs: int = 3,
+    seed: int | None = None,
+) -> CostEstimate:
+    """Time a few evaluations, and estimate what a run with default settings will take.
+
+    The timed points are draws of the prior. With the same `seed`, a sampler starts from these points, so that a
+    posterior that caches its simulations does not repeat them. The estimate of the evaluations is a range, which held
+    in 70 to 90 % of runs on posteriors that it was not made from (``python -m tests.benchmarks expected``). A posterior
+    with heavy tails needs more. Evaluations that take longer near the posterior than over the prior are not foreseen.
+
+    Parameters
+    ----------
+    posterior : callable
+        Log-posterior of a point (ndim,), with ``ndim``, ``log_prior`` and ``sample_prior``. Where it has a method
+        ``evaluation_queue``, the points are sent to its pool.
+    nwalkers : int
+        Number of walkers.
+    sampler : type
+        `SMCSampler` or `TMCMCSampler`.
+    workers : int, optional
+        Number of evaluations that run at once in the run to be estimated. By default that of the pool of the posterior,
+        or 1 if it has none.
+    runs : int
+        Number of timed evaluations, at least 2. They run at the same time where the pool has as many workers. Where one
+        of them takes less than 5 s, as many more are timed one after the other, and these count: the first ones may
+        contain the start of workers or a compilation.
+    seed : int, optional
+        Seed of the run to be estimated. By default the draws differ from call to call.
+
+    Returns
+    -------
+    CostEstimate
+        Printed as a small table.
+
+    Raises
+    ------
+    ValueError
+        For impossible arguments, or where fewer than two of the evaluations have a finite log-probability.
+
+    Examples
+    --------
+    >>> print(estimate_cost(posterior, workers=64, seed=1))
+    """
+    runs = as_whole_number("runs", runs)
+    if runs < 2:
+        raise ValueError(f"runs must be at least 2, since one duration has no spread; got {runs}")
+    if workers is not None and as_whole_number("workers", workers) < 1:
+        raise ValueError(f"workers must be at least 1; got {workers}")
+    for name in ("ndim", "log_prior", "sample_prior"):
+        if not hasattr(posterior, name):
+            raise ValueError(f"estimate_cost needs a posterior with {name}; got {type(posterior).__name__} without it")
+    ndim = as_whole_number("ndim", posterior.ndim)
+    settings = sampler(nwalkers, ndim, posterior, vectorize=True, seed=0).settings  # also checks the arguments
+    random = np.random.RandomState(seed)
+    draws = np.asarray(posterior.sample_prior(max(nwalkers, runs), random), dtype=float)  # as those of the sampler
+    seconds, values, found = _timed(posterior, draws[:runs])
+    timed = values
+    if seconds.min() < SHORT and len(draws) >= 2 * runs:
+        seconds, values, _ = _timed(posterior, draws[runs : 2 * runs], at_once=False)
+        timed = np.concatenate([timed, values])
+    log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in draws[: len(timed)]])
+    finite = np.isfinite(timed)
+    if finite.sum() < 2:
+        raise ValueError(
+            f"{len(timed) - finite.sum()} of {len(timed)} draws of the prior have a log-probability of -inf, and the "
+            "estimate needs two finite ones: check the model at these points, or time more with runs="
+        )
+    recycling = bool(settings.recycle)
+    beta = first_beta(timed[finite] - log_prior[finite], recycling)
+    left = expected_left(settings, nwalkers, ndim, recycling, beta)
+    evaluations = Expected(*(nwalkers + value for value in left))
+    workers = int(workers or found or 1)
+    times = _wall_times(settings, evaluations, nwalkers, ndim, seconds, workers, recycling)
+    return CostEstimate(
+        sampler.__name__,
+        nwalkers,
+        ndim,
+        workers,
+        seconds,
+        int((~finite).sum()),
+        evaluations,
+        times[0],
+        times[1],
+        _of_guide(posterior, float(seconds.mean()), workers),
+    )
+
+
+def _timed(posterior: Any, points: np.ndarray, at_once: bool = True) -> tuple[np.ndarray, np.ndarray, int | None]:
+    """Durations [s] (n,) and log-probabilities (n,) of points (n, ndim), and the number of workers, if it is known."""
+    if not callable(getattr(posterior, "evaluation_queue", None)):
+        pairs = [_timed_call(posterior, point) for point in points]
+        return *(np.array(column) for column in zip(*pairs, strict=True)), None
+    queue = posterior.evaluation_queue()
+    try:
+        workers = queue.workers
+        together = at_once and (workers or 1) >= len(points)
+        batches = [points] if together else [points[[row]] for row in range(len(points))]
+        seconds, values = [], []
+        for batch in batches:
+            start, arrived = time.perf_counter(), {}
+            tickets = queue.submit(batch)
+            while len(arrived) < len(tickets):
+                finished = queue.collect()
+                now = time.perf_counter() - start
+                arrived.update({ticket: (now, value) for ticket, value in finished})
+            seconds += [arrived[ticket][0] for ticket in tickets]
+            values += [arrived[ticket][1] for ticket in tickets]
+    finally:
+        queue.close()
+    return np.array(seconds), np.array(values, dtype=float), workers
+
+
+def _timed_call(posterior: Callable, point: np.ndarray) -> tuple[float, float]:
+    start = time.perf_counter()
+    value = float(np.ravel(posterior(point))[0])
+    return time.perf_counter() - start, value
+
+
+def _scheduled(lengths: np.ndarray, workers: int) -> float:
+    """Time at which the last of some evaluations with given durations (n,) ends, on a number of workers."""
+    free = [0.0] * workers
+    for length in lengths:
+        heapq.heapreplace(free, free[0] + float(length))
+    return max(free)
+
+
+def _wall_times(
+    settings: Settings,
+    evaluations: Expected,
+    nwalkers: int,
+    ndim: int,
+    seconds: np.ndarray,
+    workers: int,
+    recycling: bool,
+) -> tuple[Expected, Expected | None]:
+    """Wall times [s] of a synchronous and of an asynchronous run."""
+    spread = float(np.std(np.log(np.maximum(seconds, 1e-9)), ddof=1))
+    random = np.random.default_rng(0)
+    # the mean of the timed durations has an error of its own
+    error = min(float(np.std(seconds, ddof=1) / np.mean(seconds)) / np.sqrt(len(seconds)), 0.5)
+    factors = (1.0 - error, 1.0, 1.0 + error)
+
+    def of_batch(size: float) -> float:
+        lengths = random.lognormal(-0.5 * spread**2, spread, (REPETITIONS, max(round(size), 1)))
+        return float(np.mean(seconds)) * float(np.mean([_scheduled(row, workers) for row in lengths]))
+
+    if not recycling:
+        batch = of_batch(nwalkers)
+        return Expected(*(f * batch * n / nwalkers for f, n in zip(factors, evaluations, strict=True))), None
+    options = settings.recycling
+    size = options.draws_per_target * max(options.target_share * nwalkers, options.points_per_dimension * (ndim + 1.0))
+    batch, whole = of_batch(size), of_batch(nwalkers)
+    between = [max(n - 2.0 * nwalkers, 0.0) for n in evaluations]  # but the draws of the prior and of the check
+    waiting = (f * (2.0 * whole + batch * n / size) for f, n in zip(factors, between, strict=True))
+    # without barriers, all workers are busy until the check, which waits for all that came before it
+    busy = float(np.mean(seconds)) / workers
+    flowing = (f * (2.0 * whole + busy * n) for f, n in zip(factors, between, strict=True))
+    return Expected(*waiting), Expected(*flowing)
+
+
+def _of_guide(posterior: Any, seconds: float, workers: int) -> str:
+    """What can be said of a run with a guide; its number of simulations depends on what the search finds."""
+    if not callable(getattr(posterior, "guide", None)):
+        return ""
+    try:
+        posterior.guide()
+    except ValueError:
+        return ""
+    wall = seconds * SIMULATIONS_OF_A_GUIDE / workers
+    return f"not predicted; {SIMULATIONS_OF_A_GUIDE} simulations take {as_duration(wall, wall)}"
