@@ -201,7 +201,7 @@ class Progress:
         """Show a report of the annealing."""
         if self._silent:
             return
-        if isinstance(report, Stage | Sweep):
+        if isinstance(report, Sweep) or (isinstance(report, Stage) and self._counts_points):
             self._figures = {"beta": f"{population.beta:.3g}", "ESS": f"{population.effective_sample_size:.0f}"}
             self._figures["acceptance"] = f"{report.acceptance:.2f}"
             if result.ladder:
@@ -216,6 +216,8 @@ class Progress:
         elif isinstance(report, GuideTick):
             effective = f"{population.effective_sample_size:.0f}/{report.target}"
             self._figures = {"simulations": f"{report.simulations:.6g}", "ESS": effective}
+            if result.rounds:
+                self._figures["log Z"] = f"{result.rounds[-1].log_evidence:.2f}"
             self._bar.set_description_str(f"guide: {report.phase}", refresh=False)
             self._draw(int(report.finished), refresh=not report.finished)  # before a batch, which may take minutes
         elif isinstance(report, Sweep):
