@@ -131,8 +131,8 @@ def make_posterior(model, data: Measurements, pool, cache: Path | None) -> Poste
 #     likelihood = FELikelihood(model, measurements, pool=client, cache="simulations.db")
 #
 # Model and data are sent to each worker once, afterwards only parameters. The cache stays with the process of the
-# sampler. TMPDIR must be a folder that all machines can read. The second choice is ``mpi4py.futures.MPIPoolExecutor``
-# with ``mpiexec -n 65 python -m mpi4py.futures script.py``. The results are the same to the last bit on all of them.
+# sampler. The second choice is ``mpi4py.futures.MPIPoolExecutor`` with ``mpiexec -n 65 python -m mpi4py.futures
+# script.py``. The results are the same to the last bit on all of them. :doc:`/clusters` has complete scripts.
 
 
 def make_pool(kind: str, workers: int):

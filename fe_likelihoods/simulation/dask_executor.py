@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future
 from concurrent.futures import wait as wait_for
 from functools import cache, partial
@@ -68,13 +68,31 @@ class DaskExecutor(PoolExecutor):
     Parameters
     ----------
     pool : dask.distributed.Client
+    resources : dict of str to float, optional
+        What one simulation takes of the resources that workers were started with, such as ``{"GPU": 1}``.
+    longest_wait : float, optional
+        How long simulations wait for a cluster without workers before the run ends with an error [s]; one hour by
+        default. More is needed where jobs wait in the queue of the machine for longer.
+
+    Raises
+    ------
+    ValueError
+        If `longest_wait` or an amount of `resources` is not positive.
     """
 
     other_processes = True
     submits = True
 
-    def __init__(self, pool: Any) -> None:
+    def __init__(
+        self, pool: Any, resources: Mapping[str, float] | None = None, longest_wait: float | None = None
+    ) -> None:
         super().__init__(pool)
+        self.resources = dict(resources or {})
+        if longest_wait is not None and not longest_wait > 0:
+            raise ValueError(f"longest_wait must be a positive number of seconds, or None; got {longest_wait!r}")
+        self._options = {"resources": self.resources} if resources else {}
+        if any(not amount > 0 for amount in self.resources.values()):
+            raise ValueError(f"resources must be positive amounts by name, such as {{'GPU': 1}}; got {resources}")
         self._seconds: float | None = None  # mean duration of an item in the last map or stream
         self._total, self._done = 0.0, 0
         self._lock = threading.RLock()
@@ -83,11 +101,13 @@ class DaskExecutor(PoolExecutor):
         self._suspects: deque[_Item] = deque()
         self._suspect: _Group | None = None  # the one that runs
         self._losses = 0  # tasks that dask has given up
-        self._watch: WorkerWatch | None = None
+        self._watch = WorkerWatch(self.pool, lambda: [group.inner for group in self._sent], longest_wait)
 
     @property
     def n_workers(self) -> int | None:
-        """Number of threads of all workers that the cluster has at present."""
+        """Number of simulations that run at once on the workers that the cluster has at present."""
+        if self.resources:
+            return self.pool.run_on_scheduler(_places, self.resources) or None
         return sum(self.pool.nthreads().values()) or None
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
@@ -152,12 +172,12 @@ class DaskExecutor(PoolExecutor):
         """Send groups of items with the same function; the lock is held."""
         sent = [_Group(items, self._losses) for items in groups]
         if not self._sent:
-            self._watch = WorkerWatch(self.pool, lambda: [group.inner for group in self._sent])
             self._watch.start()
         self._sent.update(sent)
         function = partial(_run_group, groups[0][0].reference)
         try:
-            inner = self.pool.map(function, [[item.item for item in items] for items in groups], pure=False)
+            contents = [[item.item for item in items] for items in groups]
+            inner = self.pool.map(function, contents, pure=False, **self._options)
         except BaseException:
             self._forget(sent)
             raise
@@ -172,7 +192,7 @@ class DaskExecutor(PoolExecutor):
         self._sent.difference_update(groups)
         if self._suspect is not None and self._suspect not in self._sent:
             self._suspect = None
-        if not self._sent and self._watch is not None:
+        if not self._sent:
             self._watch.stop()
 
     # receiving, in a thread of dask -------------------------------------------------------------------------------
@@ -249,6 +269,14 @@ class DaskExecutor(PoolExecutor):
             item = self._suspects.popleft()
             if not item.cancelled():
                 (self._suspect,) = self._send([[item]])
+
+
+def _places(resources: dict[str, float], dask_scheduler: Any) -> int:
+    """Number of simulations that fit on the workers; called in the scheduler."""
+    return sum(
+        min(worker.nthreads, *(int(worker.resources.get(name, 0.0) // amount) for name, amount in resources.items()))
+        for worker in dask_scheduler.workers.values()
+    )
 
 
 def _again(item: _Item, outcome: Any) -> bool:

@@ -13,6 +13,7 @@ logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN_CHECKS = 5.0
 SECONDS_TO_START = 60.0  # before the same workers are asked for again
+SECONDS_TO_RETURN = 15.0  # within which a nanny starts the process of a worker again
 # How long a map waits for a first or another worker of a cluster that has none [s]
 LONGEST_WITHOUT_WORKER = 3600.0
 
@@ -25,12 +26,18 @@ class WorkerWatch:
     longer, or a simulation has killed it once more. A cluster that has lost all of its workers in this way makes its
     client wait for ever. So such workers are asked for again.
 
+    A job of dask-jobqueue with several worker processes that has ended, as by its walltime or the lifetimes of its
+    workers, is never noticed by the cluster, and adaptive scaling counts it as present. So jobs whose workers were here
+    and are gone are submitted again. A job that waits in the queue of the machine is left alone.
+
     Parameters
     ----------
     client : dask.distributed.Client
         The client.
     futures : callable
-        Returns the futures that are waited for; they are cancelled after `LONGEST_WITHOUT_WORKER` without any worker.
+        Returns the futures that are waited for; they are cancelled after `longest_wait` without any worker.
+    longest_wait : float, optional
+        How long a cluster may have no worker [s]; by default `LONGEST_WITHOUT_WORKER`.
 
     Attributes
     ----------
@@ -38,35 +45,44 @@ class WorkerWatch:
         Whether the futures were cancelled for want of a worker.
     """
 
-    def __init__(self, client: Any, futures: Callable[[], Sequence[Any]]):
-        self._client, self._futures = client, futures
+    def __init__(self, client: Any, futures: Callable[[], Sequence[Any]], longest_wait: float | None = None):
+        self._client, self._futures, self._longest_wait = client, futures, longest_wait
         self._ends, self.gave_up = threading.Event(), False
         self._asked: tuple[set, float] = (set(), 0.0)
+        self._seen: dict[Any, float] = {}  # when a worker of a job was last here
+
+    @property
+    def longest_wait(self) -> float:
+        """How long a cluster may have no worker [s]."""
+        return LONGEST_WITHOUT_WORKER if self._longest_wait is None else self._longest_wait
 
     @property
     def error(self) -> RuntimeError:
         """The error where `gave_up`."""
         return RuntimeError(
-            f"the dask cluster has had no worker for {LONGEST_WITHOUT_WORKER:g} s: start workers or scale the "
-            "cluster, and run again. Evaluations that are stored are not repeated"
+            f"the dask cluster has had no worker for {self.longest_wait:g} s: start workers or scale the cluster, or "
+            "wait longer by DaskExecutor(client, longest_wait=...), and run again. Evaluations that are stored are not "
+            "repeated"
         )
 
     def start(self) -> None:
-        """Begin to watch, in a thread."""
-        threading.Thread(target=self._watch, name="watch of dask workers", daemon=True).start()
+        """Begin to watch, in a thread; what was seen before is known."""
+        self._ends, self.gave_up = threading.Event(), False
+        arguments = (self._ends,)
+        threading.Thread(target=self._watch, args=arguments, name="watch of dask workers", daemon=True).start()
 
     def stop(self) -> None:
         """End the watch."""
         self._ends.set()
 
-    def _watch(self) -> None:
+    def _watch(self, ends: threading.Event) -> None:
         last_seen = time.monotonic()
-        while not self._ends.wait(SECONDS_BETWEEN_CHECKS):
+        while not ends.wait(SECONDS_BETWEEN_CHECKS):
             with contextlib.suppress(Exception):  # the cluster or the client is closing
                 self._restart_lost_workers(getattr(self._client, "cluster", None))
                 if self._client.nthreads():
                     last_seen = time.monotonic()
-            if time.monotonic() - last_seen > LONGEST_WITHOUT_WORKER:
+            if time.monotonic() - last_seen > self.longest_wait:
                 self.gave_up = True
                 with contextlib.suppress(Exception):
                     self._client.cancel(self._futures(), force=True)
@@ -77,11 +93,34 @@ class WorkerWatch:
         wanted, present = getattr(cluster, "worker_spec", None), getattr(cluster, "workers", None)
         if wanted is None or present is None:
             return
-        lost, (asked, when) = set(wanted) - set(present), self._asked
-        if not lost or (lost <= asked and time.monotonic() - when < SECONDS_TO_START):
+        groups = {name: spec["group"] for name, spec in wanted.items() if "group" in spec}
+        ended = self._ended_jobs(cluster, groups) & set(present)
+        lost, (asked, when) = set(wanted) - set(present) - set(groups), self._asked
+        if lost <= asked and time.monotonic() - when < SECONDS_TO_START:
+            lost = set()
+        if not lost and not ended:
             return
-        self._asked = lost, time.monotonic()
+        if lost:
+            self._asked = lost, time.monotonic()
+        n_workers = sum(len(groups.get(name, " ")) for name in wanted)
         logger.warning(
-            "The dask cluster has given up %d of its %d workers: starting them again", len(lost), len(wanted)
+            "The dask cluster has given up %d of its %d %s: starting them again",
+            len(lost) + len(ended),
+            len(wanted),
+            "jobs" if ended else "workers",
         )
-        cluster.scale(len(wanted))
+        if ended:
+            cluster.sync(cluster.scale_down, ended)
+            for name in ended:
+                del self._seen[name]
+        cluster.scale(n_workers)
+
+    def _ended_jobs(self, cluster: Any, groups: dict[Any, Sequence[str]]) -> set:
+        """Jobs with several workers, by the suffixes of their names, of which none is left."""
+        if not groups:
+            return set()
+        here, now = {worker["name"] for worker in cluster.scheduler_info["workers"].values()}, time.monotonic()
+        for name, suffixes in groups.items():
+            if any(f"{name}{suffix}" in here for suffix in suffixes):
+                self._seen[name] = now
+        return {name for name in groups if now - self._seen.get(name, now) > SECONDS_TO_RETURN}

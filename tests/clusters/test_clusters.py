@@ -1,0 +1,277 @@
+"""The scripts of docs/clusters on SLURM, MPI and one machine; workers, parents and schedulers end in the middle."""
+
+import contextlib
+import importlib.util
+import os
+import re
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.simulation import dask_workers
+from tests.clusters import noted, slurm_machine
+from tests.clusters.slurm_machine import SlurmMachine
+from tests.faults.treacherous import Treacherous, posterior_of
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = ROOT / "docs" / "clusters"
+LARGEST_GROUP = 20  # short simulations that are one task of dask, and are repeated if its worker ends
+JOB = ["--partition", "compute", "--memory", "1GB"]
+LOG_EVIDENCE = 2427.63  # +- 0.01, of problem.py with 2000 walkers in one process
+PRINTED = re.compile(r"log-evidence ([\d.]+) \+- ([\d.]+)")
+
+
+def needs(module):
+    missing = importlib.util.find_spec(module) is None
+    return pytest.mark.skipif(missing, reason=f"NO {module.upper()}: install it to test the scripts for clusters")
+
+
+needs_slurm = pytest.mark.skipif(
+    not slurm_machine.is_installed(), reason="NO SLURM: `apt-get install slurm-wlm munge` to test its scripts"
+)
+
+
+@pytest.fixture
+def slurm():
+    with SlurmMachine() as machine:
+        yield machine
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Folder with the scripts of the documentation, whose model is slow."""
+    for script in SCRIPTS.iterdir():
+        if script.suffix in (".py", ".sh"):
+            shutil.copy(script, tmp_path)
+    slow = (Path(__file__).parent / "slow_model.py").read_text()
+    with open(tmp_path / "problem.py", "a") as file:
+        file.write(slow)
+    return tmp_path
+
+
+@contextlib.contextmanager
+def started(place, machine, *command):
+    """A process of a script, which is killed at the end."""
+    environment = (machine.environment if machine else dict(os.environ)) | {"PYTHONPATH": str(ROOT)}
+    with (
+        open(place / "output.txt", "ab") as output,
+        subprocess.Popen(
+            [sys.executable, *command], cwd=place, env=environment, stdout=output, stderr=output
+        ) as process,
+    ):
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def lines(place, name):
+    path = place / name
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def progressed(place, process, number):
+    """Wait until a number of simulations has ended."""
+    stop = time.monotonic() + 300.0
+    while len(lines(place, "ends.txt")) < number:
+        assert process.poll() is None, (place / "output.txt").read_text()
+        assert time.monotonic() < stop, "no progress"
+        time.sleep(0.1)
+
+
+def check_result(place, interruptions):
+    """Every simulation that ended is in the cache, and the evidence is that of one machine without interruptions.
+
+    Each of the interruptions, the ends of worker processes, has repeated one group of simulations at most.
+    """
+    text = (place / "output.txt").read_text()
+    estimate, error = map(float, PRINTED.search(text).groups())
+    assert abs(estimate - LOG_EVIDENCE) < 4.0 * np.hypot(error, 0.01) + 0.01, text  # printed with two digits
+    starts, ends = Counter(lines(place, "starts.txt")), Counter(lines(place, "ends.txt"))
+    assert set(starts) == set(ends)  # what was interrupted was simulated again
+    repeated = starts.total() - len(starts)
+    assert repeated <= LARGEST_GROUP * interruptions, (repeated, interruptions)
+    with contextlib.closing(sqlite3.connect(place / "simulations.db")) as cache:
+        rows = cache.execute("select count(*) from simulations").fetchone()[0]
+    # the measurements are a simulation of the function that is not one of the likelihood
+    assert rows == len(ends) - 1
+    return repeated
+
+
+def ended_workers(place):
+    """Number of worker processes that have begun, by the logs of the jobs."""
+    return sum(path.read_text().count("Start worker at") for path in place.glob("slurm-*.out"))
+
+
+@needs_slurm
+@needs("dask_jobqueue")
+@pytest.mark.slow
+def test_slurm_accepts_the_directives(slurm, place):
+    for command in (["python", "dask_jobs.py"], ["--cpus-per-task=8", "slurm.sh", "python", "one_machine.py"]):
+        command = command if "slurm.sh" in command else ["slurm.sh", *command]
+        assert "to start at" in slurm.run("sbatch", "--test-only", *command, folder=place)
+    code = "import dask_jobs; print(dask_jobs.make_cluster(dask_jobs.parse_arguments()).job_script())"
+    environment = slurm.environment | {"PYTHONPATH": str(ROOT)}
+    options = [*JOB, "--cores", "8", "--threads", "4"]
+    script = subprocess.run(
+        [sys.executable, "-c", code, *options], cwd=place, env=environment, capture_output=True, text=True, check=True
+    ).stdout
+    (place / "worker.sh").write_text(script)
+    assert "to start at" in slurm.run("sbatch", "--test-only", "worker.sh", folder=place)
+    assert "OMP_NUM_THREADS=4" in script
+    assert re.search(r"--nworkers 2.*--nthreads 1 --lifetime 7h", script), script
+    refused = slurm.run("sbatch", "--test-only", "--partition=none", "slurm.sh", "true", folder=place, check=False)
+    assert "invalid partition" in refused.lower()  # the negative control
+
+
+@needs_slurm
+@needs("dask_jobqueue")
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("lifetime", ["1h", "25s"])
+def test_workers_that_end_with_their_walltime_are_replaced(lifetime, slurm, place):
+    """Jobs of one minute: SLURM kills them (a lifetime of 1 h), or their workers leave before."""
+    slurm.environment["SECONDS_PER_SIMULATION"] = "0.2" if lifetime == "1h" else "0.1"
+    options = ["--cores", "3", "--jobs", "2", "--walltime", "00:01:00", "--lifetime", lifetime, "--stagger", "3s"]
+    with started(place, slurm, "dask_jobs.py", *JOB, *options) as parent:
+        assert parent.wait(600) == 0, (place / "output.txt").read_text()
+    states = Counter(slurm.jobs().values())
+    assert states.total() > 2, states
+    if lifetime == "1h":
+        assert states["TIMEOUT"] >= 1, states
+    check_result(place, ended_workers(place))
+
+
+@needs_slurm
+@needs("dask_jobqueue")
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_parent_and_a_controller_that_are_killed(slurm, place):
+    """slurmctld is killed by -9 and comes back; then the parent with the scheduler of dask is, and its jobs end."""
+    command = ["dask_jobs.py", *JOB, "--cores", "2", "--jobs", "2"]
+    with started(place, slurm, *command) as parent:
+        progressed(place, parent, 300)
+        slurm.kill_controller()
+        progressed(place, parent, 500)
+        slurm.start_controller()
+        progressed(place, parent, 800)
+        parent.kill()
+    done = len(lines(place, "ends.txt"))
+    with started(place, slurm, *command) as parent:
+        assert parent.wait(400) == 0, (place / "output.txt").read_text()
+    slurm.wait_until(lambda: not slurm.jobs("RUNNING,PENDING"), 120.0)  # workers whose scheduler has died end
+    again = int(re.search(r"(\d+) simulations by this process", (place / "output.txt").read_text())[1])
+    assert done > 800 and again < len(lines(place, "ends.txt")) - 700
+    check_result(place, ended_workers(place))
+
+
+@needs_slurm
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_job_submits_itself_again_before_its_walltime_ends(slurm, place):
+    """``slurm.sh`` with a walltime of two minutes; SLURM sends its signal up to a minute early."""
+    slurm.environment |= {"SECONDS_PER_SIMULATION": "0.08", "PYTHONPATH": str(ROOT)}
+    options = ["--time=2", "--signal=B:USR1@30", "--cpus-per-task=2", "--output=output.txt"]
+    command = ["slurm.sh", sys.executable, "one_machine.py", "--cores", "2"]
+    number = int(slurm.run("sbatch", "--parsable", *options, *command, folder=place))
+    slurm.wait_until(lambda: slurm.jobs().get(number) in ("COMPLETED", "FAILED", "TIMEOUT"), 600.0)
+    text = (place / "output.txt").read_text()
+    assert slurm.jobs()[number] == "COMPLETED", text
+    assert "Restarts=1" in slurm.run("scontrol", "show", "job", str(number)) and "KeyboardInterrupt" in text
+    check_result(place, 2 * 2)
+
+
+@needs("mpi4py")
+@pytest.mark.slow
+def test_mpi(place):
+    mpiexec = Path(sys.executable).with_name("mpiexec")
+    command = [mpiexec if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", "3"]
+    command += [sys.executable, "-m", "mpi4py.futures", "mpi.py"]
+    environment = os.environ | {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    environment |= {"PYTHONPATH": str(ROOT), "SECONDS_PER_SIMULATION": "0.002"}
+    with open(place / "output.txt", "wb") as output:
+        subprocess.run(command, cwd=place, env=environment, stdout=output, stderr=output, timeout=300, check=True)
+    assert check_result(place, 0) == 0
+
+
+@pytest.mark.slow
+def test_one_machine_stopped_by_a_signal_goes_on(place, monkeypatch):
+    monkeypatch.setenv("SECONDS_PER_SIMULATION", "0.01")
+    with started(place, None, "one_machine.py", "--cores", "2") as parent:
+        progressed(place, parent, 1000)
+        parent.send_signal(signal.SIGTERM)
+        assert parent.wait(60) != 0
+    with started(place, None, "one_machine.py", "--cores", "2") as parent:
+        assert parent.wait(300) == 0
+    check_result(place, 2)
+
+
+# quick ones -----------------------------------------------------------------------------------------------------------
+
+
+@needs("dask_jobqueue")
+def test_a_job_with_several_workers_that_has_ended_is_submitted_again(tmp_path, monkeypatch):
+    """Jobs of dask-jobqueue that are processes of this machine; the first one is ended in the middle."""
+    from dask.distributed import Client
+    from dask_jobqueue.local import LocalCluster, LocalJob
+
+    jobs = []
+
+    class Job(LocalJob):
+        async def start(self):
+            jobs.append(self.name)
+            await super().start()
+
+        @classmethod
+        async def _close_job(cls, job_id, cancel_command):
+            with contextlib.suppress(ProcessLookupError):  # it has ended, which scancel does not mind
+                await super()._close_job(job_id, cancel_command)
+
+    class Cluster(LocalCluster):
+        job_cls = Job
+
+    monkeypatch.setattr(dask_workers, "SECONDS_BETWEEN_CHECKS", 0.1)
+    monkeypatch.setattr(dask_workers, "SECONDS_TO_RETURN", 0.5)
+    options = ["--nthreads", "1", "--no-dashboard"]
+    with (
+        Cluster(
+            cores=2, processes=2, memory="1GB", worker_extra_args=options, local_directory=str(tmp_path)
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        cluster.scale(jobs=1)
+        posterior = posterior_of(noted.EndsItsJob(tmp_path), pool=client)
+        points = posterior.sample_prior(20, 1)
+        values = posterior(points)
+    assert len(jobs) == 2
+    np.testing.assert_array_equal(values, posterior_of(Treacherous())(points))
+    assert posterior.report()["failure_count"] == 0
+
+
+@needs("distributed")
+def test_resources_limit_the_simulations_that_run_at_once(tmp_path):
+    from dask.distributed import Client, LocalCluster
+
+    from fe_likelihoods.simulation.executors import DaskExecutor
+
+    with (
+        LocalCluster(1, threads_per_worker=4, processes=False, resources={"GPU": 3}, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        pool = DaskExecutor(client, resources={"GPU": 1.5})
+        assert pool.n_workers == 2
+        assert pool.map(noted.counted, range(8)) == [(item, "") for item in range(8)]
+        assert noted.most == 2
+        assert DaskExecutor(client).map(noted.counted, range(8)) and noted.most == 4  # the negative control
+    with pytest.raises(ValueError, match="resources must be positive"):
+        DaskExecutor(client, resources={"GPU": 0})
+    with pytest.raises(ValueError, match="longest_wait must be"):
+        DaskExecutor(client, longest_wait=0)
