@@ -1,6 +1,6 @@
 #!/bin/bash
 # sbatch slurm.sh python dask_jobs.py --jobs 8
-# sbatch --cpus-per-task=64 slurm.sh python one_machine.py
+# sbatch --cpus-per-task=64 --mem=128G slurm.sh python one_machine.py
 #SBATCH --job-name=update
 #SBATCH --partition=compute
 #SBATCH --time=08:00:00

@@ -128,6 +128,9 @@ def test_slurm_accepts_the_directives(slurm, place):
     assert "to start at" in slurm.run("sbatch", "--test-only", "worker.sh", folder=place)
     assert "OMP_NUM_THREADS=4" in script
     assert re.search(r"--nworkers 2.*--nthreads 1 --lifetime 7h", script), script
+    command = [sys.executable, "-c", code, *options, "--system", "pbs"]  # no PBS is there to accept it
+    script = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=True).stdout
+    assert "#PBS -l select=1:ncpus=8:mem=" in script and "#PBS -l walltime=08:00:00" in script
     refused = slurm.run("sbatch", "--test-only", "--partition=none", "slurm.sh", "true", folder=place, check=False)
     assert "invalid partition" in refused.lower()  # the negative control
 
