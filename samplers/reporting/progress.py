@@ -248,10 +248,17 @@ class Progress:
         left = self._still_expected()
         if self._counts_points:
             steps, self._shown = self._done - self._shown, self._done
-            self._bar.total = None if left is None else self._done + round(left.likely)
+            self._set_total(None if left is None else self._done + round(left.likely))
         self._bar.set_postfix(self._figures | self._counts(left), refresh=refresh)
         if not refresh or steps > 0:
             self._bar.update(steps)
+
+    def _set_total(self, total: int | None) -> None:
+        self._bar.total = total
+        container = getattr(self._bar, "container", None)
+        if container is not None and total:  # of a notebook, whose bar has a total of its own
+            widget = container.children[1]
+            widget.max, widget.bar_style, widget.layout.width = total, "", None
 
     def _still_expected(self) -> Expected | None:
         """The range after the latest stage, less what was evaluated since."""
