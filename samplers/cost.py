@@ -107,7 +107,7 @@ def estimate_cost(
 
     The timed points are draws of the prior. With the same `seed`, a sampler starts from these points, so that a
     posterior that caches its simulations does not repeat them. The estimate of the evaluations is a range, which held
-    in 70 to 90 % of runs on posteriors that it was not made from (``python -m tests.benchmarks expected``). A posterior
+    in 67 to 86 % of runs on posteriors that it was not made from (``python -m tests.benchmarks expected``). A posterior
     with heavy tails needs more. Evaluations that take longer near the posterior than over the prior are not foreseen.
 
     Parameters

@@ -2,8 +2,8 @@
 
 The bar advances with every evaluated point. After the first stage it also shows how many points are expected in all
 (`samplers.tempering.expected_cost`: a model of the stages that are left, whose growth and cost are those of the stages
-so far). `left` is the time for the low and the high end of that range, at the mean rate of this process so far. About
-80 % of the runs end within it. It does not foresee that recycling is given up, nor a change of the rate.
+so far). `left` is the time for the low and the high end of that range, at the mean rate of this process so far. Three
+of four to nine of ten runs end within it. It does not foresee that recycling is given up, nor a change of the rate.
 """
 
 import logging

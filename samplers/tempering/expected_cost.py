@@ -36,7 +36,7 @@ class Expected(NamedTuple):
     Attributes
     ----------
     low, likely, high : float
-        About 80 % of the runs lie between `low` and `high`.
+        A range, made to hold for about 80 % of the runs, and a number in it.
     """
 
     low: float

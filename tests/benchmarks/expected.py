@@ -1,7 +1,7 @@
 """How well the expected number of evaluations predicts runs (`samplers.tempering.expected_cost`).
 
-The constants of the model were chosen by Gaussian posteriors; the others are those of `tests.benchmarks.truth_targets`
-and two problems of `fe_likelihoods.problems`. A prediction is made before the run, from the log-likelihoods of three
+The constants of the model were chosen by Gaussian posteriors; the others are those of `tests.benchmarks.truth_targets`.
+A prediction is made before the run, from the log-likelihoods of three
 draws of the prior, and after every stage.
 """
 
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from fe_likelihoods import problems
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.tempering.expected_cost import expected_left, first_beta
 
@@ -75,9 +74,4 @@ def expected(repeats: int) -> list[Row]:
                 for each in predictions(make(seed), sampler_type, nwalkers, seed)
             ]
             rows += _rows(f"{group}, {sampler_type.__name__}, {nwalkers} walkers", found)
-    column = problems.bridge_column(every=16, duration=10.0).marginal()
-    bridge = problems.isolated_bridge()
-    for name, posterior in (("bridge column", column), ("isolated bridge", bridge)):
-        for sampler_type, nwalkers in ((SMCSampler, 500), (SMCSampler, 100)):
-            rows += _rows(f"{name}, {nwalkers} walkers", list(predictions(posterior, sampler_type, nwalkers, 1)))
     return rows
