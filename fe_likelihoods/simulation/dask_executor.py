@@ -1,5 +1,6 @@
 """Executor for the cluster of a ``dask.distributed.Client``, for work on several machines."""
 
+import contextlib
 import logging
 import threading
 import time
@@ -8,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future
 from concurrent.futures import wait as wait_for
 from functools import cache, partial
+from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
 from .dask_workers import WorkerWatch
@@ -97,7 +99,7 @@ class DaskExecutor(PoolExecutor):
         self._total, self._done = 0.0, 0
         self._lock = threading.RLock()
         self._sent: set[_Group] = set()
-        self._ended: deque[_Group] = deque()  # of which dask has reported the end
+        self._ended: SimpleQueue[_Group | None] = SimpleQueue()  # of which dask has reported the end
         self._suspects: deque[_Item] = deque()
         self._suspect: _Group | None = None  # the one that runs
         self._losses = 0  # tasks that dask has given up
@@ -173,6 +175,9 @@ class DaskExecutor(PoolExecutor):
         sent = [_Group(items, self._losses) for items in groups]
         if not self._sent:
             self._watch.start()
+            self._ended = SimpleQueue()
+            # not in the threads of dask, for which Python waits at its end: a lost scheduler sends no result
+            threading.Thread(target=self._receive_all, args=(self._ended,), name="results of dask", daemon=True).start()
         self._sent.update(sent)
         function = partial(_run_group, groups[0][0].reference)
         try:
@@ -184,7 +189,7 @@ class DaskExecutor(PoolExecutor):
         for group, future in zip(sent, inner, strict=True):
             group.inner = future
         for group in sent:
-            group.inner.add_done_callback(partial(self._report, group))
+            group.inner.add_done_callback(partial(self._report, self._ended, group))
         return sent
 
     def _forget(self, groups: Iterable[_Group]) -> None:
@@ -194,15 +199,27 @@ class DaskExecutor(PoolExecutor):
             self._suspect = None
         if not self._sent:
             self._watch.stop()
+            self._ended.put(None)
 
-    # receiving, in a thread of dask -------------------------------------------------------------------------------
+    # receiving, in a thread of its own ----------------------------------------------------------------------------
 
-    def _report(self, group: _Group, inner: Any) -> None:
-        """Receive a group that has ended, and others with it."""
-        self._ended.append(group)
-        ended = []
-        while self._ended:
-            ended.append(self._ended.popleft())
+    @staticmethod
+    def _report(queue: "SimpleQueue[_Group | None]", group: _Group, inner: Any) -> None:
+        """Pass on that a group has ended; in a thread of dask."""
+        queue.put(group)
+
+    def _receive_all(self, queue: "SimpleQueue[_Group | None]") -> None:
+        """Receive groups as they end, until none is left."""
+        while (group := queue.get()) is not None:
+            ended = [group]
+            with contextlib.suppress(Empty):
+                while (group := queue.get_nowait()) is not None:
+                    ended.append(group)
+            self._receive_groups(ended)
+            if group is None:
+                return
+
+    def _receive_groups(self, ended: list[_Group]) -> None:
         finished = [group for group in ended if group.inner.status == "finished"]
         try:
             answers = self.pool.gather([group.inner for group in finished]) if finished else []
