@@ -339,7 +339,7 @@ for column, (title, response) in enumerate(predictions.items()):
         axis.set_title(f"{title}\n{channel.quantity}, RRMSE {100 * errors[title][i]:.1f} %", fontsize=10)
         if column == 0:
             axis.set_ylabel(f"{channel.quantity} [{channel.unit}]")
-axes[0, 0].legend(loc="upper right", ncols=2)
+figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)  # hides no peak
 for axis in axes[-1]:
     axis.set(xlabel="time [s]", xlim=(0.0, record.duration))
 figure.savefig(args.out / "fig5_response.png", dpi=150)

@@ -417,7 +417,8 @@ def plot_corner(bridge: Bridge, runs: dict[str, real_data.Run], path: Path) -> N
     figure = None
     draws = {noise: run.draws[:, :3] for noise, run in runs.items()}
     together = np.concatenate(list(draws.values()))
-    limits = list(zip(together.min(axis=0), together.max(axis=0), strict=True))
+    margin = 0.05 * np.ptp(together, axis=0)
+    limits = list(zip(together.min(axis=0) - margin, together.max(axis=0) + margin, strict=True))
     for noise, x in draws.items():
         figure = corner.corner(
             x,

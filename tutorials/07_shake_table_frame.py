@@ -184,12 +184,13 @@ names = white.posterior.likelihood.model.parameter_names
 drawn = [names.index(name) for name in ("stiffness_1", "stiffness_2", "stiffness_3", "damping_1", "mass_3")]
 together = np.concatenate([run.draws[:, : len(names)] for run in runs.values()])
 units = {"stiffness": "x nominal", "damping": "-", "mass": "x floor"}
+limits = np.quantile(together, [0.001, 0.999], axis=0) + np.multiply.outer([-0.1, 0.1], np.ptp(together, axis=0))
 figure = None
 for noise, run in runs.items():
     figure = corner.corner(
         run.draws[:, drawn],
         fig=figure,
-        range=[tuple(np.quantile(together[:, i], [0.001, 0.999])) for i in drawn],
+        range=[tuple(limits[:, i]) for i in drawn],
         labels=[f"{names[i]} [{units[names[i][:-2]]}]".replace("_", " ") for i in drawn],
         color=COLOURS[noise],
         plot_datapoints=False,

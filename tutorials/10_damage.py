@@ -92,10 +92,18 @@ measured = {
 figure, rows = plt.subplots(2, 1, figsize=(10, 4.6), sharex=True, layout="constrained")
 rows[0].plot(events.time, from_si(events.acceleration, "g"), color="#1f5a8c", linewidth=0.6)
 rows[0].set_ylabel("base acceleration [g]")
+rows[0].margins(y=0.15)  # room for the names of the events
 for window, name in zip(events.windows, events.names, strict=True):
     instants = window.start + measured[name].time
     rows[1].plot(instants, from_si(measured[name].channel("displacement"), "in"), color="#d9822b", linewidth=0.6)
-    rows[0].text(window.start, rows[0].get_ylim()[1], f" {name}", va="top")
+    rows[0].annotate(
+        name,
+        (window.start, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(0, -4),
+        textcoords="offset points",
+        va="top",
+    )
 rows[1].set(xlabel="time [s]", ylabel="measured displacement [in]")
 figure.suptitle("Four events on one column (synthetic)")
 figure.savefig(args.out / "events.png", dpi=110)

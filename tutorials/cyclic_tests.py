@@ -157,7 +157,7 @@ def _plot_corner(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) 
     ranges = []
     for i in range(n):
         seen = np.concatenate([np.quantile(fit.samples[:, i], (0.001, 0.999)) for fit in fits.values()])
-        margin = 0.05 * np.ptp(seen)
+        margin = 0.1 * np.ptp(seen)
         ranges.append((seen.min() - margin, seen.max() + margin))
     figure = None
     for name, fit in fits.items():

@@ -67,7 +67,7 @@ def plot_damage(damage: DamageLike, events: Sequence[str] | None = None) -> Figu
         )
     shown = select_names(events, damage.events, list(damage.events))
     colours = LinearSegmentedColormap.from_list("probability", _COLOURS)
-    widths = [*[1.0] * len(located), 1.75]
+    widths = [*[1.0] * len(located), 2.2]
     size = (1.5 * sum(widths) + 0.6, 2.75 * len(shown) + 1.0)
     figure, panels = plt.subplots(
         len(shown), len(widths), figsize=size, squeeze=False, layout="constrained", width_ratios=widths
@@ -127,6 +127,13 @@ def _per_cent(probability: float) -> str:
     return ">99" if 99.0 < value < 100.0 else f"{value:.0f}"
 
 
+def _number(value: float) -> str:
+    """Return a number with three significant digits and without an exponent, and where it is small a bound of it."""
+    if 0.0 < value < 1e-3:
+        return "<0.001"
+    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")
+
+
 def _write_extent(axes: Axes, damage: DamageLike, event: int, states: Sequence[str]) -> None:
     """Write the probabilities of limit states without a place, and the quantiles of the measures."""
     axes.set_axis_off()
@@ -137,13 +144,14 @@ def _write_extent(axes: Axes, damage: DamageLike, event: int, states: Sequence[s
         for name, label, factor, unit in _EXTENT:
             if name in damage.extent:
                 values = factor * damage.extent[name][:, event]
-                text = f"{values[middle]:.3g}" + (f" {unit}" if unit else "")
-                between = f"{values[low]:.3g} to {values[high]:.3g}" if low != high else ""
+                text = _number(values[middle]) + (f" {unit}" if unit else "")
+                ends = _number(values[low]), _number(values[high])
+                between = " to ".join(ends) if ends[0] != ends[1] else ""
                 lines.append((label, text, between))
     for state in states:
         lines.append((f"P({state})", f"{_per_cent(float(damage.presence[state].probability[event]))} %", ""))
     for k, (label, text, between) in enumerate(lines):
         y = 0.97 - 0.094 * k
         axes.text(0.0, y, label, transform=axes.transAxes, fontsize=8, va="top")
-        axes.text(0.62, y, text, transform=axes.transAxes, fontsize=8, va="top", ha="left", fontweight="bold")
-        axes.text(0.62, y - 0.056, between, transform=axes.transAxes, fontsize=6, va="top", color="0.35")
+        axes.text(0.47, y, text, transform=axes.transAxes, fontsize=8, va="top", ha="left", fontweight="bold")
+        axes.text(0.74, y - 0.008, between, transform=axes.transAxes, fontsize=6.5, va="top", color="0.35")

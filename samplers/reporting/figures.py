@@ -49,6 +49,7 @@ def ladder_plot(sampler: Any) -> "Figure":
 
     top.semilogy(number, column["beta"], "o-", color=BLUE, markersize=4)
     top.set_ylabel(r"$\beta$ [-]")
+    top.set_ylim(min(0.05, 0.5 * column["beta"].min()), 2.0)  # at least a decade, so that decades are labelled
     if stages[-1].beta == 1.0:
         top.set_title(
             f"{len(stages)} stage{'s' if len(stages) > 1 else ''}, {column['evaluations'].sum()} evaluations, "
