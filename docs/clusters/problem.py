@@ -46,7 +46,7 @@ def update(pool=None) -> SMCSampler:
     sampler = SMCSampler(
         WALKERS, posterior.ndim, posterior, vectorize=True, seed=1, backend=backend, asynchronous=pool is not None
     )
-    sampler.run_mcmc(None, 4)
+    sampler.run_mcmc(None, 4, progress=True)  # in the output of a job, a line per minute
     samples = sampler.get_chain(flat=True)
     print(summary(samples, posterior.parameter_names, mean_error=sampler.mean_error()))
     print(f"log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}")

@@ -23,7 +23,7 @@ from tests.faults.treacherous import Treacherous, posterior_of
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "docs" / "clusters"
-LARGEST_GROUP = 20  # short simulations that are one task of dask, and are repeated if its worker ends
+LARGEST_GROUP = 10  # short simulations that are one task of dask, and are repeated if its worker ends
 JOB = ["--partition", "compute", "--memory", "1GB"]
 LOG_EVIDENCE = 2427.63  # +- 0.01, of problem.py with 2000 walkers in one process
 PRINTED = re.compile(r"log-evidence ([\d.]+) \+- ([\d.]+)")
@@ -151,6 +151,38 @@ def test_workers_that_end_with_their_walltime_are_replaced(lifetime, slurm, plac
     if lifetime == "1h":
         assert states["TIMEOUT"] >= 1, states
     check_result(place, ended_workers(place))
+
+
+BATCH = """
+import dask_jobs, problem
+from dask.distributed import Client
+from fe_likelihoods.simulation.executors import DaskExecutor
+
+with dask_jobs.make_cluster(dask_jobs.parse_arguments()) as cluster, Client(cluster) as client:
+    cluster.scale(jobs=2)
+    posterior = problem.make_posterior(DaskExecutor(client))
+    posterior(posterior.sample_prior(150, 1))
+    report = posterior.report()
+    print(report["simulations"], report["failure_count"])
+"""
+
+
+@needs_slurm
+@needs("dask_jobqueue")
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_worker_that_leaves_repeats_the_one_simulation_that_it_ran(slurm, place):
+    """Simulations of more than a second are tasks of their own; without adaptive scaling, jobs are replaced as well."""
+    slurm.environment["SECONDS_PER_SIMULATION"] = "1.2"
+    (place / "batch.py").write_text(BATCH)
+    options = ["--cores", "3", "--walltime", "00:02:00", "--lifetime", "20s", "--stagger", "5s"]
+    with started(place, slurm, "batch.py", *JOB, *options) as parent:
+        assert parent.wait(600) == 0, (place / "output.txt").read_text()
+    assert "150 0" in lines(place, "output.txt")  # dask may write more when it closes
+    starts, ends = Counter(lines(place, "starts.txt")), Counter(lines(place, "ends.txt"))
+    assert set(starts) == set(ends) and len(ends) == 150 + 1  # the measurements are one of them
+    workers = ended_workers(place)
+    assert workers > 6 and starts.total() - len(starts) <= workers, (starts.total(), workers)
 
 
 @needs_slurm
