@@ -62,9 +62,10 @@ class DaskExecutor(PoolExecutor):
     first and single items at last, so that the workers finish together. No group takes longer than about a second, by
     the duration of earlier simulations, so that little is repeated if a worker dies. dask retries a group whose worker
     died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). It counts the death also
-    against other tasks on that worker. An item is the cause, and gets ``(None, reason)``, if it was a task of its own
-    and dask has given up no other task meanwhile, or after the third time. Otherwise the items are run again, alone and
-    one after the other, beside those that are not suspected. Workers that the cluster has given up are started again,
+    against other tasks on that worker, and a job that ends at its walltime kills all of its workers, on which one task
+    may be tried in turn. So the items of a group are run again, alone and one after the other, beside those that are
+    not suspected. An item is the cause, and gets ``(None, reason)``, if dask gives it up when it runs alone and has
+    given up no other task meanwhile, or after the third time. Workers that the cluster has given up are started again,
     and nothing waits for ever (`WorkerWatch`).
 
     Parameters
@@ -274,7 +275,7 @@ class DaskExecutor(PoolExecutor):
         self._losses += 1
         for item in group.items:
             item.deaths += 1
-            if item.deaths == MAX_ATTEMPTS or (len(group.items) == 1 and not others):
+            if item.deaths == MAX_ATTEMPTS or (item.deaths > 1 and not others):
                 resolve(item, (None, _DIED))
             else:
                 self._suspects.append(item)
