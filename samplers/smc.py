@@ -96,7 +96,8 @@ class SMCSampler(TemperedSampler):
         With recycling, propose the next points while the last ones run, so that no worker waits for the slowest point
         of a batch; for long runs of unequal length. Needs a `Posterior` of fe_likelihoods with a pool of its own and
         ``vectorize=True``, or a `pool` that takes single points. Proposals then depend on the order in which points
-        arrive, which the journal of a file repeats; estimates are made of complete batches only.
+        arrive, which the journal of a file repeats; beta grows when all draws but the latest
+        have arrived, and estimates are made of complete batches only.
     settings : samplers.Settings, optional
         These settings as one object; keywords take precedence.
 

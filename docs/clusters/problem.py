@@ -43,9 +43,7 @@ def update(pool=None) -> SMCSampler:
     """Sample the posterior in the files run.h5 and simulations.db; the same call goes on after any interruption."""
     posterior = make_posterior(pool)
     backend = emcee.backends.HDFBackend("run.h5")
-    sampler = SMCSampler(
-        WALKERS, posterior.ndim, posterior, vectorize=True, seed=1, backend=backend, asynchronous=pool is not None
-    )
+    sampler = SMCSampler(WALKERS, posterior.ndim, posterior, vectorize=True, seed=1, backend=backend, asynchronous=True)
     sampler.run_mcmc(None, 4, progress=True)  # in the output of a job, a line per minute
     samples = sampler.get_chain(flat=True)
     print(summary(samples, posterior.parameter_names, mean_error=sampler.mean_error()))

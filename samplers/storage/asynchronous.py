@@ -151,7 +151,8 @@ class AsynchronousEvaluator(Evaluator):
         rows = np.array([self._running.pop(number)[1] for number in numbers])
         batch = merge_batches([_single(*self._known.pop(number)) for number in numbers])
         if self._limit is not None:
-            self._limit.check(batch, self.evaluations, self.failures.count)
+            whole = len(numbers) == len(flight.coords)
+            self._limit.check(batch, self.evaluations, self.failures.count, len(self._running), whole)
         self.count(batch)
         log_base = flight.base["log_prior"][rows]
         flight.arrive(rows, self._records.pack_batch(log_base, np.ones(len(rows), dtype=bool), batch))

@@ -21,7 +21,7 @@ from ..tempering.flights import Flight, submit_and_wait
 from .checkpoint import Checkpoint
 from .first_evaluations import POINTS
 from .journal import EvaluatedBatch, merge_batches
-from .pool_queue import pool_size
+from .pool_queue import map_in, pool_size
 from .returned_values import ErrorCapturing, log_densities, log_probabilities, outcomes
 
 __all__ = ["CallingConvention", "EvaluationRecords", "Evaluator", "FailureLimit", "Failures", "Observer"]
@@ -78,10 +78,17 @@ class FailureLimit(NamedTuple):
     nwalkers: int
     ndim: int
 
-    def check(self, batch: EvaluatedBatch, evaluations: int, failures: int) -> None:
-        """Raise RuntimeError if the limit is exceeded by a batch that comes after the given numbers."""
-        n, total, count = len(batch.coords), evaluations + len(batch.coords), failures + len(batch.reasons)
-        all_failed = len(batch.reasons) == n >= self.ndim + 2
+    def check(
+        self, batch: EvaluatedBatch, evaluations: int, failures: int, running: int = 0, whole: bool = True
+    ) -> None:
+        """Raise RuntimeError if the limit is exceeded by a batch that comes after the given numbers.
+
+        Failures may be quicker or slower than successes. So points that are running count as successes, and a batch
+        may fail as a whole if it is not `whole`.
+        """
+        n, count = len(batch.coords), failures + len(batch.reasons)
+        total = evaluations + n + running
+        all_failed = whole and len(batch.reasons) == n >= self.ndim + 2
         if all_failed or (total >= self.nwalkers and count > self.share * total):
             what = f"all {n} evaluations of a batch" if all_failed else f"{count} of {total} evaluations"
             first = min(batch.reasons)
@@ -131,7 +138,7 @@ class CallingConvention(NamedTuple):
         if self.vectorize:
             return function(points)
         results, noted = [], time.perf_counter()
-        for result in (map if pool is None else pool.map)(function, points):
+        for result in map_in(pool)(function, points):
             results.append(result)
             if observer is not None:
                 observer.finished(1)
@@ -277,7 +284,7 @@ class Evaluator:
     @property
     def map(self) -> Callable:
         """``map``, or that of the pool."""
-        return map if self.pool is None else self.pool.map
+        return map_in(self.pool)
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Log-prior (n,) of points (n, ndim), always computed in this process; -inf for NaN."""

@@ -84,4 +84,6 @@ def _open_queue(
     """The queue of a posterior, or one of a pool."""
     if _has_queue(function, pool):
         return function.evaluation_queue()
+    if pool is None:
+        raise ValueError("this sampler was begun with a pool, which is not stored with it: set its attribute pool")
     return PoolQueue(captured, pool, convention.as_points)

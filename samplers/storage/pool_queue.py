@@ -7,7 +7,7 @@ from typing import Any
 
 from .returned_values import Failed
 
-__all__ = ["PoolQueue", "can_submit", "pool_size"]
+__all__ = ["PoolQueue", "can_submit", "map_in", "pool_size"]
 
 # Names under which pools have the number of their workers.
 SIZES = ("n_workers", "_max_workers", "_processes", "size")
@@ -25,6 +25,15 @@ def pool_size(pool: Any) -> int | None:
         return sum(threads().values()) or None
     sizes = (getattr(pool, name, None) for name in SIZES)
     return next((size for size in sizes if isinstance(size, int) and size > 0), None)
+
+
+def map_in(pool: Any) -> Callable:
+    """``map`` of a pool, whose results are values: those of a dask client are gathered; without a pool Python's."""
+    if pool is None:
+        return map
+    if not hasattr(pool, "gather"):
+        return pool.map
+    return lambda function, items: pool.gather(pool.map(function, list(items), pure=False))
 
 
 class PoolQueue:
@@ -105,7 +114,10 @@ class PoolQueue:
             return value
         if type(error).__name__ == "KilledWorker":
             return Failed("every process that evaluated this point died")
-        raise error
+        raise RuntimeError(
+            f"the pool cannot go on: {type(error).__name__}: {error}. Evaluations that have arrived are kept where the "
+            "sampler has a file: start the same script again with a new pool"
+        ) from error
 
     def close(self) -> None:
         """Cancel the points that have not been started."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from emcee import State
+from emcee.backends import HDFBackend
 
 from ..tempering.budget import Budget
 from ..tempering.diagnostics import warn
@@ -231,6 +232,12 @@ class Resumption:
             raise
         if isinstance(error, KeyboardInterrupt) and self._checkpoint.place:
             raise KeyboardInterrupt(self._describe_what_is_kept()) from None
+        in_memory = not isinstance(self.backend, HDFBackend) and self._budget.limit is None
+        if isinstance(error, KeyboardInterrupt) and in_memory and not self._result.finished:
+            raise KeyboardInterrupt(
+                "the annealing is not kept, and the next call begins a new one: to go on after an interrupt, give the "
+                "sampler a file, backend=emcee.backends.HDFBackend(path)"
+            ) from None
 
     def _finish(self, present: "PresentCall") -> None:
         if present.repeats:

@@ -23,7 +23,7 @@ Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-
 Owen & Zhou (2000), JASA 95(449), doi:10.1080/01621459.2000.10473909 (deterministic mixture weights)
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ import numpy as np
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.support_bounds import find_support_bounds
+from .archive import Archive, StartingDensity
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights
 from .flights import Flight
 from .population import Density, Population, Report, Stage, Sweep
@@ -39,48 +40,12 @@ from .settings import RecyclingSettings
 from .stopping import StoppedEarly
 from .weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
 
-__all__ = ["Archive", "Recycled", "StartingDensity", "recycle", "starting_mixture", "stopped_at"]
+__all__ = ["Recycled", "most_running", "recycle", "stopped_at"]
 
 # Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
 EXPECTED_GROWTH = 3.0
 # Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
 LARGEST_SHARE_KEPT = 0.9
-
-
-class StartingDensity(NamedTuple):
-    """Density that the starting points were drawn from.
-
-    Attributes
-    ----------
-    made : float
-        Number of draws made from it, including those outside the support of the prior.
-    log_density : callable
-        Function of points (n, ndim) and their records (n,) that returns the logarithm of the density (n,).
-    """
-
-    made: float
-    log_density: Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def starting_mixture(n_prior: int, proposals: Sequence[tuple[float, Mixture]]) -> StartingDensity:
-    """Density of draws of the prior and of proposals together, by their numbers.
-
-    Parameters
-    ----------
-    n_prior : int
-        Number of draws of the prior.
-    proposals : sequence of (int, Mixture)
-        Numbers of draws, including those outside the support of the prior, and what they were drawn from.
-    """
-    made = n_prior + sum(count for count, _ in proposals)
-
-    def log_start(points: np.ndarray, records: np.ndarray) -> np.ndarray:
-        total = np.log(n_prior / made) + records["log_prior"]
-        for count, mixture in proposals:
-            total = np.logaddexp(total, np.log(count / made) + log_density(mixture, points))
-        return total
-
-    return StartingDensity(made, log_start)
 
 
 class Recycled(NamedTuple):
@@ -116,7 +81,7 @@ class Recycled(NamedTuple):
     log_evidence: float
     log_evidence_error: float
     check: EvidenceCheck | None
-    archive: "Archive | None" = None
+    archive: Archive | None = None
     log_evidence_below_one: float = 0.0
     evaluations_below_one: int = 0
 
@@ -129,78 +94,6 @@ class Recycled(NamedTuple):
     def trusted(self) -> bool:
         """Whether the result can be trusted."""
         return not self.doubt
-
-
-class Archive:
-    """All points that have arrived, and the logarithm of the mixture of all densities that they were drawn from.
-
-    The mixture counts every draw that was submitted, whether it has arrived or not. While some are running, the sum of
-    the weights is therefore smaller than the evidence, by the part of the latest draws that is missing.
-
-    Parameters
-    ----------
-    flight : Flight
-        Starting points.
-    start : StartingDensity
-        What they were drawn from.
-
-    Attributes
-    ----------
-    coords, records : (n, ndim) float, (n,) structured array
-        The points that had arrived at the last `update`, and their records.
-    proposals : list of (int, Mixture)
-        The proposals in order, and how many draws were made from each.
-    """
-
-    def __init__(self, flight: Flight, start: StartingDensity):
-        self._flights, self._start = [flight], start
-        self.proposals: list[tuple[int, Mixture]] = []
-        self._log_made = np.log(start.made)
-        self._log_start_of_all = start.log_density(flight.coords, flight.base)
-        self._log_mixture_of_all = self._log_made + self._log_start_of_all
-        self.update()
-
-    def add(self, mixture: Mixture, made: float, flight: Flight) -> None:
-        """Add the draws inside the support, of `made` draws from a mixture."""
-        coords = flight.coords
-        log_start = self._start.log_density(coords, flight.base)
-        log_mixture = self._log_made + log_start
-        for count, earlier in self.proposals:
-            log_mixture = np.logaddexp(log_mixture, np.log(count) + log_density(earlier, coords))
-        self.proposals.append((made, mixture))
-        self._flights.append(flight)
-        self._log_start_of_all = np.concatenate([self._log_start_of_all, log_start])
-        coords_of_all = np.concatenate([flight.coords for flight in self._flights])
-        self._log_mixture_of_all = np.logaddexp(
-            np.concatenate([self._log_mixture_of_all, log_mixture]), np.log(made) + log_density(mixture, coords_of_all)
-        )
-        self.update()
-
-    def update(self) -> None:
-        """Take in what has arrived."""
-        parts = [flight.landed_part() for flight in self._flights]
-        parts = [part for part in parts if len(part[0]) > 0] or parts[:1]
-        self.coords = np.concatenate([coords for coords, _ in parts])
-        self.records = np.concatenate([records for _, records in parts])
-        if len(self.coords) == len(self._log_start_of_all):
-            self._log_start, self._log_mixture = self._log_start_of_all, self._log_mixture_of_all
-        else:
-            arrived = np.concatenate([flight.arrived for flight in self._flights])
-            self._log_start, self._log_mixture = self._log_start_of_all[arrived], self._log_mixture_of_all[arrived]
-
-    @property
-    def log_ratio(self) -> np.ndarray:
-        """Logarithm of the posterior over the starting density; from the prior, the log-likelihood."""
-        return self.records["log_prob"] - self._log_start
-
-    def log_target(self, beta: float) -> np.ndarray:
-        """Logarithm (n,) of the tempered target, not normalised."""
-        alive = self.records["log_prob"] > -np.inf
-        return np.where(alive, self._log_start + beta * np.where(alive, self.log_ratio, 0.0), -np.inf)
-
-    def log_weights(self, beta: float) -> np.ndarray:
-        """Logarithm of the tempered target over the mixture, (n,); the sum of the weights estimates the evidence."""
-        return self.log_target(beta) - self._log_mixture
 
 
 def recycle(
@@ -270,9 +163,17 @@ def recycle(
         log_weights, last_beta = archive.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
         if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= enough_fresh):
+            if archive.running(latest=False) > 0:
+                # a mode whose evaluations take long would otherwise be left out of every proposal
+                density.wait(archive.running() - 1)
+                continue
             # more draws shall not make larger steps: it is their number per step that finds narrow modes
             kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
-            beta, drawn = next_beta(archive.log_ratio, beta, kept, log_weights), []
+            following = next_beta(archive.log_ratio, beta, kept, log_weights)
+            if following == 1.0 and archive.running() > 0:  # what is drawn at beta = 1 is the result
+                density.wait(0)
+                continue
+            beta, drawn = following, []
             log_weights = archive.log_weights(beta)
             effective = effective_sample_size(log_weights)
         # proposals were chosen by weights with an effective sample size of `target`: this error stays in what follows

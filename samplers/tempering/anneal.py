@@ -21,7 +21,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from .adaptive_importance import Recycled, StartingDensity, most_running, recycle, stopped_at
+from .adaptive_importance import Recycled, most_running, recycle, stopped_at
+from .archive import StartingDensity
 from .budget import BudgetExhausted
 from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, fits_poorly, warn
 from .evidence_check import pareto_shape

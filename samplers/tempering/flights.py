@@ -1,8 +1,8 @@
 """Points that were submitted together for evaluation, of which some may still be running.
 
 A synchronous density returns a flight that is complete. An asynchronous one lets the points arrive in any order. What
-has arrived may shape further proposals, but no estimate may be made of a flight that is not complete: where the time of
-an evaluation depends on the parameters, the first arrivals are not a fair sample of the proposal.
+has arrived may shape further proposals. The result may use complete flights only: where the time of an evaluation
+depends on the parameters, the first arrivals are not a fair sample of the proposal.
 """
 
 from collections.abc import Callable

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .adaptive_importance import StartingDensity
+from .archive import StartingDensity
 from .budget import Budget, BudgetExhausted
 from .guide import AdaptedGuide, GuideSession
 from .population import Density, GuidedRound, GuideTick, Population, Report

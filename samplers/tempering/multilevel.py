@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from ..proposals.mixture import Mixture
-from .adaptive_importance import StartingDensity, most_running, starting_mixture
+from .adaptive_importance import most_running
+from .archive import StartingDensity, starting_mixture
 from .evidence_check import draw_inside
 from .flights import Flight
 from .population import Density, Population

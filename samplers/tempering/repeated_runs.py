@@ -15,7 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..proposals.mixture import Mixture, log_responsibilities
-from .adaptive_importance import Recycled, StartingDensity, starting_mixture
+from .adaptive_importance import Recycled
+from .archive import StartingDensity, starting_mixture
 from .population import Doubt
 from .population_check import LARGE_DIFFERENCE
 from .weights import normalised_weights

@@ -311,3 +311,16 @@ def test_finished_points_of_a_batch_are_kept(at, with_pool, tmp_path, monkeypatc
     assert before >= at - 1 and after <= calls - (at - 1)
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
     assert (sampler.evaluations, sampler.log_evidence) == (whole.evaluations, whole.log_evidence)
+
+
+def test_ctrl_c_without_a_file_says_that_nothing_is_kept():
+    posterior = Gaussian(2, sd=0.1)
+
+    def interrupted(x):
+        if posterior.calls > 60:
+            os.kill(os.getpid(), signal.SIGINT)
+        return posterior(x)
+
+    sampler = SMCSampler(40, 2, interrupted, log_prior_fn=posterior.log_prior, recycle=False, seed=1)
+    with pytest.raises(KeyboardInterrupt, match="give the sampler a file"):
+        sampler.run_mcmc(posterior.sample_prior(40, np.random.default_rng(1)), 1)
