@@ -21,14 +21,14 @@ from .tempering.settings import Settings, as_whole_number
 
 __all__ = ["CostEstimate", "estimate_cost"]
 
-# Below this duration [s], the start of workers and the compilation of kernels may dominate the first evaluations.
-SHORT = 5.0
+FIRST_POINTS = 8  # most points that start the workers, as long as it is not known that a point is cheap
+LONG = 60.0  # [s], from which a point is not cheap
 REPETITIONS = 5  # of a scheduled batch
 SIMULATIONS_OF_A_GUIDE = 500
 
 
 class CostEstimate(NamedTuple):
-    """What a run with default settings will take, until beta = 1 is reached.
+    """What a run will take, until beta = 1 is reached.
 
     Attributes
     ----------
@@ -38,15 +38,17 @@ class CostEstimate(NamedTuple):
         Numbers of walkers, of parameters, and of evaluations that run at once.
     seconds : (runs,) float
         Durations of the timed evaluations [s].
+    evaluated : int
+        Number of all evaluations that were made: those that started the workers, and the timed ones.
     failures : int
-        How many of all evaluations that were made returned -inf.
+        How many of these returned -inf.
     evaluations : Expected
         Evaluations of the posterior: the low and the high end of a range, and a number between. Sweeps over fast
         parameters, which need no simulation, do not count. Steps at beta = 1 come on top, with `nwalkers` each.
     synchronous : Expected
         Wall time [s] where every batch is waited for.
     asynchronous : Expected or None
-        Wall time [s] with ``asynchronous=True``; None for a sampler that does not recycle.
+        Wall time [s] with ``asynchronous=True``, at most the synchronous one; None without recycling.
     guide : str
         Duration of a run of 500 simulations with ``guide=posterior.guide()``; how many it needs is known only after its
         search. Empty for a posterior without a guide.
@@ -57,6 +59,7 @@ class CostEstimate(NamedTuple):
     ndim: int
     workers: int
     seconds: np.ndarray
+    evaluated: int
     failures: int
     evaluations: Expected
     synchronous: Expected
@@ -71,14 +74,16 @@ class CostEstimate(NamedTuple):
         rows = [
             (f"{self.sampler}, {self.nwalkers} walkers, {self.ndim} parameters", ""),
             (
-                f"one evaluation ({len(self.seconds)} timed)",
+                f"one evaluation ({self.evaluated} made, {len(self.seconds)} timed)",
                 f"mean {self.seconds.mean():.3g} s, {first:.3g} to {last:.3g} s",
             ),
             ("evaluations", f"about {_rounded(self.evaluations.low)} to {_rounded(self.evaluations.high)}"),
             (f"wall time, {self.workers} worker{'s' if self.workers > 1 else ''}", _range(self.synchronous)),
         ]
-        if self.asynchronous is not None:
-            rows.append(("the same, asynchronous=True", _range(self.asynchronous)))
+        without = "only with recycling (SMCSampler, recycle=True)"
+        rows.append(
+            ("the same, asynchronous=True", without if self.asynchronous is None else _range(self.asynchronous))
+        )
         if self.guide:
             rows.append(("with guide=posterior.guide()", self.guide))
         if self.failures:
@@ -102,10 +107,16 @@ def estimate_cost(
     workers: int | None = None,
     runs: int = 3,
     seed: int | None = None,
+    recycle: bool | None = None,
 ) -> CostEstimate:
-    """Time a few evaluations, and estimate what a run with default settings will take.
+    """Time a few evaluations, and estimate what a run will take; all settings but `recycle` are the defaults.
 
-    The timed points are draws of the prior. With the same `seed`, a sampler starts from these points, so that a
+    First, the workers are started: one point for each of them, at most 8, is evaluated at the same time and not timed,
+    because this may contain the wait in a job queue, the start of processes, or a compilation. This is repeated where
+    more workers are there afterwards, and with one point for every worker, however many, where no point took more than
+    a minute. Then `runs` points are timed.
+
+    All points are draws of the prior. With the same `seed`, a sampler starts from these points, so that a
     posterior that caches its simulations does not repeat them. The estimate of the evaluations is a range, which held
     in 67 to 86 % of runs on posteriors that it was not made from (``python -m tests.benchmarks expected``). A posterior
     with heavy tails needs more. Evaluations that take longer near the posterior than over the prior are not foreseen.
@@ -120,14 +131,15 @@ def estimate_cost(
     sampler : type
         `SMCSampler` or `TMCMCSampler`.
     workers : int, optional
-        Number of evaluations that run at once in the run to be estimated. By default that of the pool of the posterior,
-        or 1 if it has none.
+        Number of evaluations that run at once in the run to be estimated. By default that of the pool of the posterior
+        after its start, or 1 if it has none or does not say.
     runs : int
-        Number of timed evaluations, at least 2. They run at the same time where the pool has as many workers. Where one
-        of them takes less than 5 s, as many more are timed one after the other, and these count: the first ones may
-        contain the start of workers or a compilation.
+        Number of timed evaluations, at least 2. They are made one after the other; or at the same time, where each
+        point that started the workers took more than a minute, and as many workers were started.
     seed : int, optional
         Seed of the run to be estimated. By default the draws differ from call to call.
+    recycle : bool, optional
+        As for the sampler: `SMCSampler` recycles by default with 250 walkers or more.
 
     Returns
     -------
@@ -152,14 +164,11 @@ def estimate_cost(
         if not hasattr(posterior, name):
             raise ValueError(f"estimate_cost needs a posterior with {name}; got {type(posterior).__name__} without it")
     ndim = as_whole_number("ndim", posterior.ndim)
-    settings = sampler(nwalkers, ndim, posterior, vectorize=True, seed=0).settings  # also checks the arguments
+    # also checks the arguments
+    settings = sampler(nwalkers, ndim, posterior, vectorize=True, seed=0, recycle=recycle).settings
     random = np.random.RandomState(seed)
-    draws = np.asarray(posterior.sample_prior(max(nwalkers, runs), random), dtype=float)  # as those of the sampler
-    seconds, values, found = _timed(posterior, draws[:runs])
-    timed = values
-    if seconds.min() < SHORT and len(draws) >= 2 * runs:
-        seconds, values, _ = _timed(posterior, draws[runs : 2 * runs], at_once=False)
-        timed = np.concatenate([timed, values])
+    draws = np.asarray(posterior.sample_prior(max(nwalkers, runs + 1), random), dtype=float)  # as those of the sampler
+    seconds, timed, found = _timed(posterior, draws, runs)
     log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in draws[: len(timed)]])
     finite = np.isfinite(timed)
     if finite.sum() < 2:
@@ -179,6 +188,7 @@ def estimate_cost(
         ndim,
         workers,
         seconds,
+        len(timed),
         int((~finite).sum()),
         evaluations,
         times[0],
@@ -187,29 +197,49 @@ def estimate_cost(
     )
 
 
-def _timed(posterior: Any, points: np.ndarray, at_once: bool = True) -> tuple[np.ndarray, np.ndarray, int | None]:
-    """Durations [s] (n,) and log-probabilities (n,) of points (n, ndim), and the number of workers, if it is known."""
+def _timed(posterior: Any, draws: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray, int | None]:
+    """Time a number of evaluations after the start of the workers.
+
+    Returns
+    -------
+    seconds : (runs,) float
+        Durations [s].
+    values : (n,) float
+        Log-probabilities of the first n draws: those that started the workers, then the timed ones.
+    workers : int or None
+        Number of workers after their start, if it is known.
+    """
     if not callable(getattr(posterior, "evaluation_queue", None)):
-        pairs = [_timed_call(posterior, point) for point in points]
-        return *(np.array(column) for column in zip(*pairs, strict=True)), None
+        pairs = [_timed_call(posterior, point) for point in draws[: 1 + runs]]
+        seconds, values = (np.array(column) for column in zip(*pairs, strict=True))
+        return seconds[1:], values, None
     queue = posterior.evaluation_queue()
     try:
-        workers = queue.workers
-        together = at_once and (workers or 1) >= len(points)
-        batches = [points] if together else [points[[row]] for row in range(len(points))]
-        seconds, values = [], []
-        for batch in batches:
-            start, arrived = time.perf_counter(), {}
-            tickets = queue.submit(batch)
-            while len(arrived) < len(tickets):
-                finished = queue.collect()
-                now = time.perf_counter() - start
-                arrived.update({ticket: (now, value) for ticket, value in finished})
-            seconds += [arrived[ticket][0] for ticket in tickets]
-            values += [arrived[ticket][1] for ticket in tickets]
+        values, started, most, room = [], 0, FIRST_POINTS, len(draws) - runs
+        while len(values) < room and started < min(queue.workers or 1, most):
+            started = min(queue.workers or 1, most, room - len(values))
+            waited, found = _timed_batch(queue, draws[len(values) : len(values) + started])
+            values += found
+            most = FIRST_POINTS if max(waited) > LONG else room
+        seconds, size = [], runs if min(waited) > LONG and started >= runs else 1
+        while len(seconds) < runs:
+            durations, found = _timed_batch(queue, draws[len(values) : len(values) + size])
+            seconds += durations
+            values += found
+        return np.array(seconds), np.array(values, dtype=float), queue.workers
     finally:
         queue.close()
-    return np.array(seconds), np.array(values, dtype=float), workers
+
+
+def _timed_batch(queue: Any, points: np.ndarray) -> tuple[list[float], list[float]]:
+    """Times [s] from the submission of points (n, ndim) to their arrival, and their log-probabilities."""
+    start, arrived = time.perf_counter(), {}
+    tickets = queue.submit(points)
+    while len(arrived) < len(tickets):
+        finished = queue.collect()
+        now = time.perf_counter() - start
+        arrived.update({ticket: (now, value) for ticket, value in finished})
+    return [arrived[ticket][0] for ticket in tickets], [arrived[ticket][1] for ticket in tickets]
 
 
 def _timed_call(posterior: Callable, point: np.ndarray) -> tuple[float, float]:
@@ -257,7 +287,9 @@ def _wall_times(
     # without barriers, all workers are busy until the check, which waits for all that came before it
     busy = float(np.mean(seconds)) / workers
     flowing = (f * (2.0 * whole + busy * n) for f, n in zip(factors, between, strict=True))
-    return Expected(*waiting), Expected(*flowing)
+    # never longer than with barriers: `batch` is a mean of random durations, and can be below `busy * size` by chance
+    synchronous = Expected(*waiting)
+    return synchronous, Expected(*map(min, synchronous, flowing))
 
 
 def _of_guide(posterior: Any, seconds: float, workers: int) -> str:

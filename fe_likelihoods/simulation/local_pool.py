@@ -261,11 +261,14 @@ class LocalPool:
     def _start_jobs(self) -> None:
         """Give free workers their next items, and start as many workers as there are items for."""
         loading = sum(job is None for job in self._running.values())
-        while len(self._running) < self.workers and loading < len(self._waiting):
+        while self._waiting and len(self._running) < self.workers:
             if self._waiting[0].cancelled():
                 self._waiting.popleft()
                 continue
             function = self._waiting[0].function
+            is_loaded = any(worker.key == function.key and worker.alive for worker in self._free)
+            if loading >= len(self._waiting) and not is_loaded:  # else an item would wait although a worker is free
+                return
             worker = self._take(function.key)
             if worker.key == function.key:
                 self._next(worker)

@@ -10,7 +10,7 @@ import pytest
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
 from tests.faults import treacherous as bad
-from tests.faults.treacherous import Absent, DiesLoading, DiesOnce, Gated, Large, Treacherous, gone, line
+from tests.faults.treacherous import Absent, DiesLoading, DiesOnce, Gated, Large, LoadsOnce, Treacherous, gone, line
 
 LONG, SHORT = np.array([0.95, 0.1]), [np.array([offset, 0.1]) for offset in (0.1, 0.2, 0.3, 0.4)]
 SECONDS = 60.0  # after which a test gives up
@@ -79,6 +79,14 @@ def test_the_function_is_sent_once_to_each_process():
     with LocalPool(2) as pool:
         futures = [pool.submit(function, theta) for theta in SHORT * 5]
         assert {future.result()[0][0, 0] for future in futures} == {1.0}
+
+
+def test_a_free_process_does_not_wait_for_one_that_loads(tmp_path):
+    function = LoadsOnce(tmp_path)
+    with LocalPool(2) as pool:
+        assert [future.result(SECONDS) for future in pool.submit_all(function, [1, 2])] == [1, 2]
+        assert pool.submit(function, 3).result(SECONDS) == 3
+        (tmp_path / "go").touch()
 
 
 def test_map_goes_before_items_that_wait(function, tmp_path):
