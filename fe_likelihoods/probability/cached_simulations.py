@@ -91,7 +91,8 @@ class CachedSimulations(NewSimulations):
         self._outcomes = 0
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"pool": None, "_running": None, "when_simulated": None}
+        kept = {name: value for name, value in self.__dict__.items() if name not in ("_running", "when_simulated")}
+        return kept | {"pool": None}
 
     @property
     def verifications(self) -> int:

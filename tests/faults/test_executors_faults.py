@@ -292,6 +292,7 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
         np.testing.assert_array_equal(np.delete(values, 3), np.delete(expected, 3))
         # points that are collected as they end
         posterior = posterior_of(Gated(tmp_path), top=20.0, pool=client, cache=tmp_path / "cache.sqlite")
+        client.wait_for_workers(2)  # the killed one is replaced
         with posterior.evaluation_queue() as queue:
             assert queue.workers == 2
             tickets, done = queue.submit(many), {}

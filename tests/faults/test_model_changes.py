@@ -193,6 +193,9 @@ def test_processes_that_import_other_code_refuse(isolated):
             np.testing.assert_array_equal(likelihood.misfit(THETAS[:1]), expected)
             pool.close()
         (folder / "helper.py").write_text(changes.HELPER.replace("3.0", "4.0"))
+        # Python takes compiled code for that of a source of the same size and the same second
+        later = time.time() + 5.0
+        os.utime(folder / "helper.py", (later, later))
         with pytest.raises(ValueError, match="not the same in the worker process .* source file was edited"):
             likelihood.misfit(THETAS[1:2])
         assert likelihood.failure_count == 0
