@@ -96,7 +96,10 @@ def busy_workers(repeats: int) -> list[Row]:
 
     rows = []
     warnings.simplefilter("ignore")
-    with LocalCluster(WORKERS, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
+    with (
+        LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
         list(client.gather(client.map(slow, [np.array([1.0, 0.5])] * WORKERS, pure=False)))  # imports of the workers
         for asynchronous in (False, True):
             case = f"{WORKERS} dask workers, {WALKERS} walkers, {'a' if asynchronous else ''}synchronous"
