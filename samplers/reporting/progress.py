@@ -67,14 +67,11 @@ def get_progress_bar(display: bool | str, total: int | None, **kwargs: Any) -> A
     """
     if display is not True:
         return emcee.pbar.get_progress_bar(display, total, **kwargs)
-    try:
-        from tqdm import tqdm as terminal_bar
-        from tqdm.auto import tqdm
-    except ImportError:
-        return emcee.pbar.get_progress_bar(display, total, **kwargs)
-    in_notebook = (
-        tqdm.display is not terminal_bar.display
-    )  # tqdm.auto is a subclass of the bar of terminals or notebooks
+    from tqdm import tqdm as terminal_bar
+    from tqdm.auto import tqdm
+
+    # tqdm.auto is a subclass of the bar of terminals or of that of notebooks
+    in_notebook = tqdm.display is not terminal_bar.display
     if not in_notebook and "file" not in kwargs and not sys.stderr.isatty():
         rare = {"mininterval": SECONDS_BETWEEN_LINES, "maxinterval": SECONDS_BETWEEN_LINES, "ncols": 0}
         kwargs = rare | kwargs | {"file": _Lines()}

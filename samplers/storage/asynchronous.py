@@ -60,7 +60,7 @@ class AsynchronousEvaluator(Evaluator):
         super().__init__(*args, **kwargs)
 
     def __getstate__(self) -> dict:
-        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}}
+        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}, "_known": {}}
 
     def reset(self) -> None:
         """Forget evaluations and failures; nothing runs afterwards."""

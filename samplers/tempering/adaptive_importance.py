@@ -37,10 +37,10 @@ from .flights import Flight
 from .population import Density, Population, Report, Stage, Sweep
 from .rounds import tail_variance
 from .settings import RecyclingSettings
-from .stopping import StoppedEarly
+from .stopping import StoppedEarly, stop_at
 from .weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
 
-__all__ = ["Recycled", "most_running", "recycle", "stopped_at"]
+__all__ = ["Recycled", "most_running", "recycle", "stopped_at", "submit_start"]
 
 # Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
 EXPECTED_GROWTH = 3.0
@@ -291,6 +291,36 @@ def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
     n, effective = len(log_weights), effective_sample_size(log_weights)
     log_evidence = float(log_mean_weight(log_weights) + np.log(n))
     return log_evidence, float(np.sqrt(max(1.0 / effective - 1.0 / n, 0.0) + inherited))
+
+
+def submit_start(
+    coords: np.ndarray, density: Density, start: StartingDensity | None = None, whole: bool = False
+) -> Flight:
+    """Begin to evaluate the points (n, ndim) that an annealing starts from.
+
+    Parameters
+    ----------
+    coords : (n, ndim) float
+        The points.
+    density : Density
+        Evaluates them.
+    start : StartingDensity, optional
+        What they were drawn from; the prior by default.
+    whole : bool
+        Whether to wait for all of them; by default some may be running.
+
+    Raises
+    ------
+    StoppedEarly
+        If the limit of simulations does not allow all points: with those that it allows.
+    """
+    flight = density.submit(coords)
+    density.wait(0 if flight.refused or whole else most_running(density, len(coords)))
+    if flight.refused:
+        few, records = flight.landed_part()
+        log_start = None if start is None else start.log_density(few, records)
+        raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0, log_start=log_start)
+    return flight
 
 
 def most_running(density: Density, submitted: int) -> int:

@@ -21,7 +21,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .adaptive_importance import Recycled, most_running, recycle, stopped_at
+from .adaptive_importance import Recycled, recycle, stopped_at, submit_start
 from .archive import StartingDensity
 from .budget import BudgetExhausted
 from .diagnostics import check_annealing, check_fallback, check_fit, check_stages, fits_poorly, warn
@@ -30,7 +30,7 @@ from .flights import Flight
 from .genealogy import trace_founders
 from .guided import Guidance, RoundsOfGuide, better_of, draw_rounds, start_from_guide, stopped_rounds
 from .inner_steps import and_last_population, only_sweeps
-from .multilevel import draw_start, submit_start
+from .multilevel import draw_start
 from .mutation import MoveSchedule, Mutated, grow_chains, move_together
 from .population import Density, Doubt, GuidedStart, Halt, Population, Report, Restart, Stage, Sweep
 from .population_check import check_population
@@ -130,7 +130,10 @@ def _without_limit(
         return
     if coarse is not None and (yield from _from_coarse(population, density, coarse, random, schedule, settings)):
         return
-    flight = _submit_all(population, density, settings)
+    if population.records is None:
+        flight = submit_start(population.coords, density, whole=not settings.recycle)
+    else:
+        flight = Flight.landed(population.coords, population.records)
     recycled = None
     if settings.recycle:
         by_recycling = _by_recycling if settings.runs == 1 else _by_runs
@@ -139,19 +142,6 @@ def _without_limit(
             return
     population = population._replace(records=flight.landed_part()[1])
     yield from _by_moves(population, density, random, schedule, settings, recycled)
-
-
-def _submit_all(population: Population, density: Density, settings: Settings) -> Flight:
-    """Evaluate draws of the prior, if that has not been done; before recycling, some of them may be running."""
-    coords = population.coords
-    if population.records is not None:
-        return Flight.landed(coords, population.records)
-    flight = density.submit(coords)
-    density.wait(0 if flight.refused or not settings.recycle else most_running(density, len(coords)))
-    if flight.refused:
-        few, records = flight.landed_part()
-        raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0)
-    return flight
 
 
 def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
@@ -454,7 +444,7 @@ def _from_coarse(
         return False
     coarse_cost = few + sum(made for made, _ in found.proposals)
     drawn, start = draw_start(found.proposals, coords, few, random, density.inside)
-    population, flight = population._replace(coords=drawn), submit_start(drawn, start, density)
+    population, flight = population._replace(coords=drawn), submit_start(drawn, density, start)
     found = yield from _by_recycling(population, flight, density, random, schedule, settings, start, n)
     if not found.trusted:
         warn(

@@ -17,14 +17,10 @@ from typing import Any
 import numpy as np
 
 from ..proposals.mixture import Mixture
-from .adaptive_importance import most_running
 from .archive import StartingDensity, starting_mixture
 from .evidence_check import draw_inside
-from .flights import Flight
-from .population import Density, Population
-from .stopping import stop_at
 
-__all__ = ["check_coarse", "draw_start", "submit_start"]
+__all__ = ["check_coarse", "draw_start"]
 
 LAST_SHARE = 0.5
 
@@ -85,14 +81,3 @@ def draw_start(
         coords.append(drawn)
         parts.append((made, mixture))
     return np.concatenate(coords), starting_mixture(len(coords[0]), parts)
-
-
-def submit_start(coords: np.ndarray, start: StartingDensity, density: Density) -> Flight:
-    """Begin to evaluate draws (n, ndim) of a starting density; raises `StoppedEarly` at a limit of simulations."""
-    flight = density.submit(coords)
-    density.wait(0 if flight.refused else most_running(density, len(coords)))
-    if flight.refused:
-        few, records = flight.landed_part()
-        log_start = start.log_density(few, records)
-        raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0, log_start=log_start)
-    return flight
