@@ -26,23 +26,32 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
         RAMANCHA_2022_CONSTANT,
         RAMANCHA_2022_LITERAL,
     )
+    from .reporting.arviz_data import (
+        to_arviz,
+    )
+    from .reporting.corner_figures import (
+        plot_corner,
+        plot_marginals,
+    )
     from .reporting.diagnosis import (
         Diagnostics,
-    )
-    from .reporting.figures import (
-        ladder_plot,
-        pair_plot,
     )
     from .reporting.model_comparison import (
         ModelComparison,
         compare_models,
+    )
+    from .reporting.pair_figures import (
+        plot_pairs,
+    )
+    from .reporting.run_figures import (
+        plot_ladder,
+        plot_run,
     )
     from .reporting.summary import (
         Summary,
         comparison_table,
         ladder_table,
         summary,
-        to_arviz,
     )
     from .smc import (
         SMCSampler,
@@ -111,9 +120,12 @@ __all__ = [
     "compare_models",
     "comparison_table",
     "estimate_cost",
-    "ladder_plot",
     "ladder_table",
-    "pair_plot",
+    "plot_corner",
+    "plot_ladder",
+    "plot_marginals",
+    "plot_pairs",
+    "plot_run",
     "presets",
     "read_ladder",
     "summary",
@@ -136,21 +148,26 @@ _EXPORTS = {
         "RAMANCHA_2022_CONSTANT",
         "RAMANCHA_2022_LITERAL",
     ),
-    "reporting.diagnosis": ("Diagnostics",),
-    "reporting.figures": (
-        "ladder_plot",
-        "pair_plot",
+    "reporting.arviz_data": ("to_arviz",),
+    "reporting.corner_figures": (
+        "plot_corner",
+        "plot_marginals",
     ),
+    "reporting.diagnosis": ("Diagnostics",),
     "reporting.model_comparison": (
         "ModelComparison",
         "compare_models",
+    ),
+    "reporting.pair_figures": ("plot_pairs",),
+    "reporting.run_figures": (
+        "plot_ladder",
+        "plot_run",
     ),
     "reporting.summary": (
         "Summary",
         "comparison_table",
         "ladder_table",
         "summary",
-        "to_arviz",
     ),
     "smc": ("SMCSampler",),
     "storage.ladder_file": ("read_ladder",),

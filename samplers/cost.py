@@ -7,7 +7,6 @@ and the spread of the timed ones. A synchronous run waits for the end of every b
 """
 
 import heapq
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,11 +17,10 @@ from .smc import SMCSampler
 from .tempered import TemperedSampler
 from .tempering.expected_cost import Expected, expected_left, first_beta
 from .tempering.settings import Settings, as_whole_number
+from .timing import Draws, time_evaluations
 
 __all__ = ["CostEstimate", "estimate_cost"]
 
-FIRST_POINTS = 8  # most points that start the workers, as long as it is not known that a point is cheap
-LONG = 60.0  # [s], from which a point is not cheap
 REPETITIONS = 5  # of a scheduled batch
 SIMULATIONS_OF_A_GUIDE = 500
 
@@ -39,7 +37,7 @@ class CostEstimate(NamedTuple):
     seconds : (runs,) float
         Durations of the timed evaluations [s].
     evaluated : int
-        Number of all evaluations that were made: those that started the workers, and the timed ones.
+        Number of all evaluations that were made: those that started the workers, the timed ones, and cached ones.
     failures : int
         How many of these returned -inf.
     evaluations : Expected
@@ -52,6 +50,9 @@ class CostEstimate(NamedTuple):
     guide : str
         Duration of a run of 500 simulations with ``guide=posterior.guide()``; how many it needs is known only after its
         search. Empty for a posterior without a guide.
+    cached : int
+        How many of the evaluations needed no new simulation. They are not timed, unless all are cached. 0 for a
+        posterior whose ``report()`` has no number of simulations.
     """
 
     sampler: str
@@ -65,16 +66,23 @@ class CostEstimate(NamedTuple):
     synchronous: Expected
     asynchronous: Expected | None
     guide: str
+    cached: int = 0
+
+    @property
+    def any_simulated(self) -> bool:
+        """Whether the durations are those of simulations, and not of points whose simulations are cached."""
+        return self.evaluated > self.cached
 
     def __repr__(self) -> str:
         return str(self)
 
     def __str__(self) -> str:
         first, last = self.seconds.min(), self.seconds.max()
+        cached = f"{self.cached} cached, " if self.cached else ""
         rows = [
             (f"{self.sampler}, {self.nwalkers} walkers, {self.ndim} parameters", ""),
             (
-                f"one evaluation ({self.evaluated} made, {len(self.seconds)} timed)",
+                f"one evaluation ({self.evaluated} made, {cached}{len(self.seconds)} timed)",
                 f"mean {self.seconds.mean():.3g} s, {first:.3g} to {last:.3g} s",
             ),
             ("evaluations", f"about {_rounded(self.evaluations.low)} to {_rounded(self.evaluations.high)}"),
@@ -88,6 +96,8 @@ class CostEstimate(NamedTuple):
             rows.append(("with guide=posterior.guide()", self.guide))
         if self.failures:
             rows.append(("failed evaluations", f"{self.failures}"))
+        if not self.any_simulated:
+            rows.append(("note", "no point needed a simulation: the times are those of cached points"))
         width = max(len(name) for name, _ in rows)
         return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
 
@@ -117,9 +127,11 @@ def estimate_cost(
     a minute. Then `runs` points are timed.
 
     All points are draws of the prior. With the same `seed`, a sampler starts from these points, so that a
-    posterior that caches its simulations does not repeat them. The estimate of the evaluations is a range, which held
-    in 67 to 86 % of runs on posteriors that it was not made from (``python -m tests.benchmarks expected``). A posterior
-    with heavy tails needs more. Evaluations that take longer near the posterior than over the prior are not foreseen.
+    posterior that caches its simulations does not repeat them. Points whose simulations are cached already, as after an
+    earlier estimate with the same seed, are passed over, and further draws take their place. The estimate of the
+    evaluations is a range, which held in 67 to 88 % of runs on posteriors that it was not made from
+    (``python -m tests.benchmarks expected``). A posterior with heavy tails needs more. Evaluations that take longer
+    near the posterior than over the prior are not foreseen.
 
     Parameters
     ----------
@@ -167,20 +179,21 @@ def estimate_cost(
     # also checks the arguments
     settings = sampler(nwalkers, ndim, posterior, vectorize=True, seed=0, recycle=recycle).settings
     random = np.random.RandomState(seed)
-    draws = np.asarray(posterior.sample_prior(max(nwalkers, runs + 1), random), dtype=float)  # as those of the sampler
-    seconds, timed, found = _timed(posterior, draws, runs)
-    log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in draws[: len(timed)]])
-    finite = np.isfinite(timed)
+    n = max(nwalkers, runs + 1)
+    draws = np.asarray(posterior.sample_prior(n, random), dtype=float)  # as those of the sampler
+    made = time_evaluations(posterior, Draws(draws, lambda: posterior.sample_prior(n, random)), runs)
+    log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in made.points])
+    finite = np.isfinite(made.values)
     if finite.sum() < 2:
         raise ValueError(
-            f"{len(timed) - finite.sum()} of {len(timed)} draws of the prior have a log-probability of -inf, and the "
+            f"{len(finite) - finite.sum()} of {len(finite)} draws of the prior have a log-probability of -inf, and the "
             "estimate needs two finite ones: check the model at these points, or time more with runs="
         )
     recycling = bool(settings.recycle)
-    beta = first_beta(timed[finite] - log_prior[finite], recycling)
+    beta = first_beta(made.values[finite] - log_prior[finite], recycling)
     left = expected_left(settings, nwalkers, ndim, recycling, beta)
     evaluations = Expected(*(nwalkers + value for value in left))
-    workers = int(workers or found or 1)
+    workers, seconds = int(workers or made.workers or 1), made.seconds
     times = _wall_times(settings, evaluations, nwalkers, ndim, seconds, workers, recycling)
     return CostEstimate(
         sampler.__name__,
@@ -188,64 +201,14 @@ def estimate_cost(
         ndim,
         workers,
         seconds,
-        len(timed),
+        len(finite),
         int((~finite).sum()),
         evaluations,
         times[0],
         times[1],
         _of_guide(posterior, float(seconds.mean()), workers),
+        made.cached,
     )
-
-
-def _timed(posterior: Any, draws: np.ndarray, runs: int) -> tuple[np.ndarray, np.ndarray, int | None]:
-    """Time a number of evaluations after the start of the workers.
-
-    Returns
-    -------
-    seconds : (runs,) float
-        Durations [s].
-    values : (n,) float
-        Log-probabilities of the first n draws: those that started the workers, then the timed ones.
-    workers : int or None
-        Number of workers after their start, if it is known.
-    """
-    if not callable(getattr(posterior, "evaluation_queue", None)):
-        pairs = [_timed_call(posterior, point) for point in draws[: 1 + runs]]
-        seconds, values = (np.array(column) for column in zip(*pairs, strict=True))
-        return seconds[1:], values, None
-    queue = posterior.evaluation_queue()
-    try:
-        values, started, most, room = [], 0, FIRST_POINTS, len(draws) - runs
-        while len(values) < room and started < min(queue.workers or 1, most):
-            started = min(queue.workers or 1, most, room - len(values))
-            waited, found = _timed_batch(queue, draws[len(values) : len(values) + started])
-            values += found
-            most = FIRST_POINTS if max(waited) > LONG else room
-        seconds, size = [], runs if min(waited) > LONG and started >= runs else 1
-        while len(seconds) < runs:
-            durations, found = _timed_batch(queue, draws[len(values) : len(values) + size])
-            seconds += durations
-            values += found
-        return np.array(seconds), np.array(values, dtype=float), queue.workers
-    finally:
-        queue.close()
-
-
-def _timed_batch(queue: Any, points: np.ndarray) -> tuple[list[float], list[float]]:
-    """Times [s] from the submission of points (n, ndim) to their arrival, and their log-probabilities."""
-    start, arrived = time.perf_counter(), {}
-    tickets = queue.submit(points)
-    while len(arrived) < len(tickets):
-        finished = queue.collect()
-        now = time.perf_counter() - start
-        arrived.update({ticket: (now, value) for ticket, value in finished})
-    return [arrived[ticket][0] for ticket in tickets], [arrived[ticket][1] for ticket in tickets]
-
-
-def _timed_call(posterior: Callable, point: np.ndarray) -> tuple[float, float]:
-    start = time.perf_counter()
-    value = float(np.ravel(posterior(point))[0])
-    return time.perf_counter() - start, value
 
 
 def _scheduled(lengths: np.ndarray, workers: int) -> float:

@@ -93,11 +93,11 @@ class SMCSampler(TemperedSampler):
         The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
         (a returned -inf is not a failure); 0 stops at the first failure.
     asynchronous : bool, default False
-        With recycling, propose the next points while the last ones run, so that no worker waits for the slowest point
-        of a batch; for long runs of unequal length. Needs a `Posterior` of fe_likelihoods with a pool of its own and
-        ``vectorize=True``, or a `pool` that takes single points. Proposals then depend on the order in which points
-        arrive, which the journal of a file repeats; beta grows when all draws but the latest
-        have arrived, and estimates are made of complete batches only.
+        With recycling or a guide, propose the next points while the last ones run, so that no worker waits for the
+        slowest point of a batch; for long runs of unequal length. Needs a `Posterior` of fe_likelihoods with a pool of
+        its own and ``vectorize=True``, or a `pool` that takes single points. Proposals then depend on the order in
+        which points arrive, which the journal of a file repeats; beta grows when all draws but the latest have arrived,
+        and estimates are made of complete batches or rounds only.
     settings : samplers.Settings, optional
         These settings as one object; keywords take precedence.
 

@@ -28,7 +28,7 @@ from .moves.fast_parameters import with_fast_sweeps
 from .moves.guided import GuideMove
 from .moves.kernels import RandomWalkMove, calibrate_move
 from .moves.snooker import with_snooker_moves
-from .reporting.progress import Progress, get_progress_bar, show_sweeps
+from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
 from .reporting.run_results import RunResults
 from .storage.checkpoint import Checkpoint
 from .storage.compatibility import SEED, header, warn_of_other_seed
@@ -36,6 +36,7 @@ from .storage.emcee_internals import get_moves, get_previous_state, get_random, 
 from .storage.evaluation import CallingConvention, FailureLimit
 from .storage.evaluators import check_asynchronous, make_evaluators
 from .storage.journal import RunStart
+from .storage.pool_queue import advise_on_pool
 from .storage.recording import record
 from .storage.resumption import PresentCall, Resumption
 from .storage.script import Request, describe_options
@@ -195,6 +196,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         if coarse_log_prob_fn is not None:
             unused["runs"] = "the runs begin with draws of the prior, not with a coarse model: pass one of them"
         refuse_unused(given, recycle, followed != own_moves, unused, guide is not None)
+        advise_on_pool(pool)
         if given.asynchronous:
             check_asynchronous(functions.function, pool, vectorize)
         if given.ess_floor >= nwalkers:
@@ -202,9 +204,10 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
 
         convention = CallingConvention(vectorize, self.parameter_names if self.params_are_named else None, blobs_dtype)
         limit = FailureLimit(self.settings.max_failure_share, nwalkers, ndim)
+        queue = getattr(guide, "evaluation_queue", None)
         common = (self.log_prob_fn.args, self.log_prob_fn.kwargs), convention, self._checkpoint, limit, self._budget
         self._evaluator, self._coarse_evaluator = make_evaluators(
-            functions, coarse_log_prob_fn, *common, self.settings.asynchronous
+            functions, coarse_log_prob_fn, *common, self.settings.asynchronous, queue
         )
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._result, self._verdict = self._checkpoint.stored_result(), self._checkpoint.stored_verdict()
@@ -439,6 +442,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         log_base = self._evaluator.log_base_of_start(coords)
         if not np.array_equal(coords, self._drawn):
             self._functions.check_start(coords, self._evaluator.log_base)
+        self._prior_draws = coords if self._functions.start_density is None else None
         if self._checkpoint.wants_start:
             self._checkpoint.begin(self._header() | {SEED: self._seed}, RunStart(coords, log_base, self.random_state))
         records = None
@@ -457,10 +461,11 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         schedule, guidance, self._usual_moves = MoveSchedule(*get_moves(self)), None, None
         if self._given_guide is not None:
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
-            guidance = lend(self._guide, get_random(self), self._checkpoint.remember, self._budget)
+            lent = get_random(self), self._checkpoint.remember, self._budget, self.settings.asynchronous
+            guidance = lend(self._guide, *lent)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, coarse, guidance)
         unit = " evaluations" if guidance is None else " batches"
-        labels = {"desc": "ladder", "unit": unit, **(bar["progress_kwargs"] or {})}
+        labels = {"desc": ANNEALING, "unit": unit, **(bar["progress_kwargs"] or {})}
         known = None if coarse is not None or self.settings.runs > 1 or guidance is not None else self.settings
         seen = self._evaluator, labels["desc"], self._functions.function, known, (self.nwalkers, self.ndim)
         with (

@@ -6,11 +6,20 @@ process does takes no time.
 """
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
+from queue import SimpleQueue
+from unittest.mock import patch
 
 import numpy as np
 
-__all__ = ["SimulatedCluster"]
+from fe_likelihoods.probability import evaluation_queue, new_simulations, running_requests
+from fe_likelihoods.simulation.executors import PoolExecutor
+
+__all__ = ["SimulatedCluster", "SimulatedPool"]
+
+take_without_clock = new_simulations.take_all
 
 
 class SimulatedCluster:
@@ -86,3 +95,75 @@ class SimulatedCluster:
     def close(self) -> None:
         """Drop what has not ended."""
         self._running = []
+
+
+class SimulatedPool(PoolExecutor):
+    """A pool of a likelihood on simulated workers, which evaluates the responses of its model.
+
+    Parameters
+    ----------
+    workers : int
+        Number of workers.
+    length : callable
+        Function of parameters (n_parameters,) that returns how long a simulation of the whole record takes.
+    n_steps : int
+        Samples of the whole record; a part of it takes its share of the time.
+
+    Attributes
+    ----------
+    n_workers, now, busy, simulations
+        As of a `SimulatedCluster`; `simulations` counts parts of a record as fractions.
+    """
+
+    n_workers = 0
+    submits = True
+    other_processes = False
+
+    def __init__(self, workers: int, length: Callable[[np.ndarray], float], n_steps: int):
+        self.n_workers, self._length, self._n_steps = workers, length, n_steps
+        self.now = self.busy = self.simulations = 0.0
+        self._free = [0.0] * workers
+        self._running: list[tuple[float, int, Future, object]] = []
+        self._submitted = 0
+
+    @property
+    def utilisation(self) -> float:
+        """Share of the time of all workers in which they were busy."""
+        return self.busy / (self.n_workers * self.now)
+
+    def submit_all(self, function: Callable, items: Sequence[np.ndarray]) -> list[Future]:
+        """Futures that have a result when the clock has advanced to their end."""
+        futures = []
+        for item in items:
+            outcome, future = function(item), Future()
+            share = function.args[-1].model.n_steps / self._n_steps
+            length = share * float(self._length(np.asarray(item)))
+            end = max(heapq.heappop(self._free), self.now) + length
+            heapq.heappush(self._free, end)
+            self._submitted += 1
+            heapq.heappush(self._running, (end, self._submitted, future, outcome))
+            self.busy += length
+            self.simulations += share
+            futures.append(future)
+        return futures
+
+    def advance(self) -> None:
+        """Advance the clock to the end of the next simulation, and of all that end with it."""
+        self.now = self._running[0][0]
+        while self._running and self._running[0][0] == self.now:
+            _, _, future, outcome = heapq.heappop(self._running)
+            future.set_result(outcome)
+
+    @contextmanager
+    def clock(self) -> Iterator[None]:
+        """Whoever waits for a simulation advances the clock."""
+
+        def take_all(arrived: SimpleQueue, wait: bool) -> list:
+            while wait and arrived.empty():
+                self.advance()
+            return take_without_clock(arrived, wait)
+
+        with ExitStack() as stack:
+            for module in (new_simulations, evaluation_queue, running_requests):
+                stack.enter_context(patch.object(module, "take_all", take_all))
+            yield

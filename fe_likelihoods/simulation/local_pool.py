@@ -105,6 +105,7 @@ class LocalPool:
         self._is_woken = self._gives_up = (
             False  # the thread has been sent a message; jobs that were started are given up
         )
+        self._idle_ended: threading.Event | None = None  # the thread is to end processes without an item, and to set it
         self._last: tuple[Any, PickledFunction | None] = None, None  # the function that was submitted last
 
     def __enter__(self) -> "LocalPool":
@@ -128,8 +129,22 @@ class LocalPool:
             left = [*self._waiting, *filter(None, self._running.values())]
         self.give_up(left)
         with self._lock:
-            while self._free:
-                self._free.pop().kill()
+            if self._thread is None or threading.current_thread() is self._thread:
+                self._end_idle()
+                return
+            ended = self._idle_ended = self._idle_ended or threading.Event()
+            self._wake_thread()
+        ended.wait()
+
+    def _end_idle(self) -> None:
+        """End the processes that have no item: those that are free, and those that load a function."""
+        for worker in [worker for worker, job in self._running.items() if job is None]:
+            self._end(worker)
+        while self._free:
+            self._free.pop().kill()
+        if self._idle_ended is not None:
+            self._idle_ended.set()
+            self._idle_ended = None
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in their order; they run before items that were submitted.
@@ -229,6 +244,8 @@ class LocalPool:
         try:
             while True:
                 with self._lock:
+                    if self._idle_ended is not None:
+                        self._end_idle()
                     self._start_jobs()
                     finished, self._finished = self._finished, []
                     ends = not self._running
@@ -255,6 +272,7 @@ class LocalPool:
                 self._finished = []
                 self._waiting.clear()
                 self._running.clear()
+                self._end_idle()
             for job in left:
                 _fail(job, error)
 

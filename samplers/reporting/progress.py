@@ -1,11 +1,15 @@
 """Progress of a run: a bar of tqdm in a terminal or a notebook, a line per minute where stderr is neither.
 
-The bar advances with every evaluated point. After the first stage it also shows how many points are expected in all
-(`samplers.tempering.expected_cost`: a model of the stages that are left, whose growth and cost are those of the stages
-so far). `left` is the time for the low and the high end of that range, at the mean rate of this process so far. Three
-of four to nine of ten runs end within it. It does not foresee that recycling is given up, nor a change of the rate.
+The bar names the latest stage, and shows what a user asks first from left to right: the time left, beta, the
+log-evidence so far, failures. A narrow terminal cuts off the rest. Evaluations, simulations and failures are those
+since the bar began, for the annealing or for the sweeps that its label names. It advances with every evaluated point.
+After the first stage it also shows how many points are expected in all (`samplers.tempering.expected_cost`: a model of
+the stages that are left, whose growth and cost are those of the stages so far). `left` is the time for the low and the
+high end of that range, at the mean rate of this process so far. Seven to nine of ten runs end within it. It does not
+foresee that recycling is given up, nor a change of the rate.
 """
 
+import contextlib
 import logging
 import sys
 import time
@@ -20,13 +24,21 @@ from ..tempering.expected_cost import Expected, expected_left
 from ..tempering.population import GuideTick, Population, Report, Restart, Stage, Sweep
 from ..tempering.results import AnnealingResult
 from ..tempering.settings import Settings
+from .messages import messages_above
 
-__all__ = ["Progress", "as_duration", "get_progress_bar", "show_sweeps"]
+__all__ = ["ANNEALING", "SWEEPS", "Progress", "as_duration", "get_progress_bar", "show_sweeps"]
 
 logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_FIGURES = 0.1
+ANNEALING = "annealing"
+SWEEPS = "sweeps at beta = 1"
+# figures of the bar, the most important ones first: the width of a terminal ends them
+ORDER = (
+    *("left", "beta", "log Z", "failures", "ESS", "acceptance"),
+    *("evaluations", "simulations", "running", "busy", "per hour"),
+)
 
 
 class _Lines:
@@ -54,6 +66,8 @@ class _Lines:
 def get_progress_bar(display: bool | str, total: int | None, **kwargs: Any) -> Any:
     """A bar of tqdm, or emcee's silent one.
 
+    Its attribute ``formats`` has the formats with and without a known total, unless the user gives a format.
+
     Parameters
     ----------
     display : bool or str
@@ -72,10 +86,17 @@ def get_progress_bar(display: bool | str, total: int | None, **kwargs: Any) -> A
 
     # tqdm.auto is a subclass of the bar of terminals or of that of notebooks
     in_notebook = tqdm.display is not terminal_bar.display
+    part = "|{bar}|" if in_notebook else "|{bar:5}|"
     if not in_notebook and "file" not in kwargs and not sys.stderr.isatty():
-        rare = {"mininterval": SECONDS_BETWEEN_LINES, "maxinterval": SECONDS_BETWEEN_LINES, "ncols": 0}
-        kwargs = rare | kwargs | {"file": _Lines()}
-    return tqdm(total=total, **({"miniters": 0} | kwargs))
+        rare = {"mininterval": SECONDS_BETWEEN_LINES, "maxinterval": SECONDS_BETWEEN_LINES}
+        kwargs, part = rare | kwargs | {"file": _Lines()}, ""
+    counts = "{n_fmt}/{total_fmt}{unit} [{elapsed}{postfix}]"
+    formats = f"{{desc}}: {{percentage:3.0f}}%{part} {counts}", "{desc}: {n_fmt}{unit} [{elapsed}{postfix}]"
+    if "bar_format" in kwargs:
+        return tqdm(total=total, **({"miniters": 0} | kwargs))
+    bar = tqdm(total=total, **({"miniters": 0, "bar_format": formats[total is None]} | kwargs))
+    bar.formats = formats
+    return bar
 
 
 def as_duration(low: float, high: float) -> str:
@@ -132,10 +153,13 @@ class Progress:
         self._part = 0.0  # of a point: simulations of a point that has several
         self._begun = self._changed = self._drawn = time.perf_counter()
         self._busy, self._workers = 0.0, 0  # time of all workers [s], and their number; 0: not known
-        self._simulations_before = self._reported().get("simulations", 0)
+        self._guided = False
+        self._messages = contextlib.ExitStack()
+        self._simulations_before, self._failures_before = self._reported().get("simulations", 0), self._failures()
 
     def __enter__(self) -> "Progress":
         if not self._silent:
+            self._messages.enter_context(messages_above(self._bar))
             self._workers = self._known_workers()
             self._evaluator.observer = self
             if self._announce is not None and not self._evaluator.asynchronous:
@@ -149,6 +173,7 @@ class Progress:
                 self._announce(None)
             if kind is None and self._settings is not None:
                 self._left, self._done_at_stage = Expected(0.0, 0.0, 0.0), self._done
+            self._messages.close()
             self._draw(0)
 
     def _known_workers(self) -> int:
@@ -203,6 +228,10 @@ class Progress:
             self._figures["acceptance"] = f"{report.acceptance:.2f}"
             if result.ladder:
                 self._figures["log Z"] = f"{sum(stage.log_evidence_increment for stage in result.ladder):.2f}"
+        if isinstance(report, Sweep) or (isinstance(report, Stage) and not self._guided):
+            self._name_stage(result)
+        if isinstance(report, Restart | Sweep | GuideTick):
+            self._guided = isinstance(report, GuideTick)
         if isinstance(report, Restart):
             self._recycling, self._left = False, None
         elif isinstance(report, Stage) and self._settings is not None:
@@ -218,8 +247,13 @@ class Progress:
             self._bar.set_description_str(f"guide: {report.phase}", refresh=False)
             self._draw(int(report.finished), refresh=not report.finished)  # before a batch, which may take minutes
         elif isinstance(report, Sweep):
-            self._bar.set_description_str(self._label, refresh=False)
             self._draw(1)
+
+    def _name_stage(self, result: AnnealingResult) -> None:
+        own = "" if self._label == ANNEALING else f"{self._label}, "  # a label of the user is kept
+        self._bar.set_description_str(
+            f"{own}stage {len(result.ladder)}" if result.ladder else self._label, refresh=False
+        )
 
     def step(self, steps: int) -> None:
         """Advance a bar that does not count points."""
@@ -242,16 +276,22 @@ class Progress:
     def _draw(self, steps: int, refresh: bool = False) -> None:
         """Show the figures, and advance the bar by steps, or by the points since the last time."""
         self._drawn = time.perf_counter()
-        left = self._still_expected()
+        left, total = self._still_expected(), getattr(self._bar, "total", None)
         if self._counts_points:
             steps, self._shown = self._done - self._shown, self._done
             self._set_total(None if left is None else self._done + round(left.likely))
-        self._bar.set_postfix(self._figures | self._counts(left), refresh=refresh)
+        figures = self._figures | self._counts(left)
+        made = getattr(self._bar, "n", 0) + steps
+        if not self._counts_points and total and 0 < made < total:
+            figures["left"] = as_duration(*2 * ((self._drawn - self._begun) * (total - made) / made,))
+        self._bar.set_postfix({name: figures[name] for name in ORDER if name in figures}, refresh=refresh)
         if not refresh or steps > 0:
             self._bar.update(steps)
 
     def _set_total(self, total: int | None) -> None:
         self._bar.total = total
+        if hasattr(self._bar, "formats"):
+            self._bar.bar_format = self._bar.formats[not total]
         container = getattr(self._bar, "container", None)
         if container is not None and total:  # of a notebook, whose bar has a total of its own
             widget = container.children[1]
@@ -267,24 +307,28 @@ class Progress:
     def _counts(self, left: Expected | None) -> dict[str, str]:
         """Figures that change with every point."""
         seconds, reported = max(self._drawn - self._begun, 1e-9), self._reported()
-        figures = {"evaluations": str(self._done)} if self._counts_points or self._done > 0 else {}
+        figures = {"evaluations": str(self._done)} if self._done > 0 and not self._counts_points else {}
         made = self._new
         if "simulations" in reported:
             made = reported["simulations"] - self._simulations_before
-            figures |= {} if "simulations" in self._figures else {"simulations": str(reported["simulations"])}
+            figures |= {} if "simulations" in self._figures else {"simulations": str(made)}
         if self._running > 0:
             figures["running"] = str(self._running)
         if made > 0:
             figures["per hour"] = f"{3600.0 * made / seconds:.3g}"
         if self._workers > 1:
             figures["busy"] = f"{100.0 * self._busy / (self._workers * seconds):.0f} %"
-        failures = self._evaluator.failures.count + reported.get("failure_count", 0)
+        failures = self._failures() - self._failures_before
         if failures > 0:
             figures["failures"] = str(failures)
         if left is not None and left.high > 0.0 and self._new > 0:
             pace = seconds / self._new
             figures["left"] = as_duration(pace * left.low, pace * left.high)
         return figures
+
+    def _failures(self) -> int:
+        """Failed evaluations of the run, and failed simulations of this process, so far."""
+        return self._evaluator.failures.count + self._reported().get("failure_count", 0)
 
     def _reported(self) -> Mapping[str, Any]:
         return {} if self._report is None else self._report()
@@ -314,9 +358,10 @@ def show_sweeps(
     evaluator, function, size
         As for `Progress`.
     """
+    labels = {"desc": SWEEPS, "unit": " sweeps"} | dict(bar["progress_kwargs"] or {})
     with (
-        get_progress_bar(bar["progress"] and sweeps != 0, sweeps, **(bar["progress_kwargs"] or {})) as shown,
-        Progress(shown, evaluator, "", function, None, size, counts_points=False) as progress,
+        get_progress_bar(bar["progress"] and sweeps != 0, sweeps, **labels) as shown,
+        Progress(shown, evaluator, labels["desc"], function, None, size, counts_points=False) as progress,
     ):
         for state in states:
             progress.step(per_state)

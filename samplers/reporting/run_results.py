@@ -31,6 +31,8 @@ class RunResults:
     _guide: AdaptedGuide | None
     _result: AnnealingResult
     _verdict: Verdict | None
+    _seed: list[int] | None
+    _prior_draws: np.ndarray | None = None
 
     @property
     def evaluations(self) -> int:
@@ -78,6 +80,15 @@ class RunResults:
         return self._result.ladder
 
     @property
+    def ended_at(self) -> float | None:
+        """Exponent beta at which the limit of simulations ended the annealing; None if it did not end it.
+
+        The last stage of `ladder` is then that of all points known at that time, weighted for beta = 1.
+        """
+        halt = self._result.halt
+        return None if halt is None or halt.complete or halt.beta >= 1.0 else halt.beta
+
+    @property
     def log_evidence(self) -> float:
         """Log-evidence: of `log_evidence_ladder` and `log_evidence_check` the one with the smaller error."""
         return self._result.evidence[0]
@@ -101,6 +112,24 @@ class RunResults:
         self._result.require_finished()
         return self._result.check
 
+    @property
+    def founders(self) -> np.ndarray:
+        """Founder (nwalkers,) of each walker: walkers with the same number are copies that have been moved since.
+
+        See `samplers.tempering.genealogy`. Each walker has its own where the record of the resampling is lost, as in a
+        chain that another sampler continues without the journal.
+        """
+        founders = self._result.founders
+        return np.arange(self.nwalkers) if founders is None else founders
+
+    @property
+    def prior_draws(self) -> np.ndarray | None:
+        """Draws of the prior (nwalkers, ndim) from which this object annealed; None if they are not known.
+
+        They are not known in a run that was read from a file, and where the annealing began with a `start_density`.
+        """
+        return self._prior_draws
+
     def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
         """Monte Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
 
@@ -110,9 +139,13 @@ class RunResults:
         introduce, such as emcee's stretch move, is not accounted for. A single run cannot detect a mode that it lost,
         or moves that did not move: after a `SamplingWarning` the errors are too small.
         """
-        founders = self._result.founders
-        chain = self.get_chain(discard=discard, thin=thin)
-        return standard_error_of_mean(chain, np.arange(self.nwalkers) if founders is None else founders)
+        return standard_error_of_mean(self.get_chain(discard=discard, thin=thin), self.founders)
+
+    def _repr_html_(self) -> str:
+        """In notebooks: what the run has done and found, or how to start it."""
+        from .html import describe_sampler
+
+        return describe_sampler(self)
 
     @property
     def guide(self) -> Guide | None:
@@ -147,6 +180,11 @@ class RunResults:
         continued. A cache of `log_prob_fn` can make some of them unnecessary.
         """
         return self._evaluator.budget.simulations
+
+    @property
+    def seed(self) -> int | list[int] | None:
+        """The seed that this object was given; None if it was given none."""
+        return self._seed[0] if self._seed is not None and len(self._seed) == 1 else self._seed
 
     @property
     def verdict(self) -> Verdict:

@@ -1,20 +1,27 @@
-"""Results of finished runs as tables and arviz data.
+"""Results of finished runs as tables.
 
-`summary` gives the moments of the posterior, `ladder_table` the tempering stages of a run, `comparison_table` the cost
-of several samplers, and `to_arviz` the samples in the format of arviz (imported only there). Figures are in
-`samplers.reporting.figures`.
+`summary` gives the moments of the posterior, `ladder_table` the tempering stages of a run, and `comparison_table` the
+cost of several samplers. Figures are in `samplers.reporting.corner_figures`,
+`pair_figures` and `run_figures`, data for arviz in `samplers.reporting.arviz_data`.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..tempering.population import Stage
-from .inspection import is_tempered, parameter_names_of, summary_of
+from .inspection import is_tempered, summary_of
 
-__all__ = ["SamplerComparison", "Summary", "comparison_table", "finished_ladder", "ladder_table", "summary", "to_arviz"]
+__all__ = [
+    "SamplerComparison",
+    "Summary",
+    "comparison_table",
+    "finished_ladder",
+    "ladder_table",
+    "names_of_parameters",
+    "summary",
+]
 
 
 class Summary(NamedTuple):
@@ -47,7 +54,8 @@ class Summary(NamedTuple):
         return "\n".join(rows)
 
 
-def _names(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
+def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
+    """The given names, or theta_0, theta_1, ...; ValueError if there is not one per parameter."""
     names = tuple(f"theta_{i}" for i in range(ndim)) if names is None else tuple(names)
     if len(names) != ndim:
         raise ValueError(f"expected one name per parameter: {ndim} parameters, but {len(names)} names {names}")
@@ -111,61 +119,7 @@ def summary(
     mean = weights @ samples
     sd = np.sqrt(weights @ (samples - mean) ** 2)
     cv = np.divide(sd, np.abs(mean), out=np.where(sd > 0.0, np.inf, 0.0), where=mean != 0.0)
-    return Summary(_names(names, samples.shape[1]), mean, sd, cv, mean_error)
-
-
-def to_arviz(sampler: Any, parameter_names: Sequence[str] | None = None) -> Any:
-    """Convert one run, or several independent runs, to arviz data.
-
-    Each run is one chain, because the walkers of one run share proposals and ancestors and are not independent chains.
-    (`arviz.from_emcee` makes each walker a chain.) The log-probability is ``lp`` in ``sample_stats``. The attributes of
-    ``sample_stats`` contain ``log_evidence`` and ``log_evidence_error``, with one number per run, and ``ladder``, the
-    stages of each run as JSON.
-
-    Parameters
-    ----------
-    sampler : sampler or sequence of samplers
-        Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
-    parameter_names : sequence of str, optional
-        One name per parameter; by default those of ``log_prob_fn``, or else theta_0, theta_1, ...
-
-    Returns
-    -------
-    arviz.InferenceData
-        A DataTree from arviz 1.0 on. Its method ``to_netcdf(path)`` writes it to a file.
-
-    Raises
-    ------
-    ValueError
-        If the chains have different shapes, or the number of names is wrong.
-    """
-    import inspect
-
-    import arviz
-
-    runs = list(sampler) if isinstance(sampler, Sequence) else [sampler]
-    if parameter_names is None:
-        parameter_names = parameter_names_of(runs[0])
-    names = _names(parameter_names, runs[0].ndim)
-    chains = [run.get_chain(flat=True) for run in runs]
-    if len({chain.shape for chain in chains}) > 1:
-        raise ValueError(f"all runs must have chains of the same shape; got {[c.shape for c in chains]}")
-    draws = np.stack(chains)
-    groups = {
-        "posterior": {name: draws[:, :, i] for i, name in enumerate(names)},
-        "sample_stats": {"lp": np.stack([run.get_log_prob(flat=True) for run in runs])},
-    }
-    # arviz 1.0 takes the groups as one dictionary, earlier versions as keywords
-    by_keyword = "posterior" in inspect.signature(arviz.from_dict).parameters
-    data = arviz.from_dict(**groups) if by_keyword else arviz.from_dict(groups)
-
-    if all(is_tempered(run) and run.ladder for run in runs):
-        data["sample_stats"].attrs.update(
-            log_evidence=np.array([run.log_evidence for run in runs]),
-            log_evidence_error=np.array([run.log_evidence_error for run in runs]),
-            ladder=json.dumps([[stage._asdict() for stage in run.ladder] for run in runs]),
-        )
-    return data
+    return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, mean_error)
 
 
 def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
@@ -201,14 +155,18 @@ def ladder_table(sampler: Any) -> str:
     """
     stages = finished_ladder(sampler)
     rows = [
-        f"{'stage':>5} {'beta':>10} {'ESS':>7} {'acceptance':>10} {'sweeps':>6} {'distinct':>8} {'d log Z':>10} "
+        f"{'stage':>5} {'beta':>10}  {'ESS':>6} {'acceptance':>10} {'sweeps':>6} {'distinct':>8} {'d log Z':>10} "
         f"{'evaluations':>11} {'time [s]':>9}"
     ]
     for number, s in enumerate(stages, start=1):
+        ended = sampler.ended_at is not None and number == len(stages)
+        beta = f"{sampler.ended_at:.3e}*" if ended else f"{s.beta:.3e} "
         rows.append(
-            f"{number:>5} {s.beta:>10.3e} {s.effective_sample_size:>7.0f} {s.acceptance:>10.3f} {s.moves:>6} "
+            f"{number:>5} {beta:>11} {s.effective_sample_size:>6.0f} {s.acceptance:>10.3f} {s.moves:>6} "
             f"{s.distinct_ancestors:>8} {s.log_evidence_increment:>10.3f} {s.evaluations:>11} {s.seconds:>9.3g}"
         )
+    if sampler.ended_at is not None:
+        rows.append("* the limit of simulations ended the run here: all points known then, weighted for beta = 1")
     evaluations, seconds = sum(s.evaluations for s in stages), sum(s.seconds for s in stages)
     rows.append(
         f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "

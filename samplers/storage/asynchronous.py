@@ -3,9 +3,12 @@
 Points are submitted to a queue as soon as they are proposed. What has arrived is entered in the journal, and at each
 decision of the sampler (`AsynchronousEvaluator.wait`) also which points had arrived by then. The decisions depend on
 the order of arrival; a run that is continued repeats them from the journal, and goes on to the last bit as the one that
-was interrupted. Points that were running when the process ended are submitted again.
+was interrupted. Points that were running when the process ended are submitted again. If Ctrl-C or an error ends the
+run, points that have ended by then are entered in the journal first.
 """
 
+import hashlib
+import logging
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -14,8 +17,11 @@ import numpy as np
 from ..tempering.flights import Flight
 from .evaluation import Evaluator
 from .journal import EvaluatedBatch, merge_batches
+from .lenient_file import deferred_interrupts
 
 __all__ = ["AsynchronousEvaluator", "EvaluationQueue"]
+
+logger = logging.getLogger(__name__)
 
 # Finite values that the check of the first evaluations needs.
 FIRST_VALUES = 8
@@ -23,6 +29,9 @@ FIRST_VALUES = 8
 
 class EvaluationQueue(Protocol):
     """Where points are evaluated, such as ``posterior.evaluation_queue()`` or `samplers.storage.pool_queue.PoolQueue`.
+
+    A queue may also have a method ``ended()``, which returns numbers and values of the points that have ended, without
+    waiting, also of those that the last `collect` has returned. It is called before `close`.
 
     Attributes
     ----------
@@ -60,7 +69,7 @@ class AsynchronousEvaluator(Evaluator):
         super().__init__(*args, **kwargs)
 
     def __getstate__(self) -> dict:
-        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}, "_known": {}}
+        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}, "_known": {}, "_held": []}
 
     def reset(self) -> None:
         """Forget evaluations and failures; nothing runs afterwards."""
@@ -70,6 +79,7 @@ class AsynchronousEvaluator(Evaluator):
         self._running: dict[int, tuple[Flight, int]] = {}  # by number: points that have not arrived at a decision
         self._tickets: dict[int, int] = {}  # number of the point by ticket of the queue
         self._known: dict[int, tuple[EvaluatedBatch, int]] = {}  # values of points that are still in `_running`
+        self._held: list[EvaluatedBatch] = []  # not stored before the first values are checked
 
     def _opened(self) -> EvaluationQueue:
         if self._queue is None:
@@ -102,10 +112,8 @@ class AsynchronousEvaluator(Evaluator):
                 fitting = fitting if fitting == len(wanted) or self.evaluates_parts else 0
                 if fitting < len(wanted):
                     refused, end, wanted = True, int(wanted[fitting]), wanted[:fitting]
-            else:
-                self._check = None  # the interrupted run has checked its first batch
-                if self.observer is not None:
-                    self.observer.repeated(len(wanted))
+            elif self.observer is not None:
+                self.observer.repeated(len(wanted))
             self.budget.count(coords[wanted])
             numbers.append((known, wanted))
             if refused:
@@ -135,10 +143,18 @@ class AsynchronousEvaluator(Evaluator):
         if self._checkpoint is None:
             arrived = self._gather(most)
         else:
-            remembered = self._checkpoint.remember(
-                "arrived", lambda: [self._gather(most)], lambda: self.budget.of_guides
-            )
-            arrived = remembered[0]
+            new: list[np.ndarray] = []
+
+            def gather() -> list[np.ndarray]:
+                new.append(self._gather(most))
+                return new
+
+            # by the points, since a search that goes on under a larger limit leads to others
+            points = np.array([flight.coords[row] for flight, row in self._running.values()])
+            key = f"arrived of {hashlib.blake2b(points.tobytes(), digest_size=16).hexdigest()}"
+            arrived = self._checkpoint.remember(key, gather, lambda: self.budget.of_guides)[0]
+            if not new:
+                self._check = None  # the interrupted run has checked its first values before it entered this
         by_flight: dict[int, list[int]] = {}
         for number in arrived.tolist():
             by_flight.setdefault(id(self._running[number][0]), []).append(number)
@@ -159,41 +175,69 @@ class AsynchronousEvaluator(Evaluator):
 
     def _gather(self, most: int) -> np.ndarray:
         """Numbers (m,) of the points that have arrived by the time when `most` others are running."""
-        held: list[EvaluatedBatch] = []  # not stored before the first values are checked
         while len(self._running) - len(self._known) > most:
-            collected = self._opened().collect()
-            numbers = [self._tickets.pop(ticket) for ticket, _ in collected]
-            coords = np.array([self._running[number][0].coords[self._running[number][1]] for number in numbers])
-            batch = self._as_batch(coords, [value for _, value in collected])
-            for place, number in enumerate(numbers):
-                self._known[number] = batch, place
-            self.new_evaluations += len(numbers)
-            if self.observer is not None:
-                self.observer.finished(len(numbers))
-            held.append(batch)
-            if self._check is None or sum(np.isfinite(b.log_prob).sum() for b in held) >= FIRST_VALUES:
-                self._store(held)
-        self._store(held)
+            self._take(self._opened().collect())
+            if self._check is None or self._finite() >= FIRST_VALUES:
+                self._check_and_store()
+        self._check_and_store()
         return np.array(sorted(self._known), dtype=np.int64)
 
-    def _store(self, held: list[EvaluatedBatch]) -> None:
-        """Check the first values, and enter arrivals in the journal."""
-        if not held:
+    def _finite(self) -> int:
+        """Number of finite values that are known and have not arrived at a decision."""
+        return sum(bool(np.isfinite(batch.log_prob[row])) for batch, row in self._known.values())
+
+    def _take(self, collected: list[tuple[int, Any]]) -> None:
+        """Take values of the queue that are not known yet."""
+        new = [(ticket, self._tickets[ticket], value) for ticket, value in collected if ticket in self._tickets]
+        if not new:
             return
-        batch = merge_batches(held)
-        held.clear()
-        if self._check is not None:
-            self._check(self, batch)
+        coords = np.array([self._running[number][0].coords[self._running[number][1]] for _, number, _ in new])
+        batch = self._as_batch(coords, [value for _, _, value in new])
+        with deferred_interrupts():
+            self._held.append(batch)
+            for place, (ticket, number, _) in enumerate(new):
+                self._known[number] = batch, place
+                del self._tickets[ticket]
+        self.new_evaluations += len(new)
+        if self.observer is not None:
+            self.observer.finished(len(new))
+
+    def _check_and_store(self) -> None:
+        """Check the first values, and enter arrivals in the journal."""
+        if self._known and self._check is not None:
+            try:
+                self._check(self, merge_batches([_single(*known) for known in self._known.values()]))
+            except ValueError:
+                self._held, self._tickets = [], {}  # wrong values are not stored
+                raise
             self._check = None
-        if self._checkpoint is not None:
-            self._checkpoint.evaluated(batch)
+        self._store()
+
+    def _store(self) -> None:
+        """Enter arrivals in the journal."""
+        with deferred_interrupts():
+            if self._held and self._checkpoint is not None:
+                self._checkpoint.evaluated(merge_batches(self._held))
+            self._held = []
 
     def close(self) -> None:
-        """End the evaluation of points that are running."""
-        queue, self._queue, self._submitted = self._queue, None, 0
-        self._running, self._known, self._tickets = {}, {}, {}
-        if queue is not None:
-            queue.close()
+        """End the evaluation of points that are running; those that have ended are entered in the journal.
+
+        The first values are entered without a check, which may take evaluations; the next run makes it.
+        """
+        queue, self._queue = self._queue, None
+        try:
+            self._store()
+            if hasattr(queue, "ended") and self._checkpoint is not None:
+                self._take(queue.ended())
+                self._store()
+        except Exception as error:  # another error or Ctrl-C is the reason why the run ends
+            logger.warning("evaluations that have ended are not stored: %s", error)
+        finally:
+            self._submitted = 0
+            self._running, self._known, self._tickets, self._held = {}, {}, {}, []
+            if queue is not None:
+                queue.close()
 
 
 def _single(batch: EvaluatedBatch, row: int) -> EvaluatedBatch:

@@ -25,6 +25,7 @@ def make_evaluators(
     limit: FailureLimit,
     budget: Budget,
     asynchronous: bool = False,
+    queue: Callable[[], EvaluationQueue] | None = None,
 ) -> tuple[Evaluator, Evaluator | None]:
     """The evaluator of the posterior, and that of the coarse model or None.
 
@@ -40,6 +41,8 @@ def make_evaluators(
         As in `samplers.storage.evaluation.Evaluator`; the coarse model has the convention only.
     asynchronous : bool
         Whether points of the posterior arrive in any order (`samplers.storage.asynchronous`).
+    queue : callable, optional
+        Opens the queue of a posterior in place of its method `evaluation_queue`.
     """
     captured = ErrorCapturing(functions.function, *arguments, convention.vectorize)
     options = {
@@ -50,7 +53,7 @@ def make_evaluators(
     }
     common = captured, functions.log_prior, convention, checkpoint, limit
     if asynchronous:
-        opened = partial(_open_queue, functions.function, captured, convention)
+        opened = partial(_open_queue, functions.function, captured, convention, queue)
         fine: Evaluator = AsynchronousEvaluator(*common, **options, open_queue=opened)
     else:
         fine = Evaluator(*common, **options)
@@ -79,11 +82,15 @@ def _has_queue(function: Callable, pool: Any) -> bool:
 
 
 def _open_queue(
-    function: Callable, captured: ErrorCapturing, convention: CallingConvention, pool: Any
+    function: Callable,
+    captured: ErrorCapturing,
+    convention: CallingConvention,
+    queue: Callable[[], EvaluationQueue] | None,
+    pool: Any,
 ) -> EvaluationQueue:
     """The queue of a posterior, or one of a pool."""
     if _has_queue(function, pool):
-        return function.evaluation_queue()
+        return function.evaluation_queue() if queue is None else queue()
     if pool is None:
         raise ValueError("this sampler was begun with a pool, which is not stored with it: set its attribute pool")
     return PoolQueue(captured, pool, convention.as_points)

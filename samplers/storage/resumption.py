@@ -110,8 +110,8 @@ class Resumption:
         """
         contents = self._checkpoint.resume(self._header(), self._evaluator.log_base, self._evaluator.compute)
         start, last, ladder = contents.start, contents.last, self._checkpoint.stored_result().ladder
-        logger.info(
-            "Resuming %s at stage %d, beta %.3g: %d evaluations and %d steps kept",
+        logger.warning(  # a user who waits sees that the time spent is not lost
+            "Continuing %s: stage %d, beta %.3g, %d evaluations and %d steps are stored",
             self._checkpoint.place or "the run",
             len(ladder),
             ladder[-1].beta if ladder else 0.0,

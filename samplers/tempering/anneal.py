@@ -152,7 +152,7 @@ def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, 
         return
     log_weights = population.log_weights
     if len(log_weights) == 0 or np.max(log_weights) == -np.inf:
-        search = f", besides {searched:.6g} simulations of the search by the guide" if searched > 0.0 else ""
+        search = f", besides {searched:.0f} simulations of the search by the guide" if searched > 0.0 else ""
         advice = f", or {WHERE_TO_LOOK}" if len(log_weights) > 0 else ""
         raise NothingToReport(
             f"the limit of simulations (max_simulations) ended the run after {len(log_weights)} evaluated points, none "

@@ -83,11 +83,18 @@ class Flight:
 
 class _Evaluates(Protocol):
     evaluate: Callable[[np.ndarray], np.ndarray]
+    evaluate_observed: Callable[[np.ndarray, Callable[[np.ndarray], None]], np.ndarray]
 
 
-def submit_and_wait(density: _Evaluates, coords: np.ndarray) -> Flight:
-    """Evaluate points (n, ndim), of which a limit of simulations may allow the first few only."""
+def submit_and_wait(
+    density: _Evaluates, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None
+) -> Flight:
+    """Evaluate points (n, ndim), of which a limit of simulations may allow the first few only.
+
+    `observe`, if given, is called with the points directly before they are evaluated.
+    """
     try:
-        return Flight.landed(coords, density.evaluate(coords))
+        records = density.evaluate(coords) if observe is None else density.evaluate_observed(coords, observe)
+        return Flight.landed(coords, records)
     except BudgetExhausted as stop:
         return Flight.landed(coords[: len(stop.records)], stop.records, refused=True)

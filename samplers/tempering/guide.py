@@ -34,12 +34,15 @@ class GuideSession(NamedTuple):
     remaining : callable
         ``remaining()``: simulations left, inf without a limit. For information: no decision except to stop may depend
         on it, otherwise a run that is continued with a larger limit cannot repeat its first part.
+    asynchronous : bool
+        Whether draws arrive in any order, and the next ones are made while some of the last ones run.
     """
 
     random: np.random.RandomState
     remember: Callable[[str, Callable[[], Sequence[np.ndarray]]], list[np.ndarray]]
     fits: Callable[[float], bool]
     remaining: Callable[[], float]
+    asynchronous: bool
 
 
 class Guide(Protocol):
@@ -51,7 +54,15 @@ class Guide(Protocol):
         A generator that makes a costly search before the first draw; each item advances the progress bar.
     ``observe(coords, session)``
         Called with points (n, ndim) directly before they are evaluated, so that a guide can simulate and keep what
-        `log_prob_fn` does not return. Requires ``vectorize=True``.
+        `log_prob_fn` does not return. Requires ``vectorize=True``. In an asynchronous run it is called when they have
+        been evaluated, a few at a time.
+    ``evaluation_queue()``
+        The queue that points are submitted to in an asynchronous run, in place of that of `log_prob_fn`, for a guide
+        that keeps more of an evaluation than its value.
+    ``learns_from_parts`` : bool
+        Whether `refine` is to be called in an asynchronous run before all draws of a round have arrived. The first ones
+        are those with short evaluations: a regression may learn from them, an estimate of the density may not, since
+        a part of the posterior with long evaluations would be missing. False by default.
     ``check(log_prob_fn)``
         Raises ValueError if the guide is of another density than the sampler.
     ``fresh()``
@@ -80,7 +91,9 @@ class Guide(Protocol):
     def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Iterator[None] | None:
         """Learn from the latest draws (n, ndim) and their log-probabilities (n,), -inf where an evaluation failed.
 
-        Later draws and densities may change. May be a generator; each item advances the progress bar.
+        Later draws and densities may change. May be a generator; each item advances the progress bar. In an
+        asynchronous run, the draws may be of an earlier density than the present one, and the next draws may have been
+        made already.
         """
 
 
@@ -132,6 +145,11 @@ class AdaptedGuide:
     def observe(self) -> Callable[[np.ndarray, GuideSession], None] | None:
         """The guide's method `observe`, or None."""
         return self._optional("observe", None)
+
+    @property
+    def learns_from_parts(self) -> bool:
+        """Whether the guide may learn from the first arrivals of a round."""
+        return bool(self._optional("learns_from_parts", False))
 
     def prepare(self, session: GuideSession) -> Iterator[None]:
         """The search before the first draw."""

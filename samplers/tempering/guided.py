@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .adaptive_importance import most_running
 from .archive import StartingDensity
-from .budget import Budget, BudgetExhausted
+from .budget import Budget
+from .cohorts import Cohort, let_arrive, submit_cohort
 from .guide import AdaptedGuide, GuideSession
 from .population import Density, GuidedRound, GuideTick, Population, Report
 from .rounds import PooledRounds, Round, pool_rounds
@@ -56,14 +58,17 @@ class Guidance(NamedTuple):
     budget: Budget
 
 
-def lend(guide: AdaptedGuide, random: np.random.RandomState, remember: Callable, budget: Budget) -> Guidance:
+def lend(
+    guide: AdaptedGuide, random: np.random.RandomState, remember: Callable, budget: Budget, asynchronous: bool
+) -> Guidance:
     """A fresh guide with what it is lent; its simulations count from now on."""
     budget.begin(guide)
 
     def remember_with_count(key: str, compute: Callable) -> list[np.ndarray]:
         return remember(key, compute, lambda: budget.of_guides_with_batch)
 
-    return Guidance(guide, GuideSession(random, remember_with_count, budget.fits, lambda: budget.remaining), budget)
+    session = GuideSession(random, remember_with_count, budget.fits, lambda: budget.remaining, asynchronous)
+    return Guidance(guide, session, budget)
 
 
 class RoundsOfGuide(NamedTuple):
@@ -132,53 +137,103 @@ def draw_rounds(
     RoundsOfGuide
     """
     guide, session, budget = guidance
-    size, rounds = len(population.coords), []
-    population = population._replace(effective_sample_size=0.0)
+    size, population = len(population.coords), population._replace(effective_sample_size=0.0)
+    rounds: list[Round] = []
+    cohorts: list[Cohort] = []  # of which draws are running
+    lessons: list[Cohort] = []  # of which the guide has not learned from all draws
+    refused, pooled = False, None
 
     def tick(phase: str, finished: bool) -> tuple[Population, GuideTick]:
         return population, GuideTick(phase, budget.simulations, size, finished)
+
+    def judge(most: int) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
+        """Let draws arrive; returns how the rounds end, or None where another one follows."""
+        nonlocal population, pooled
+        while True:
+            let_arrive(cohorts, most, density, guide, session)
+            outcome = None
+            while cohorts and cohorts[0].flight.complete:
+                rounds.append(cohorts.pop(0).as_round())
+                pooled = pool_rounds(rounds, guide.log_density_error)
+                population = population._replace(effective_sample_size=pooled.effective_sample_size)
+                yield population, _report(rounds[-1], pooled)
+                yield tick(f"round {len(rounds)}", True)
+                outcome = _outcome(rounds, pooled, size, settings)
+            if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
+                outcome = RoundsOfGuide("", "", pooled, rounds[-1] if rounds else None, True)
+            if not cohorts or (outcome is None and _too_few(rounds, cohorts, size, settings, guide)):
+                return outcome
+            most = 0  # what was submitted is part of the result
 
     yield tick("search", False)
     for _ in guide.prepare(session):
         yield tick("search", True)
     while True:
-        yield tick(f"round {len(rounds) + 1}", False)
-        coords = guide.draw(_next_size(rounds, size, settings, guide), random)
-        latest, complete = _evaluate_round(coords, density, guide, session)
-        if latest is not None:
-            rounds.append(latest)
-        if not rounds:
-            return RoundsOfGuide("", "", None, None, True)
-        pooled = pool_rounds(rounds, guide.log_density_error)
-        last = rounds[-1]
-        population = population._replace(effective_sample_size=pooled.effective_sample_size)
-        yield (
-            population,
-            GuidedRound(
-                len(last.coords),
-                last.effective_share,
-                last.pareto_shape,
-                pooled.log_evidence,
-                pooled.log_evidence_error,
-                pooled.effective_sample_size,
-            ),
-        )
-        yield tick(f"round {len(rounds)}", True)
-        if not complete or budget.refused:  # a search that was cut short goes on first, if the limit is raised
-            return RoundsOfGuide("", "", pooled, last, True)
-        enough = pooled.effective_sample_size >= size
-        if enough and trusted(last, settings) and _even(pooled, settings):
-            return RoundsOfGuide("", "", pooled, last)
-        if doubt := _impossible(rounds) or _hopeless(rounds, settings):
-            return RoundsOfGuide(doubt, "", pooled, last)
-        if len(rounds) >= settings.most_rounds:
-            shortfall = _describe(last, pooled, settings)
-            usable = last.effective_share >= settings.usable_share and pooled.pareto_shape < LARGEST_SHAPE
-            return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
-        for _ in guide.refine(last.coords, last.records["log_prob"].copy(), session):
+        yield tick(f"round {len(rounds) + len(cohorts) + 1}", False)
+        coords = guide.draw(_next_size(rounds, cohorts, size, settings, guide), random)
+        cohort = submit_cohort(coords, density, guide, session)
+        refused = cohort.flight.refused
+        if len(cohort) > 0:
+            cohorts.append(cohort)
+            lessons.append(cohort)
+        outcome = yield from judge(0 if refused or budget.refused else most_running(density, len(coords)))
+        if outcome is not None:
+            return outcome
+        parts = [each.take_lesson(guide.learns_from_parts) for each in lessons]
+        lessons = [each for each in lessons if not each.learned]
+        points, log_prob = (np.concatenate(column) for column in zip(*parts, strict=True))
+        for _ in guide.refine(points, log_prob, session) if len(points) > 0 else ():
             yield tick(f"after round {len(rounds)}", True)
         if budget.refused:
-            return RoundsOfGuide("", "", pooled, last, True)
+            return (yield from judge(0))
+
+
+def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
+    """What is reported of a round, with all before it."""
+    return GuidedRound(
+        len(last.coords),
+        last.effective_share,
+        last.pareto_shape,
+        pooled.log_evidence,
+        pooled.log_evidence_error,
+        pooled.effective_sample_size,
+    )
+
+
+def _outcome(
+    rounds: Sequence[Round], pooled: PooledRounds, size: int, settings: GuidedSettings
+) -> RoundsOfGuide | None:
+    """How the rounds end; None if they go on."""
+    last, enough = rounds[-1], pooled.effective_sample_size >= size
+    if enough and trusted(last, settings) and _even(pooled, settings):
+        return RoundsOfGuide("", "", pooled, last)
+    if doubt := _impossible(rounds) or _hopeless(rounds, settings):
+        return RoundsOfGuide(doubt, "", pooled, last)
+    if len(rounds) < settings.most_rounds:
+        return None
+    shortfall = _describe(last, pooled, settings)
+    usable = last.effective_share >= settings.usable_share and pooled.pareto_shape < LARGEST_SHAPE
+    return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
+
+
+def _too_few(
+    rounds: Sequence[Round], cohorts: Sequence[Cohort], size: int, settings: GuidedSettings, guide: AdaptedGuide
+) -> bool:
+    """Whether more draws are made while some are running, since these will not be enough.
+
+    A guide that has to learn, and does so from complete rounds only, would repeat draws of the density that it has.
+    """
+    if len(rounds) + len(cohorts) >= settings.most_rounds:
+        return False
+    if rounds and trusted(rounds[-1], settings):
+        return _missing(rounds, cohorts, size, guide) > 0.0
+    return guide.learns_from_parts and (not _all_impossible(rounds) or any(cohort.possible for cohort in cohorts))
+
+
+def _missing(rounds: Sequence[Round], cohorts: Sequence[Cohort], size: int, guide: AdaptedGuide) -> float:
+    """Effective draws that are missing, if those that are running have the effective share of the last round."""
+    expected = rounds[-1].effective_share * sum(len(cohort) for cohort in cohorts)
+    return size - pool_rounds(rounds, guide.log_density_error).effective_sample_size - expected
 
 
 def _even(pooled: PooledRounds, settings: GuidedSettings) -> bool:
@@ -192,45 +247,19 @@ def _even(pooled: PooledRounds, settings: GuidedSettings) -> bool:
     return even and bool(np.isfinite(pooled.log_evidence_error))
 
 
-def _next_size(rounds: Sequence[Round], size: int, settings: GuidedSettings, guide: AdaptedGuide) -> int:
-    """Number of draws of the next round."""
+def _next_size(
+    rounds: Sequence[Round], cohorts: Sequence[Cohort], size: int, settings: GuidedSettings, guide: AdaptedGuide
+) -> int:
+    """Number of draws of the next cohort; of the `cohorts` that are running, only their number of draws matters."""
     first = max(settings.fewest_draws, int(np.ceil(settings.first_round_share * size)))
-    if not rounds:
+    if not rounds and not cohorts:
         return first
-    last = rounds[-1]
-    if _all_impossible(rounds):  # perhaps all simulations fail: find out with few more
+    if rounds and _all_impossible(rounds):  # perhaps all simulations fail: find out with few more
         return settings.fewest_draws
-    if trusted(last, settings):
-        missing = size - pool_rounds(rounds, guide.log_density_error).effective_sample_size
-        return int(np.clip(np.ceil(missing / last.effective_share), first, max(size, first)))
+    if rounds and trusted(rounds[-1], settings):
+        missing = _missing(rounds, cohorts, size, guide)
+        return int(np.clip(np.ceil(missing / rounds[-1].effective_share), first, max(size, first)))
     return max(settings.fewest_draws, int(np.ceil(settings.round_share * size)))
-
-
-def _evaluate_round(
-    coords: np.ndarray, density: Density, guide: AdaptedGuide, session: GuideSession
-) -> tuple[Round | None, bool]:
-    """Evaluate draws; None if the limit of simulations allows not one, and whether it allowed all."""
-    log_density = guide.log_density(coords)
-    if np.any(log_density == -np.inf):
-        raise ValueError(
-            f"guide.log_density is -inf at {int(np.sum(log_density == -np.inf))} of {len(coords)} draws of the guide: "
-            "it must return the logarithm of the density that guide.draw draws from"
-        )
-    complete, observe = True, guide.observe
-    try:
-        if observe is None:
-            records = density.evaluate(coords)
-        else:
-            records = density.evaluate_observed(coords, lambda points: observe(points, session))
-    except BudgetExhausted as stop:
-        records, complete = stop.records, False
-    n = len(records)
-    if n == 0:
-        return None, complete
-    log_prob = records["log_prob"]
-    alive = log_prob > -np.inf
-    log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density[:n], -np.inf)
-    return Round(coords[:n], records, log_weights), complete
 
 
 def _all_impossible(rounds: Sequence[Round]) -> bool:

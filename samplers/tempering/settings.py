@@ -281,8 +281,9 @@ class Settings:
         (a returned -inf is not a failure); 0 stops at the first failure.
     asynchronous : bool
         Whether points are evaluated without waiting for the slowest of each batch, for long runs of unequal length on
-        many workers. Recycling then proposes the next points while the last ones run. The result depends on the order
-        of arrival, in the choice of the proposals; every estimate is made of complete batches. Moves wait as before.
+        many workers. Recycling, or a guide, then proposes the next points while the last ones run. The result depends
+        on the order of arrival, in the choice of the proposals; every estimate is made of complete batches. Moves wait
+        as before.
     """
 
     ess_ratio: float = 0.5
@@ -465,9 +466,7 @@ def refuse_unused(
     elif not guided:
         reasons.setdefault("recycling", "the annealing is by moves: pass recycle=True")
         reasons.setdefault("runs", "it belongs to recycling, and the annealing is by moves: pass recycle=True")
-    if guided:
-        reasons["asynchronous"] = "the rounds of a guide wait for all their draws: pass one of them"
-    elif not recycles:
+    if not recycles and not guided:
         reasons["asynchronous"] = "moves wait for all points that they propose: pass recycle=True"
     for name in changed_settings(settings):
         if name in reasons:

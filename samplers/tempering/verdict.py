@@ -57,7 +57,7 @@ class Verdict(NamedTuple):
     def __str__(self) -> str:
         first = (
             f"{self.status.capitalize()}: effective sample size {self.effective_sample_size:.0f} ({self.sample}) from "
-            f"{self.simulations:.6g} simulations."
+            f"{self.simulations:.0f} simulations."
         )
         more = []
         if self.more_simulations is None:
@@ -104,7 +104,7 @@ def judge(
     found = list(result.doubts)
     reasons: list[str] = []
     if searched > 0.0:
-        reasons.append(f"the guide used {searched:.6g} of the {simulations:.6g} simulations for its search")
+        reasons.append(f"the guide used {searched:.0f} of the {simulations:.0f} simulations for its search")
     more: float | None = 0.0
     halt = result.halt
     if halt is not None and not halt.complete:
@@ -197,7 +197,7 @@ def describe_halt(verdict: Verdict, limit: float, result: AnnealingResult, made:
     else:
         ended = f"max_simulations={limit:g} allowed {made} of {made + missing} steps at beta = 1"
     if verdict.simulations > limit:
-        ended += f" (the stored run has made {verdict.simulations:.6g} simulations, which are kept)"
+        ended += f" (the stored run has made {verdict.simulations:.0f} simulations, which are kept)"
     if verdict.status == CONVERGED:
         return f"{ended}. The chain holds draws of the posterior: no further simulation is necessary"
     return (

@@ -346,7 +346,7 @@ def test_arviz_from_emcee(Sampler):
 
     sampler = run(Sampler)
     data = arviz.from_emcee(sampler, var_names=sampler.log_prob_fn.f.parameter_names)
-    assert data.posterior["x1"].shape == (N, STEPS)
+    assert dict(data["posterior"]["x1"].sizes) == {"chain": N, "draw": STEPS}  # arviz 1 has draws first
 
 
 @every
@@ -385,12 +385,12 @@ def test_our_moves_are_emcees():
 def test_progress_bar(Sampler, capfd):
     pytest.importorskip("tqdm")
     posterior = Gaussian()
-    posterior.report = lambda: {"simulations": 123456}
+    posterior.report = lambda: {"simulations": 1000 + 7 * posterior.calls}  # 1000 before the run
     Sampler(N, 3, posterior).run_mcmc(start(posterior), 3, progress=True)
     shown = capfd.readouterr().err
     assert "3/3" in shown
     if Sampler is not emcee.EnsembleSampler:
-        for word in ("beta=1", "ESS=", "acceptance=", "evaluations=", "simulations=123456"):
+        for word in ("beta=1", "ESS=", "acceptance=", "evaluations=72", "simulations=504"):
             assert word in shown, word
     Sampler(N, 3, posterior).run_mcmc(start(posterior), 3)
     assert capfd.readouterr().err == ""

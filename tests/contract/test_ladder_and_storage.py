@@ -22,8 +22,10 @@ from samplers import (
     read_ladder,
 )
 from samplers.moves.kernels import RandomWalkMove
-from samplers.reporting.figures import ladder_plot, pair_plot
-from samplers.reporting.summary import comparison_table, ladder_table, summary, to_arviz
+from samplers.reporting.arviz_data import to_arviz
+from samplers.reporting.pair_figures import plot_pairs
+from samplers.reporting.run_figures import plot_ladder
+from samplers.reporting.summary import comparison_table, ladder_table, summary
 from samplers.tempering.resampling import stratified
 from samplers.tempering.results import AnnealingResult
 from tests.contract.targets import Box, Gaussian
@@ -545,17 +547,20 @@ def test_to_arviz_writes_netcdf(tmp_path):
     runs = [annealed(seed=s) for s in (1, 2)]
     data = to_arviz(runs)
     assert data["posterior"]["x2"].shape == (2, 3 * N)
-    assert np.array_equal(data["posterior"]["x2"][1], runs[1].get_chain(flat=True)[:, 2])
+    in_order = np.sort(data["posterior"]["x2"][1])  # the draws are those of the chain, in another order
+    assert np.array_equal(in_order, np.sort(runs[1].get_chain(flat=True)[:, 2]))
     data.to_netcdf(str(tmp_path / "run.nc"))
     stored = arviz.from_netcdf(str(tmp_path / "run.nc"))["sample_stats"]
-    assert np.array_equal(stored["lp"][0], runs[0].get_log_prob(flat=True))
+    step, walker = (np.asarray(stored[name][0]) for name in ("step", "walker"))
+    assert np.array_equal(stored["lp"][0], runs[0].get_log_prob()[step, walker])
+    assert np.array_equal(data["posterior"]["x2"][0], runs[0].get_chain()[step, walker, 2])
     assert np.allclose(stored.attrs["log_evidence"], [run.log_evidence for run in runs])
     assert [row["beta"] for row in json.loads(stored.attrs["ladder"])[0]] == [s.beta for s in runs[0].ladder]
     plain = emcee.EnsembleSampler(N, 3, Gaussian())
     plain.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 2)
-    assert to_arviz(plain, ["a", "b", "c"])["posterior"]["a"].shape == (1, 2 * N)
+    assert to_arviz(plain, parameter_names=["a", "b", "c"])["posterior"]["a"].shape == (1, 2 * N)
     with pytest.raises(ValueError, match="one name per parameter"):
-        to_arviz(plain, ["a"])
+        to_arviz(plain, parameter_names=["a"])
 
 
 def test_table_and_figures():
@@ -571,17 +576,17 @@ def test_table_and_figures():
     assert f"{sampler.log_evidence_ladder:.3f}" in table[-2]
     assert f"{sampler.log_evidence_check.log_evidence:.3f}" in table[-2]
     assert table[-1] == sampler.diagnostics.summary
-    figure = ladder_plot(sampler)
+    figure = plot_ladder(sampler)
     assert len(figure.axes[0].lines[0].get_xdata()) == len(sampler.ladder)
     samples = sampler.get_chain(flat=True)
-    figure = pair_plot(samples, ["a", "b", "c"], truth=[0.7, 0.7, 0.7])
+    figure = plot_pairs(samples, labels=["a", "b", "c"], truths=[0.7, 0.7, 0.7])
     titles = [figure.axes[4 * i].get_title() for i in range(3)]
     assert titles == [f"CV = {cv:.2e}" for cv in summary(samples).cv]
     assert figure.axes[3].texts[0].get_text() == f"r = {np.corrcoef(samples[:, 0], samples[:, 1])[0, 1]:.2f}"
-    pair_plot(np.column_stack([samples[:, 0], np.ones(len(samples))]))  # a parameter without spread
+    plot_pairs(np.column_stack([samples[:, 0], np.ones(len(samples))]))  # a parameter without spread
     plt.close("all")
     with pytest.raises(ValueError, match="call run_mcmc first"):
-        ladder_plot(SMCSampler(N, 3, Gaussian()))
+        plot_ladder(SMCSampler(N, 3, Gaussian()))
 
 
 def test_summary_with_weights():

@@ -38,7 +38,7 @@ def at_work(folder: Path) -> set[int]:
 def _dask():
     from dask.distributed import Client, LocalCluster
 
-    return Client(LocalCluster(WORKERS, threads_per_worker=1, processes=True, dashboard_address=None))
+    return Client(LocalCluster(n_workers=WORKERS, threads_per_worker=1, processes=True, dashboard_address=None))
 
 
 def _loky():

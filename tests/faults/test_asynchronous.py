@@ -1,6 +1,9 @@
 """Asynchronous runs: killed anywhere, they go on; the journal repeats them to the last bit without an evaluation."""
 
+import importlib.util
 import multiprocessing
+import os
+import signal
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
@@ -9,6 +12,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler
+from samplers.storage import pool_queue
 from samplers.storage.journal import MAGIC
 from tests.contract.targets import Gaussian, WithBlobs
 from tests.faults.test_prefixes import ends, journal_of
@@ -140,11 +144,23 @@ def test_killed_by_signal_9(tmp_path, rng):
     assert abs(sampler.log_evidence - Gaussian(NDIM, sd=0.05).log_evidence) < 4 * sampler.log_evidence_error
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes", "pool"])
+def open_loky():
+    import loky
+
+    return loky.ProcessPoolExecutor(2)
+
+
+needs_loky = pytest.mark.skipif(
+    importlib.util.find_spec("loky") is None, reason="NO LOKY: install it to test this pool"
+)
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes", "pool", pytest.param("loky", marks=needs_loky)])
 def test_pools_that_take_single_points(kind):
     """Each point goes to the pool by itself; the result is that of the posterior."""
     opened = {"threads": lambda: ThreadPoolExecutor(2), "pool": lambda: multiprocessing.get_context("spawn").Pool(2)}
     opened["processes"] = lambda: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))
+    opened["loky"] = open_loky
     posterior = Gaussian(NDIM, sd=0.05)
     with opened[kind]() as pool:
         sampler = SMCSampler(N, NDIM, posterior, pool=pool, seed=3, recycle=True, asynchronous=True)
@@ -172,3 +188,70 @@ def test_what_cannot_be_asynchronous_is_refused():
         SMCSampler(N, NDIM, posterior, pool=pool, recycle=False, asynchronous=True)
     with pytest.raises(ValueError, match="True or False"):
         SMCSampler(300, NDIM, posterior, vectorize=True, asynchronous=1)
+
+
+class Killed(Gaussian):
+    """Ends its process at the evaluation of a point, once, after a number of points."""
+
+    fingerprint = "of this target"
+
+    def __init__(self, folder, after=60):
+        super().__init__(NDIM, sd=0.05)
+        self.folder, self.after = folder, after
+
+    def __call__(self, x):
+        (self.folder / f"{x[0]!r}").touch()
+        if len(list(self.folder.iterdir())) > self.after and not (self.folder / "killed").exists():
+            (self.folder / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(x)
+
+
+def killed_run(folder, pool, asynchronous=True):
+    posterior, backend = Killed(folder / "points"), emcee.backends.HDFBackend(str(folder / "run.h5"))
+    settings = {"seed": 5, "recycle": True, "asynchronous": asynchronous}
+    sampler = SMCSampler(N, NDIM, posterior, pool=pool, backend=backend, **settings)
+    sampler.run_mcmc(None, 1)
+    return sampler
+
+
+@pytest.mark.parametrize(
+    "kind", ["pool", pytest.param("executor", marks=pytest.mark.slow), pytest.param("loky", marks=needs_loky)]
+)
+def test_a_process_of_a_pool_that_is_killed_ends_the_run_with_advice(kind, tmp_path, monkeypatch):
+    """multiprocessing.Pool loses the point without a word; ProcessPoolExecutor gives up. Both runs go on afterwards."""
+    monkeypatch.setattr(pool_queue, "SECONDS_BETWEEN_CHECKS", 0.05)
+    (tmp_path / "points").mkdir()
+    context = multiprocessing.get_context("spawn")
+    opened = {"pool": lambda: context.Pool(2), "executor": lambda: ProcessPoolExecutor(2, mp_context=context)}
+    opened["loky"] = open_loky
+    messages = {"pool": r"a process of the multiprocessing.Pool has died \(exit code -9\)"}
+    messages |= {"executor": "BrokenProcessPool", "loky": "TerminatedWorkerError"}
+    with (
+        opened[kind]() as pool,
+        pytest.raises(RuntimeError, match=f"(?s){messages[kind]}.*start the same script again"),
+    ):
+        killed_run(tmp_path, pool)
+    known = len(list((tmp_path / "points").iterdir()))
+    with opened[kind]() as pool:
+        sampler = killed_run(tmp_path, pool)
+    assert sampler.iteration == 1 and known > 60
+    assert sampler.report()["new_evaluations"] < sampler.evaluations - 50
+
+
+def test_a_synchronous_run_ends_with_the_same_advice(tmp_path, monkeypatch):
+    monkeypatch.setattr(pool_queue, "SECONDS_BETWEEN_CHECKS", 0.05)
+    (tmp_path / "points").mkdir()
+    message = r"a process of the multiprocessing.Pool has died \(exit code -9\)"
+    with multiprocessing.get_context("spawn").Pool(2) as pool, pytest.raises(RuntimeError, match=message):
+        killed_run(tmp_path, pool, asynchronous=False)
+
+
+def test_processes_that_a_pool_replaces_after_a_number_of_tasks_are_not_taken_for_dead(monkeypatch):
+    monkeypatch.setattr(pool_queue, "SECONDS_BETWEEN_CHECKS", 0.01)
+    with multiprocessing.get_context("fork").Pool(2, maxtasksperchild=4) as pool:
+        queue = pool_queue.PoolQueue(np.negative, pool, list)
+        values, tickets = {}, queue.submit(range(30))
+        while len(values) < 30:
+            values.update(queue.collect())
+    assert [values[ticket] for ticket in tickets] == [-number for number in range(30)]

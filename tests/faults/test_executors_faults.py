@@ -28,6 +28,7 @@ from tests.faults.treacherous import (
     DiesLoading,
     DiesOnce,
     Gated,
+    LoadsOnce,
     Treacherous,
     descendants,
     gone,
@@ -153,6 +154,19 @@ def test_workers_end_with_the_likelihood_and_after_an_interrupt():
         pool.map(_interrupts, range(4))
 
 
+@needs_proc
+def test_a_pool_that_is_closed_while_a_process_loads_ends_that_process(tmp_path):
+    function = LoadsOnce(tmp_path)  # only the first process can load it
+    pool = LocalPool(2)
+    assert pool.map(function, [1, 2, 3]) == [1, 2, 3]
+    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.processes" in _command(child)]
+    assert len(workers) == 2
+    pool.close()
+    assert not any(worker in descendants(os.getpid()) for worker in workers)
+    assert pool._thread is None or not pool._running
+    pool.close()
+
+
 class _Interrupt(Exception):
     def __reduce__(self):
         return _interrupt, ()
@@ -247,7 +261,7 @@ def test_dask_gives_up_every_worker_that_dies(tmp_path, monkeypatch):
     x = np.column_stack([np.concatenate([theta(bad.FINE, 2), theta(bad.KILLED)]), np.full(3, 0.5)])
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 2, "distributed.deploy.lost-worker-timeout": "0s"}),
-        LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
         Client(cluster) as client,
     ):
         posterior = posterior_of(DiesOnce(tmp_path), top=20.0, pool=client)
@@ -268,7 +282,7 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
     x = np.column_stack([thetas, np.full(7, 0.5)])
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 2, "distributed.deploy.lost-worker-timeout": "60s"}),
-        LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
         Client(cluster) as client,
     ):
         expected = posterior_of(Treacherous(), top=20.0)(x[:3])

@@ -496,7 +496,7 @@ def test_an_interrupt_says_what_is_kept_and_how_to_go_on(share, tmp_path, caplog
             sampler = make(path, "smc", seed=99)
         with caplog.at_level("INFO", logger="samplers"):
             sampler.run_mcmc(None, STEPS)
-        assert f"{made} evaluations and" in caplog.text and "Resuming" in caplog.text
+        assert f"{made} evaluations and" in caplog.text and "Continuing" in caplog.text
         assert same(sampler, whole)
         report = sampler.report()
         assert report["evaluations"] == calls and report["steps"] == STEPS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, LocalPool, Measurements
-from samplers import SMCSampler, TMCMCSampler, cost, estimate_cost
+from samplers import SMCSampler, TMCMCSampler, estimate_cost, timing
 from samplers.cost import _scheduled, _wall_times
 from samplers.tempering.expected_cost import Expected
 from samplers.tempering.settings import Settings
@@ -72,7 +72,7 @@ def test_long_points_are_timed_at_once(monkeypatch):
     # cheap points start all workers, after the first ones have shown that they are cheap
     assert made(1) == [1, 1, 1, 1] and made(4) == [4, 1, 1, 1] and made(20) == [8, 20, 1, 1, 1]
     assert made(64) == [8, 29, 1, 1, 1]  # as many as the run has draws of the prior
-    monkeypatch.setattr(cost, "LONG", -1.0)
+    monkeypatch.setattr(timing, "LONG", -1.0)
     assert made(64) == [8, 3] and made(4) == [4, 3] and made(2) == [2, 1, 1, 1] and made(64, 9) == [8, *[1] * 9]
 
 
@@ -87,6 +87,56 @@ def test_the_run_begins_with_the_timed_points():
     # another seed has other points
     posterior(SMCSampler(64, posterior.ndim, posterior, seed=5)._functions.draw_prior(64, np.random.RandomState(5)))
     assert posterior.report()["simulations"] == 128
+
+
+@pytest.mark.parametrize(("pool", "on_disk"), [(None, True), (2, False), pytest.param(2, True, marks=pytest.mark.slow)])
+def test_points_that_are_cached_are_not_timed(pool, on_disk, tmp_path):
+    """A second estimate with the same seed, in the same process or with the same file; and one after a whole run."""
+
+    def make():
+        likelihood = FELikelihood(*slow, pool=pool, cache=tmp_path / "cache.db" if on_disk else None)
+        return posterior_of(likelihood)
+
+    slow = sleeping(0.03)
+    first = posterior = make()
+    earlier = estimate_cost(first, 20, seed=4)
+    assert earlier.cached == 0 and "cached" not in str(earlier)
+    for n in (0, 20):
+        posterior = make() if on_disk else first
+        if n:
+            posterior(posterior.sample_prior(n, np.random.RandomState(4)))  # all draws of a sampler
+        before = posterior.report()["simulations"]
+        estimate = estimate_cost(posterior, 20, seed=4)
+        made = posterior.report()["simulations"] - before
+        assert made == estimate.evaluated - estimate.cached >= 4 and estimate.cached >= (n or 4)
+        assert len(estimate.seconds) == 3 and estimate.seconds.min() >= 0.03
+        assert f"{estimate.cached} cached, 3 timed" in str(estimate) and estimate.any_simulated
+
+
+def sleeping(seconds):
+    """A model that takes a time [s], and its measurements."""
+    channels = (Channel("top", "displacement", "mm"),)
+    model = FunctionModel(Sleeping(seconds), ("a", "b"), channels, dt=0.01, n_steps=3, version="1")
+    return model, Measurements(channels, 0.01, np.ones((1, 3)))
+
+
+@dataclass(frozen=True)
+class Sleeping:
+    seconds: float
+
+    def __call__(self, theta):
+        time.sleep(self.seconds)
+        return 0.01 * np.array([theta[0], theta[1], theta[0] * theta[1]])[None]
+
+
+def test_a_posterior_that_never_simulates_is_timed_and_says_so():
+    class Recalled(Gaussian):
+        def report(self):
+            return {"simulations": 0}
+
+    estimate = estimate_cost(Recalled(), 20, seed=1)
+    assert not estimate.any_simulated and len(estimate.seconds) == 3 and estimate.evaluated == 40
+    assert "no point needed a simulation: the times are those of cached points" in str(estimate)
 
 
 def test_the_table():

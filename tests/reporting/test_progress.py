@@ -1,7 +1,10 @@
 """Progress: what a terminal, a pipe and the log show, compared with the numbers of the sampler itself."""
 
+import contextlib
 import fcntl
+import io
 import json
+import logging
 import os
 import re
 import struct
@@ -13,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 import emcee
 import numpy as np
 import pytest
+import tqdm
 
 from fe_likelihoods import (
     Channel,
@@ -26,6 +30,7 @@ from fe_likelihoods import (
 )
 from samplers import SMCSampler, Stage
 from samplers.reporting import progress
+from samplers.reporting.messages import messages_above
 from samplers.tempering.expected_cost import expected_left
 from tests.contract.targets import Gaussian
 
@@ -39,22 +44,23 @@ def figures(line):
 
 def check_last_states(states, numbers):
     """The last state of the annealing and of the sweeps, compared with the sampler."""
-    ladder = [state for state in states if state.startswith("ladder")][-1]
-    shown = {name.strip(): value for name, value in figures(ladder).items()}
+    annealing = [state for state in states if state.startswith("stage")][-1]
+    assert annealing.startswith(f"stage {numbers['stages']}: ") and states[0].startswith("annealing: 0 evaluations")
+    shown = {name.strip(): value for name, value in figures(annealing).items()}
     annealed = numbers["annealed"]
-    assert f"100% {annealed}/{annealed}" in re.sub(r"\|.*?\|", "", ladder)
-    assert shown["evaluations"] == str(annealed)
+    assert f"100% {annealed}/{annealed} evaluations" in re.sub(r"\|.*?\|", "", annealing)
     assert shown["beta"] == "1" and shown["log Z"] == numbers["log Z"]
     assert "per hour" in shown and "left" not in shown
-    assert "2/2" in states[-1]
+    assert states[-1].startswith("sweeps at beta = 1: ") and "2/2 sweeps" in states[-1]
     swept = {name.strip(): value for name, value in figures(states[-1]).items()}
     assert int(swept["evaluations"]) == numbers["evaluations"] - annealed
 
 
-def test_a_terminal_shows_a_bar():
+def run_in_a_terminal(*options):
+    """What a run writes to a terminal, and the numbers that it prints to a pipe."""
     parent, terminal = os.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 250, 0, 0))
-    process = subprocess.Popen(RUN, stdout=subprocess.PIPE, stderr=terminal)
+    process = subprocess.Popen([*RUN, *options], stdout=subprocess.PIPE, stderr=terminal)
     os.close(terminal)
     shown = b""
     while True:
@@ -68,8 +74,60 @@ def test_a_terminal_shows_a_bar():
     os.close(parent)
     numbers = json.loads(process.communicate()[0])
     assert process.returncode == 0
-    assert b"\r" in shown.replace(b"\r\n", b"")
-    check_last_states([state.strip() for state in re.split(r"[\r\n]+", shown.decode()) if state.strip()], numbers)
+    return shown.decode(), numbers
+
+
+def screen(written):
+    """Lines that a terminal shows at the end, after carriage returns and line feeds."""
+    lines, column = [""], 0
+    for character in written:
+        if character == "\r":
+            column = 0
+        elif character == "\n":
+            lines.append("")
+        else:
+            lines[-1] = lines[-1][:column].ljust(column) + character + lines[-1][column + 1 :]
+            column += 1
+    return [line.rstrip() for line in lines]
+
+
+def test_a_terminal_shows_a_bar():
+    shown, numbers = run_in_a_terminal()
+    assert "\r" in shown.replace("\r\n", "")
+    check_last_states([state.strip() for state in re.split(r"[\r\n]+", shown) if state.strip()], numbers)
+
+
+def test_messages_do_not_break_the_bar():
+    """A warning, two log messages and a print, each between two states of the bar."""
+    lines = screen(run_in_a_terminal("talking")[0])
+    assert [line for line in lines if line.startswith(("stage", "sweeps"))] == lines[-3:-1]  # the last states alone
+    assert sum("UserWarning: warned" in line for line in lines) == 1
+    for message in ("logged by a handler", "logged without one", "printed"):
+        assert lines.count(message) == 1, lines
+
+
+def test_streams_are_restored():
+    """Also where somebody else has replaced a stream meanwhile, which is left alone."""
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal, other, handler = Terminal(), io.StringIO(), logging.StreamHandler()
+    bar = tqdm.tqdm(total=10, file=terminal)
+    with contextlib.redirect_stderr(terminal), contextlib.redirect_stdout(terminal):
+        handler.setStream(sys.stderr)
+        logging.getLogger("samplers").addHandler(handler)
+        try:
+            with messages_above(bar):
+                assert sys.stderr is handler.stream is not terminal
+                print("without an end", end="")
+                sys.stderr = other
+            assert handler.stream is sys.stdout is terminal and sys.stderr is other
+        finally:
+            logging.getLogger("samplers").removeHandler(handler)
+    assert "without an end\n" in terminal.getvalue()
+    bar.close()
 
 
 @pytest.mark.parametrize("option", [(), pytest.param(("log",), marks=pytest.mark.slow)])
@@ -181,6 +239,22 @@ def test_the_bar_moves_within_a_batch(bars):
     assert int(shown[-1][2]["failures"]) == posterior.report()["failure_count"] > 0
     assert int(shown[-1][2]["simulations"]) == posterior.report()["simulations"]
     assert posterior.likelihood.when_simulated is None
+
+
+def test_figures_of_a_bar_are_those_since_it_began(bars):
+    """Evaluations, simulations and failures of the annealing, and of the sweeps of each call."""
+    posterior = posterior_of(oscillating())
+    sampler = SMCSampler(32, posterior.ndim, posterior, vectorize=True, seed=1, recycle=True)
+    counts = [(0, 0, 0)]
+    for steps in (0, 3, 3):
+        sampler.run_mcmc(None, steps, progress=True)
+        report = posterior.report()
+        counts.append((sampler.evaluations, report["simulations"], report["failure_count"]))
+    shown = [[int(bar.figures.get(name, 0)) for name in ("evaluations", "simulations", "failures")] for bar in bars]
+    shown = [figures for figures in shown if any(figures)]
+    shown[0][0] = bars[0].n  # the annealing counts evaluations
+    assert shown == np.diff(counts, axis=0).tolist()
+    assert shown[0][2] > 0 and all(0 < simulations <= evaluations for evaluations, simulations, _ in shown[1:])
 
 
 def test_parts_of_a_joint_likelihood_are_parts_of_a_point():

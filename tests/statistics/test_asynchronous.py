@@ -1,12 +1,21 @@
-"""Asynchronous recycling where the time of an evaluation depends on what is to be found."""
+"""Asynchronous recycling, and rounds of a guide, where the time of an evaluation depends on what is to be found."""
 
+from concurrent.futures import ThreadPoolExecutor
+
+import emcee
 import numpy as np
 import pytest
+from scipy import stats
 
+from fe_likelihoods import FELikelihood, JointLikelihood, LocalPool, Posterior
 from samplers import SMCSampler
+from samplers.tempering.cohorts import Cohort
+from samplers.tempering.flights import Flight
 from tests.benchmarks import truth_targets
 from tests.contract.targets import Gaussian
+from tests.probability.linear_gaussian import KnownNoise, exact_log_evidence, likelihood_of
 from tests.simulated_cluster import SimulatedCluster
+from tests.tempering.guides import LearningGuide
 
 SEEDS = range(4)
 
@@ -53,3 +62,71 @@ def test_a_run_of_failures_is_stopped():
     sampler = SMCSampler(250, 3, cluster, vectorize=True, seed=1, asynchronous=True)
     with pytest.raises(RuntimeError, match="max_failure_share"):
         sampler.run_mcmc(None, 0)
+
+
+@pytest.mark.parametrize("kind", ["one pool", "two pools"])
+def test_a_joint_likelihood_has_its_evidence(kind, rng, tmp_path):
+    """Two tests that share a parameter; the parts have one pool of processes, or one of threads beside it."""
+    names = ["a", "b", "c"]
+    with LocalPool(2) as processes, ThreadPoolExecutor(2) as threads:
+        pools = {"component": processes, "system": processes if kind == "one pool" else threads}
+        parts = {}
+        for name, parameters in (("component", ("a", "b")), ("system", ("b", "c"))):
+            part = likelihood_of(parameters, rng, sigma=0.2)
+            parts[name] = FELikelihood(part.model, part.measurements, KnownNoise(0.2), pool=pools[name])
+        posterior = Posterior(JointLikelihood(parts), {name: stats.norm(1.0, 0.7) for name in names})
+        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+        sampler = SMCSampler(
+            100, 3, posterior, vectorize=True, seed=1, recycle=True, asynchronous=True, backend=backend
+        )
+        sampler.run_mcmc(None, 1)
+        exact = exact_log_evidence(parts.values(), names, 1.0, 0.7)
+        assert abs(sampler.log_evidence - exact) < 4.0 * sampler.log_evidence_error < 0.4
+        report = posterior.report()
+        assert report["failure_count"] == 0
+        assert {part["simulations"] for part in report["likelihoods"].values()} == {sampler.evaluations}
+
+
+def deviations_with_a_guide(seeds=30):
+    """Deviations (3,) of log-evidence, mean and variance of a parameter, in standard errors of the mean over the seeds.
+
+    Half of the posterior, where the first parameter is large, takes about 100 times as long.
+    """
+
+    def length(x):
+        return np.where(x[:, 0] > target.mean[0], random.uniform(50.0, 150.0, len(x)), 1.0)
+
+    numbers = []
+    for seed in range(seeds):
+        target, random = Gaussian(2, sd=0.05), np.random.default_rng(seed)
+        cluster = SimulatedCluster(target, 32, length)
+        guide = LearningGuide(target, target.mean, [np.diag((2.0 * target.sd) ** 2)])
+        sampler = SMCSampler(80, 2, cluster, vectorize=True, seed=seed, guide=guide, asynchronous=True)
+        z = (sampler.run_mcmc(None, 0).coords[:, 0] - target.mean[0]) / target.sd[0]
+        evidence = (sampler.log_evidence - target.log_evidence) / sampler.log_evidence_error
+        numbers.append((evidence, z.mean(), z.var() - 1.0))
+    numbers = np.array(numbers)
+    return numbers.mean(axis=0) / (numbers.std(axis=0, ddof=1) / np.sqrt(seeds))
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("parts", [False, True], ids=["complete rounds", "parts of rounds"])
+def test_rounds_of_a_guide_do_not_prefer_short_runs(monkeypatch, parts):
+    """Also where the guide learns from the first arrivals, none of which is from the long half."""
+    monkeypatch.setattr(LearningGuide, "learns_from_parts", parts, raising=False)
+    assert np.all(np.abs(deviations_with_a_guide()) < 3.0)
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_control_rounds_of_early_arrivals_prefer_short_runs(monkeypatch):
+    """Negative control: rounds are judged when 60 % of their draws have arrived, and consist of these."""
+    monkeypatch.setattr(Flight, "complete", property(lambda flight: np.mean(flight.arrived) > 0.6))
+    monkeypatch.setattr(Flight, "landed_part", lambda flight: (flight.coords[flight.arrived], records_of(flight)))
+    running = Cohort.running.fget
+    monkeypatch.setattr(Cohort, "running", property(lambda cohort: 0 if cohort.flight.complete else running(cohort)))
+    evidence, mean, _ = deviations_with_a_guide()
+    assert evidence < -3.0 and mean < -6.0
+
+
+def records_of(flight):
+    return flight.base[:0] if flight._records is None else flight._records[flight.arrived]

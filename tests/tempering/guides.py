@@ -72,6 +72,7 @@ class LearningGuide(FixedGuide):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.mixture, self.coords, self.log_weights, self.refinements = None, [], [], 0
+        self.known = {}
 
     def _draw_parts(self, n, random):
         start = super()._draw_parts(n, random)
@@ -86,11 +87,18 @@ class LearningGuide(FixedGuide):
         fitted = np.log1p(-self.start_share) + log_density(self.mixture, coords)
         return np.logaddexp(fitted, np.log(self.start_share) + start)
 
+    def log_density(self, coords):
+        """Kept for draws that arrive when the density has changed."""
+        values = super().log_density(coords)
+        for row, value in zip(coords, values, strict=True):
+            self.known.setdefault(row.tobytes(), value)
+        return values
+
     def refine(self, coords, log_prob, session):
         self.refinements += 1
         alive = log_prob > -np.inf
         self.coords.append(coords[alive])
-        self.log_weights.append(log_prob[alive] - self.log_density(coords[alive]))
+        self.log_weights.append(log_prob[alive] - np.array([self.known[row.tobytes()] for row in coords[alive]]))
         points, log_weights = np.concatenate(self.coords), np.concatenate(self.log_weights)
         if effective_sample_size(log_weights) > 3 * (points.shape[1] + 1):
             self.mixture = fit_mixture(points, coarse_weights(log_weights))

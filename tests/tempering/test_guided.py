@@ -203,7 +203,7 @@ def test_the_progress_bar_shows_what_a_guide_does(good, monkeypatch):
         assert bar.shown[-1][2]["ESS"] == f"{sampler.rounds[-1].effective_sample_size:.0f}/{N}"
     else:  # recycling follows
         figures = {"beta", "ESS", "acceptance", "log Z", "evaluations", "per hour"}
-        assert labels[-1] == "ladder" and set(bar.shown[-1][2]) == figures
+        assert labels[-1] == f"stage {len(sampler.ladder)}" and set(bar.shown[-1][2]) == figures
 
 
 def test_shares_of_rounds_depend_on_earlier_rounds_only():

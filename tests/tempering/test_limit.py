@@ -171,7 +171,7 @@ def test_the_verdict_says_what_the_search_took(limit):
         halted(sampler, 1)
     made = sampler.guide.simulations
     assert made == {20: 16, 30: 24}.get(limit, made) and made >= 16
-    words = f"The guide used {made:g} of the {sampler.simulations:g} simulations for its search."
+    words = f"The guide used {made:.0f} of the {sampler.simulations:.0f} simulations for its search."
     assert words in str(sampler.verdict)
 
 

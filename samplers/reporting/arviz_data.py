@@ -1,0 +1,343 @@
+"""Results of runs as data of arviz, for its statistics, its figures and its files.
+
+Each run is one chain. The walkers of one run share proposals and ancestors, so they are not independent chains, and
+`arviz.from_emcee`, which makes each walker a chain, gives wrong statistics.
+
+The draws of a chain are in the order of founder, walker and step instead of step and walker. Draws that depend on each
+other are then neighbours, which is what arviz expects: it estimates effective sample sizes from the correlation between
+neighbours. Its ``ess`` and ``mcse`` of the mean then agree with ``sampler.mean_error()``; in emcee's order they count
+copies of a walker as independent draws.
+
+A posterior can have further members, by which it is asked for units, measurements and predictions: `parameters`,
+`sample_prior`, `measured_data` and `predictive_draws`, as those of `fe_likelihoods.Posterior`.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .inspection import is_tempered, log_posterior_of, parameter_names_of
+from .summary import names_of_parameters
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["to_arviz"]
+
+_PRIOR_DRAWS = 1000
+_ORDER = (
+    "Draws are ordered by founder, walker and step, so that dependent draws are neighbours; sample_stats has the step, "
+    "the walker and the founder of each draw."
+)
+_ONE_RUN = (
+    "One run is one chain, so there is no r_hat: it compares independent runs. Make two or more runs with different "
+    "seeds and pass them as a list."
+)
+_RUNS = "Each chain is an independent run, so r_hat compares runs."
+
+
+def to_arviz(
+    sampler: Any,
+    posterior: Any = None,
+    prediction: Any = None,
+    *,
+    parameter_names: Sequence[str] | None = None,
+    discard: int = 0,
+    draws: int = 400,
+    block: float | None = None,
+    seed: int = 0,
+) -> Any:
+    """Convert one run, or several independent runs, to arviz data.
+
+    Parameters
+    ----------
+    sampler : sampler or sequence of samplers
+        Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
+    posterior : fe_likelihoods.Posterior, optional
+        Adds the groups that need simulations: ``posterior_predictive`` and ``log_likelihood``, from `draws` samples.
+    prediction : fe_likelihoods.Prediction, optional
+        The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
+    parameter_names : sequence of str, optional
+        One name per parameter; by default those of the posterior, or else theta_0, theta_1, ...
+    discard : int
+        Burn-in to leave out: number of initial steps of each run. Chains of SMC and TMCMC have none.
+    draws : int
+        Number of samples for the groups that need simulations, evenly spaced in the chains. Equal samples are simulated
+        once, cached responses not at all.
+    block : float, optional
+        Length of the blocks of the log-likelihood [s]. Default: five correlation times of the residuals. Give models
+        that are compared the same length.
+    seed : int
+        Seed of draws of the prior and of the noise.
+
+    Returns
+    -------
+    arviz.InferenceData
+        A DataTree from arviz 1.0 on. Its method ``to_netcdf(path)`` writes it to a file. The groups are ``posterior``,
+        ``sample_stats`` and, where they are known, ``prior``, ``observed_data``, ``constant_data``,
+        ``posterior_predictive``, ``log_likelihood`` and ``predictions``; see Notes.
+
+    Raises
+    ------
+    ValueError
+        If a sampler is given twice, the chains have different shapes or no steps, the number of names is wrong, or the
+        posterior has other parameters than the sampler or no method `predictive_draws`.
+
+    Notes
+    -----
+    ``posterior``: one variable per parameter with its unit, label and nominal value as attributes. Several runs are
+    chains, so that r_hat compares independent runs. arviz gives no r_hat (NaN) for one run.
+
+    ``sample_stats``: the log-probability ``lp``, and step, walker and founder of each draw. The attributes contain the
+    log-evidence and its error, beta of the stages, all stages as JSON (``ladder``), failures, evaluations, simulations,
+    the verdict, and the settings.
+
+    ``prior``: draws from which the annealing began, or else draws of ``sample_prior``; the attribute ``source`` says
+    which.
+
+    ``observed_data`` and ``posterior_predictive``: one variable per measured channel in SI units, over time [s];
+    replicated measurements are simulated responses plus noise. ``constant_data``: the records of the excitation, and
+    time step, display unit and quantity of each channel.
+
+    ``log_likelihood``: one observation per block of time, because single samples have correlated errors and would
+    predict each other. The attribute ``note`` says how long a block is.
+    """
+    import xarray
+
+    runs = list(sampler) if isinstance(sampler, Sequence) else [sampler]
+    if len({id(run) for run in runs}) < len(runs):
+        raise ValueError(
+            "to_arviz: a sampler is given twice, and its chains would agree without being independent: pass runs of "
+            "different seeds"
+        )
+    if posterior is not None:
+        _check_posterior(posterior, runs[0])
+    known = log_posterior_of(runs[0]) if posterior is None else posterior
+    if parameter_names is None:
+        parameter_names = getattr(known, "parameter_names", None) or parameter_names_of(runs[0])
+    names = names_of_parameters(parameter_names, runs[0].ndim)
+    if not all(hasattr(run, "get_chain") and run.ndim == len(names) for run in runs):
+        raise ValueError(f"expected samplers of {len(names)} parameters; got {[type(run).__name__ for run in runs]}")
+    chains, stats = _ordered(runs, discard)
+    described = {each.name: each for each in getattr(known, "parameters", ())}
+    notes = {"chains": _ONE_RUN if len(runs) == 1 else _RUNS, "order": _ORDER}
+    groups = {
+        "posterior": _parameter_group(chains, names, described, notes),
+        "sample_stats": xarray.Dataset(
+            {name: (("chain", "draw"), values) for name, values in stats.items()},
+            _coordinates(*chains.shape[:2]),
+            _statistics_of_runs(runs),
+        ),
+    }
+    if (prior := _prior_group(runs, known, names, described, seed)) is not None:
+        groups["prior"] = prior
+    if hasattr(known, "measured_data"):
+        groups |= _measured_groups(known.measured_data())
+    if posterior is not None:
+        groups |= _predictive_groups(posterior, chains, groups["observed_data"], draws, block, seed)
+    if prediction is not None:
+        groups["predictions"] = _prediction_group(prediction)
+    return _as_arviz(groups)
+
+
+def _as_arviz(groups: Mapping[str, "xarray.Dataset"]) -> Any:
+    import arviz
+
+    if int(arviz.__version__.split(".")[0]) == 0:
+        return arviz.InferenceData(**groups)
+    import xarray
+
+    return xarray.DataTree.from_dict(dict(groups))
+
+
+def _check_posterior(posterior: Any, run: Any) -> None:
+    missing = [name for name in ("measured_data", "predictive_draws") if not hasattr(posterior, name)]
+    if missing:
+        raise ValueError(
+            f"to_arviz asks the posterior for predictions of its measurements, and {type(posterior).__name__} has no "
+            f"{' and no '.join(missing)}: pass a fe_likelihoods.Posterior, or leave out posterior="
+        )
+    if posterior.ndim != run.ndim:
+        raise ValueError(f"the posterior has {posterior.ndim} parameters, but the sampler {run.ndim}")
+
+
+def _ordered(runs: Sequence[Any], discard: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Chains (n_runs, n_draws, ndim) in the order of founder, walker and step, and statistics (n_runs, n_draws)."""
+    shapes = [run.get_chain(discard=discard).shape for run in runs]
+    if len(set(shapes)) > 1 or 0 in shapes[0]:
+        raise ValueError(f"all runs must have chains of the same shape, with one step or more; got {shapes}")
+    n_steps, n_walkers, _ = shapes[0]
+    chains, stats = [], {"lp": [], "step": [], "walker": [], "founder": []}
+    for run in runs:
+        founders = run.founders if is_tempered(run) else np.arange(n_walkers)
+        order = np.argsort(founders, kind="stable")
+        chains.append(run.get_chain(discard=discard)[:, order].swapaxes(0, 1).reshape(-1, run.ndim))
+        stats["lp"].append(run.get_log_prob(discard=discard)[:, order].T.ravel())
+        stats["step"].append(np.tile(discard + np.arange(n_steps), n_walkers))
+        stats["walker"].append(np.repeat(order, n_steps))
+        stats["founder"].append(np.repeat(founders[order], n_steps))
+    return np.stack(chains), {name: np.stack(values) for name, values in stats.items()}
+
+
+def _coordinates(n_chains: int, draws: int | np.ndarray) -> dict[str, np.ndarray]:
+    return {"chain": np.arange(n_chains), "draw": np.arange(draws) if isinstance(draws, int) else draws}
+
+
+def _parameter_group(
+    samples: np.ndarray, names: Sequence[str], described: Mapping[str, Any], attributes: Mapping[str, Any]
+) -> "xarray.Dataset":
+    """Samples (n_chains, n_draws, ndim) with units, labels and nominal values of the parameters."""
+    import xarray
+
+    variables = {}
+    for column, name in enumerate(names):
+        parameter = described.get(name)
+        about = {} if parameter is None else {"units": parameter.unit, "factor": parameter.factor}
+        if parameter is not None:
+            about |= {"long_name": parameter.label, "nominal": parameter.nominal, "multiple_of": parameter.multiple_of}
+        variables[name] = (("chain", "draw"), samples[:, :, column], about)
+    return xarray.Dataset(variables, _coordinates(*samples.shape[:2]), dict(attributes))
+
+
+def _prior_group(
+    runs: Sequence[Any], known: Any, names: Sequence[str], described: Mapping[str, Any], seed: int
+) -> "xarray.Dataset | None":
+    first = [getattr(run, "prior_draws", None) for run in runs]
+    if all(draws is not None for draws in first):
+        source = "draws of the prior from which the annealing began; the chains are the runs"
+        return _parameter_group(np.stack(first), names, described, {"source": source})
+    if not hasattr(known, "sample_prior"):
+        return None
+    source = f"{_PRIOR_DRAWS} draws of sample_prior with the seed {seed}"
+    samples = np.asarray(known.sample_prior(_PRIOR_DRAWS, np.random.default_rng(seed)))
+    return _parameter_group(samples[None], names, described, {"source": source})
+
+
+def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
+    """Attributes of ``sample_stats``: numbers of one run, or arrays over the runs; texts one below the other."""
+    attributes: dict[str, Any] = {"samplers": "\n".join(type(run).__name__ for run in runs)}
+    if not all(is_tempered(run) and run.ladder for run in runs):
+        return attributes
+    numbers = ("log_evidence", "log_evidence_error", "evaluations", "simulations", "failure_count", "seconds")
+    attributes |= {name: np.array([float(getattr(run, name)) for run in runs]) for name in numbers}
+    attributes["ladder"] = json.dumps([[stage._asdict() for stage in run.ladder] for run in runs])
+    if len(runs) == 1:
+        attributes["beta"] = np.array([stage.beta for stage in runs[0].ladder])
+    texts: dict[str, Callable[[Any], str]] = {
+        "settings": lambda run: repr(run.settings),
+        "verdict": _verdict,
+        "failures": lambda run: json.dumps(_reasons(run.failures)),
+    }
+    for name, text in texts.items():
+        attributes[name] = "\n".join(text(run) for run in runs)
+    return attributes
+
+
+def _verdict(run: Any) -> str:
+    try:
+        return str(run.verdict)
+    except ValueError:  # a file of an earlier version
+        return "The run has no stored verdict."
+
+
+def _reasons(failures: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for failure in failures:
+        counts[failure["reason"]] = counts.get(failure["reason"], 0) + 1
+    return counts
+
+
+def _time_coordinate(times: Mapping[str, np.ndarray]) -> tuple[dict[str, str], dict[str, Any]]:
+    """Dimension of each history, and coordinates: one time if all histories share it, else one per history."""
+    rows = list(times.values())
+    same = all(np.array_equal(row, rows[0]) for row in rows)
+    dimensions = {name: "time" if same else f"time_{name}" for name in times}
+    about = {"units": "s", "long_name": "time [s]"}
+    return dimensions, {dimensions[name]: (dimensions[name], row, about) for name, row in times.items()}
+
+
+def _measured_groups(data: Any) -> dict[str, "xarray.Dataset"]:
+    import xarray
+
+    groups = {}
+    for group, histories in (("observed_data", data.channels), ("constant_data", data.excitations)):
+        dimensions, coordinates = _time_coordinate({each.name: each.time for each in histories})
+        variables = {
+            each.name: (dimensions[each.name], each.values, _about(each.channel, each.name)) for each in histories
+        }
+        groups[group] = xarray.Dataset(variables, coordinates)
+    channels = [each.name for each in data.channels]
+    groups["constant_data"] = groups["constant_data"].assign(
+        time_step=xarray.DataArray(list(data.time_steps.values()), {"channel": channels}, attrs={"units": "s"}),
+        display_unit=xarray.DataArray([each.channel.unit for each in data.channels], {"channel": channels}),
+        quantity=xarray.DataArray([each.channel.quantity for each in data.channels], {"channel": channels}),
+    )
+    return groups
+
+
+def _about(channel: Any, name: str) -> dict[str, str]:
+    return {"units": channel.si_unit, "long_name": f"{name} [{channel.si_unit}]", "quantity": channel.quantity}
+
+
+def _predictive_groups(
+    posterior: Any, chains: np.ndarray, observed: "xarray.Dataset", draws: int, block: float | None, seed: int
+) -> dict[str, "xarray.Dataset"]:
+    import xarray
+
+    n_chains, n_draws, ndim = chains.shape
+    if not draws >= n_chains:
+        raise ValueError(f"draws must be one or more for each of {n_chains} chains; got {draws!r}")
+    chosen = np.unique(np.linspace(0, n_draws - 1, min(n_draws, -(-int(draws) // n_chains))).round().astype(int))
+    found = posterior.predictive_draws(chains[:, chosen].reshape(-1, ndim), block, seed)
+    shape, coordinates = (n_chains, len(chosen)), _coordinates(n_chains, chosen)
+    groups = {}
+    if found.replicates:
+        variables = {
+            name: (("chain", "draw", *observed[name].dims), values.reshape(*shape, -1), observed[name].attrs)
+            for name, values in found.replicates.items()
+        }
+        note = {"note": "replicated measurements: simulated response plus one draw of the noise per sample"}
+        groups["posterior_predictive"] = xarray.Dataset(variables, {**observed.coords, **coordinates}, note)
+    blocks = found.blocks
+    coordinates |= {
+        "block": np.arange(len(blocks.starts)),
+        "block_start": ("block", blocks.starts, {"units": "s"}),
+        "block_stop": ("block", blocks.stops, {"units": "s"}),
+        "block_part": ("block", list(blocks.parts)),
+    }
+    values = {"measurements": (("chain", "draw", "block"), blocks.values.reshape(*shape, -1))}
+    about = {"note": "\n".join([blocks.note, *found.notes]), "block_seconds": blocks.seconds}
+    groups["log_likelihood"] = xarray.Dataset(values, coordinates, about)
+    return groups
+
+
+def _prediction_group(prediction: Any) -> "xarray.Dataset":
+    """Mean, standard deviation and quantiles of a prediction; the values of each sample where it keeps them."""
+    import xarray
+
+    attributes = {
+        "n_samples": prediction.n_samples,
+        "n_failed": prediction.n_failed,
+        "noise": int(prediction.noise),
+        "from_state": prediction.from_state,
+    }
+    histories = prediction.dt is not None
+    columns = {"probability": np.array(prediction.probabilities)}
+    if histories:
+        columns["time"] = ("time", prediction.time, {"units": "s", "long_name": "time [s]"})
+    variables: dict[str, Any] = {}
+    if histories:
+        for row, channel in enumerate(prediction.channels):
+            about = _about(channel, channel.name)
+            variables[f"{channel.name}_mean"] = ("time", prediction.mean[row], about)
+            variables[f"{channel.name}_sd"] = ("time", prediction.sd[row], about)
+            variables[f"{channel.name}_quantiles"] = (("probability", "time"), prediction.quantiles[:, row], about)
+        return xarray.Dataset(variables, columns, attributes)
+    dims = tuple(f"quantity_dim_{i}" for i in range(np.ndim(prediction.mean)))
+    variables["mean"], variables["sd"] = (dims, prediction.mean), (dims, prediction.sd)
+    variables["quantiles"] = (("probability", *dims), prediction.quantiles)
+    if prediction.values is not None:
+        variables["values"] = (("sample", *dims), prediction.values)
+    return xarray.Dataset(variables, columns, attributes)

@@ -1,0 +1,107 @@
+"""Warnings of workers that a dask cluster has given up, with real clusters."""
+
+import importlib.util
+import time
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.simulation import dask_workers
+from fe_likelihoods.simulation.executors import DaskExecutor
+from samplers.storage.pool_queue import PoolQueue
+from tests.clusters.noted import Gate
+from tests.faults.treacherous import Gated, Treacherous, posterior_of
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None, reason="NO DISTRIBUTED: install it to test dask clusters"
+)
+
+LATE = """
+import asyncio
+
+async def dask_setup(worker):
+    await asyncio.sleep({seconds})
+"""
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    """A function that makes a client of a cluster without workers, whose workers take some seconds to start."""
+    import dask
+    from dask.distributed import Client, LocalCluster
+
+    monkeypatch.setattr(dask_workers, "SECONDS_BETWEEN_CHECKS", 0.05)
+    opened = []
+
+    def make(seconds):
+        options = {"processes": False, "threads_per_worker": 1, "dashboard_address": None}
+        opened.append(LocalCluster(n_workers=0, preload=[LATE.format(seconds=seconds)], **options))
+        opened.append(Client(opened[0]))
+        return opened[1]
+
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "0s"}):
+        yield make
+        for each in reversed(opened):
+            each.close()
+
+
+def test_workers_that_are_still_starting_are_not_called_lost(cluster, caplog):
+    client = cluster(1.0)
+    client.cluster.scale(2)
+    posterior = posterior_of(Treacherous(), pool=client)
+    points = posterior.sample_prior(4, 1)
+    np.testing.assert_array_equal(posterior(points), posterior_of(Treacherous())(points))
+    assert "has no worker; 4 simulations wait" in caplog.text
+    assert "given up" not in caplog.text and "asking for them again" not in caplog.text
+
+
+def test_workers_that_do_not_start_are_asked_for_again(cluster, caplog, monkeypatch):
+    monkeypatch.setattr(dask_workers, "SECONDS_TO_START", 0.4)
+    client = cluster(1.0)
+    client.cluster.scale(2)
+    posterior_of(Treacherous(), pool=client)([[0.5, 0.1, 0.5]])
+    assert "2 of 2 workers of the dask cluster have not started within 0.4 s" in caplog.text
+
+
+def test_workers_that_the_cluster_has_given_up_are_started_again(cluster, caplog, tmp_path):
+    """The negative control: both workers are closed while a simulation runs."""
+    client = cluster(0.0)
+    client.cluster.scale(2)
+    client.wait_for_workers(2)
+    posterior = posterior_of(Gated(tmp_path), top=20.0, pool=DaskExecutor(client))
+    with posterior.evaluation_queue() as queue:
+        (ticket,) = queue.submit([[0.95, 0.1, 0.5]])
+        stop = time.monotonic() + 30.0
+        while not list(tmp_path.iterdir()):
+            assert time.monotonic() < stop
+            time.sleep(0.01)
+        before = set(client.scheduler_info()["workers"])
+        client.retire_workers(list(before), close_workers=True)
+        (tmp_path / "go").touch()
+        ((arrived, value),) = queue.collect()
+    assert arrived == ticket and np.isfinite(value)
+    stop = time.monotonic() + 30.0
+    while len(set(client.scheduler_info()["workers"]) - before) < 1:
+        assert time.monotonic() < stop
+        time.sleep(0.01)
+    assert "has given up" in caplog.text
+
+
+def test_a_closed_queue_of_a_sampler_cancels_what_has_not_been_started(cluster, tmp_path):
+    client = cluster(0.0)
+    client.cluster.scale(1)
+    client.wait_for_workers(1)
+    pool = DaskExecutor(client)
+    queue = PoolQueue(Gate(tmp_path), pool, list)
+    for item in range(6):  # tasks of their own
+        queue.submit([item])
+    stop = time.monotonic() + 30.0
+    while not (tmp_path / "0").exists():
+        assert time.monotonic() < stop
+        time.sleep(0.01)
+    queue.close()
+    (tmp_path / "go").touch()
+    assert pool.map(Gate(tmp_path), [7]) == [7]
+    # a worker has received one or two before it starts them
+    begun = {path.name for path in tmp_path.iterdir()}
+    assert {"0", "7", "go"} <= begun and not {"3", "4", "5"} & begun

@@ -1,0 +1,142 @@
+"""Asynchronous runs with a guide: killed anywhere they go on, and the journal repeats them without a simulation."""
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+import emcee
+import numpy as np
+import pytest
+
+from fe_likelihoods.simulation.executors import as_executor
+from samplers import SMCSampler, TMCMCSampler
+from samplers.tempering.stopping import NothingToReport
+from tests.contract.targets import Gaussian
+from tests.emulation.problems import symmetric
+from tests.faults.test_asynchronous import kinds
+from tests.faults.test_prefixes import journal_of
+from tests.simulated_cluster import SimulatedPool
+from tests.tempering.guides import FixedGuide
+
+N, WORKERS = 40, 12
+
+pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+
+
+def finished(path, order=0, workers=WORKERS, **settings):
+    """A run on two modes, with searches on parts of the record; `order` is the seed of the run lengths."""
+    posterior, lengths = symmetric(), np.random.default_rng(order)
+    likelihood = posterior.likelihood
+    likelihood.pool = pool = SimulatedPool(workers, lambda theta: lengths.exponential(), likelihood.model.n_steps)
+    settings = {"seed": 5, "guide": posterior.guide(4), "asynchronous": True, **settings}
+    backend = emcee.backends.HDFBackend(str(path))
+    sampler = SMCSampler(N, 2, posterior, vectorize=True, backend=backend, **settings)
+    with pool.clock():
+        sampler.run_mcmc(None, 1)
+    sampler.backend.close()
+    return sampler, pool
+
+
+def state_of(sampler):
+    """Everything that two runs are compared by."""
+    chain = sampler.get_chain().tobytes()
+    return chain, sampler.rounds, sampler.log_evidence, sampler.evaluations, sampler.simulations, sampler.verdict
+
+
+def cut(path, place, copy):
+    """A copy of a journal up to a place, as a kill leaves it."""
+    journal_of(copy).write_bytes(journal_of(path).read_bytes()[:place])
+    copy.unlink(missing_ok=True)
+
+
+def repeated(path, folder, order):
+    """The run of a journal that is cut before its last step."""
+    last = [place for kind, place in kinds(journal_of(path).read_bytes()) if kind == b"STEP"][-1]
+    cut(path, last, folder / "repeated.h5")
+    return finished(folder / "repeated.h5", order)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "run.h5"
+    return path, *finished(path, order=1)
+
+
+def test_nothing_is_simulated_twice_and_the_order_of_arrival_decides(whole, tmp_path):
+    """The control: other lengths give another run, so that a replay that ignored the order would be noticed."""
+    _, sampler, pool = whole
+    assert pool.simulations == pytest.approx(sampler.simulations)
+    assert state_of(finished(tmp_path / "other.h5", order=2)[0]) != state_of(sampler)
+
+
+def test_the_journal_repeats_a_run_without_a_simulation(whole, tmp_path):
+    path, sampler, _ = whole
+    again, pool = repeated(path, tmp_path, order=3)
+    assert state_of(again) == state_of(sampler) and pool.simulations == 0.0
+
+
+@pytest.mark.parametrize(
+    "share", [0.1, 0.5, 0.9, *(pytest.param(s, marks=pytest.mark.slow) for s in np.arange(0.04, 1.0, 0.07).round(2))]
+)
+def test_killed_anywhere_a_run_goes_on_and_its_journal_repeats_it(whole, tmp_path, share):
+    """In the search and in the rounds; continued with other lengths, of which a later replay takes no account."""
+    path, sampler, pool = whole
+    places = [place for _, place in kinds(journal_of(path).read_bytes())]
+    cut(path, places[int(share * len(places))], tmp_path / "killed.h5")
+    resumed, rest = finished(tmp_path / "killed.h5", order=4)
+    assert rest.simulations < (1.4 - share) * pool.simulations + WORKERS
+    again, nothing = repeated(tmp_path / "killed.h5", tmp_path, order=99)
+    assert state_of(again) == state_of(resumed) and nothing.simulations == 0.0
+
+
+def test_a_run_that_limits_have_ended_goes_on(tmp_path):
+    """The search, then the rounds; what was simulated is not simulated again."""
+    with suppress(NothingToReport):  # a draw or none
+        finished(tmp_path / "run.h5", max_simulations=20)
+    limited, first = finished(tmp_path / "run.h5", order=1, max_simulations=80)
+    assert 79.0 < limited.simulations <= 80.0 and first.simulations < 80.0 - 10.0
+    sampler, rest = finished(tmp_path / "run.h5", order=2, max_simulations=5000)
+    assert sampler.verdict.status != "not usable"
+    assert rest.simulations < sampler.simulations - 80.0 + N
+    again, nothing = repeated(tmp_path / "run.h5", tmp_path, order=3)
+    assert state_of(again)[:3] == state_of(sampler)[:3] and nothing.simulations == 0.0
+
+
+def test_a_limit_counts_what_is_running(tmp_path):
+    sampler, pool = finished(tmp_path / "run.h5", order=1, max_simulations=90)
+    assert 89.0 < sampler.simulations <= 90.0 and pool.simulations == pytest.approx(sampler.simulations)
+
+
+@pytest.mark.parametrize("kind", ["threads", "map only", "none"])
+def test_pools(kind):
+    """Real threads; pools that take batches only, or no pool, are used without overlap."""
+    posterior = symmetric()
+
+    class MapOnly:
+        map = staticmethod(map)
+
+    with ThreadPoolExecutor(3) as threads:
+        posterior.likelihood.pool = as_executor({"threads": threads, "map only": MapOnly(), "none": None}[kind])
+        sampler = SMCSampler(
+            N, 2, posterior, vectorize=True, seed=5, guide=posterior.guide(4), asynchronous=True, max_simulations=1000
+        )
+        sampler.run_mcmc(None, 0)
+    reference = symmetric()
+    barriers = SMCSampler(N, 2, reference, vectorize=True, seed=6, guide=reference.guide(4))
+    barriers.run_mcmc(None, 0)
+    joint = np.hypot(sampler.log_evidence_error, barriers.log_evidence_error)
+    assert abs(sampler.log_evidence - barriers.log_evidence) < 4.0 * joint < 0.8
+
+
+def test_what_cannot_be_asynchronous_is_refused():
+    posterior = Gaussian(2)
+    guide = FixedGuide(posterior, posterior.mean, [np.diag(posterior.sd**2)])
+    with pytest.raises(ValueError, match="evaluation_queue"):
+        SMCSampler(N, 2, posterior, vectorize=True, guide=guide, asynchronous=True)
+    with pytest.raises(ValueError, match="use SMCSampler"), ThreadPoolExecutor(1) as pool:
+        TMCMCSampler(N, 2, posterior, pool=pool, guide=guide, asynchronous=True)
+    emulated = symmetric()
+    emulated.likelihood.response_memory.max_bytes = 1000
+    sampler = SMCSampler(N, 2, emulated, vectorize=True, guide=emulated.guide(), asynchronous=True)
+    with pytest.raises(ValueError, match="memory_bytes of 128000 or more"):
+        sampler.run_mcmc(None, 0)
+    assert emulated.likelihood.simulations == 0

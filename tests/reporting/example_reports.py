@@ -1,0 +1,60 @@
+"""Reports of three systems, to be looked at: ``python -m tests.reporting.example_reports FOLDER [NAME ...]``.
+
+The bridge column (both events), the isolated bridge, and a steel frame in OpenSees; synthetic data, reduced settings, a
+guide, so that each takes a few minutes.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fe_likelihoods import Posterior, problems, propagate, report
+from samplers import SMCSampler
+from tests.benchmarks import opensees_frame
+
+__all__ = ["EXAMPLES", "make_report"]
+
+
+def column() -> tuple[Posterior, np.ndarray]:
+    """The bridge column under two events, and the truth of its data."""
+    truth = [*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_SENSOR_NOISE.values()]
+    return problems.bridge_column(events=2, every=4), np.array(truth)
+
+
+def bridge() -> tuple[Posterior, np.ndarray]:
+    """The isolated bridge, and the truth of its data."""
+    posterior = problems.isolated_bridge()
+    truth = problems.ISOLATED_BRIDGE_TRUTH["twin"] | {"sigma": problems.ISOLATED_BRIDGE_NOISE["twin"]}
+    return posterior, np.array([truth.get(name, np.nan) for name in posterior.parameter_names])
+
+
+def opensees() -> tuple[Posterior, np.ndarray]:
+    """A two-storey frame in OpenSees, and the truth of its data."""
+    return opensees_frame.posterior(1), np.array(opensees_frame.TRUTH)
+
+
+EXAMPLES: dict[str, Callable] = {"column": column, "bridge": bridge, "opensees": opensees}
+
+
+def make_report(name: str, folder: Path, walkers: int = 100, steps: int = 2) -> Path:
+    """Sample one of the systems and write its report."""
+    posterior, truth = EXAMPLES[name]()
+    sampler = SMCSampler(
+        walkers, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=1500
+    )
+    sampler.run_mcmc(None, steps, progress=True)
+    prediction = propagate(posterior, sampler.get_chain(flat=True)[-40:], progress=False)
+    measured = posterior.likelihood.measurements
+    out = folder / f"{name}.html"
+    return report(sampler, posterior, {"Response": prediction}, out, truth=truth, measured=measured)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="*", choices=[*EXAMPLES, []], default=[])
+    arguments = parser.parse_args()
+    for each in arguments.names or EXAMPLES:
+        print(make_report(each, arguments.folder))

@@ -1,0 +1,218 @@
+"""Data of arviz: groups, units, Monte Carlo errors, and leave-one-out cross-validation of blocks of time."""
+
+import json
+import warnings
+
+import emcee
+import matplotlib
+import numpy as np
+import pytest
+from scipy import stats
+
+from fe_likelihoods import Posterior, TruncatedNormal, propagate
+from samplers import SMCSampler, TMCMCSampler, to_arviz
+from tests.contract.targets import Gaussian
+from tests.probability.linear_gaussian import likelihood_of
+
+arviz = pytest.importorskip("arviz")
+SIGMA, MEAN, SD = 0.5, 0.8, 1.5
+GENERATION = int(arviz.__version__.split(".")[0])
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """A linear model with 60 samples, whose posterior is normal and known."""
+    likelihood = likelihood_of(("a", "b", "c"), np.random.default_rng(4), 60, SIGMA)
+    normal = TruncatedNormal(MEAN, SD, -np.inf, np.inf)
+    return Posterior(likelihood, dict.fromkeys(likelihood.parameter_names, normal))
+
+
+def run(posterior, seed=1, n=200, steps=5, Sampler=SMCSampler):
+    sampler = Sampler(n, posterior.ndim, posterior, vectorize=True, seed=seed)
+    sampler.run_mcmc(None, steps)
+    return sampler
+
+
+@pytest.fixture(scope="module")
+def runs(linear):
+    return [run(linear, seed) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def data(linear, runs):
+    prediction = propagate(linear, runs[0].get_chain(flat=True)[:50], progress=False)
+    return to_arviz(runs, linear, prediction, draws=600, block=1.0)
+
+
+def exact_loo(posterior, length):
+    """Sum of log p(y_k | the other blocks), of blocks of `length` samples, in closed form."""
+    model, y = posterior.likelihood.model, posterior.likelihood.measurements.values[0]
+    total, within = 0.0, 0.0
+    for first in range(0, len(y), length):
+        out = np.arange(first, first + length)
+        left = np.setdiff1d(np.arange(len(y)), out)
+        for rows, which in ((left, "loo"), (np.arange(len(y)), "lppd")):
+            design = model.design[rows]
+            precision = np.eye(3) / SD**2 + design.T @ design / SIGMA**2
+            covariance = np.linalg.inv(precision)
+            mean = covariance @ (np.full(3, MEAN) / SD**2 + design.T @ y[rows] / SIGMA**2)
+            there = model.design[out]
+            density = stats.multivariate_normal(
+                there @ mean, there @ covariance @ there.T + SIGMA**2 * np.eye(length)
+            ).logpdf(y[out])
+            total, within = (total + density, within) if which == "loo" else (total, within + density)
+    return total, within
+
+
+def test_loo_of_blocks_is_that_of_the_closed_form(linear, data):
+    exact, within = exact_loo(linear, 10)
+    found = arviz.loo(data, pointwise=True)
+    elpd = float(found.elpd if GENERATION else found.elpd_loo)
+    assert data["log_likelihood"]["measurements"].sizes["block"] == 6
+    assert elpd == pytest.approx(exact, abs=0.25)
+    assert abs(within - exact) > 1.0  # control: the density with the block in the data is another number
+
+
+def test_the_same_run_is_not_two_chains(runs):
+    with pytest.raises(ValueError, match="a sampler is given twice"):
+        to_arviz([runs[0], runs[0]])
+
+
+def test_compare_prefers_the_right_model(linear, data, runs):
+    wrong = Posterior(
+        likelihood_of(("a",), np.random.default_rng(4), 60, SIGMA),
+        {"a": TruncatedNormal(MEAN, SD, -np.inf, np.inf)},
+    )
+    likelihood = type(wrong.likelihood)(wrong.likelihood.model, linear.likelihood.measurements, linear.likelihood.noise)
+    wrong = Posterior(likelihood, wrong.prior)
+    other = to_arviz(run(wrong), wrong, block=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Pareto shapes of the wrong model
+        table = arviz.compare({"right": data, "wrong": other})
+    assert list(table.index) == ["right", "wrong"]
+
+
+def values(dataset):
+    """One number per variable, of a Dataset or of a DataTree with one group."""
+    dataset = dataset["posterior"] if "posterior" in getattr(dataset, "children", {}) else dataset
+    return np.array([float(np.squeeze(dataset[name])) for name in dataset.data_vars])
+
+
+def test_two_runs_have_an_r_hat_and_one_has_none(data, linear, runs):
+    between = values(arviz.rhat(data))
+    assert np.all((between > 0.99) & (between < 1.1))
+    one = to_arviz(runs[0])
+    assert np.isnan(values(arviz.rhat(one))).all()
+    assert "no r_hat" in one["posterior"].attrs["chains"]
+    assert "independent run" in data["posterior"].attrs["chains"]
+    assert "posterior_predictive" not in list(one.groups() if callable(one.groups) else one.children)
+    moved = runs[0].get_chain(flat=True) + 0.0
+    apart = to_arviz([runs[0], runs[1]])
+    apart["posterior"]["a"][1] += 10.0 * moved[:, 0].std()  # control: runs that disagree
+    assert values(arviz.rhat(apart))[0] > 1.5
+
+
+def test_mcse_is_that_of_the_sampler():
+    sampler = run(Gaussian(), seed=3, n=600, steps=6)
+    expected = sampler.mean_error()
+    found = values(arviz.mcse(to_arviz(sampler), method="mean"))
+    assert found == pytest.approx(expected, rel=0.2)  # 90 % of 40 runs: 0.97 to 1.07
+    shuffled = sampler.get_chain(flat=True)[None]  # control: in the order of emcee
+    plain = {f"x{i}": shuffled[:, :, i] for i in range(3)}
+    plain = arviz.from_dict({"posterior": plain}) if GENERATION else arviz.from_dict(posterior=plain)
+    assert np.all(values(arviz.mcse(plain, method="mean")) < 0.9 * expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("Sampler, n, steps", [(SMCSampler, 600, 4), (TMCMCSampler, 200, 10)])
+def test_mcse_is_the_error_of_the_mean(Sampler, n, steps):
+    target, errors, stated = Gaussian(), [], []
+    for seed in range(40):
+        sampler = run(target, seed, n, steps, Sampler)
+        errors.append(sampler.get_chain(flat=True).mean(axis=0) - target.mean)
+        stated.append(values(arviz.mcse(to_arviz(sampler), method="mean")))
+    ratio = np.sqrt(np.mean(np.square(stated)) / np.mean(np.square(errors)))
+    assert ratio == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * 3 * 40))
+
+
+def test_chain_of_emcee_in_the_order_of_its_walkers():
+    target = Gaussian()
+    sampler = emcee.EnsembleSampler(32, 3, target, vectorize=True)
+    sampler.run_mcmc(target.sample_prior(32, np.random.default_rng(0)), 30)
+    data = to_arviz(sampler, discard=10)
+    assert data["posterior"]["x1"].shape == (1, 32 * 20)
+    assert np.array_equal(data["posterior"]["x1"][0, :20], sampler.get_chain()[10:, 0, 1])
+    assert np.array_equal(data["sample_stats"]["step"][0, :20], np.arange(10, 30))
+    assert "sample_prior" in data["prior"].attrs["source"]
+    assert "observed_data" not in data if GENERATION else not hasattr(data, "observed_data")
+
+
+def test_groups_have_units_and_are_read_back(tmp_path, data, linear, runs):
+    data.to_netcdf(str(tmp_path / "run.nc"))
+    again = arviz.from_netcdf(str(tmp_path / "run.nc"))
+    y = linear.likelihood.measurements
+    assert np.array_equal(again["observed_data"]["top"], y.values[0])
+    assert np.array_equal(again["observed_data"]["time"], y.time)
+    assert again["observed_data"]["top"].attrs["units"] == "m"
+    assert again["observed_data"]["time"].attrs["units"] == "s"
+    assert again["constant_data"]["time_step"].values == [y.dt]
+    assert again["predictions"]["top_mean"].shape == (60,)
+    assert again["predictions"]["top_quantiles"].shape == (3, 60)
+    stats_of_runs = again["sample_stats"].attrs
+    assert np.allclose(stats_of_runs["simulations"], [run.simulations for run in runs])
+    assert len(json.loads(stats_of_runs["ladder"])) == 2 and "onverged" in stats_of_runs["verdict"]
+    assert json.loads(stats_of_runs["failures"].split("\n")[0]) == {}
+    assert np.array_equal(again["prior"]["a"][1], runs[1].prior_draws[:, 0])
+    blocks = again["log_likelihood"]
+    assert blocks["measurements"].shape == (2, 300, 6)
+    assert "at most 1 s long" in blocks.attrs["note"]
+    chosen = blocks["measurements"].draw.values
+    rows = np.stack([again["posterior"][name][0, chosen] for name in ("a", "b", "c")], axis=1)
+    assert np.allclose(blocks["measurements"][0].sum("block"), linear.likelihood.log_likelihood(rows))
+
+
+def test_a_run_of_a_file_without_a_verdict(runs, monkeypatch):
+    monkeypatch.setattr(runs[0], "_verdict", None)
+    assert to_arviz(runs[0])["sample_stats"].attrs["verdict"] == "The run has no stored verdict."
+
+
+@pytest.fixture(scope="module")
+def oscillator():
+    from fe_likelihoods import Channel, FELikelihood, FunctionModel, HalfNormal, Measurements
+
+    time = 0.05 * np.arange(80)
+    channels = [Channel("top", "displacement", "mm")]
+    model = FunctionModel(lambda theta: 0.05 * np.cos(6.0 * theta[0] * time)[None], ["stiffness"], channels, 0.05, 80)
+    noise = 0.002 * np.random.default_rng(1).standard_normal((1, 80))
+    measured = Measurements(model.channels, model.dt, model.simulate([1.1]) + noise)
+    return Posterior(
+        FELikelihood(model, measured), {"stiffness": TruncatedNormal(1.0, 0.3), "sigma_top": HalfNormal(0.01)}
+    )
+
+
+def test_labels_and_figures(oscillator, tmp_path):
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    data = to_arviz([run(oscillator, seed, 60, 2) for seed in (1, 2)], oscillator, draws=80)
+    assert data["posterior"]["sigma_top"].attrs["long_name"] == "sigma_top [mm]"
+    assert data["posterior"]["sigma_top"].attrs["factor"] == 1e-3
+    replicates = data["posterior_predictive"]["top"]
+    assert replicates.dims == ("chain", "draw", "time") and replicates.attrs["units"] == "m"
+    assert float(replicates.std(("chain", "draw")).mean()) == pytest.approx(0.002, rel=0.25)
+    names = ["plot_trace", "plot_forest", "plot_ppc_dist" if GENERATION else "plot_ppc"]
+    for name in [*names, "plot_dist" if GENERATION else "plot_posterior"]:
+        getattr(arviz, name)(data)
+        plt.close("all")
+    assert "r_hat" in arviz.summary(data)
+
+
+def test_what_is_refused(linear, runs, oscillator):
+    with pytest.raises(ValueError, match="chains of the same shape"):
+        to_arviz([runs[0], run(linear, steps=1)])
+    with pytest.raises(ValueError, match="no measured_data and no predictive_draws"):
+        to_arviz(runs[0], Gaussian())
+    with pytest.raises(ValueError, match="the posterior has 2 parameters, but the sampler 3"):
+        to_arviz(runs[0], oscillator)
+    with pytest.raises(ValueError, match="draws must be"):
+        to_arviz(runs, linear, draws=1)

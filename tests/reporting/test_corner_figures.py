@@ -1,0 +1,294 @@
+"""Figures of samples are asserted by what they show: limits, labels, densities, marks of true and nominal values."""
+
+import pickle
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+import pytest
+
+from fe_likelihoods import HalfNormal, MultivariateNormal, Prior, TruncatedNormal, problems
+from samplers import plot_corner, plot_marginals, plot_pairs
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+NAMES = ["stiffness", "damping [%]", "sigma [mm]"]
+RED, GREY = "#b03a48", "#8a8f98"
+
+
+class Shown(NamedTuple):
+    """As `fe_likelihoods.Parameter`."""
+
+    name: str
+    label: str
+    factor: float = 1.0
+    nominal: float = np.nan
+
+
+class Posterior:
+    """Two multiples of nominal values, and a noise level in metres that is shown in millimetres."""
+
+    parameter_names = ("k", "c", "sigma")
+    parameters = (
+        Shown("k", "k [x 3 kN/m]", 1.0, 1.0),
+        Shown("c", "c [x 0.02]", 1.0, 1.0),
+        Shown("sigma", "sigma [mm]", 1e-3),
+    )
+    prior = Prior({"k": TruncatedNormal(1.0, 0.3), "c": TruncatedNormal(1.0, 0.5), "sigma": HalfNormal(0.01)})
+
+
+@pytest.fixture
+def samples(rng):
+    return rng.multivariate_normal([1.0, 5.0, 0.2], np.diag([0.01, 1.0, 1e-4]), size=500)
+
+
+@pytest.fixture
+def updated(rng):
+    return rng.normal([1.2, 0.9, 0.002], [0.1, 0.2, 0.0002], size=(600, 3))
+
+
+@pytest.fixture(autouse=True)
+def close():
+    yield
+    plt.close("all")
+
+
+def grid(figure) -> np.ndarray:
+    n = round(len(figure.axes) ** 0.5)
+    return np.array(figure.axes, dtype=object).reshape(n, n)
+
+
+def lines(axes, colour: str) -> list[float]:
+    """Positions of the vertical lines of a colour."""
+    marks = [line for line in axes.lines if line.get_color() == colour and len(line.get_xdata()) == 2]
+    return [line.get_xdata()[0] for line in marks if line.get_xdata()[0] == line.get_xdata()[1]]
+
+
+def arrows(axes) -> list[tuple[str, float]]:
+    """Value beside each arrow, and the edge at which its tip is."""
+    tips = [text.xy[0] for text in axes.texts if not text.get_text()]
+    return list(zip([text.get_text() for text in axes.texts if text.get_text()], tips, strict=True))
+
+
+def legend(figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_corner_shows_units_prior_truth_and_nominal_values(updated):
+    figure = plot_corner(updated, Posterior(), truths=[1.25, 0.95, 0.0021], title="a title")
+    axes = grid(figure)
+    labels = ["k [x 3 kN/m]", "c [x 0.02]", "sigma [mm]"]
+    assert [each.get_xlabel() for each in axes[-1]] == labels
+    assert [each.get_ylabel() for each in axes[:, 0]] == ["", *labels[1:]]
+    assert legend(figure) == [
+        "posterior",
+        "prior (much wider: near zero in some panels)",
+        "nominal value",
+        "true value",
+    ]
+    assert figure.get_suptitle() == "a title"
+    assert updated[:, 0].std() < 0.1, "two digits of it are in the title"
+    low, high = axes[2, 2].get_xlim()
+    assert low < 1e3 * updated[:, 2].min() < 1e3 * updated[:, 2].max() < 1.2 * high, "millimetres"
+    assert lines(axes[2, 2], RED) == [pytest.approx(2.1)] and lines(axes[0, 0], GREY) == [1.0]
+    prior = next(line for line in axes[0, 0].lines if line.get_linestyle() == ":")
+    np.testing.assert_allclose(prior.get_ydata(), np.exp(Posterior.prior.distributions["k"].logpdf(prior.get_xdata())))
+    of_sigma = next(line for line in axes[2, 2].lines if line.get_linestyle() == ":")
+    assert of_sigma.get_ydata()[0] == pytest.approx(
+        1e-3 * np.exp(Posterior.prior.distributions["sigma"].logpdf(1e-3 * of_sigma.get_xdata()[0]))
+    )
+    assert axes[0, 0].get_title() == f"{updated[:, 0].mean():.3f} ± {updated[:, 0].std():.3f}"
+    assert all(not axes[i, j].axison for i in range(3) for j in range(i + 1, 3))
+    for i in range(3):
+        for j in range(i):
+            assert axes[i, j].collections, "contours"
+            assert axes[i, j].get_xlim() == axes[j, j].get_xlim() and axes[i, j].get_ylim() == axes[i, i].get_xlim()
+
+
+def test_arrows_point_to_values_outside_of_the_panels(updated):
+    axes = grid(plot_corner(updated, Posterior(), truths=[9.0, 0.9, 0.002], nominal={"k": -3.0, "sigma": 0.5}))
+    assert arrows(axes[0, 0]) == [("-3", 0.005), ("9", 0.995)]
+    assert arrows(axes[2, 2]) == [("500", 0.995)], "in millimetres"
+    assert arrows(axes[1, 1]) == [] and lines(axes[1, 1], GREY) == [] and lines(axes[1, 1], RED) == [0.9]
+    assert axes[0, 0].get_xlim()[1] < 2.0, "the panels stay those of the samples"
+    highest = max(polygon.get_xy()[:, 1].max() for polygon in axes[0, 0].patches)
+    assert highest < 0.75 * axes[0, 0].get_ylim()[1], "the arrows are above the histogram"
+
+
+def test_true_values_near_the_samples_widen_the_panels(updated):
+    axes = grid(plot_corner(updated, Posterior(), truths=[1.7, np.nan, np.nan]))
+    assert lines(axes[0, 0], RED) == [1.7] and axes[0, 0].get_xlim()[1] > 1.7
+    assert lines(axes[1, 1], RED) == []
+
+
+def test_several_samplers_have_common_axes_and_a_legend(updated, rng):
+    figure = plot_corner({"SMC": updated, "TMCMC": updated + 0.01, "emcee": updated}, truths={"x1": 1.0})
+    axes = grid(figure)
+    assert [each.get_xlabel() for each in axes[-1]] == ["x0", "x1", "x2"]
+    assert legend(figure) == ["SMC", "TMCMC", "emcee", "true value"]
+    assert len(axes[0, 0].patches) == 3 and axes[0, 0].get_title() == ""
+    colours = [tuple(polygon.get_edgecolor()) for polygon in axes[0, 0].patches]
+    assert len(set(colours)) == 3
+    with pytest.raises(ValueError, match="columns are {'a': 3, 'b': 2}"):
+        plot_corner({"a": updated, "b": updated[:, :2]})
+
+
+def test_too_many_parameters_are_left_out_aloud(rng):
+    many = rng.normal(size=(300, 15))
+    figure = plot_corner(many, max_parameters=4)
+    assert grid(figure).shape == (4, 4)
+    assert "the first 4 of 15 parameters; names= chooses others" in figure.legends[0].get_title().get_text()
+    axes = grid(plot_corner(many, names=["x14", "x2"]))
+    assert [each.get_xlabel() for each in axes[-1]] == ["x14", "x2"]
+    np.testing.assert_allclose(np.mean(axes[0, 0].get_xlim()), np.median(many[:, 14]), atol=1.0)
+    with pytest.raises(ValueError, match="names must be some of the parameters x0, .*unknown: x99"):
+        plot_corner(many, names=["x99"])
+
+
+def test_parameters_that_do_not_vary_and_few_samples_are_points(rng):
+    flat = np.column_stack([rng.normal(size=400), np.full(400, 2.0)])
+    figure = plot_corner(flat)
+    axes = grid(figure)
+    assert axes[1, 1].get_title() == "2, does not vary" and not axes[1, 0].collections
+    assert len(axes[1, 0].lines[0].get_xdata()) == 400
+    assert figure.legends[0].get_title().get_text() == "titles: mean ± standard deviation", "there are no contours"
+    copies = np.repeat(rng.normal(size=(40, 2)), 20, axis=0)
+    assert not grid(plot_corner(copies))[1, 0].collections, "800 rows of which 40 are distinct"
+    figure = plot_corner([[0.0], [1.0]])
+    assert len(figure.axes) == 1
+
+
+def test_samples_at_a_bound_show_the_bound(rng):
+    posterior = Posterior()
+    x = np.abs(rng.normal(0.0, [0.1, 0.3, 0.003], size=(500, 3)))
+    axes = grid(plot_corner(x, posterior))[0, 0]
+    assert axes.get_xlim()[0] < 0.0
+    prior = next(line for line in axes.lines if line.get_linestyle() == ":")
+    assert np.all(prior.get_ydata()[prior.get_xdata() < 0.0] == 0.0) and prior.get_ydata()[-1] > 0.0
+    heights = axes.patches[0].get_xy()
+    assert heights[heights[:, 0] < -0.05, 1].max(initial=0.0) == 0.0, "no density below the bound"
+
+
+def test_correlated_priors_are_drawn_from_their_draws(updated):
+    class Correlated(Posterior):
+        prior = Prior(
+            {("k", "c"): MultivariateNormal([1.0, 1.0], [[0.09, 0.1], [0.1, 0.25]]), "sigma": HalfNormal(0.01)}
+        )
+
+    line = next(each for each in grid(plot_corner(updated, Correlated()))[0, 0].lines if each.get_linestyle() == ":")
+    x = line.get_xdata()
+    np.testing.assert_allclose(
+        line.get_ydata(), np.exp(-0.5 * ((x - 1) / 0.3) ** 2) / (0.3 * np.sqrt(2 * np.pi)), atol=0.1
+    )
+
+
+def test_figures_can_be_pickled(updated):
+    pickle.dumps(plot_corner(updated[:50], Posterior()))
+
+
+def test_wrong_arguments_are_refused(updated):
+    with pytest.raises(ValueError, match=r"array \(n, ndim\) with n >= 2"):
+        plot_corner(updated[0])
+    with pytest.raises(ValueError, match="1 of 600 rows are not"):
+        plot_corner(np.vstack([updated[1:], [np.nan, 1.0, 1.0]]))
+    with pytest.raises(ValueError, match=r"3 parameters \(k, c, sigma\), but the samples have 2 columns"):
+        plot_corner(updated[:, :2], Posterior())
+    with pytest.raises(ValueError, match="truths must have one value for each of 3"):
+        plot_corner(updated, truths=[1.0])
+    with pytest.raises(ValueError, match="nominal: unknown parameters mass; known are k, c, sigma"):
+        plot_corner(updated, Posterior(), nominal={"mass": 1.0})
+    with pytest.raises(ValueError, match="one label for each of 3"):
+        plot_corner(updated, labels=["a"])
+    with pytest.raises(ValueError, match="no samples to draw"):
+        plot_corner({})
+    with pytest.raises(ValueError, match="columns must be 1 or more"):
+        plot_marginals(updated, columns=0)
+
+
+def test_labels_of_the_library_fit_their_panels(rng):
+    """Of neighbours below the panels, no label covers another."""
+    posterior = problems.bridge_column(every=16, duration=10.0)
+    means = np.array([0.6, 0.96, 0.3, 4.7, 2.4, 0.05, 5e-4])
+    figure = plot_corner(means * (1.0 + 0.02 * rng.standard_normal((300, 7))), posterior)
+    figure.canvas.draw()
+    below = [axes.xaxis.label.get_window_extent() for axes in grid(figure)[-1]]
+    assert all(left.x1 < right.x0 for left, right in zip(below, below[1:], strict=False))
+    beside = [axes.yaxis.label.get_window_extent() for axes in grid(figure)[1:, 0]]
+    assert all(lower.y1 < upper.y0 for upper, lower in zip(beside, beside[1:], strict=False))
+    assert all(0 <= box.x0 and box.y1 < figure.bbox.y1 for box in (*below, *beside))
+
+
+def test_marginals_show_what_the_data_changed(updated):
+    figure = plot_marginals(updated, Posterior(), truths=[1.25, 0.95, 0.0021], columns=2)
+    k, c, sigma = figure.axes
+    assert [axes.get_xlabel() for axes in figure.axes] == ["k [x 3 kN/m]", "c [x 0.02]", "sigma [mm]"]
+    low, high = k.get_xlim()
+    assert low < 0.4 and high > 1.6, "the prior is in the panel"
+    assert sigma.get_title().endswith("times wider") and sigma.get_xlim()[1] < 4.0, "the prior is much wider"
+    ratio = float(sigma.get_title().split()[-3])
+    assert ratio == pytest.approx(0.01 * np.sqrt(1.0 - 2.0 / np.pi) / updated[:, 2].std(), rel=0.1)
+    assert lines(k, RED) == [1.25] and lines(k, GREY) == [1.0] == lines(c, GREY)
+    assert legend(figure) == ["posterior", "prior", "nominal value", "true value"]
+    figure = plot_marginals({"a": updated, "b": updated}, prior=False)
+    assert legend(figure) == ["a", "b"] and len(figure.axes[0].patches) == 2
+
+
+def test_pairs_show_samples_labels_and_truth(samples):
+    truth = [1.4, 4.0, 0.21]  # the first one is 4 standard deviations from the samples
+    axes = grid(plot_pairs(samples, labels=NAMES, truths=truth, max_points=200))
+    for i in range(3):
+        assert axes[2, i].get_xlabel() == axes[i, 0].get_ylabel() == NAMES[i]
+        assert axes[i, i].get_title() == f"CV = {samples[:, i].std() / samples[:, i].mean():.2e}"
+        for j in range(3):
+            low, high = axes[i, j].get_xlim()
+            assert low < samples[:, j].mean() < high and low < truth[j] < high
+            assert any(np.all(np.asarray(line.get_xdata()) == truth[j]) for line in axes[i, j].lines)
+            if i != j:
+                assert axes[i, j].get_ylim()[0] < truth[i] < axes[i, j].get_ylim()[1]
+    points = axes[0, 1].lines[0]
+    assert len(points.get_xdata()) == 200 and set(points.get_xdata()) <= set(samples[:, 1])
+    assert axes[1, 0].texts[0].get_text() == f"r = {np.corrcoef(samples[:, 0], samples[:, 1])[0, 1]:.2f}"
+    assert len(axes[1, 0].collections) > 0, "contours of the density"
+
+
+def test_pairs_point_to_values_outside_of_their_panels(samples):
+    truth, nominal = [1.9, 5.0, np.nan], [0.2, 5.1, 0.2]  # 9 and -8 standard deviations from the samples
+    axes = grid(plot_pairs(samples, labels=NAMES, truths=truth, nominal=nominal))
+    assert axes[0, 0].get_xlim()[0] > 0.2 and axes[0, 0].get_xlim()[1] < 1.9, "the panels stay those of the samples"
+    assert arrows(axes[0, 0]) == [("0.2", 0.005), ("1.9", 0.995)]
+    assert lines(axes[1, 1], GREY) == [5.1] and lines(axes[1, 1], RED) == [5.0] and not axes[1, 1].texts
+    assert lines(axes[2, 2], RED) == [], "no mark for NaN"
+
+
+def test_contours_end_at_a_bound_of_the_prior(rng):
+    x = np.abs(rng.normal(0.0, [0.1, 0.3, 0.003], size=(2000, 3)))
+    axes = grid(plot_corner(x, Posterior()))[1, 0]
+    for collection in axes.collections:
+        corners = axes.transData.inverted().transform(collection.get_clip_box().get_points())
+        assert corners.min() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_points_or_contours_are_chosen_per_sampler(rng):
+    few = np.repeat(rng.normal(size=(60, 3)), 20, axis=0)
+    figure = plot_corner({"many": rng.normal(size=(600, 3)), "few": few})
+    assert {len(grid(figure)[i, j].lines) for i in range(3) for j in range(i)} == {1}, "the points of one sampler"
+    assert "fewer than 150 distinct" in figure.legends[0].get_title().get_text()
+
+
+def test_long_names_do_not_cover_each_other(rng):
+    names = [f"a_parameter_with_a_long_name_{i}" for i in range(13)]
+    figure = plot_corner(rng.normal(size=(300, 13)), labels=names)
+    figure.canvas.draw()
+    below = [axes.xaxis.label.get_window_extent() for axes in grid(figure)[-1]]
+    assert all(left.x1 < right.x0 for left, right in zip(below, below[1:], strict=False))
+    beside = [axes.yaxis.label.get_window_extent() for axes in grid(figure)[1:, 0]]
+    assert all(lower.y1 < upper.y0 for upper, lower in zip(beside, beside[1:], strict=False))
+    assert all(0 <= box.x0 and 0 <= box.y0 for box in (*below, *beside))
+
+
+def test_the_prior_of_a_parameter_that_does_not_vary_is_not_called_wide(updated):
+    constant = updated.copy()
+    constant[:, 2] = 0.002 * (1.0 + 1e-16 * np.arange(len(updated)))
+    title = plot_marginals(constant, Posterior()).axes[2].get_title()
+    assert "wider" not in title and "does not vary" in title

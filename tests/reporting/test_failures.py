@@ -1,0 +1,133 @@
+"""What a report says about failed simulations: how many, where, and whether they border on the samples."""
+
+import emcee
+import numpy as np
+
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    SimulationFailed,
+    TruncatedNormal,
+    report,
+)
+from fe_likelihoods.reporting.contents import summary_sentences
+from fe_likelihoods.reporting.failures import failures
+from fe_likelihoods.reporting.fits import fit_data_sets
+from fe_likelihoods.reporting.report import gather
+from fe_likelihoods.reporting.run import read_run
+from fe_likelihoods.reporting.table import parameter_rows
+from samplers import SMCSampler
+from tests.contract.targets import Gaussian
+from tests.reporting.report_page import read_page
+
+TIME = 0.02 * np.arange(150)
+
+
+def free_vibration(theta, limit=1.1):
+    if theta[0] > limit:
+        raise SimulationFailed("no convergence")
+    omega = 2.0 * np.pi * 2.0 * np.sqrt(theta[0])
+    return [0.05 * np.exp(-0.02 * theta[1] * omega * TIME) * np.cos(omega * TIME)]
+
+
+def posterior_of(truth):
+    """A model that fails above a stiffness of 1.1, with data of a model that does not."""
+    model = FunctionModel(
+        free_vibration, ["stiffness", "damping"], [Channel("top", "displacement", "mm")], 0.02, len(TIME)
+    )
+    noise = 0.002 * np.random.default_rng(1).standard_normal((1, len(TIME)))
+    measured = Measurements(model.channels, model.dt, np.array(free_vibration(truth, np.inf)) + noise)
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")} | {"sigma_top": HalfNormal(0.01)}
+    return Posterior(FELikelihood(model, measured), prior)
+
+
+def run(posterior, walkers=60, steps=4, **options):
+    made = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=1, **options)
+    made.run_mcmc(None, steps)
+    return made
+
+
+def notes_of(contents):
+    return {note.title: note for note in contents.advice}
+
+
+def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
+    posterior = posterior_of([1.1003, 0.8])
+    sampler = run(posterior)
+    contents = gather(read_run(sampler, posterior), {})
+    (row,) = contents.failures.rows
+    assert row.reason == "no convergence" and row.where.startswith("at stiffness above 1.1 (100 %")
+    assert contents.failures.count == posterior.report()["failure_count"]
+    note = notes_of(contents)["Failures border on the samples"]
+    assert note.level == "severe" and contents.status == "not usable"
+    assert "Do not use these numbers" in contents.summary[2]
+    bad = int((sampler.prior_draws[:, 0] > 1.1).sum())
+    assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].text
+
+
+def test_control_failures_far_from_the_samples_are_no_severe_doubt():
+    posterior = posterior_of([1.05, 0.8])
+    sampler = run(posterior)
+    contents = gather(read_run(sampler, posterior), {})
+    assert contents.failures.count > 10 and contents.failures.near_failed == 0
+    assert "Failures border on the samples" not in notes_of(contents)
+    assert contents.status == sampler.verdict.status
+
+
+def test_failures_that_are_not_counted_are_not_known(tmp_path):
+    posterior = posterior_of([1.0, 0.8])
+    sampler = run(posterior)
+    assert failures(read_run(sampler, posterior)).count > 0
+    elsewhere = failures(read_run(sampler, posterior_of([1.0, 0.8])))
+    assert elsewhere.count == 0 and elsewhere.sentence.startswith("Not known")
+    target = Gaussian(ndim=2)
+    chain = emcee.EnsembleSampler(20, 2, target, vectorize=True)
+    chain.run_mcmc(0.7 + 0.1 * np.random.default_rng(3).standard_normal((20, 2)), 30)
+    page = read_page(report(chain, out=tmp_path / "plain.html"))
+    assert "Not known: neither the sampler nor the log-density counts failures" in page.text
+    assert "No simulation failed" not in page.text
+    assert "-inf" in failures(read_run(run(target), target)).sentence
+
+
+def test_failures_in_the_first_parts_of_the_record_count():
+    posterior = posterior_of([1.0, 0.8])
+    sampler = run(posterior, steps=1)
+    known = failures(read_run(sampler, posterior))
+    posterior.likelihood.shortened.append(posterior_of([1.0, 0.8]).likelihood)
+    posterior.likelihood.shortened[0].simulate([[1.2, 0.8], [1.0, 0.8]])
+    with_parts = failures(read_run(sampler, posterior))
+    assert (with_parts.count, with_parts.attempts) == (known.count + 1, known.attempts + 2)
+
+
+def test_a_run_without_a_result_leads_to_no_conclusion():
+    posterior = posterior_of([1.0, 0.8])
+    chain = emcee.EnsembleSampler(24, 3, posterior, vectorize=True)
+    chain.run_mcmc([1.0, 0.8, 0.002] * (1.0 + 0.01 * np.random.default_rng(1).standard_normal((24, 3))), 10)
+    finished = read_run(chain, posterior, truth=[5.0, 5.0, 5.0])
+    contents = gather(finished, {})
+    titles = notes_of(contents).keys()
+    assert titles.isdisjoint(
+        {"True values are missed", "Not informed by the data", "The errors are not white noise", "Far from the prior"}
+    )
+    assert "Nothing can be said about the parameters yet" in contents.summary[1] and not contents.residuals
+    assert "The chain is short" in titles
+
+
+def test_samples_are_not_worth_more_independent_ones_than_they_are(monkeypatch):
+    target = Gaussian(ndim=2)
+    chain = emcee.EnsembleSampler(24, 2, target, vectorize=True)
+    chain.run_mcmc(np.random.default_rng(1).standard_normal((24, 2)), 10)
+    monkeypatch.setattr(chain, "get_autocorr_time", lambda **options: np.array([0.9, 0.8]))
+    assert read_run(chain).effective_sample_size == 240.0
+
+
+def test_growth_is_not_called_shrinking():
+    posterior = posterior_of([1.0, 0.8])
+    finished = read_run(run(posterior), posterior)
+    rows = [row._replace(prior_sd=0.9 * row.sd) for row in parameter_rows(finished)]
+    text = summary_sentences(finished, rows, fit_data_sets(finished))[1]
+    assert "shrank" not in text and "No parameter" in text

@@ -1,0 +1,303 @@
+"""The report of a run: well-formed, complete, self-contained, and right in what it says."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from types import MappingProxyType
+
+import emcee
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from PIL import Image
+
+from fe_likelihoods import (
+    Channel,
+    Events,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    JointLikelihood,
+    LinearOscillator,
+    Measurements,
+    Posterior,
+    Record,
+    SimulationFailed,
+    TruncatedNormal,
+    Uniform,
+    peak,
+    propagate,
+    report,
+)
+from fe_likelihoods.reporting.advice import advise
+from fe_likelihoods.reporting.contents import evidence, residual_sentences
+from fe_likelihoods.reporting.failures import Failures
+from fe_likelihoods.reporting.fits import fit_data_sets
+from fe_likelihoods.reporting.report import _like
+from fe_likelihoods.reporting.run import read_run
+from fe_likelihoods.reporting.table import parameter_rows
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_ladder
+from tests.contract.targets import Gaussian
+from tests.reporting.report_page import Page, read_page
+
+TIME = 0.02 * np.arange(150)
+ODD = 'k<1> & "k2"'  # a name that must be escaped
+PRIOR = MappingProxyType(
+    {ODD: TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.4), "sigma_top": HalfNormal(0.01)}
+)
+TRUTH = MappingProxyType({ODD: 1.1, "damping": 0.8, "sigma_top": 0.002})
+
+
+def free_vibration(theta):
+    omega = 2.0 * np.pi * 2.0 * np.sqrt(theta[0])
+    if theta[1] > 1.9:
+        raise SimulationFailed("too much <damping>")
+    return [0.05 * np.exp(-0.02 * theta[1] * omega * TIME) * np.cos(omega * TIME)]
+
+
+def vibration(description="SYNTHETIC <script>alert(1)</script>", noise=None, prior=PRIOR):
+    """Posterior of a free vibration with two structural parameters and one noise level."""
+    model = FunctionModel(free_vibration, [ODD, "damping"], [Channel("top", "displacement", "mm")], 0.02, len(TIME))
+    noise = 0.002 * np.random.default_rng(1).standard_normal((1, len(TIME))) if noise is None else noise
+    measured = Measurements(model.channels, model.dt, model.simulate([1.1, 0.8]) + noise, description)
+    return Posterior(FELikelihood(model, measured), dict(prior))
+
+
+def run(posterior, sampler=SMCSampler, walkers=60, steps=4, **options):
+    made = sampler(walkers, posterior.ndim, posterior, vectorize=True, seed=1, **options)
+    made.run_mcmc(None, steps)
+    return made
+
+
+def page_of(path) -> Page:
+    return read_page(path)
+
+
+@pytest.fixture(scope="module")
+def vibrating():
+    posterior = vibration()
+    return run(posterior), posterior
+
+
+@pytest.fixture(scope="module")
+def page(vibrating, tmp_path_factory):
+    sampler, posterior = vibrating
+    path = tmp_path_factory.mktemp("report") / "folder" / "vibration.html"
+    prediction = propagate(posterior, sampler.get_chain(flat=True)[-10:], noise=True, progress=False)
+    peaks = propagate(posterior, sampler.get_chain(flat=True)[-10:], quantity=peak("top"), progress=False)
+    named = {"Free vibration": prediction, "Peaks": peaks}
+    measured = {"Free vibration": posterior.likelihood.measurements}
+    assert report(sampler, posterior, named, path, truth=TRUTH, measured=measured) == path
+    return page_of(path)
+
+
+def test_the_page_needs_nothing_from_elsewhere(page):
+    assert not page.tags & {"script", "iframe", "object", "embed"}
+    assert all(address.startswith("data:") for address in page.addresses)
+    assert "url(" not in page.style and "@import" not in page.style
+    assert "@media print" in page.style
+    for png, alt in page.images:
+        assert png.startswith(b"\x89PNG") and alt
+    assert len(page.images) >= 5
+
+
+def test_texts_of_users_are_escaped_and_shown(page):
+    assert ODD in page.text and "too much <damping>" in page.text and "<script>alert(1)</script>" in page.text
+
+
+def test_the_table_has_every_parameter_in_the_units_of_a_reader(page, vibrating):
+    sampler, posterior = vibrating
+    samples, error = sampler.get_chain(flat=True), sampler.mean_error()
+    rows = {row[0]: row for row in page.tables[0][1:]}
+    assert list(rows) == [ODD, "damping", "sigma_top [mm]"]
+    name, prior, mean, mean_error, sd, cv, interval, nominal, truth = rows["sigma_top [mm]"]
+    assert prior == "half-normal, scale 10" and truth == "2" and nominal == "–"
+    assert float(mean) == pytest.approx(1e3 * samples[:, 2].mean(), rel=1e-3)
+    assert float(mean_error) == pytest.approx(1e3 * error[2], rel=0.1)
+    assert float(sd) == pytest.approx(1e3 * samples[:, 2].std(), rel=1e-2)
+    assert float(cv.removesuffix(" %")) == pytest.approx(100 * samples[:, 2].std() / samples[:, 2].mean(), rel=1e-2)
+    assert float(interval.split(" to ")[1]) == pytest.approx(1e3 * np.quantile(samples[:, 2], 0.95), rel=1e-3)
+    assert rows["damping"][1] == "normal, mean 1, sd 0.4, above 0"
+
+
+def test_digits_follow_the_standard_deviation():
+    template = [_like(value, sd) for value, sd in ((1.09976, 0.000545), (1.1, 0.3), (-1234.5, 20.0), (2.0, 0.0))]
+    assert template == ["1.09976", "1.100", "−1234", "2"] and _like(np.nan, 1.0) == "–"
+
+
+def test_a_run_that_the_limit_ended_shows_the_exponent_that_it_reached():
+    posterior = vibration()
+    with pytest.warns(SamplingWarning, match="ended the run"):
+        sampler = run(posterior, max_simulations=200)
+    assert sampler.ended_at is not None and sampler.ended_at < 1.0 == sampler.ladder[-1].beta
+    last = ladder_table(sampler).splitlines()[len(sampler.ladder)]
+    assert f"{sampler.ended_at:.3e}*" in last and "1.000e+00" not in last
+    text = " ".join(evidence(read_run(sampler, posterior)))
+    assert "check_draws" not in text and "limit of simulations ended the run at beta" in text
+    figure = plot_ladder(sampler)
+    assert "ended by the limit" in figure.axes[0].get_title()
+    plt.close(figure)
+    assert run(vibration(), walkers=20, steps=1).ended_at is None
+
+
+def test_what_a_reader_has_to_know_is_said(page, vibrating):
+    sampler, posterior = vibrating
+    assert "Synthetic data" in page.notes
+    assert f"{posterior.report()['failure_count']} of" in page.notes["Simulations failed"]
+    assert f"{sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2f}" in page.text
+    assert "top: White: no correlation" in page.text and "Verdict of the sampler: " in page.text
+    assert sampler.verdict.status in page.text
+    for digest in (posterior.fingerprint, posterior.data_fingerprint, posterior.likelihood.model.fingerprint):
+        assert digest in page.text
+    assert "SMCSampler( 60, posterior.ndim, posterior, vectorize=True, seed=1, recycle=False, )" in page.text
+    assert ["simulations for this report", "2"] in [row for table in page.tables for row in table]
+    assert "Free vibration" in page.text and "Peaks" in page.text and "95 % quantile" in page.text
+    assert "CRPS" in page.text and "of 3 true values are within their 90 % intervals" in page.text
+
+
+def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(vibrating):
+    sampler, _ = vibrating
+    posterior = vibration()  # nothing is cached
+    fits = fit_data_sets(read_run(sampler, posterior))
+    assert (fits.simulations, posterior.report()["simulations"]) == (2, 2)
+    centre = sampler.get_chain(flat=True).mean(axis=0)
+    median = posterior.prior_transform(np.full(3, 0.5))  # a function has no nominal values
+    measured = posterior.likelihood.measurements.values
+    for point, error in ((median, fits.fits[0].channels[0].before), (centre, fits.fits[0].channels[0].after)):
+        residuals = posterior.likelihood.residuals(point)
+        assert error == pytest.approx(np.sqrt(np.square(residuals).sum() / np.square(measured).sum()), rel=1e-12)
+    np.testing.assert_array_equal(fits.fits[0].residuals, posterior.likelihood.residuals(centre))
+    assert fit_data_sets(read_run(sampler, posterior)).simulations == 0
+
+
+def test_correlated_errors_and_edges_are_named():
+    slow = np.convolve(np.random.default_rng(2).standard_normal(len(TIME) + 30), np.ones(20) / 20, "same")
+    prior = PRIOR | {ODD: Uniform(0.5, 1.08), "sigma_top": HalfNormal(0.02)}
+    posterior = vibration("measured", 0.02 * slow[None, : len(TIME)], prior)
+    finished = read_run(run(posterior), posterior)
+    fits, rows = fit_data_sets(finished), parameter_rows(finished)
+    notes = {note.title: note for note in advise(finished, rows, fits, Failures((), 0, 100))}
+    assert "top" in notes["The errors are not white noise"].text
+    assert f"{ODD} at 1.08" in notes["At the edge of the prior"].text
+    assert "Synthetic data" not in notes and "Simulations failed" not in notes
+    assert "are worth" in residual_sentences(fits)[0]
+    notes = {note.title: note for note in advise(finished, rows, fits, Failures((), 30, 100))}
+    assert "30 of 100 simulations failed (30 %)" in notes["Simulations failed"].text
+    assert notes["Simulations failed"].level == "caution"
+
+
+def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_named(vibrating):
+    sampler, posterior = vibrating
+    finished = read_run(sampler, posterior)
+    rows = parameter_rows(finished)
+    fits = fit_data_sets(finished)
+    assert "True values are missed" not in {n.title for n in advise(finished, rows, fits, Failures((), 0, 1))}
+    missed = [row._replace(truth=row.high + row.sd) for row in rows]
+    notes = {note.title: note for note in advise(finished, missed, fits, Failures((), 0, 1))}
+    assert "sigma_top [mm]" in notes["True values are missed"].text
+    moved = [row._replace(prior_mean=row.mean - 4.0 * row.sd, prior_sd=1.01 * row.sd) for row in rows]
+    notes = {note.title: note for note in advise(finished, moved, fits, Failures((), 0, 100))}
+    for title in ("Not informed by the data", "Far from the prior"):
+        assert "sigma_top [mm]" in notes[title].text and title not in {
+            n.title for n in advise(finished, rows, fits, Failures((), 0, 1))
+        }
+
+
+def test_samplers_without_a_ladder_and_functions_without_data_are_reported(tmp_path):
+    target = Gaussian(ndim=2)
+    sampler = emcee.EnsembleSampler(20, 2, target, vectorize=True)
+    sampler.run_mcmc(0.7 + 0.1 * np.random.default_rng(3).standard_normal((20, 2)), 60)
+    page = page_of(report(sampler, out=tmp_path / "a.html", discard=10))
+    assert [row[0] for row in page.tables[0][1:]] == ["x0", "x1"]
+    assert "gives no evidence" in page.text and "function of the user's own" in page.text
+    assert "The chain is short" in page.notes and "No burn-in was left out" not in page.notes
+    unnamed = page_of(report(sampler, lambda x: 0.0, out=tmp_path / "b.html", names=["a", "b"]))
+    assert [row[0] for row in unnamed.tables[0][1:]] == ["a", "b"] and "No burn-in was left out" in unnamed.notes
+    tempered = run(Gaussian(ndim=2), TMCMCSampler)
+    other = page_of(report(tempered, out=tmp_path / "c.html"))
+    assert f"{tempered.log_evidence:.2f} ±" in other.text and other.notes.keys().isdisjoint({"No verdict"})
+
+
+def test_every_data_set_and_every_event_has_its_block():
+    motion = np.sin(np.arange(200) * 0.31) * np.hanning(200)
+    first, second = Record("EQ1", 0.02, motion), Record("EQ2", 0.02, 2.0 * motion)
+    events = LinearOscillator(Events([first, second], rest=1.0), period=0.7)
+    short = LinearOscillator(first, period=0.4)
+    likelihoods = {}
+    for key, model in (("a & b", events), ("short", short)):
+        noise = 0.02 * np.random.default_rng(4).standard_normal((2, model.n_steps))
+        clean = model.simulate([1.1, 0.9])
+        likelihoods[key] = FELikelihood(model, Measurements(model.channels, model.dt, clean + noise * [[1.0], [0.01]]))
+    joint = JointLikelihood(likelihoods)
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
+    prior |= {"sigma_acceleration": HalfNormal(0.1), "sigma_displacement": HalfNormal(0.01)}
+    posterior = Posterior(joint, prior)
+    fits = fit_data_sets(read_run(run(posterior), posterior))
+    assert [fit.title for fit in fits.fits] == ["a & b, EQ1", "a & b, EQ2", "short"]
+    assert fits.simulations == 4 and not fits.failures
+    for fit, n in zip(fits.fits, (200, 200, 200), strict=True):
+        assert [each.samples for each in fit.channels] == [n, n]
+        assert all(each.after < each.before for each in fit.channels)
+    assert [fit.measurements.start for fit in fits.fits] == pytest.approx([0.0, 5.0, 0.0])
+    assert residual_sentences(fits)[2].startswith("acceleration (a & b, EQ2): ")
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_written(vibrating, tmp_path):
+    sampler, posterior = vibrating
+    out = tmp_path / "none.html"
+    with pytest.raises(ValueError, match="needs a sampler that has run"):
+        report(posterior, sampler, out=out)
+    with pytest.raises(ValueError, match="call run_mcmc|Call run_mcmc"):
+        report(SMCSampler(20, 3, posterior), posterior, out=out)
+    with pytest.raises(ValueError, match="unknown parameters mass"):
+        report(sampler, posterior, out=out, truth={"mass": 1.0})
+    with pytest.raises(ValueError, match="the chain has 3 parameters"):
+        report(sampler, Gaussian(ndim=2), out=out)
+    with pytest.raises(ValueError, match="result of propagate"):
+        report(sampler, posterior, "bands", out)
+    assert not out.exists()
+
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+MEASURE = """<!DOCTYPE html><iframe id="page" src="{page}" width="{width}" height="4000" onload="
+const d = this.contentDocument, images = [...d.images];
+document.title = JSON.stringify({{width: d.documentElement.scrollWidth, images: images.length,
+broken: images.filter(i => !i.naturalWidth).length,
+font: parseFloat(getComputedStyle(d.body).fontSize)}});"></iframe>"""
+
+
+def browse(address, folder, *options) -> subprocess.CompletedProcess:
+    """Open a page without a window; the console of the page is in stderr."""
+    common = ["--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
+    common += [f"--user-data-dir={folder / 'browser'}", "--enable-logging=stderr", "--virtual-time-budget=10000"]
+    return subprocess.run([BROWSER, *common, *options, address], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="NO BROWSER: install chromium to look at the report as a reader does")
+def test_a_browser_shows_the_report_on_a_telephone_a_desk_and_paper(page, tmp_path):
+    path = page.path
+    for width in (400, 1200):
+        wrapper = tmp_path / f"{width}.html"
+        wrapper.write_text(MEASURE.format(page=path.as_uri(), width=width))
+        seen = browse(wrapper.as_uri(), tmp_path, "--dump-dom")
+        found = json.loads(html.unescape(re.search("<title>(.*?)</title>", seen.stdout)[1]))
+        assert found["width"] <= width and found["broken"] == 0 and found["images"] == len(page.images)
+        assert found["font"] >= 14.0
+        assert "CONSOLE" not in seen.stderr
+        shot = tmp_path / f"{width}.png"
+        seen = browse(path.as_uri(), tmp_path, f"--window-size={width},1500", f"--screenshot={shot}")
+        assert "CONSOLE" not in seen.stderr
+        pixels = np.asarray(Image.open(shot).convert("L"))
+        assert pixels[0, 0] == 255 and 0.01 < np.mean(pixels < 128) < 0.5  # dark text on a light background
+    paper = tmp_path / "page.pdf"
+    browse(path.as_uri(), tmp_path, "--no-pdf-header-footer", f"--print-to-pdf={paper}")
+    assert paper.read_bytes().startswith(b"%PDF") and len(re.findall(rb"/Type\s*/Page\b", paper.read_bytes())) >= 2
+
+
+@pytest.mark.skipif(BROWSER is None, reason="NO BROWSER: install chromium to look at the report as a reader does")
+def test_control_the_browser_tells_of_errors(tmp_path):
+    bad = tmp_path / "bad.html"
+    bad.write_text("<!DOCTYPE html><script>undefined_function()</script>")
+    assert "CONSOLE" in browse(bad.as_uri(), tmp_path, "--dump-dom").stderr
