@@ -20,6 +20,7 @@ import numpy as np
 
 from .density import EmulatedPosterior, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
+from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes
 from .student import StudentMixture, draw_mixture, mixture_log_density
 from .target import ResponseTarget
@@ -75,6 +76,9 @@ class ResponseGuide:
     concerns : tuple of str
         Why parts of the posterior may be missing.
     """
+
+    # whatever the durations are, the response at a point is that at this point
+    learns_from_parts = True
 
     def __init__(self, posterior: Any, starts: int = 8) -> None:
         starts = check_starts(starts)
@@ -135,8 +139,11 @@ class ResponseGuide:
 
     def prepare(self, session: Any) -> Iterator[None]:
         """Search for modes; each item is a batch of simulations."""
+        if session.asynchronous:
+            self._check_memory()
         starts = draw_starts(self._target, self._starts, session.random)
-        self.search = yield from self._counted(search_modes(self._target, starts, session.remember, session.fits))
+        search = search_modes(self._target, starts, session.remember, session.fits, session.asynchronous)
+        self.search = yield from self._counted(search)
         self._add_modes(self.search.modes)
         residuals = self._target.archive.residuals
         if len(residuals) > 1 and all(np.array_equal(residuals[0], other) for other in residuals):
@@ -156,6 +163,10 @@ class ResponseGuide:
                 f"only one of {self._starts} starts led to one of the modes, so there may be modes to which none led: "
                 "use more starts"
             )
+
+    def evaluation_queue(self) -> Any:
+        """The queue of the posterior, which keeps the responses for `observe`."""
+        return self._posterior.evaluation_queue(responses=True)
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Independent draws (n, ndim) of the parameters, inside the support of the prior."""
@@ -182,7 +193,7 @@ class ResponseGuide:
         return result
 
     def observe(self, parameters: np.ndarray, session: Any) -> None:
-        """Simulate the responses of points (n, ndim) that are about to be evaluated, and keep them."""
+        """Simulate the responses of points (n, ndim) that are evaluated next, or take cached ones, and keep them."""
         structural = parameters[:, : self._target.n_structural]
         coords = self._target.coordinates(parameters)[:, : self._target.n_structural]
         self._target.run_parameters(structural, coords, session.remember)
@@ -202,6 +213,17 @@ class ResponseGuide:
             self._wide = self._wide_mixture()
 
     # ------------------------------------------------------------------ parts
+
+    def _check_memory(self) -> None:
+        """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
+        target, memory = self._target, self._posterior.likelihood.response_memory
+        most = self._starts * max(target.n_structural, POINTS_PER_STEP)
+        needed = 8 * most * len(target.model.channels) * target.model.n_steps
+        if memory.max_bytes < needed:
+            raise ValueError(
+                f"an asynchronous run with a guide needs a likelihood with memory_bytes of {needed} or more, which "
+                f"holds the responses that arrive together, so that none is simulated twice; got {memory.max_bytes}"
+            )
 
     def _counted(self, search: Generator[float, None, Any]) -> Generator[None, None, Any]:
         """Result of a search; the simulations of each of its batches are counted as soon as they are made."""

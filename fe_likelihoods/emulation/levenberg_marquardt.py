@@ -25,9 +25,10 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
-__all__ = ["TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends"]
+__all__ = ["POINTS_PER_STEP", "TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends"]
 
 _DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+POINTS_PER_STEP = len(_DAMPINGS)
 _FIRST_DAMPING = 1e-2
 _LARGEST_DAMPING = 1e8
 _LARGEST_STEP = 2.0  # prior standard deviations
@@ -300,43 +301,80 @@ def _difference(
 
 
 class Batches:
-    """Runs generators of points side by side: their requests are simulated as one batch."""
+    """Runs generators of points side by side.
 
-    def __init__(self, target: ResponseTarget, remember: Remember, fits: Callable[[float], bool]) -> None:
+    Parameters
+    ----------
+    target : ResponseTarget
+        Simulates points.
+    remember, fits : callable
+        As for `fe_likelihoods.emulation.modes.search_modes`.
+    overlap : bool
+        Whether each generator goes on as soon as its own points have been simulated. By default the requests of all are
+        simulated as one batch. The order in which requests end is stored with `remember`.
+    """
+
+    def __init__(
+        self, target: ResponseTarget, remember: Remember, fits: Callable[[float], bool], overlap: bool = False
+    ) -> None:
         self._target, self._remember, self._fits = target, remember, fits
+        self._running = target.running_requests() if overlap else None
 
     def complete(
         self, ascents: Sequence[Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
     ) -> Iterator[int]:
         """Advance all generators to their ends; yields the number of points of each batch.
 
-        Stops early, with `interrupted` set, when a batch does not fit in what remains of the budget.
+        Stops early, with `interrupted` set, when a batch does not fit in what remains of the budget; what runs by then
+        is kept by the target.
         """
         self.interrupted = False
         waiting: dict[int, np.ndarray] = {}
+        begun: set[int] = set()
 
         def advance(index: int, runs: Runs | None) -> None:
             try:
                 waiting[index] = ascents[index].send(runs)
             except StopIteration as end:
-                waiting.pop(index, None)
                 finished(index, end.value)
 
         for index in range(len(ascents)):
             advance(index, None)
-        while waiting:
-            requests = list(waiting.items())
-            points = np.concatenate([request for _, request in requests])
-            if not self._fits(len(points)):
-                self.interrupted = True
-                return
-            runs = self._target.run(points, self._remember)
-            yield len(points)
-            place = 0
-            for index, request in requests:
-                rows = slice(place, place + len(request))
-                place += len(request)
-                advance(index, Runs(*(column[rows] for column in runs)))
+        try:
+            while waiting:
+                if not self.interrupted and not self._fits(sum(len(points) for points in waiting.values())):
+                    self.interrupted = True
+                    for index in waiting.keys() - begun:
+                        del waiting[index]
+                    continue
+                begun.update(waiting)
+                ended = self._wait(waiting)
+                runs = self._target.run(np.concatenate([waiting[index] for index in ended]), self._remember)
+                yield len(runs.failed)
+                place = 0
+                for index in ended:
+                    rows = slice(place, place + len(waiting.pop(index)))
+                    place = rows.stop
+                    begun.discard(index)
+                    if not self.interrupted:
+                        advance(index, Runs(*(column[rows] for column in runs)))
+        finally:
+            if self._running is not None:
+                self._running.close()
+
+    def _wait(self, waiting: dict[int, np.ndarray]) -> list[int]:
+        """Numbers of the generators whose points are simulated: in lock-step all of them."""
+        running = self._running
+        if running is None:
+            return list(waiting)
+
+        def wait() -> list[np.ndarray]:
+            for index, coords in waiting.items():
+                if index not in running:
+                    running.begin(index, self._target.structural_parameters(coords))
+            return [np.array(running.wait())]
+
+        return self._remember("ascents", wait)[0].tolist()
 
 
 def distinct_ends(ends: Sequence[Ascent], apart: float = np.inf) -> list[Ascent]:

@@ -139,6 +139,7 @@ def search_modes(
     starts: np.ndarray,
     remember: Remember = run_at_once,
     fits: Callable[[float], bool] = lambda _: True,
+    overlap: bool = False,
 ) -> Generator[float, None, ModeSearch]:
     """Search from given starts, on growing parts of the record where the model offers them.
 
@@ -152,6 +153,8 @@ def search_modes(
         Stores responses for a resumed run.
     fits : callable, optional
         ``fits(n)``: whether n more simulations of the whole record fit into the budget.
+    overlap : bool
+        Whether each ascent goes on as soon as its own simulations have ended (`Batches`), and all begin together.
 
     Yields
     ------
@@ -169,9 +172,10 @@ def search_modes(
         # the more starts, the closer they are, and none may be lost before the part that its difference acts in
         apart = np.inf if whole else min(_APART, _APART_OF_ALL / len(starts))
         origin = np.zeros(target.n_structural)
-        batches = Batches(part, remember, lambda points, share=share: fits(share * points))
-        # two waves: the ascents of the second one stop as soon as they head for an end of the first
-        first = _FIRST_WAVE if part is parts[0] else 1
+        batches = Batches(part, remember, lambda points, share=share: fits(share * points), overlap)
+        # two waves: the ascents of the second one stop as soon as they head for an end of the first. That saves a few
+        # simulations and doubles the time, so that it is left out where the time matters
+        first = len(fronts) if overlap else _FIRST_WAVE if part is parts[0] else 1
         for wave in (fronts[:first], fronts[first:]):
             ascents = [
                 ascend(part, start, origin if whole else centre, ends, tolerance, apart) for start, centre, _ in wave

@@ -53,6 +53,7 @@ class _Likelihood(Protocol):
     simulations: int
 
     def simulate(self, thetas: np.ndarray) -> Any: ...
+    def running_requests(self) -> Any: ...
     def statistics(self, thetas: np.ndarray) -> np.ndarray: ...
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None: ...
 
@@ -321,6 +322,10 @@ class ResponseTarget:
         failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
         self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
         return Runs(residuals.astype(float), statistics, failed)
+
+    def running_requests(self) -> Any:
+        """Requests for simulations that go on while others are waited for; `run` finds their responses in the cache."""
+        return self._likelihood.running_requests()
 
     def _residuals(self, responses: np.ndarray) -> np.ndarray:
         """Measured minus simulated responses (n, n_channels, n_samples); zero where a sample is missing."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .inputs import SampleNoise
+from ..probability.noise_draws import SampleNoise
 from .streaming import RetainedResults, RunningMoments
 
 __all__ = ["Accumulator"]
@@ -43,7 +43,7 @@ class Accumulator:
     moments : RunningMoments
         Mean and variance of the results, for histories without noise.
     noise_variance : RunningMoments
-        Mean variance of the noise, for histories.
+        Mean variance of the noise, for histories; per step if the noise depends on the response.
     retained : RetainedResults or None
         Results for quantiles, None if there are none.
     failed : list of ndarray
@@ -108,32 +108,44 @@ class Accumulator:
             return
         if self.rows is not None:
             every = len(usable) == len(responses) and self.rows == list(range(responses.shape[1]))
-            self._add_histories(start, responses if every else responses[np.ix_(usable, self.rows)], usable, members)
+            histories = responses if every else responses[np.ix_(usable, self.rows)]
+            self._add_histories(start, histories, usable, members, responses)
         elif self.noise is None:
             values = [self._value(responses[j]) for j in usable]
             self._add_values(values, [start + j for j in usable], [members[j] for j in usable])
         else:
             for j in usable:
-                values = [self._value(responses[j] + self._noise(i, responses.shape[2])) for i in members[j]]
+                values = [self._value(responses[j] + self._noise(i, responses[j])) for i in members[j]]
                 self._add_values(values, list(members[j]), [np.array([i]) for i in members[j]])
 
     def _add_histories(
-        self, start: int, histories: np.ndarray, usable: list[int], members: Sequence[np.ndarray]
+        self,
+        start: int,
+        histories: np.ndarray,
+        usable: list[int],
+        members: Sequence[np.ndarray],
+        responses: np.ndarray,
     ) -> None:
         self.moments.add(histories, np.array([len(members[j]) for j in usable]))
         if self.noise is None:
             if self.retained is not None:
                 self.retained.add(start + np.array(usable), histories)
             return
-        samples = np.concatenate([members[j] for j in usable])
-        self.noise_variance.add(np.square(self.noise.deviations[samples][..., self.rows]), np.ones(len(samples)))
+        if self.noise.of_response is not None:
+            for j in usable:
+                for i in members[j]:
+                    variance = np.square(self.noise.of_response(self.noise.deviations[i], responses[j])[self.rows])
+                    self.noise_variance.add(variance[None], np.ones(1))
+        else:
+            samples = np.concatenate([members[j] for j in usable])
+            self.noise_variance.add(np.square(self.noise.deviations[samples][..., self.rows]), np.ones(len(samples)))
         if self.retained is None:
             return
         for history, j in zip(histories, usable, strict=True):
             for i in members[j]:
                 if i in self.retained:
                     # Noise is drawn for all channels, so that it does not depend on which channels are wanted.
-                    noise = self._noise(i, history.shape[1])
+                    noise = self._noise(i, responses[j])
                     self.retained.add(np.array([i]), (history + noise[self.rows])[None])
 
     def _add_values(self, values: list[np.ndarray], results: list[int], members: list[np.ndarray]) -> None:
@@ -156,10 +168,10 @@ class Accumulator:
             raise ValueError(f"quantity must return one shape for every response; got {self.shape}, then {value.shape}")
         return value
 
-    def _noise(self, sample: int, n_steps: int) -> np.ndarray:
+    def _noise(self, sample: int, response: np.ndarray) -> np.ndarray:
         # Each sample has its own random stream, so that its noise depends neither on batches nor on failures.
         rng = np.random.default_rng(np.random.SeedSequence(self.seeds.entropy, spawn_key=(1, int(sample))))
-        return self.noise.draw(int(sample), n_steps, rng)
+        return self.noise.draw(int(sample), response.shape[1], rng, response)
 
     def _leave_out(self, samples: np.ndarray, reason: str) -> None:
         self.failed.append(samples)

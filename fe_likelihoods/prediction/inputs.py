@@ -15,13 +15,13 @@ from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
 from ..probability.marginal_noise import sampled_noise
+from ..probability.noise_draws import SampleNoise, sample_noise
 from ..simulation.executors import as_executor
 from ..simulation.memory_cache import distinct_keys
 from ..simulation.model import Model
 
 __all__ = [
     "PredictionSource",
-    "SampleNoise",
     "distinct_rows",
     "part_of",
     "read_source",
@@ -50,45 +50,6 @@ class PredictionSource(NamedTuple):
     noise: Any
     likelihood: FELikelihood | None
     executor: Any
-
-
-class SampleNoise(NamedTuple):
-    """Noise of every sample.
-
-    Attributes
-    ----------
-    deviations : ndarray, shape (n, n_channels), or (n, n_events, n_channels)
-        Standard deviations [SI].
-    lag_one : ndarray, shape (n, n_channels), or None
-        Correlation of successive errors [-], None for white noise.
-    events : tuple of slice
-        Steps of each event, for standard deviations per event. Other steps have no noise.
-    """
-
-    deviations: np.ndarray
-    lag_one: np.ndarray | None
-    events: tuple[slice, ...] = ()
-
-    def over_time(self, levels: np.ndarray, n_steps: int) -> np.ndarray:
-        """Values at all steps, shape (n_channels, n_steps) or (n_channels, 1), from those of one sample."""
-        if not self.events:
-            return levels[:, None]
-        values = np.zeros((levels.shape[1], n_steps))
-        for level, steps in zip(levels, self.events, strict=True):
-            values[:, steps] = level[:, None]
-        return values
-
-    def draw(self, sample: int, n_steps: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw the errors of one sample, shape (n_channels, n_steps) [SI]."""
-        errors = rng.standard_normal((self.deviations.shape[-1], n_steps))
-        if self.lag_one is not None:
-            from scipy.signal import lfilter  # imported here because it is slow to import and rarely needed
-
-            for row, rho in zip(errors, self.lag_one[sample], strict=True):
-                # e_t = rho e_{t-1} + sqrt(1 - rho^2) z_t is stationary: e_0 has the same variance as the others.
-                row[1:] *= np.sqrt((1.0 - rho) * (1.0 + rho))
-                row[:] = lfilter([1.0], [1.0, -rho], row)
-        return self.over_time(self.deviations[sample], n_steps) * errors
 
 
 def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
@@ -225,7 +186,7 @@ def split_samples(
         raise ValueError(
             f"noise={noise!r} names an event, and {type(noise_model).__name__} has no levels per event; give noise=True"
         )
-    return thetas, _sample_noise(noise_model, parameters, len(model.channels))
+    return thetas, sample_noise(noise_model, parameters, len(model.channels), model.dt)
 
 
 def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -268,26 +229,3 @@ def _noise_of_events(
             f"another event of {names}, or noise=False"
         )
     return SampleNoise(chosen, None)
-
-
-def _sample_noise(noise_model: Any, parameters: np.ndarray, n_channels: int) -> SampleNoise:
-    if not hasattr(noise_model, "standard_deviations"):
-        raise ValueError(
-            f"{type(noise_model).__name__} cannot be drawn from: give it a method standard_deviations(parameters (n, "
-            "n_parameters)) that returns (n, n_channels) in SI units"
-        )
-    deviations = np.asarray(noise_model.standard_deviations(parameters), dtype=float)
-    if deviations.shape != (len(parameters), n_channels) or not np.all((deviations > 0) & (deviations < np.inf)):
-        raise ValueError(
-            f"the noise needs a positive standard deviation for each of {len(parameters)} samples and {n_channels} "
-            f"channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
-        )
-    if not hasattr(noise_model, "lag_one_correlations"):
-        return SampleNoise(deviations, None)
-    lag_one = np.asarray(noise_model.lag_one_correlations(parameters), dtype=float)
-    if lag_one.shape != deviations.shape or not np.all(np.abs(lag_one) < 1.0):
-        raise ValueError(
-            f"the noise needs a correlation between -1 and 1 for each of {len(parameters)} samples and {n_channels} "
-            f"channels; got shape {lag_one.shape}, largest {np.abs(lag_one).max(initial=0.0)}"
-        )
-    return SampleNoise(deviations, lag_one)

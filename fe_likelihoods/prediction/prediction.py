@@ -1,13 +1,19 @@
 """The result of uncertainty propagation: mean, variance and quantiles of a quantity."""
 
+import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_shifted, compare_with
 from ..signals.error_measures import rrmse
+from ..units import find_unit
+from .quantities import measured_quantity
+from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -15,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["Prediction"]
+
+_MOST_ROWS = 50  # of a table in a notebook
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +202,69 @@ class Prediction:
             raise ValueError(f"channels {', '.join(empty)} have no sample in this part; choose another one")
         return ((below <= measured) & (measured <= above)).sum(axis=1) / samples
 
+    def score(
+        self,
+        measured: Measurements | ArrayLike,
+        level: float = 0.9,
+        part: slice = slice(None),
+        time_shifts: "Mapping[str, float] | None" = None,
+    ) -> HistoryScores | QuantityScores:
+        """Compute proper scores, coverage and sharpness; ``print(prediction.score(measurements))`` is a table.
+
+        Parameters
+        ----------
+        measured : Measurements or array_like
+            Measurements of all channels, as for `rrmse`. For quantities that are no histories also the measured values
+            themselves [SI], in the shape of the quantity. Of `Measurements`, the same function of the same channels is
+            taken, such as the peak.
+        level : float
+            Probability of the scored intervals, between 0 and 1. For histories, the prediction must have the quantiles
+            with the probabilities (1 - level) / 2 and (1 + level) / 2; the default has those of 0.9.
+        part : slice
+            The samples of the histories to score. Default: all.
+        time_shifts : mapping of str to float, optional
+            As for `rrmse`.
+
+        Returns
+        -------
+        HistoryScores or QuantityScores
+            Scores per channel for histories, per quantity for other quantities.
+
+        Raises
+        ------
+        ValueError
+            As `rrmse`. For histories from one sample. For other quantities: if the values of the samples are not kept
+            or are fewer than three, the measured values have another shape, samples of the channel are missing, or
+            measurements are given for a function of the whole response.
+
+        Warns
+        -----
+        UserWarning
+            If less than one sample is expected on each side of the intervals, which then have another level: with
+            fewer than 20 samples for 0.9. If the predicted standard deviation of measured samples of histories is zero;
+            they are left out of the log score and of the PIT.
+
+        Notes
+        -----
+        Measurements contain the error of the model and of the sensors: score a prediction with ``noise=True``, unless
+        the quantity is known to be free of them. Of histories, CRPS, log score and PIT are those of the normal
+        distributions with the predicted means and standard deviations, because the samples of histories are not kept.
+        """
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"score: level must be a probability between 0 and 1; got {level!r}")
+        if self.dt is None:
+            return self._score_values(measured, level)
+        if not isinstance(measured, Measurements):
+            raise ValueError(f"score: a prediction of histories needs Measurements; got {type(measured).__name__}")
+        compared = self._compared(measured, time_shifts)
+        values = _values_of(compared)
+        histories = [self.mean, self.sd, self._near_quantile(0.5 - 0.5 * level), self._near_quantile(0.5 + 0.5 * level)]
+        mean, sd, lower, upper, around = (_at_samples(compared, each) for each in [*histories, envelope(self.mean)])
+        scored = (each[:, part] for each in (values, mean, sd, lower, upper, around))
+        values, mean, sd, lower, upper, around = scored
+        _check_number(self.n_quantile, 2, level)
+        return score_histories(self.channels, values, (mean, sd), (lower, upper), around, level)
+
     def plot(
         self,
         measurements: Measurements | None = None,
@@ -222,6 +293,62 @@ class Prediction:
         drawn = [channel.name for channel in self.channels] if channels is None else channels
         shifts = self._shifts([name for name in measured if name in drawn], time_shifts)
         return plot_bands(self, measurements, channels, shifts)
+
+    def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
+        """Scores of numbers against the same numbers of measurements."""
+        if self.values is None:
+            raise ValueError(
+                "score: this prediction has kept no values of the samples; propagate with more memory_bytes"
+            )
+        _check_number(len(self.values), 3, level)
+        observed = measured_quantity(self.quantity, measured) if isinstance(measured, Measurements) else measured
+        observed = np.asarray(observed, dtype=float)
+        if observed.shape != self.mean.shape or not np.isfinite(observed).all():
+            raise ValueError(
+                f"score: expected finite measured values of the shape of the quantity, {self.mean.shape}; got "
+                f"{observed.shape}"
+            )
+        known = len(self.channels) == observed.size
+        names = [c.name for c in self.channels] if known else [str(k) for k in range(observed.size)]
+        units = [c.unit for c in self.channels] if known else ["SI"] * observed.size
+        values = self.values.reshape(len(self.values), -1)
+        return score_values(names, units, values, observed.ravel(), level, self.effective_sample_size)
+
+    def _near_quantile(self, probability: float) -> np.ndarray:
+        """The quantile of a probability that is known up to round-off."""
+        return self.quantile(next((p for p in self.probabilities if abs(p - probability) < 1e-9), probability))
+
+    def _repr_html_(self) -> str:
+        """In notebooks: the largest values of histories, or the moments of a few numbers, in the units of channels."""
+        from ..plots.html import html_object, html_table
+
+        noise = "with measurement noise" if self.noise else "without measurement noise"
+        lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
+        if self.n_failed:
+            lines.append(f"{self.n_failed} samples failed and are left out")
+        units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
+        if self.dt is not None:
+            header = ("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")
+            rows = []
+            for channel, (unit, factor), mean, sd in zip(self.channels, units, self.mean, self.sd, strict=True):
+                at = int(np.argmax(np.abs(mean)))
+                numbers = mean[at] / factor, at * self.dt, sd[at] / factor, sd.mean() / factor
+                rows.append((channel.name, unit, *map(float, numbers)))
+            return html_object("Prediction of histories", lines, html_table(header, rows))
+        if self.mean.size > _MOST_ROWS:
+            lines.append(f"{self.mean.size} values of shape {self.mean.shape}: mean, sd and quantiles are attributes")
+            return html_object("Prediction", lines)
+        of_channels = len(self.channels) == self.mean.size
+        names = [channel.name for channel in self.channels] if of_channels else [f"{i}" for i in range(self.mean.size)]
+        header = ("value", "unit", "mean", "MC error", "sd", *(f"{100 * p:g} %" for p in self.probabilities))
+        table = np.vstack([np.ravel(each) for each in (self.mean, self.standard_error, self.sd, *self.quantiles)])
+        rows = [
+            (name, unit, *(column / factor).tolist())
+            for name, (unit, factor), column in zip(
+                names, units if of_channels else [("SI", 1.0)] * self.mean.size, table.T, strict=True
+            )
+        ]
+        return html_object("Prediction", lines, html_table(header, rows))
 
     def _need_histories(self) -> None:
         if self.dt is None:
@@ -254,6 +381,19 @@ class Prediction:
         shifts = self._shifts([channel.name for channel in self.channels], time_shifts)
         compared = compare_with(chosen, self.dt, self.mean.shape[1])
         return compare_shifted(chosen, compared, self.dt, self.mean.shape[1], shifts) if shifts else compared
+
+
+def _check_number(n_samples: int, least: int, level: float) -> None:
+    """Raise ValueError for fewer samples than `least`; warn if the ends of an interval are beyond all samples."""
+    if n_samples < least:
+        raise ValueError(f"score: expected {least} samples or more, and 20 for intervals of 90 %; got {n_samples}")
+    needed = math.ceil(2.0 / (1.0 - level) - 1e-9)
+    if n_samples < needed:
+        warnings.warn(
+            f"score: the intervals are from {n_samples} samples and do not have their level of {level:g}: coverage and "
+            f"interval score need {needed} samples or more",
+            stacklevel=4,
+        )
 
 
 def _values_of(compared: np.ndarray | Comparison) -> np.ndarray:

@@ -20,6 +20,7 @@ Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00
 """
 
 import logging
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
@@ -39,6 +40,7 @@ from ..simulation.model import SimulationFailed
 from .accumulator import Accumulator
 from .excitation import chosen_state, excite, under_record
 from .inputs import (
+    PredictionSource,
     distinct_rows,
     part_of,
     read_source,
@@ -55,6 +57,7 @@ logger = logging.getLogger(__name__)
 
 _BATCH_VALUES = 2**22  # response values in one batch: 32 MiB
 _LARGEST_BATCH = 256
+_LARGEST_LEVEL_RATIO = 3.0  # of predicted and calibrated response, beyond which noise in SI units does not transfer
 _LARGEST_SERIAL_BATCH = 16  # small, so that the progress bar moves often when simulations run one by one
 
 
@@ -148,6 +151,12 @@ def propagate(
         Later: for a function that returns arrays of different shapes.
     SimulationFailed
         If every simulation fails.
+
+    Warns
+    -----
+    UserWarning
+        If histories under another record are predicted with noise in SI units, and their level is more than three times
+        that of the measurements of the calibration, or less than a third.
     """
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     source = read_source(posterior_or_model, pool)
@@ -195,6 +204,8 @@ def propagate(
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
     prediction = _prediction(accumulator, n, effective, evaluate.channels, model.dt, state, shifted)
+    if record is not None and noise and prediction.dt is not None:
+        _warn_of_level(prediction, source)
     return replace(prediction, quantity=quantity)
 
 
@@ -277,7 +288,9 @@ def _prediction(
     variance = accumulator.moments.variance
     error = np.sqrt(variance / effective)
     if histories and noise:
-        variance = variance + accumulator.noise.over_time(accumulator.noise_variance.mean, variance.shape[1])
+        added = accumulator.noise_variance.mean
+        per_step = accumulator.noise.of_response is not None
+        variance = variance + (added if per_step else accumulator.noise.over_time(added, variance.shape[1]))
     probabilities, n_quantile = accumulator.probabilities, 0 if retained is None else retained.n_samples
     if probabilities and n_quantile == 0:
         logger.warning("no quantiles: all samples retained for them failed; increase memory_bytes")
@@ -312,6 +325,25 @@ def _prediction(
         from_state=from_state,
         shifted=shifted,
     )
+
+
+def _warn_of_level(prediction: Prediction, source: PredictionSource) -> None:
+    """Warn if noise in SI units was calibrated with a much stronger or weaker response than the predicted one."""
+    if hasattr(source.noise, "response_deviations"):
+        return
+    far = []
+    for channel, mean in zip(prediction.channels, prediction.mean, strict=True):
+        measured = np.sqrt(np.nanmean(np.square(source.likelihood.measurements.channel(channel.name))))
+        ratio = np.sqrt(np.mean(np.square(mean))) / measured if measured > 0.0 else 1.0
+        if not 1.0 / _LARGEST_LEVEL_RATIO <= ratio <= _LARGEST_LEVEL_RATIO:
+            far.append(f"{channel.name} ({ratio:.2g} times)")
+    if far:
+        warnings.warn(
+            "the predicted response has another level (root mean square) than the measurements of the calibration: "
+            f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
+            "too narrow for a stronger motion; RelativeNoise scales with the response",
+            stacklevel=3,
+        )
 
 
 def _probabilities(quantiles: Sequence[float]) -> tuple[float, ...]:

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..signals.channels import Channel
+from ..signals.channels import Channel, Measurements
 
-__all__ = ["ChannelQuantity", "Evaluator", "Quantity", "evaluator", "peak"]
+__all__ = ["ChannelQuantity", "Evaluator", "Quantity", "evaluator", "final_value", "measured_quantity", "peak", "rms"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,81 @@ class Evaluator(NamedTuple):
 def peak(channel: str) -> ChannelQuantity:
     """Return the quantity "largest absolute value of the channel"."""
     return ChannelQuantity(channel, _largest)
+
+
+def rms(channel: str) -> ChannelQuantity:
+    """Return the quantity "root mean square of the channel", a measure of the energy of a motion."""
+    return ChannelQuantity(channel, _root_mean_square)
+
+
+def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
+    """Return the quantity "mean of the last samples of the channel", such as the residual drift after a motion.
+
+    Parameters
+    ----------
+    channel : str
+        Name of the channel.
+    samples : int
+        Number of last samples. Take those of a whole number of periods where the structure still vibrates.
+
+    Raises
+    ------
+    ValueError
+        If the number is not a positive whole number.
+    """
+    if not isinstance(samples, int | np.integer) or samples < 1:
+        raise ValueError(f"final_value: samples must be a whole number, 1 or more; got {samples!r}")
+    return ChannelQuantity(channel, _MeanOfLast(int(samples)))
+
+
+def measured_quantity(quantity: Any, measurements: Measurements) -> np.ndarray:
+    """Evaluate a quantity of channels for measurements.
+
+    Parameters
+    ----------
+    quantity : ChannelQuantity or sequence of ChannelQuantity
+        The quantity, as it was predicted.
+    measurements : Measurements
+        Measurements of these channels.
+
+    Returns
+    -------
+    ndarray, shape () or (n_quantities,)
+        The measured values [SI].
+
+    Raises
+    ------
+    ValueError
+        If the quantity is another one, the measurements lack a channel, or samples of it are missing.
+    """
+    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
+    if not isinstance(several, Sequence) or not all(isinstance(each, ChannelQuantity) for each in several):
+        raise ValueError(
+            "a function of the whole response is not known for measurements: give the measured values [SI] instead"
+        )
+    values = []
+    for each in several:
+        (history,) = measurements.select([each.channel]).values
+        if np.isnan(history).any():
+            raise ValueError(
+                f"samples of channel {each.channel!r} are missing, so that its measured quantity is not known: give "
+                "the measured values [SI], or measurements that are trimmed to a part without gaps"
+            )
+        values.append(float(each.function(history)))
+    return np.array(values[0] if isinstance(quantity, ChannelQuantity) else values)
+
+
+class _MeanOfLast(NamedTuple):
+    """Function of a history: the mean of its last samples."""
+
+    samples: int
+
+    def __call__(self, history: np.ndarray) -> float:
+        return float(np.mean(history[-self.samples :]))
+
+
+def _root_mean_square(history: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(history))))
 
 
 def _largest(history: np.ndarray) -> float:

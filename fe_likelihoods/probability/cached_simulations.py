@@ -35,6 +35,7 @@ from .failures import FailureLog
 from .inputs import as_rows, check_statistic, name_of_statistic
 from .new_simulations import NewSimulations
 from .requested_simulations import Requested
+from .running_requests import RunningRequests
 from .sample_counts import count_samples
 
 __all__ = ["CachedSimulations"]
@@ -89,10 +90,11 @@ class CachedSimulations(NewSimulations):
         self.simulations = self.cache_hits = self.disk_hits = 0
         self.seconds = 0.0
         self._outcomes = 0
+        self.shortened: list[CachedSimulations] = []  # likelihoods of the first parts of the measurements
 
     def __getstate__(self) -> dict:
         kept = {name: value for name, value in self.__dict__.items() if name not in ("_running", "when_simulated")}
-        return kept | {"pool": None}
+        return kept | {"pool": None, "shortened": []}
 
     @property
     def verifications(self) -> int:
@@ -217,6 +219,21 @@ class CachedSimulations(NewSimulations):
         for row, place in zip(finite, distinct, strict=True):
             response[row], reasons[row] = batch.response[place], batch.reasons[place]
         return SimulationBatch(response, reasons)
+
+    def running_requests(self) -> RunningRequests:
+        """Requests for responses of which several run at once; `simulate` then finds the responses in the cache."""
+        return RunningRequests(self)
+
+    def has_responses(self, keys: list[bytes]) -> np.ndarray:
+        """Whether `simulate` needs no simulation for each of the distinct keys: (n,) bool, see `distinct_keys`.
+
+        Responses of the cache on disk are read into memory. Some may be simulated again for verification.
+        """
+        misfit, known = self.memory_cache.look_up(keys, self._width)
+        response = np.full((len(keys), *self._response_shape), np.nan)
+        requested = self._requested(keys, misfit, np.array(known, dtype=bool), response)
+        self._read(requested)
+        return requested.cached
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache statistics that are known from an earlier run in memory, without a simulation.

@@ -343,7 +343,9 @@ class HalfNormal(Distribution):
     Parameters
     ----------
     sd : float
-        Standard deviation (> 0) of the normal before taking the absolute value, in the unit of the parameter.
+        Standard deviation (> 0) of the normal before taking the absolute value, in the unit of the parameter: ``scale``
+        of `scipy.stats.halfnorm`. The standard deviation of the half-normal distribution itself is 0.603 times as
+        large, its mean 0.798 times (`moments`).
     """
 
     sd: float

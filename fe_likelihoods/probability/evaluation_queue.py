@@ -83,14 +83,17 @@ class EvaluationQueue:
     likelihood : FELikelihood or JointLikelihood
     prior : Prior
         Of the same parameters.
+    responses : bool
+        Whether the likelihood caches the responses as well, for its method `simulate`.
     """
 
-    def __init__(self, likelihood: FELikelihood | JointLikelihood, prior: Prior) -> None:
-        self._prior = prior
+    def __init__(self, likelihood: FELikelihood | JointLikelihood, prior: Prior, responses: bool = False) -> None:
+        self._prior, self._responses = prior, responses
         self._parts = [_Part(part, columns) for part, columns in likelihood.parts()]
         self._arrived: SimpleQueue = SimpleQueue()
         self._taken: list[RunningSimulation] = []  # from the queue of arrivals
         self._finished: list[tuple[int, float]] = []
+        self._collected: list[tuple[int, float]] = []  # last; the caller may not have received them
         self._tickets = self._pending = 0
         self._error: Exception | None = None
         self._closed = False
@@ -181,11 +184,23 @@ class EvaluationQueue:
         except BaseException:
             self._write()
             raise
-        finished, self._finished = self._finished, []
-        self._pending -= len(finished)
+        self._collected, self._finished = self._finished, []
+        self._pending -= len(self._collected)
         if not self._pending:
             self._write()
-        return finished
+        return self._collected
+
+    def ended(self) -> list[tuple[int, float]]:
+        """Tickets and log-probabilities of points that have ended, without waiting, also of those last collected.
+
+        For the end of a run by Ctrl-C, before `close`: what is known shall be kept. Errors are left to `collect`.
+        """
+        self._require_open()
+        for part in self._parts:
+            # not all of them may have announced their end
+            self._taken += [running for running in part.running if running.future.done()]
+        self._receive(wait=False)
+        return self._collected + self._finished
 
     def close(self) -> None:
         """Stop waiting: points that the pool has not started are cancelled, those that run are cached when they end.
@@ -246,7 +261,7 @@ class EvaluationQueue:
         keys, distinct = distinct_keys(thetas)
         first = [distinct.index(place) for place in range(len(keys))]
         try:
-            started = part.likelihood.start_simulations(keys, thetas[first], False, self._arrived)
+            started = part.likelihood.start_simulations(keys, thetas[first], self._responses, self._arrived)
         except Exception as error:  # raised by `collect`, as in a call of the posterior
             self._error = self._error or error
             part.unstarted.append(points)
@@ -263,6 +278,8 @@ class EvaluationQueue:
                     if part.likelihood.streams:
                         unknown = self._look_up(stage, points, on_disk=True)
                     else:
+                        if self._responses:
+                            part.likelihood.simulate(part.thetas(points))
                         misfit, unknown = part.likelihood.statistics(part.thetas(points)), []
                         for point, row in zip(points, misfit, strict=True):
                             self._pass_on(stage, point, row)
@@ -278,7 +295,7 @@ class EvaluationQueue:
         """Take simulations that have ended; with `wait`, at least one."""
         self._taken += take_all(self._arrived, wait and not self._taken)
         for stage, part in enumerate(self._parts):
-            ended = [running for running in self._taken if running in part.running]
+            ended = [running for running in dict.fromkeys(self._taken) if running in part.running]
             if not ended:
                 continue
             try:

@@ -136,9 +136,13 @@ def match_measurements(model: Model, measurements: Measurements) -> Measurements
     expected = [channel.name for channel in model.channels]
     got = [channel.name for channel in measurements.channels]
     if sorted(expected) != sorted(got):
+        advice = "select the common ones with Measurements.select(names) and in the model"
+        common = tuple(name for name in got if name in expected)
+        if common and hasattr(model, "outputs"):  # of the library's models, whose channels have the names of outputs
+            advice = f"make the model with outputs={common!r}"
+            advice += "" if len(common) == len(got) else f", and take measurements.select({list(common)!r})"
         raise ValueError(
-            f"the model's channels are {', '.join(expected)}, the measurements' are {', '.join(got)}; "
-            "select the common ones with Measurements.select(names) and in the model"
+            f"the model's channels are {', '.join(expected)}, the measurements' are {', '.join(got)}; {advice}"
         )
     matched = measurements if expected == got else measurements.select(expected)
     for ours, theirs in zip(model.channels, matched.channels, strict=True):

@@ -15,10 +15,10 @@ import numpy as np
 
 from .data_identity import combined_digest
 from .distributions import Distribution, RandomState
-from .event_noise import EventNoise
 from .inputs import as_points
 from .likelihood import FELikelihood
 from .marginal_noise import sampled_noise
+from .parameters import Parameter, channels_of_deviations
 from .report import simulation_report
 
 __all__ = ["JointLikelihood"]
@@ -270,6 +270,16 @@ class JointLikelihood:
         return _digest([likelihood.fingerprint for likelihood in self.likelihoods.values()])
 
     @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Units, nominal values and labels of the parameters."""
+        described: dict[str, Parameter] = {}
+        for key, likelihood in self.likelihoods.items():
+            for each in likelihood.parameters:
+                joint = self._joint_name(key, each.name)
+                described.setdefault(joint, each._replace(name=joint))
+        return tuple(described[name] for name in self.parameter_names)
+
+    @property
     def data_fingerprint(self) -> str:
         """Hex digest of all measurements, in any order: evidences for the same measurements can be compared."""
         return combined_digest([digest for each in self.likelihoods.values() for digest in each.data_digests()])
@@ -364,11 +374,7 @@ def _unit(likelihood: FELikelihood, name: str) -> str | None:
         if name in units:
             return str(units[name])
         return f"multiples of {nominal[name]:.12g}" if isinstance(nominal, Mapping) and name in nominal else None
-    noise = sampled_noise(likelihood.noise)
-    channels = {f"sigma_{channel.name}": channel for channel in model.channels}
-    if isinstance(noise, EventNoise):
-        rows = [noise.channels[row] for _, row in noise.levels]
-        channels = dict(zip(noise.parameter_names, rows, strict=True))
+    channels = channels_of_deviations(likelihood.noise, model.channels)
     return channels[name].si_unit if name in channels else None
 
 

@@ -26,6 +26,7 @@ from .event_noise import join_measurements, named_noise
 from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
 from .marginal_noise import MarginalNoise
 from .noise import Noise, noise_of_part, noise_statistic, noise_time_shifts
+from .parameters import Parameter, describe_parameters
 from .report import simulation_report
 
 __all__ = ["FELikelihood"]
@@ -147,6 +148,11 @@ class FELikelihood(CachedSimulations):
         return len(self.parameter_names)
 
     @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Units, nominal values and labels of the parameters."""
+        return describe_parameters(self.model, self.noise)
+
+    @property
     def data_fingerprint(self) -> str:
         """Hex digest of the samples that are compared: equal for likelihoods of the same data.
 
@@ -164,7 +170,8 @@ class FELikelihood(CachedSimulations):
     def first(self, seconds: float) -> "FELikelihood":
         """The likelihood of the first part of the measurements, for models that can be shortened (`first_part`).
 
-        Noise, pool, limits, cache on disk and the responses in memory are kept; counts start at zero.
+        Noise, pool, limits, cache on disk and the responses in memory are kept; counts start at zero. `shortened` keeps
+        the result, for reports of all simulations.
 
         Parameters
         ----------
@@ -188,7 +195,8 @@ class FELikelihood(CachedSimulations):
             steps = math.ceil(measurements.end / self.model.dt - 1e-6)
             last = min(steps, self.model.n_steps - 1) * self.model.dt
         model = first_part(self.model, last)
-        return self._with(model, measurements, noise_of_part(self.noise, measurements))
+        self.shortened.append(self._with(model, measurements, noise_of_part(self.noise, measurements)))
+        return self.shortened[-1]
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
         """Measured minus simulated response at one point: one simulation, which is neither counted nor cached.
@@ -221,12 +229,32 @@ class FELikelihood(CachedSimulations):
         response, (reason,) = simulate_batch(self.model, theta[None, : self._n_structural])
         if reason:
             raise SimulationFailed(reason)
+        return self._residuals(response[0], shifts)
+
+    def residuals_of(self, response: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        """Measured minus simulated response, as `residuals`, from a response that is known: nothing is simulated.
+
+        Parameters
+        ----------
+        response : (n_channels, n_steps) float
+            Response of the model [SI], such as one of ``simulate(thetas).response``.
+        theta : (n_structural,) or (ndim,) float
+            Its parameters, as for `residuals`; needed for unknown time shifts only.
+
+        Returns
+        -------
+        (n_channels, n_steps) float
+            [SI]; NaN where a sample is missing.
+        """
+        return self._residuals(np.asarray(response, dtype=float), self._shifts_of(np.asarray(theta, dtype=float)))
+
+    def _residuals(self, response: np.ndarray, shifts: Mapping[str, float]) -> np.ndarray:
         if shifts:
             times = {name: self.measurements.times(name) - shift for name, shift in shifts.items()}
-            return -self.measured.residuals_at(response[0], self.model.dt, self.measurements.channels, times)
+            return -self.measured.residuals_at(response, self.model.dt, self.measurements.channels, times)
         if isinstance(self.measured, Comparison):
-            return -self.measured.residuals(response[0])
-        return self.measurements.values - response[0]
+            return -self.measured.residuals(response)
+        return self.measurements.values - response
 
     def _shifts_of(self, theta: np.ndarray) -> dict[str, float]:
         """Time shifts [s] of channels at a point, empty for a noise without such parameters."""

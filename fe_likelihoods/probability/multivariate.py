@@ -367,11 +367,18 @@ def as_distribution(name: str, distribution: Any) -> Distribution:
     if isinstance(distribution, Distribution):
         return distribution
     # a foreign object: frozen distributions of scipy have no public base class
+    advice = ""
     if all(hasattr(distribution, member) for member in ("logpdf", "ppf", "support", "dist")):
-        return FrozenDistribution(distribution)
+        if np.ndim(distribution.mean()) == 0:
+            return FrozenDistribution(distribution)
+        advice = ": this one has arrays as parameters; give each parameter of the posterior a distribution of its own"
+    elif hasattr(distribution, "logpdf") and hasattr(distribution, "rvs"):
+        advice = ": freeze it with its parameters, such as scipy.stats.gamma(2.0)"
+        if not hasattr(distribution, "ppf"):
+            advice = ": for a distribution of several parameters, give a tuple of their names as key"
     raise ValueError(
-        f"Prior: {name!r} must be a Distribution of fe_likelihoods or a frozen continuous distribution of scipy.stats; "
-        f"got {distribution!r}"
+        f"Prior: {name!r} must be a Distribution of fe_likelihoods or a frozen continuous distribution of scipy.stats, "
+        f"such as scipy.stats.gamma(2.0); got {distribution!r}{advice}"
     )
 
 

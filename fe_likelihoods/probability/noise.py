@@ -14,13 +14,16 @@ Which noise to take:
 ``GaussianNoise(channels, effective_samples=n_eff)``      Correlated errors without more parameters; `n_eff` is
                                                           estimated from residuals.
 ``SharedGaussianNoise.of(measurements)``                  One unknown standard deviation for all channels.
+``RelativeNoise.of(measurements)``                        Standard deviations that are shares of the response levels,
+                                                          for predictions of weaker or stronger motions.
 ``...Noise(channels, sensor={"top": 0.02})``              Known sensor noise in addition to the unknown model error.
 ========================================================  ==============================================================
 
 Real measurements differ from a model by more than the noise of a sensor, and the differences are correlated in time.
 White noise counts the n samples of a channel as n independent observations, which makes the posterior too narrow. The
 module `fe_likelihoods.probability.residuals` has checks of this assumption and estimates the effective number of
-samples. `AutoregressiveNoise` is in `fe_likelihoods.probability.autoregressive_noise`.
+samples. `AutoregressiveNoise` is in `fe_likelihoods.probability.autoregressive_noise`, `RelativeNoise` in
+`fe_likelihoods.probability.relative_noise`.
 """
 
 import math
@@ -43,6 +46,7 @@ __all__ = [
     "noise_time_shifts",
     "options_repr",
     "set_channels",
+    "set_effective",
     "total_deviations",
 ]
 
@@ -64,6 +68,9 @@ class Noise(Protocol):
       `fe_likelihoods.probability.time_shift_noise.TimeShiftNoise`.
     * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
       errors (n, n_channels) [SI]; needed for predictions with noise.
+    * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
+      standard deviations (n_channels, n_steps) of the errors of a simulated response; used in predictions in place of
+      ``standard_deviations`` where the noise depends on the response.
     * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed where it
       depends on their number.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
@@ -152,7 +159,7 @@ class GaussianNoise:
         self, channels: Sequence[Channel], *, sensor: PerChannel = None, effective_samples: PerChannel = None
     ) -> None:
         set_channels(self, channels, sensor)
-        _set_effective(self, effective_samples)
+        set_effective(self, effective_samples)
 
     def __repr__(self) -> str:
         # display units change no value, so they are left out
@@ -183,7 +190,7 @@ class GaussianNoise:
             -inf where a sigma is impossible (zero or negative; with sensor noise only negative) and where the misfit is
             NaN or infinite; never NaN.
         """
-        return _log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
+        return white_log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
         """Standard deviation of the errors of every channel, sensor noise included.
@@ -256,7 +263,7 @@ class SharedGaussianNoise:
                     "channel without signal from the measurements, or give its scale"
                 )
         set_channels(self, channels, sensor)
-        _set_effective(self, effective_samples)
+        set_effective(self, effective_samples)
 
     @classmethod
     def of(cls, measurements: Measurements, **options: PerChannel) -> "SharedGaussianNoise":
@@ -314,7 +321,7 @@ class SharedGaussianNoise:
             -inf where sigma is impossible (see `GaussianNoise.log_likelihood`) and where the misfit is NaN or infinite;
             never NaN.
         """
-        return _log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
+        return white_log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
 
 
 def set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) -> None:
@@ -330,7 +337,7 @@ def set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) ->
     object.__setattr__(noise, "sensor", values)
 
 
-def _set_effective(noise: Any, effective_samples: PerChannel) -> None:
+def set_effective(noise: Any, effective_samples: PerChannel) -> None:
     """Set and check the field `effective_samples` of a frozen noise."""
     values = _per_channel(noise, "effective_samples", effective_samples, math.inf)
     if values is not None and not all(value > 0.0 for value in values):
@@ -375,7 +382,7 @@ def total_deviations(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.
         return np.where(sigma >= 0.0, np.hypot(sigma, sensor), np.nan)
 
 
-def _log_likelihood(
+def white_log_likelihood(
     misfit: np.ndarray, n_samples: int | SampleCounts, sigma: np.ndarray, effective: tuple[float, ...] | None
 ) -> np.ndarray:
     """Log-likelihood (n,) of independent Gaussian residuals with standard deviations `sigma` (n, n_channels)."""

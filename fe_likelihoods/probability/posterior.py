@@ -13,11 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .block_likelihood import BlockLogLikelihood
 from .distributions import Distribution, RandomState
 from .evaluation_queue import EvaluationQueue
 from .inputs import as_points, complete_repr
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
+from .parameters import Parameter
+from .predictive_draws import MeasuredData, PredictiveDraws, measured_data, predictive_draws
 from .priors import Prior
 
 if TYPE_CHECKING:
@@ -80,6 +83,11 @@ class Posterior:
     def parameter_names(self) -> list[str]:
         """Structural parameters first, then those of the noise; a list, as emcee, arviz and corner expect."""
         return list(self.prior.names)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Units, nominal values and labels of the parameters, for tables and figures."""
+        return self.likelihood.parameters
 
     @property
     def fast_parameters(self) -> tuple[int, ...]:
@@ -274,11 +282,68 @@ class Posterior:
 
         return ResponseGuide(self, starts)
 
-    def evaluation_queue(self) -> EvaluationQueue:
+    def measured_data(self) -> MeasuredData:
+        """The measurements, without missing samples, and the records of the excitation; nothing is simulated."""
+        return measured_data(self.likelihood)
+
+    def predictive_draws(self, samples: Any, block: float | None = None, seed: int = 0) -> PredictiveDraws:
+        """Predictions of the measurements by samples of the posterior, and the log-likelihood in blocks of time.
+
+        The responses are cached, like those for a guide; cached ones are not simulated again.
+
+        Parameters
+        ----------
+        samples : (n, ndim) float, or mapping
+            Samples of the posterior.
+        block : float, optional
+            Length of a block [s], by default from the correlation of the residuals
+            (`fe_likelihoods.probability.block_likelihood.choose_blocks`).
+        seed : int
+            Seed of the noise.
+
+        Returns
+        -------
+        PredictiveDraws
+
+        Raises
+        ------
+        ValueError
+            For samples of another shape, or a length of a block that is not positive.
+        SimulationFailed
+            If a sample cannot be simulated.
+        """
+        return predictive_draws(self.likelihood, as_points(samples, self.prior.names), block, seed)
+
+    def block_log_likelihood(self, samples: Any, seconds: float | None = None) -> BlockLogLikelihood:
+        """Log-likelihood of samples in blocks of time, for leave-one-out cross-validation.
+
+        The terms of all blocks add up to `log_likelihood`. For a `marginal` posterior they do so for one draw of its
+        noise parameters.
+
+        Parameters
+        ----------
+        samples : (n, ndim) float, or mapping
+            Samples of the posterior.
+        seconds : float, optional
+            Length of a block [s]; see `predictive_draws`, whose errors are raised here too.
+
+        Returns
+        -------
+        BlockLogLikelihood
+        """
+        return self.predictive_draws(samples, seconds).blocks
+
+    def evaluation_queue(self, responses: bool = False) -> EvaluationQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.
 
         Samplers that propose points while others still run keep all workers of a pool busy with it. The values are
         those of `log_prob`.
+
+        Parameters
+        ----------
+        responses : bool
+            Whether the likelihood caches the responses as well, so that its method `simulate` returns them without
+            another simulation.
 
         Returns
         -------
@@ -292,7 +357,7 @@ class Posterior:
         ...     for ticket, log_prob in queue.collect():    # the first that have ended
         ...         print(ticket, log_prob)
         """
-        return EvaluationQueue(self.likelihood, self.prior)
+        return EvaluationQueue(self.likelihood, self.prior, responses)
 
     def when_simulated(self, callback: Callable[[float], None] | None) -> None:
         """Announce simulations as they end, also within a batch: samplers show their progress with it.
@@ -342,6 +407,29 @@ class Posterior:
         """
         return self.likelihood.report()
 
+    def _repr_html_(self) -> str:
+        """In notebooks: what is updated with what data, the parameters with their priors, simulations so far."""
+        from ..plots.html import html_object, html_table
+
+        parts, lines = self.likelihood.parts(), []
+        for part, _ in parts:
+            channels = ", ".join(channel.name for channel in part.measurements.channels)
+            samples = np.sum(~np.isnan(part.measurements.values))
+            lines.append(f"{type(part.model).__name__}, {type(part.noise).__name__}, {samples} samples of {channels}")
+        report = self.report()
+        lines.append(f"{report['simulations']} simulations so far, {report['failure_count']} failed")
+        header, rows = self.prior.table()
+        shown = [
+            (
+                parameter.label,
+                _family(row[1]),
+                *(float(parameter.shown(value)) for value in (*row[2:], parameter.nominal)),
+            )
+            for parameter, row in zip(self.parameters, rows, strict=True)
+        ]
+        table = html_table((*header[:1], "prior", *header[2:], "nominal"), shown)
+        return html_object(f"Posterior of {self.ndim} parameters", lines, table)
+
     def _evaluate(self, x: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points in the given shape, and log-prior (n,) and log-likelihood (n,) of their rows."""
         points = as_points(x, self.prior.names)
@@ -351,3 +439,8 @@ class Posterior:
         if inside.any():
             log_likelihood[inside] = self.likelihood.log_likelihood(np.atleast_2d(points)[inside])
         return points, log_prior, log_likelihood
+
+
+def _family(distribution: str) -> str:
+    """Name of a distribution without its parameters, which are in the unit of the samples."""
+    return distribution.removeprefix("FrozenDistribution(").partition("(")[0]

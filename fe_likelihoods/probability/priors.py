@@ -92,6 +92,34 @@ class Prior:
     def __repr__(self) -> str:
         return f"Prior({self.distributions!r})"
 
+    def _repr_html_(self) -> str:
+        """In notebooks: one row per parameter, in the units of the samples."""
+        from ..plots.html import html_object, html_table
+
+        return html_object(f"Prior of {self.dim} parameters", [], html_table(*self.table()))
+
+    def table(self) -> tuple[tuple[str, ...], list[tuple]]:
+        """What a reader asks of the prior, for tables: a header, and one row per parameter.
+
+        Returns
+        -------
+        header : tuple of str
+        rows : list of tuple
+            Name, distribution, mean, standard deviation, lower and upper bound; moments of joint distributions by
+            10 000 draws with a fixed seed.
+        """
+        rows: list[tuple] = [()] * self.dim
+        for column, distribution in self._single:
+            rows[column] = (repr(distribution), *distribution.moments, *distribution.bounds)
+        for columns, distribution in self._joint:
+            draws, bounds = distribution.rvs(10_000, 0), np.asarray(distribution.bounds)
+            kind = f"{type(distribution).__name__} of {len(columns)}"
+            for place, column in enumerate(columns):
+                one = draws[:, place]
+                rows[column] = (kind, float(one.mean()), float(one.std()), *map(float, bounds[place]))
+        header = ("parameter", "distribution", "mean", "sd", "lower", "upper")
+        return header, [(name, *row) for name, row in zip(self.names, rows, strict=True)]
+
     def _checked(self, values: np.ndarray, what: str) -> np.ndarray:
         values = np.asarray(values, dtype=float)
         if values.ndim not in (1, 2) or values.shape[-1] != self.dim:

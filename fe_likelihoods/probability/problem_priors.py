@@ -27,7 +27,10 @@ def bridge_column_prior(
     """Make the prior of Ramancha et al. (2022).
 
     The structural parameters are normal with mean 1, truncated at zero, with coefficients of variation of 0.30 (Ec),
-    0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal with scales of 0.1 g and 1.2 in.
+    0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal. Their 0.1 g and 1.2 in are taken
+    as scales, the standard deviations of the normal before taking the absolute value (`HalfNormal`). The paper does not
+    say whether they are these or the standard deviations of the half-normal distributions, which would give scales that
+    are 1.66 times as large.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ of independent samples for `fe_likelihoods.probability.noise.GaussianNoise`, and
 `fe_likelihoods.AutoregressiveNoise` explains them::
 
     residuals = posterior.likelihood.residuals(best)
-    residual_checks(residuals)
+    print(residual_checks(residuals, model.channels))
     noise = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
 
 The equations are on the page ``docs/theory/noise.rst``.
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..signals.channels import Channel
+from ..units import find_unit
 from .sample_counts import distinct_gaps
 
 if TYPE_CHECKING:
@@ -34,11 +35,14 @@ __all__ = [
     "residual_checks",
 ]
 
+_UNLIKELY = 0.01  # probability below which residuals are not called white, or normal
+_WEAK = 0.2  # lag-one correlation of which intervals hardly depend: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
+_FEWEST = 10  # samples, below which nothing is said about their correlation and distribution
 _WINDOW = 5.0  # length of the sums over lags, in correlation times
 
 
 class ResidualChecks(NamedTuple):
-    """Checks of the residuals of each channel; all arrays are (n_channels,).
+    """Checks of the residuals of each channel; all arrays are (n_channels,). ``str`` gives a table and sentences.
 
     Attributes
     ----------
@@ -53,6 +57,10 @@ class ResidualChecks(NamedTuple):
     normal : ndarray
         Probability that normal residuals have a skewness and kurtosis at least as far from those of the normal
         distribution.
+    n_samples : ndarray
+        Number of samples that are there.
+    channels : tuple of Channel
+        The channels, for names and units of the table; empty if they were not given.
     """
 
     mean: np.ndarray
@@ -61,6 +69,46 @@ class ResidualChecks(NamedTuple):
     n_effective: np.ndarray
     white: np.ndarray
     normal: np.ndarray
+    n_samples: np.ndarray
+    channels: tuple[Channel, ...] = ()
+
+    def __str__(self) -> str:
+        names, units = [f"channel {i}" for i in range(len(self.mean))], [("SI", 1.0)] * len(self.mean)
+        if self.channels:
+            names = [channel.name for channel in self.channels]
+            units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
+        width = max(map(len, ["channel", *names]))
+        heads = ("unit", "mean", "sd", "lag one", "samples", "independent", "p white", "p normal")
+        lines = [f"{'channel':<{width}} " + " ".join(f"{head:>11}" for head in heads)]
+        for i, (name, (unit, factor)) in enumerate(zip(names, units, strict=True)):
+            sizes = f"{self.mean[i] / factor:>11.3g} {self.standard_deviation[i] / factor:>11.3g}"
+            counts = f"{self.lag_one[i]:>11.2f} {self.n_samples[i]:>11.0f} {self.n_effective[i]:>11.0f}"
+            lines.append(f"{name:<{width}} {unit:>11} {sizes} {counts} {self.white[i]:>11.2g} {self.normal[i]:>11.2g}")
+        return "\n".join([*lines, *(f"{name}: {text}" for name, text in zip(names, self.sentences, strict=True))])
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What the checks of each channel say, and what to do, in words."""
+        return tuple(_sentence(*numbers) for numbers in zip(*self[2:7], strict=True))
+
+
+def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n_samples: int) -> str:
+    """The verdict on one channel."""
+    if n_samples < _FEWEST:
+        return f"Not checked: {n_samples:.0f} samples are too few, {_FEWEST} are needed."
+    if white >= _UNLIKELY:
+        found = ["White: no correlation from sample to sample was found."]
+    elif abs(lag_one) < _WEAK:
+        found = [f"Nearly white: the correlation from sample to sample, {lag_one:.2f}, changes intervals little."]
+    else:
+        found = [
+            f"Not white: correlation {lag_one:.2f} from sample to sample. {n_samples:.0f} samples are worth "
+            f"{n_effective:.0f} independent ones, and intervals under white noise are too narrow: use "
+            "AutoregressiveNoise or GaussianNoise(effective_samples=...)."
+        ]
+    if normal < _UNLIKELY:
+        found.append("Not normal: look at the tails for outliers or missing physics.")
+    return " ".join(found)
 
 
 def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
@@ -252,7 +300,7 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     return (residuals[:, 1:] - rho[:, None] * residuals[:, :-1]) / np.sqrt(1.0 - rho[:, None] ** 2)
 
 
-def residual_checks(residuals: np.ndarray) -> ResidualChecks:
+def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> ResidualChecks:
     """Compare residuals with Gaussian white noise.
 
     Parameters
@@ -260,6 +308,8 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     residuals : (n_channels, n_steps) float
         Measured minus simulated response at parameters that fit [SI unit of the channel]. NaN where a sample is
         missing.
+    channels : sequence of Channel, optional
+        The channels, one per row: their names and display units are those of the printed table.
 
     Returns
     -------
@@ -268,8 +318,8 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     Raises
     ------
     ValueError
-        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel, or
-        if a channel has no two successive samples.
+        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel, if
+        a channel has no two successive samples, or if the number of channels differs from the number of rows.
 
     Notes
     -----
@@ -285,7 +335,9 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
     """
     from scipy import stats  # takes 0.5 s to import, and every noise imports this module
 
-    residuals = _checked(residuals)
+    residuals = _checked(residuals, channels)
+    if len(channels) not in (0, len(residuals)):
+        raise ValueError(f"expected one channel per row of the residuals, {len(residuals)}; got {len(channels)}")
     n_effective = effective_samples(residuals)
     lag_one = autocorrelation(residuals)[:, 1]
     n, missing = residuals.shape[1], np.isnan(residuals)
@@ -293,7 +345,7 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
         n = 1.0 + _pair_counts(missing)[:, 1]
         if not (n > 1.0).all():
             raise ValueError(
-                f"channels {np.flatnonzero(n == 1.0).tolist()} have no two successive samples, so their lag-one "
+                f"{_listed(n == 1.0, channels)} have no two successive samples, so their lag-one "
                 "correlation is unknown: check residuals with a longer step, without the missing samples between"
             )
     # rows without their missing samples; one array where none is missing
@@ -307,6 +359,8 @@ def residual_checks(residuals: np.ndarray) -> ResidualChecks:
         n_effective=n_effective,
         white=2.0 * stats.norm.sf(np.sqrt(n) * np.abs(lag_one)),
         normal=stats.chi2.sf(score, 2),
+        n_samples=(~missing).sum(axis=1),
+        channels=tuple(channels),
     )
 
 
@@ -314,7 +368,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
 
     The shaded band holds 95 % of the autocorrelation coefficients of white residuals. The quantiles of normal
-    residuals follow the straight line.
+    residuals follow the straight line. Above each row is the verdict of `residual_checks` in words.
 
     Parameters
     ----------
@@ -338,10 +392,12 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     """
     from ..plots.histories import plot_residual_checks
 
-    return plot_residual_checks(residuals, channels, dt, residual_checks(residuals), autocorrelation(residuals))
+    known = channels if len(channels) == len(residuals) else ()
+    checks = residual_checks(residuals, known)
+    return plot_residual_checks(residuals, channels, dt, checks, autocorrelation(residuals))
 
 
-def _checked(residuals: np.ndarray) -> np.ndarray:
+def _checked(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> np.ndarray:
     residuals = np.asarray(residuals, dtype=float)
     if residuals.ndim != 2 or residuals.shape[1] < 2:
         raise ValueError(
@@ -356,7 +412,14 @@ def _checked(residuals: np.ndarray) -> np.ndarray:
     zero = ~np.nan_to_num(residuals).any(axis=1)
     if zero.any():
         raise ValueError(
-            f"the residuals of channels {np.flatnonzero(zero).tolist()} are all zero and have no "
-            "correlation; leave these channels out"
+            f"the residuals of {_listed(zero, channels)} are all zero and have no correlation; leave these channels out"
         )
     return residuals
+
+
+def _listed(chosen: np.ndarray, channels: Sequence[Channel]) -> str:
+    """Names of the chosen channels (n_channels,) bool, or their numbers where they are not known."""
+    places = np.flatnonzero(chosen).tolist()
+    if len(channels) == len(chosen):
+        return ", ".join(channels[place].name for place in places)
+    return f"channels {places}"

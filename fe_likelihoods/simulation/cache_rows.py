@@ -15,6 +15,7 @@ __all__ = [
     "COLUMNS",
     "MIN_STOPS",
     "REMOVE",
+    "RESPONSE_COLUMNS",
     "STORE",
     "STORE_FAILURE",
     "STORE_RESPONSE",
@@ -24,6 +25,7 @@ __all__ = [
     "checksum",
     "insert_rows",
     "is_undamaged",
+    "is_undamaged_response",
     "pack_failure",
     "pack_row",
     "select_rows",
@@ -33,6 +35,7 @@ __all__ = [
 ]
 
 COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc"
+RESPONSE_COLUMNS = "key, source, theta, n_channels, size, crc, response"
 KEY_BYTES = 16
 KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_REASON_LENGTH = 2000
@@ -45,10 +48,7 @@ STORE = (
     "seconds = excluded.seconds, crc = excluded.crc WHERE length(reason) > 0"  # a success is never overwritten
 )
 # replaces a response that an earlier version stored in single precision
-STORE_RESPONSE = (
-    "INSERT OR REPLACE INTO responses (key, source, theta, n_channels, size, crc, response) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?)"
-)
+STORE_RESPONSE = f"INSERT OR REPLACE INTO responses ({RESPONSE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
 REMOVE = {
     table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses", "failures", "remarks")
 }
@@ -172,6 +172,12 @@ def is_undamaged(*row: Any) -> bool:
         return row[-1] == checksum(*row[:-1])
     except (TypeError, struct.error):  # damage may change the type of a value
         return False
+
+
+def is_undamaged_response(*row: Any) -> bool:
+    """Whether a stored response, given by the values of `RESPONSE_COLUMNS`, matches its checksum and its size."""
+    key, *_, size, crc, data = row
+    return isinstance(data, bytes) and len(data) == size and isinstance(key, bytes) and crc == zlib.crc32(key + data)
 
 
 def pack_failure(key: bytes, source: int, reason: str) -> tuple | None:

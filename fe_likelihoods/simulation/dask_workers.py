@@ -12,7 +12,7 @@ __all__ = ["LONGEST_WITHOUT_WORKER", "WorkerWatch"]
 logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN_CHECKS = 5.0
-SECONDS_TO_START = 60.0  # before the same workers are asked for again
+SECONDS_TO_START = 60.0  # within which a worker of a cluster begins to run after it was asked for
 SECONDS_TO_RETURN = 15.0  # within which a nanny starts the process of a worker again
 # How long a map waits for a first or another worker of a cluster that has none [s]
 LONGEST_WITHOUT_WORKER = 3600.0
@@ -24,7 +24,8 @@ class WorkerWatch:
     A cluster of dask closes the nanny of a worker that is absent at the instant 15 s after it was lost
     (``distributed.deploy.lost-worker-timeout``), and never starts it again: on a busy machine the new process may need
     longer, or a simulation has killed it once more. A cluster that has lost all of its workers in this way makes its
-    client wait for ever. So such workers are asked for again.
+    client wait for ever. So such workers are asked for again. A worker that has never been here may still be starting,
+    and is asked for again only after `SECONDS_TO_START`.
 
     A job of dask-jobqueue with several worker processes that has ended, as by its walltime or the lifetimes of its
     workers, is never noticed by the cluster, and adaptive scaling counts it as present. So jobs whose workers were here
@@ -48,7 +49,8 @@ class WorkerWatch:
     def __init__(self, client: Any, futures: Callable[[], Sequence[Any]], longest_wait: float | None = None):
         self._client, self._futures, self._longest_wait = client, futures, longest_wait
         self._ends, self.gave_up = threading.Event(), False
-        self._asked: tuple[set, float] = (set(), 0.0)
+        self._started: set = set()  # workers of the cluster that were here
+        self._absent: dict[Any, float] = {}  # since when others were not
         self._seen: dict[Any, float] = {}  # when a worker of a job was last here
 
     @property
@@ -68,6 +70,7 @@ class WorkerWatch:
     def start(self) -> None:
         """Begin to watch, in a thread; what was seen before is known."""
         self._ends, self.gave_up = threading.Event(), False
+        self._started |= set(getattr(getattr(self._client, "cluster", None), "workers", None) or ())
         arguments = (self._ends,)
         threading.Thread(target=self._watch, args=arguments, name="watch of dask workers", daemon=True).start()
 
@@ -95,25 +98,38 @@ class WorkerWatch:
             return
         groups = {name: spec["group"] for name, spec in wanted.items() if "group" in spec}
         ended = self._ended_jobs(cluster, groups) & set(present)
-        lost, (asked, when) = set(wanted) - set(present) - set(groups), self._asked
-        if lost <= asked and time.monotonic() - when < SECONDS_TO_START:
-            lost = set()
-        if not lost and not ended:
+        given_up, late = self._missing(set(wanted) - set(groups), set(present))
+        if not given_up and not late and not ended:
             return
-        if lost:
-            self._asked = lost, time.monotonic()
         n_workers = sum(len(groups.get(name, " ")) for name in wanted)
-        logger.warning(
-            "The dask cluster has given up %d of its %d %s: starting them again",
-            len(lost) + len(ended),
-            len(wanted),
-            "jobs" if ended else "workers",
-        )
+        if given_up or ended:
+            logger.warning(
+                "The dask cluster has given up %d of its %d %s: starting them again",
+                len(given_up) + len(ended),
+                len(wanted),
+                "jobs" if ended else "workers",
+            )
+        if late:
+            logger.warning(
+                "%d of %d workers of the dask cluster have not started within %g s: asking for them again",
+                len(late),
+                len(wanted),
+                SECONDS_TO_START,
+            )
         if ended:
             cluster.sync(cluster.scale_down, ended)
             for name in ended:
                 del self._seen[name]
         cluster.scale(n_workers)
+
+    def _missing(self, wanted: set, present: set) -> tuple[set, set]:
+        """Workers that were here and are gone, and those that did not come within `SECONDS_TO_START`."""
+        now, given_up = time.monotonic(), (self._started - present) & wanted
+        self._started = present
+        absent = {name: self._absent.get(name, now) for name in wanted - present}
+        late = {name for name, since in absent.items() if now - since > SECONDS_TO_START}
+        self._absent = absent | dict.fromkeys(given_up | late, now)  # they are asked for now
+        return given_up, late
 
     def _ended_jobs(self, cluster: Any, groups: dict[Any, Sequence[str]]) -> set:
         """Jobs with several workers, by the suffixes of their names, of which none is left."""

@@ -411,6 +411,23 @@ class SimulationCache(RowDeletion):
         self._insist(lambda connection: self._insert(connection, STORE, rows))
         return len(rows)
 
+    def check_rows(self) -> tuple[int, int]:
+        """Compare all simulations with their checksums; no row is changed.
+
+        Returns
+        -------
+        rows, damaged : int
+            Numbers of simulations, and of those that do not match their checksums.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read.
+        """
+        count = "SELECT count(*) FROM simulations"
+        (rows,) = self._insist(lambda connection: connection.execute(count).fetchone())
+        return rows, rows - sum(len(page) for page in self._pages())
+
     def close(self) -> None:
         """Store waiting rows, if possible, and close the connection of this process; the next use opens a new one."""
         with self.file.lock:

@@ -91,6 +91,12 @@ class MemoryCache:
         misfits = np.frombuffer(filled, dtype=float).reshape(len(keys), width)
         return misfits, [misfit is not None for misfit in found]
 
+    def successes(self, n_structural: int) -> np.ndarray:
+        """Structural parameters (n, n_structural) of the cached simulations that did not fail."""
+        with self._lock:
+            keys = [key for key, misfit in self._misfits.items() if not np.isnan(np.frombuffer(misfit)).any()]
+        return np.frombuffer(b"".join(keys), dtype=float).reshape(-1, n_structural)
+
     def clear(self) -> None:
         """Drop all rows."""
         with self._lock:

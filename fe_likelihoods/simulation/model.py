@@ -147,6 +147,10 @@ class Model(Protocol):
     of the response of this one, up to and including the given time [s], which is that of a sample, and its fingerprint
     must be another one. A model with ``with_record`` and its excitation in the attribute ``record``, a `Record`, can be
     shortened without this method (`first_part`).
+
+    Tables and figures use ``nominal``, a mapping of names to the nominal values [SI] of which the parameters are
+    multiples, ``nominal_units`` with their units, and ``parameter_units`` with the units of other parameters, in words
+    (`fe_likelihoods.probability.parameters.describe_parameters`).
     """
 
     @property

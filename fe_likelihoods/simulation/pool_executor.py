@@ -1,5 +1,7 @@
 """Executor of other pools: concurrent.futures, multiprocessing, MPI, and any object with ``map``."""
 
+import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from functools import partial
@@ -7,10 +9,13 @@ from multiprocessing.pool import Pool, ThreadPool
 from typing import Any
 
 from .local_pool import Outcome
+from .pool_workers import PoolWorkers
 from .processes import TemporaryFolder
 from .sent_functions import FunctionReference, Missing, Unusable
 
 __all__ = ["PoolExecutor", "resolve"]
+
+SECONDS_BETWEEN_CHECKS = 1.0  # of the processes of a multiprocessing.Pool
 
 
 class _Task(Future):
@@ -52,6 +57,7 @@ class PoolExecutor:
         self.pool = pool
         self.folder: TemporaryFolder | None = None
         self._last: tuple[Any, FunctionReference, FunctionReference] | None = None
+        self._waiting_lock, self._waiting = threading.Lock(), set()  # tasks of a multiprocessing.Pool
 
     @property
     def other_processes(self) -> bool:
@@ -73,16 +79,27 @@ class PoolExecutor:
         """Outcomes of a function for every item, in their order; RuntimeError if a worker cannot load the function."""
         items = list(items)
         reference, carrying = self._references(function)
-        outcomes = list(self.pool.map(reference, items))
+        outcomes = self._map(reference, items)
         missing = [index for index, outcome in enumerate(outcomes) if isinstance(outcome, Missing)]
         if missing:
-            carried = list(self.pool.map(carrying, [items[index] for index in missing]))
+            carried = self._map(carrying, [items[index] for index in missing])
             for index, outcome in zip(missing, carried, strict=True):
                 outcomes[index] = outcome
         for outcome in outcomes:
             if isinstance(outcome, Unusable):
                 raise outcome.error
         return outcomes
+
+    def _map(self, function: Callable, items: list) -> list:
+        workers = PoolWorkers(self.pool)
+        if not workers.are_watched:
+            return list(self.pool.map(function, items))
+        result = self.pool.map_async(function, items)
+        while not result.ready():
+            result.wait(SECONDS_BETWEEN_CHECKS)
+            if not result.ready():
+                workers.check()
+        return result.get()
 
     def submit(self, function: Callable[[Any], Outcome], item: Any) -> Future:
         """Future of the outcome of a function for one item, with the errors of `map`.
@@ -149,8 +166,35 @@ class PoolExecutor:
             task.inner = self.pool.submit(reference, item)
             task.inner.add_done_callback(partial(_forward, task, received))
         else:
+            self._expect(task)
             task.inner = self.pool.apply_async(reference, (item,), callback=received, error_callback=failed)
         return task
+
+    def _expect(self, task: _Task) -> None:
+        """Let a task fail when a process of its `multiprocessing.Pool` dies, which never reports it."""
+        workers = PoolWorkers(self.pool)
+        if not workers.are_watched:
+            return
+        with self._waiting_lock:
+            if not self._waiting:
+                threading.Thread(target=self._check, args=(workers,), name="watch of a pool", daemon=True).start()
+            self._waiting.add(task)
+
+    def _check(self, workers: PoolWorkers) -> None:
+        """Watch the processes while tasks are waited for; in a thread."""
+        while True:
+            time.sleep(SECONDS_BETWEEN_CHECKS)
+            with self._waiting_lock:
+                self._waiting = {task for task in self._waiting if not task.done()}
+                if not self._waiting:
+                    return
+                try:
+                    workers.check()
+                except RuntimeError as error:
+                    for task in self._waiting:
+                        resolve(task, error=error)
+                    self._waiting = set()
+                    return
 
 
 def _fail(task: _Task, error: BaseException) -> None:

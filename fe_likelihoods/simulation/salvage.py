@@ -2,26 +2,47 @@
 
 A damaged page of an SQLite file makes every query fail that reads it, so one bad page would lose all rows. Ranges of
 row numbers are read, and halved where they fail, until only the rows of the damaged pages are left out. Each row has a
-checksum of its own, so nothing wrong is copied. Responses are not copied: they can be simulated again.
+checksum of its own, so nothing wrong is copied. Simulations and responses are copied. Failures that are stored for any
+measurements, and remarks, are not: they can be simulated again.
 """
 
 import contextlib
 import logging
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from .cache_rows import COLUMNS, STORE, is_undamaged
+from .cache_rows import (
+    COLUMNS,
+    RESPONSE_COLUMNS,
+    STORE,
+    STORE_RESPONSE,
+    is_undamaged,
+    is_undamaged_response,
+)
 
-__all__ = ["Salvaged", "salvage"]
+__all__ = ["Salvaged", "read_options", "salvage"]
 
 logger = logging.getLogger(__name__)
 
 SECONDS = 60.0
-ROWS_PER_QUERY = 1000
 FEWEST_BYTES = 100  # of a row; bounds the row numbers where they cannot be queried
+
+
+class _Table(NamedTuple):
+    """A table that is copied: its columns, its statement, the check of a row, and the rows that are read together."""
+
+    name: str
+    columns: str
+    store: str
+    check: Callable[..., bool]
+    rows_per_query: int
+
+
+_SIMULATIONS = _Table("simulations", COLUMNS, STORE, is_undamaged, 1000)
+_RESPONSES = _Table("responses", RESPONSE_COLUMNS, STORE_RESPONSE, is_undamaged_response, 20)
 
 
 class Salvaged(NamedTuple):
@@ -33,14 +54,18 @@ class Salvaged(NamedTuple):
         Simulations that were copied.
     lost : int
         Simulations that could not be read, or whose checksum is wrong; at most so many where rows had been deleted.
+    responses, lost_responses : int
+        The same of stored responses.
     """
 
     rows: int
     lost: int
+    responses: int
+    lost_responses: int
 
 
 def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
-    """Copy the readable simulations of a damaged cache, and say in a warning how many were lost.
+    """Copy the readable simulations and responses of a damaged cache.
 
     Parameters
     ----------
@@ -54,38 +79,49 @@ def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
     Salvaged
         The counts; zero where the file as a whole cannot be read.
     """
+    return Salvaged(*_copy(damaged, connection, _SIMULATIONS), *_copy(damaged, connection, _RESPONSES))
+
+
+def read_options(path: Path) -> str:
+    """Options of SQLite to read a file without changing it; one without a log is not in use, and no log is created."""
+    return "mode=ro" if path.with_name(f"{path.name}-wal").exists() else "mode=ro&immutable=1"
+
+
+def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple[int, int]:
+    """Copy the readable rows of a table; return how many were copied, and how many were lost."""
     kept = lost = 0
     try:
-        with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?mode=ro", uri=True)) as source:
+        with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
             source.text_factory = bytes
-            for rows, missing in _ranges(source, damaged):
-                good = [row for row in rows if is_undamaged(*row)]
+            for rows, missing in _ranges(source, damaged, table):
+                good = [row for row in rows if table.check(*row)]
                 lost += missing + len(rows) - len(good)
                 if good:
                     connection.execute("BEGIN IMMEDIATE")
-                    connection.executemany(STORE, good)
+                    connection.executemany(table.store, good)
                     connection.execute("COMMIT")
                     kept += len(good)
     except (sqlite3.Error, OSError, ValueError, MemoryError) as error:
         if connection.in_transaction:
             connection.execute("ROLLBACK")
-        logger.warning("%s: no more simulations can be salvaged (%s)", damaged.name, error)
-    logger.warning("%s: %d simulations were salvaged, %d were lost", damaged.name, kept, lost)
-    return Salvaged(kept, lost)
+        logger.warning("%s: no more %s can be salvaged (%s)", damaged.name, table.name, error)
+    return kept, lost
 
 
-def _ranges(source: sqlite3.Connection, path: Path) -> Iterator[tuple[list[tuple], int]]:
+def _ranges(source: sqlite3.Connection, path: Path, table: _Table) -> Iterator[tuple[list[tuple], int]]:
     """Rows of consecutive ranges of row numbers, and how many rows of each cannot be read."""
-    query, stop = f"SELECT {COLUMNS} FROM simulations WHERE id BETWEEN ? AND ?", time.monotonic() + SECONDS
-    waiting = [(1, _largest_id(source, path))]
+    query = f"SELECT {table.columns} FROM {table.name} WHERE id BETWEEN ? AND ?"
+    stop = time.monotonic() + SECONDS
+    waiting = [(1, _largest_id(source, path, table.name))]
     while waiting:
         first, last = waiting.pop()
-        if last - first >= ROWS_PER_QUERY:
-            middle = first + ROWS_PER_QUERY
+        if last - first >= table.rows_per_query:
+            middle = first + table.rows_per_query
             waiting += [(middle, last), (first, middle - 1)]
             continue
         if time.monotonic() > stop:
-            logger.warning("%s: salvage ended after %g s, at row %d of %d", path.name, SECONDS, first, last)
+            text = "%s: salvage of %s ended after %g s, at row %d of %d"
+            logger.warning(text, path.name, table.name, SECONDS, first, last)
             return
         try:
             yield source.execute(query, (first, last)).fetchall(), 0
@@ -99,11 +135,11 @@ def _ranges(source: sqlite3.Connection, path: Path) -> Iterator[tuple[list[tuple
                 waiting += [(middle + 1, last), (first, middle)]
 
 
-def _largest_id(source: sqlite3.Connection, path: Path) -> int:
+def _largest_id(source: sqlite3.Connection, path: Path, table: str) -> int:
     """The largest row number, or an upper bound of it."""
     bound = path.stat().st_size // FEWEST_BYTES
     try:
-        (largest,) = source.execute("SELECT max(id) FROM simulations").fetchone()
+        (largest,) = source.execute(f"SELECT max(id) FROM {table}").fetchone()
     except (sqlite3.DatabaseError, MemoryError):
         return bound
     return largest or 0

@@ -11,6 +11,7 @@ a file, so the file must be on a local disk, not on a network file system.
 
 import contextlib
 import logging
+import math
 import os
 import sqlite3
 import threading
@@ -25,7 +26,7 @@ try:
 except ImportError:  # without such locks two programs must not find the same damage at the same time
     lock_file = None
 
-from .salvage import salvage
+from .salvage import read_options, salvage
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
 
@@ -175,6 +176,29 @@ class CacheFile:
                     raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
                 self._replace(error)
 
+    def damage(self) -> str:
+        """What is wrong with the contents of an existing file, which is not changed; empty for an undamaged cache.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a cache, has another layout, or cannot be opened.
+        """
+        connection = None
+        try:
+            connection = self._connect(read_options(self.path))
+            self._identify(connection)
+            self._check_integrity(connection, seconds=math.inf)
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            if not is_damage(error):
+                raise ValueError(f"{self.path} cannot be opened as a cache: {error}") from error
+            self._refuse_other_files()
+            return " ".join(str(error).split())
+        finally:
+            if connection is not None:
+                connection.close()
+        return ""
+
     def _replace(self, error: Exception) -> None:
         """Move a damaged file aside and create a new one."""
         try:
@@ -206,7 +230,12 @@ class CacheFile:
                 self._inode = self._inode_of_cache = self._inode_now()
             if self._aside is not None and self.writable:
                 aside, self._aside = self._aside, None
-                salvage(aside, self._connection)
+                found = salvage(aside, self._connection)
+                text = "%s: %d simulations were salvaged, %d were lost"
+                logger.warning(text, aside.name, found.rows, found.lost)
+                if found.responses or found.lost_responses:
+                    text = "%s: %d responses were salvaged, %d were lost"
+                    logger.warning(text, aside.name, found.responses, found.lost_responses)
         return self._connection
 
     def close(self) -> None:
@@ -378,9 +407,9 @@ class CacheFile:
             raise _Damaged("its tables are not those of a cache")
 
     @staticmethod
-    def _check_integrity(connection: sqlite3.Connection) -> None:
-        """SQLite's own integrity check, as far as it gets in `CHECK_SECONDS`."""
-        stop = time.monotonic() + CHECK_SECONDS
+    def _check_integrity(connection: sqlite3.Connection, seconds: float = CHECK_SECONDS) -> None:
+        """SQLite's own integrity check, as far as it gets in some seconds."""
+        stop = time.monotonic() + seconds
         connection.set_progress_handler(lambda: time.monotonic() > stop, 100_000)
         try:
             (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()

@@ -375,3 +375,47 @@ def test_reorder_keeps_the_density(prior, seed):
     with pytest.raises(ValueError, match="uniform.*half normal|half normal.*uniform"):
         prior.reorder(("uniform",))
     assert pickle.loads(pickle.dumps(turned)).names == names
+
+
+@pytest.mark.parametrize(
+    "frozen",
+    [
+        stats.norm(0.0, 1.0),
+        stats.lognorm(0.3),
+        stats.uniform(-1.0, 2.0),
+        stats.gamma(2.0, scale=0.5),
+        stats.truncnorm(-1.0, 2.0, loc=1.0),
+        stats.multivariate_normal([0.0, 1.0], [[1.0, 0.3], [0.3, 2.0]]),
+    ],
+    ids=lambda frozen: getattr(getattr(frozen, "dist", None), "name", "multivariate_normal"),
+)
+def test_frozen_distributions_of_scipy_are_priors(frozen):
+    joint = not hasattr(frozen, "support")
+    prior = Prior({("a", "b") if joint else "a": frozen})
+    x = prior.rvs(2000, 3)
+    assert x.shape == (2000, 1 + joint)
+    np.testing.assert_allclose(prior.logpdf(x), frozen.logpdf(x if joint else x[:, 0]), rtol=1e-12, atol=1e-12)
+    assert stats.kstest(x[:, 0], stats.norm.cdf if joint else frozen.cdf).pvalue > 1e-3
+    np.testing.assert_allclose(prior.transform(np.full(1 + joint, 0.3))[0], (stats.norm if joint else frozen).ppf(0.3))
+    assert joint or tuple(prior.bounds[0]) == frozen.support()
+    np.testing.assert_allclose(prior.from_normal(prior.to_normal(x[:9])), x[:9], rtol=1e-9)
+
+
+def test_fingerprints_of_frozen_distributions_are_those_of_their_arguments():
+    prints = [repr(Prior({"a": frozen})) for frozen in (stats.gamma(2.0), stats.gamma(2.0), stats.gamma(2.1))]
+    assert prints[0] == prints[1] != prints[2]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (stats.poisson(3.0), "frozen continuous distribution of scipy.stats, such as"),
+        (stats.norm, "freeze it with its parameters"),
+        (stats.norm([0.0, 1.0], 1.0), "has arrays as parameters"),
+        (stats.multivariate_normal([0.0, 0.0]), "a tuple of their names"),
+        (3.0, "got 3.0"),
+    ],
+)
+def test_other_objects_are_no_priors(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        Prior({"a": wrong})

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from fe_likelihoods import FELikelihood, FunctionModel, LocalPool, Measurements
 from fe_likelihoods.probability.residuals import (
     autocorrelation,
     effective_samples,
@@ -119,3 +120,47 @@ def test_figure_of_residuals(rng):
     assert lags.max() > 0.1 and axes[1, 0].get_ylabel() == "drift [in]"
     with pytest.raises(ValueError, match="one channel for each row.*got 1 and 2"):
         plot_residuals(residuals, channels[:1], 0.02)
+
+
+def test_verdicts_say_what_to_do(rng):
+    white, slow = rng.normal(size=800), autoregressive(rng, 0.9, n=800)[0]
+    nearly = white + 0.12 * np.roll(white, 1)
+    heavy = rng.standard_t(2.5, size=800)
+    checks = residual_checks(np.array([white, slow, nearly, heavy]))
+    first, second, third, fourth = checks.sentences
+    assert first == "White: no correlation from sample to sample was found."
+    assert second.startswith(f"Not white: correlation {checks.lag_one[1]:.2f} from sample to sample. 800 samples are ")
+    assert f"worth {checks.n_effective[1]:.0f} independent ones" in second and "AutoregressiveNoise" in second
+    assert third.startswith("Nearly white: ") and checks.white[2] < 0.01
+    assert "Not normal" in fourth and "Not normal" not in first
+    gappy = slow.copy()
+    gappy[100:300] = np.nan
+    assert residual_checks(gappy[None]).n_samples == [600]
+
+
+def response_of(theta):
+    return np.stack([theta[0] * np.sin(0.1 * np.arange(400)), np.cos(0.1 * np.arange(400))])
+
+
+def test_checks_are_a_table_with_names_units_and_sentences(rng):
+    """Of a model of the user's own that runs in a pool."""
+    channels = Channel("top", "displacement", "mm"), Channel("base", "acceleration", "g")
+    noise = np.stack([0.001 * rng.standard_normal(400), autoregressive(rng, 0.9, n=400)[0]])
+    model = FunctionModel(response_of, ["a"], channels, 0.01, 400)
+    with LocalPool(2) as pool:
+        likelihood = FELikelihood(model, Measurements(channels, 0.01, response_of([1.0]) + noise), pool=pool)
+        checks = residual_checks(likelihood.residuals([1.0]), channels)
+    lines = str(checks).splitlines()
+    assert [line.split()[0] for line in lines] == ["channel", "top", "base", "top:", "base:"]
+    cells = dict(zip(lines[0].split()[1:4], lines[1].split()[1:4], strict=True))
+    assert cells["unit"] == "mm" and float(cells["sd"]) == pytest.approx(1000.0 * noise[0].std(), rel=0.01)
+    assert lines[3].startswith("top: White") and "use AutoregressiveNoise" in lines[4]
+    assert str(residual_checks(noise)).splitlines()[2].split()[:3] == ["channel", "1", "SI"]
+    with pytest.raises(ValueError, match="one channel per row"):
+        residual_checks(noise, channels[:1])
+
+
+def test_few_samples_and_zeros_are_named():
+    assert residual_checks(np.array([[1.0, -2.0]])).sentences[0].startswith("Not checked: 2 samples are too few")
+    with pytest.raises(ValueError, match="residuals of top are all zero"):
+        residual_checks(np.zeros((1, 20)), [Channel("top", "displacement", "mm")])

@@ -1,0 +1,347 @@
+"""Scores of one prediction as tables: of histories per channel, of numbers (peaks, residual values) per quantity."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..signals.channels import Channel
+from ..signals.error_measures import rrmse
+from ..units import from_si
+from .scores import crps_normal, crps_samples, interval_score, log_score_normal, pit_normal, pit_samples
+
+__all__ = ["LEVELS", "HistoryScores", "QuantityScores", "envelope", "score_histories", "score_values", "strong_part"]
+
+LEVELS = (0.1, 0.5)
+"""Shares of the largest predicted envelope that separate weak, moderate and strong response."""
+_BINS = 10  # of the histograms of the PIT
+
+
+class HistoryScores(NamedTuple):
+    """Scores of predicted histories, averaged over the measured samples of each channel.
+
+    ``print(scores)`` is a table in the display units of the channels. All arrays are in SI units and have one row per
+    channel.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+        The channels.
+    level : float
+        Probability of the intervals.
+    samples : ndarray of int, shape (n_channels,)
+        Number of measured samples.
+    rms : ndarray, shape (n_channels,)
+        Root mean square of the measured samples, the scale of the scores.
+    rrmse : ndarray, shape (n_channels,)
+        Relative root mean square error of the mean [-].
+    crps : ndarray, shape (n_channels,)
+        CRPS of the normal distributions with the predicted means and standard deviations.
+    log_score : ndarray, shape (n_channels,)
+        Minus the logarithm of their density.
+    interval_score : ndarray, shape (n_channels,)
+        Interval score of the band between the quantiles.
+    width : ndarray, shape (n_channels,)
+        Width of this band: the sharpness of the prediction.
+    coverage : ndarray, shape (n_channels,)
+        Share of the measured samples in the band.
+    coverage_strong : ndarray, shape (n_channels,)
+        The same in the strong part: between 5 and 95 % of the sum of squares of the measured history.
+    coverage_by_level : ndarray, shape (n_channels, 3)
+        The same where the envelope of the predicted mean is below 10 %, between 10 and 50 %, and above 50 % of its
+        largest value; NaN without such samples.
+    pit : ndarray, shape (n_channels, 10)
+        Shares of the measured samples whose PIT (for the normal distributions) is in each tenth of 0 to 1: about 0.1
+        each for a calibrated prediction; high at both ends if the prediction is too narrow, in the middle if too wide.
+    without_spread : ndarray of int, shape (n_channels,)
+        Number of measured samples with a predicted standard deviation of zero. They are left out of `log_score` and
+        `pit`, which are NaN if no other samples are left.
+    """
+
+    channels: tuple[Channel, ...]
+    level: float
+    samples: np.ndarray
+    rms: np.ndarray
+    rrmse: np.ndarray
+    crps: np.ndarray
+    log_score: np.ndarray
+    interval_score: np.ndarray
+    width: np.ndarray
+    coverage: np.ndarray
+    coverage_strong: np.ndarray
+    coverage_by_level: np.ndarray
+    pit: np.ndarray
+    without_spread: np.ndarray
+
+    def __str__(self) -> str:
+        head = ["channel", "unit", "RMS", "RRMSE", "CRPS", "interval score", "width", "log score"]
+        head += [f"in {self.level:.0%} band", "strong part", "weak", "moderate", "strong"]
+        rows = [head]
+        for k, channel in enumerate(self.channels):
+            scaled = [from_si(a[k], channel.unit) for a in (self.rms, self.crps, self.interval_score, self.width)]
+            rms, crps, score, width = (f"{each:.3g}" for each in scaled)
+            row = [channel.name, channel.unit, rms, f"{self.rrmse[k]:.1%}", crps, score, width]
+            row.append(f"{self.log_score[k] + np.log(from_si(1.0, channel.unit)):.2f}")
+            shares = [self.coverage[k], self.coverage_strong[k], *self.coverage_by_level[k]]
+            rows.append(row + ["-" if np.isnan(share) else f"{share:.1%}" for share in shares])
+        if not self.without_spread.any():
+            return _table(rows)
+        left_out = ", ".join(f"{n} of {c.name}" for c, n in zip(self.channels, self.without_spread, strict=True) if n)
+        return f"{_table(rows)}\nlog score without samples whose predicted standard deviation is zero: {left_out}"
+
+
+class QuantityScores(NamedTuple):
+    """Scores of predicted numbers, such as peaks, each against one measured value.
+
+    ``print(scores)`` is a table in the display units of the channels. All arrays are in SI units and have one entry
+    per quantity. One value says little about calibration: collect `pit` over events and channels, and see
+    `fe_likelihoods.share_within`.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the quantities: of their channels, or numbers.
+    units : tuple of str
+        Display units, "SI" for a function of the whole response.
+    level : float
+        Probability of the intervals.
+    measured : ndarray, shape (n_quantities,)
+        Measured values.
+    median : ndarray, shape (n_quantities,)
+        Predicted medians.
+    lower, upper : ndarray, shape (n_quantities,)
+        Ends of the predicted intervals: the samples whose ranks are nearest to (n + 1) p, at most the smallest and the
+        largest. An interval between such ranks has its level on average, also if it is estimated from few samples.
+    crps : ndarray, shape (n_quantities,)
+        CRPS of the samples, for their effective sample size.
+    log_score : ndarray, shape (n_quantities,)
+        Minus the logarithm of the normal density with the mean and the standard deviation of the samples; inf if these
+        are all equal.
+    interval_score : ndarray, shape (n_quantities,)
+        Interval score.
+    pit : ndarray, shape (n_quantities,)
+        Predicted probability of a smaller value than the measured one.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    level: float
+    measured: np.ndarray
+    median: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    crps: np.ndarray
+    log_score: np.ndarray
+    interval_score: np.ndarray
+    pit: np.ndarray
+
+    @property
+    def within(self) -> np.ndarray:
+        """Whether each measured value is in its interval, from its `pit` as `fe_likelihoods.share_within`.
+
+        Fewer than ten samples cannot show that a value is outside of a 90 % interval.
+        """
+        return np.abs(self.pit - 0.5) <= 0.5 * self.level
+
+    def __str__(self) -> str:
+        head = ["quantity", "unit", "measured", "median", f"{self.level:.0%} interval", "within"]
+        rows = [[*head, "CRPS", "interval score", "PIT"]]
+        for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            arrays = (self.measured, self.median, self.lower, self.upper, self.crps, self.interval_score)
+            scaled = [array[k] if unit == "SI" else from_si(array[k], unit) for array in arrays]
+            measured, median, lower, upper, crps, score = (f"{each:.3g}" for each in scaled)
+            within = "yes" if self.within[k] else "no"
+            row = [name, unit, measured, median, f"{lower} to {upper}", within, crps, score, f"{self.pit[k]:.3f}"]
+            rows.append(row)
+        return _table(rows)
+
+
+def score_histories(
+    channels: Sequence[Channel],
+    measured: np.ndarray,
+    moments: tuple[np.ndarray, np.ndarray],
+    band: tuple[np.ndarray, np.ndarray],
+    envelope: np.ndarray,
+    level: float,
+) -> HistoryScores:
+    """Score predicted histories.
+
+    Parameters
+    ----------
+    channels : sequence of Channel
+        The channels.
+    measured : ndarray, shape (n_channels, n_samples)
+        Measured values [SI], NaN where missing.
+    moments : (ndarray, ndarray), each (n_channels, n_samples)
+        Predicted means and standard deviations [SI].
+    band : (ndarray, ndarray), each (n_channels, n_samples)
+        Predicted quantiles with the probabilities (1 - level) / 2 and (1 + level) / 2 [SI].
+    envelope : ndarray, shape (n_channels, n_samples)
+        Envelope of the predicted mean [SI].
+    level : float
+        Probability of the band.
+
+    Returns
+    -------
+    HistoryScores
+
+    Raises
+    ------
+    ValueError
+        If a channel has no sample or is zero at all of them.
+
+    Warns
+    -----
+    UserWarning
+        If the predicted standard deviation of measured samples is zero.
+    """
+    error = rrmse(moments[0], measured, [channel.name for channel in channels])
+    there = np.isfinite(measured)
+    inside = (band[0] <= measured) & (measured <= band[1])
+    largest = np.array(LEVELS)[:, None, None] * envelope.max(axis=1, keepdims=True)
+    classes = (envelope >= largest).sum(axis=0)
+    spread = there & (moments[1] > 0.0)
+    certain = there.sum(axis=1) - spread.sum(axis=1)
+    if certain.any():
+        _warn_of_certainty(channels, certain, there.sum(axis=1))
+    transforms = pit_normal(*moments, measured)
+    shares = [_histogram(row[known]) for row, known in zip(transforms, spread, strict=True)]
+    return HistoryScores(
+        channels=tuple(channels),
+        level=level,
+        samples=there.sum(axis=1),
+        rms=np.sqrt(np.nanmean(np.square(measured), axis=1)),
+        rrmse=error,
+        crps=np.nanmean(crps_normal(*moments, measured), axis=1),
+        log_score=_mean(log_score_normal(*moments, measured), spread),
+        interval_score=np.nanmean(interval_score(*band, measured, level), axis=1),
+        width=_mean(band[1] - band[0], there),
+        coverage=_mean(inside, there),
+        coverage_strong=_mean(inside, there & strong_part(measured)),
+        coverage_by_level=np.stack([_mean(inside, there & (classes == k)) for k in range(len(LEVELS) + 1)], axis=1),
+        pit=np.array(shares),
+        without_spread=certain,
+    )
+
+
+def score_values(
+    names: Sequence[str],
+    units: Sequence[str],
+    values: np.ndarray,
+    measured: ArrayLike,
+    level: float,
+    effective_sample_size: float | None = None,
+) -> QuantityScores:
+    """Score predicted numbers.
+
+    Parameters
+    ----------
+    names, units : sequence of str
+        Name and display unit of each quantity.
+    values : ndarray, shape (n, n_quantities)
+        Samples of the predictions [SI], three or more.
+    measured : (n_quantities,) array_like
+        Measured values [SI].
+    level : float
+        Probability of the intervals, between 0 and 1.
+    effective_sample_size : float, optional
+        As for `fe_likelihoods.crps_samples`.
+
+    Returns
+    -------
+    QuantityScores
+    """
+    measured, ascending, n = np.asarray(measured, dtype=float), np.sort(values, axis=0), len(values)
+    rank = max(1, math.ceil(0.5 * (1.0 - level) * (n + 1) - 0.5))  # as `share_within` of the PIT (rank + 0.5) / (n + 1)
+    lower, upper = ascending[rank - 1], ascending[n - rank]
+    return QuantityScores(
+        names=tuple(names),
+        units=tuple(units),
+        level=level,
+        measured=measured,
+        median=np.median(values, axis=0),
+        lower=lower,
+        upper=upper,
+        crps=crps_samples(values, measured, effective_sample_size),
+        log_score=log_score_normal(values.mean(axis=0), values.std(axis=0, ddof=1), measured),
+        interval_score=interval_score(lower, upper, measured, level),
+        pit=pit_samples(values, measured),
+    )
+
+
+def envelope(histories: np.ndarray) -> np.ndarray:
+    """Envelope of histories: the absolute value of the analytic signal, the history plus i times its Hilbert transform.
+
+    Parameters
+    ----------
+    histories : ndarray, shape (n_channels, n_steps)
+        The histories.
+
+    Returns
+    -------
+    ndarray, shape (n_channels, n_steps)
+        The amplitude of the oscillation at each step; 2 for ``2 * sin(omega * t)``.
+    """
+    from scipy.signal import hilbert  # imported here because it is slow to import
+
+    return np.abs(hilbert(histories, axis=-1))
+
+
+def strong_part(measured: ArrayLike, start: float = 0.05, stop: float = 0.95) -> np.ndarray:
+    """Samples of the strong part of histories: between two shares of their sums of squares.
+
+    Parameters
+    ----------
+    measured : (..., n_samples) array_like
+        Histories, NaN where a sample is missing. For an acceleration, the samples between 5 and 95 % are those of the
+        significant duration (M. D. Trifunac, A. G. Brady, 1975, A study on the duration of strong earthquake ground
+        motion, Bulletin of the Seismological Society of America 65, 581-626).
+    start, stop : float
+        The shares.
+
+    Returns
+    -------
+    ndarray of bool, shape (..., n_samples)
+    """
+    squares = np.square(np.nan_to_num(np.asarray(measured, dtype=float)))
+    share = np.cumsum(squares, axis=-1)
+    total = share[..., -1:]
+    return (share >= start * total) & (share - squares <= stop * total)
+
+
+def _warn_of_certainty(channels: Sequence[Channel], certain: np.ndarray, samples: np.ndarray) -> None:
+    which = [f"{c.name} ({k} of {n})" for c, k, n in zip(channels, certain, samples, strict=True) if k]
+    warnings.warn(
+        f"score: the predicted standard deviation of measured samples is zero: {', '.join(which)}. They are left out "
+        "of the log score and of the PIT. Predict with noise=True; for a noise that is a share of the response, state "
+        "the noise of the sensors too, such as RelativeNoise.of(measurements, sensor=...)",
+        stacklevel=4,
+    )
+
+
+def _histogram(transforms: np.ndarray) -> np.ndarray:
+    """Shares of PIT values in each tenth, NaN without any."""
+    counts = np.histogram(transforms, _BINS, (0.0, 1.0))[0]
+    return counts / len(transforms) if len(transforms) else np.full(_BINS, np.nan)
+
+
+def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Mean of each row over the samples `where`, NaN without any."""
+    count = where.sum(axis=1)
+    return np.where(count > 0, np.where(where, values, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """Cells as aligned text; the first column to the left, the others to the right."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        first, *others = (
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append("  ".join([first, *others]).rstrip())
+    return "\n".join(lines)

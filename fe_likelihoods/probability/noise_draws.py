@@ -1,0 +1,107 @@
+"""Draws of the errors of measurements, given the parameters of a noise."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["SampleNoise", "sample_noise"]
+
+
+class SampleNoise(NamedTuple):
+    """Noise of every sample.
+
+    Attributes
+    ----------
+    deviations : ndarray, shape (n, n_channels), or (n, n_events, n_channels)
+        Standard deviations [SI]; the parameters (n, n_noise) of the noise if it depends on the response.
+    lag_one : ndarray, shape (n, n_channels), or None
+        Correlation of successive errors [-], None for white noise.
+    events : tuple of slice
+        Steps of each event, for standard deviations per event. Other steps have no noise.
+    of_response : callable or None
+        For a noise that depends on the response: function of the parameters (n_noise,) of one sample and its response
+        (n_channels, n_steps) that returns the standard deviations (n_channels, n_steps) [SI].
+    """
+
+    deviations: np.ndarray
+    lag_one: np.ndarray | None
+    events: tuple[slice, ...] = ()
+    of_response: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+
+    def over_time(self, levels: np.ndarray, n_steps: int) -> np.ndarray:
+        """Values at all steps, shape (n_channels, n_steps) or (n_channels, 1), from those of one sample."""
+        if not self.events:
+            return levels[:, None]
+        values = np.zeros((levels.shape[1], n_steps))
+        for level, steps in zip(levels, self.events, strict=True):
+            values[:, steps] = level[:, None]
+        return values
+
+    def draw(
+        self, sample: int, n_steps: int, rng: np.random.Generator, response: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Draw the errors of one sample, shape (n_channels, n_steps) [SI].
+
+        The response (n_channels, n_steps) of the sample is needed if the noise depends on it.
+        """
+        errors = rng.standard_normal((self.deviations.shape[-1], n_steps))
+        if self.lag_one is not None:
+            from scipy.signal import lfilter  # imported here because it is slow to import and rarely needed
+
+            for row, rho in zip(errors, self.lag_one[sample], strict=True):
+                # e_t = rho e_{t-1} + sqrt(1 - rho^2) z_t is stationary: e_0 has the same variance as the others.
+                row[1:] *= np.sqrt((1.0 - rho) * (1.0 + rho))
+                row[:] = lfilter([1.0], [1.0, -rho], row)
+        if self.of_response is not None:
+            return self.of_response(self.deviations[sample], response) * errors
+        return self.over_time(self.deviations[sample], n_steps) * errors
+
+
+def sample_noise(noise: Any, parameters: np.ndarray, n_channels: int, dt: float | None = None) -> SampleNoise:
+    """Noise of samples whose levels hold for the whole measurements, or depend on the response.
+
+    Parameters
+    ----------
+    noise : Noise
+        With a method ``standard_deviations``, see `fe_likelihoods.probability.noise.Noise`.
+    parameters : (n, n_noise) float
+        Parameters of the noise.
+    n_channels : int
+        Number of channels.
+    dt : float, optional
+        Time step of the responses [s], for a noise whose level depends on the response. Without it, such a noise has
+        the level of the measurements.
+
+    Returns
+    -------
+    SampleNoise
+
+    Raises
+    ------
+    ValueError
+        If the noise cannot be drawn from, or has impossible standard deviations or correlations.
+    """
+    if not hasattr(noise, "standard_deviations"):
+        raise ValueError(
+            f"{type(noise).__name__} cannot be drawn from: give it a method standard_deviations(parameters (n, "
+            "n_parameters)) that returns (n, n_channels) in SI units"
+        )
+    deviations = np.asarray(noise.standard_deviations(parameters), dtype=float)
+    if deviations.shape != (len(parameters), n_channels) or not np.all((deviations > 0) & (deviations < np.inf)):
+        raise ValueError(
+            f"the noise needs a positive standard deviation for each of {len(parameters)} samples and {n_channels} "
+            f"channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
+        )
+    if dt is not None and hasattr(noise, "response_deviations"):
+        return SampleNoise(parameters, None, of_response=partial(noise.response_deviations, dt=dt))
+    if not hasattr(noise, "lag_one_correlations"):
+        return SampleNoise(deviations, None)
+    lag_one = np.asarray(noise.lag_one_correlations(parameters), dtype=float)
+    if lag_one.shape != deviations.shape or not np.all(np.abs(lag_one) < 1.0):
+        raise ValueError(
+            f"the noise needs a correlation between -1 and 1 for each of {len(parameters)} samples and {n_channels} "
+            f"channels; got shape {lag_one.shape}, largest {np.abs(lag_one).max(initial=0.0)}"
+        )
+    return SampleNoise(deviations, lag_one)

@@ -1,0 +1,111 @@
+"""What the parameters of a likelihood are: units, nominal values and labels, for tables and figures.
+
+Densities and samplers work with plain numbers: structural parameters in the model's own convention, often multiples of
+nominal values, and noise parameters in SI units. `Parameter` says how to show such a number to a reader.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..signals.channels import Channel
+from ..simulation.model import Model
+from ..units import UNITS, find_unit
+from .event_noise import EventNoise
+from .marginal_noise import sampled_noise
+from .noise import Noise, SharedGaussianNoise, noise_channels
+from .relative_noise import RelativeNoise
+
+__all__ = ["Parameter", "channels_of_deviations", "describe_parameters"]
+
+
+class Parameter(NamedTuple):
+    """What is known of one parameter.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    unit : str
+        Unit in which it is shown: "-" for multiples of nominal values and other numbers without a unit, empty where the
+        unit is not known.
+    factor : float
+        Size of that unit in the unit of the samples: a sample divided by `factor` is in `unit`.
+    nominal : float
+        Nominal value, in the unit of the samples: 1 for multiples of nominal values, NaN where none is known.
+    multiple_of : str
+        What a multiple is a multiple of, such as "28.3 GPa"; empty for other parameters.
+    """
+
+    name: str
+    unit: str = ""
+    factor: float = 1.0
+    nominal: float = np.nan
+    multiple_of: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name and unit, for axes and tables: "sigma_top [mm]", "Ec [x 28.3 GPa]", "damping"."""
+        unit = f"x {self.multiple_of}" if self.multiple_of else self.unit
+        return f"{self.name} [{unit}]" if unit else self.name
+
+    def shown(self, values: np.ndarray) -> np.ndarray:
+        """Values of samples in the unit in which the parameter is shown."""
+        return np.asarray(values, dtype=float) / self.factor
+
+
+def describe_parameters(model: Model, noise: Noise) -> tuple[Parameter, ...]:
+    """Describe the parameters of a model and of a noise, in this order.
+
+    Parameters
+    ----------
+    model : Model
+        Optional members are used: ``nominal``, a mapping of names to the nominal values [SI] of which the parameters
+        are multiples; ``nominal_units``, a mapping of names to the units in which these are shown; ``parameter_units``,
+        a mapping of the names of other parameters to their units in words.
+    noise : Noise
+
+    Returns
+    -------
+    tuple of Parameter
+    """
+    return (*(_of_model(model, name) for name in model.parameter_names), *_of_noise(noise, model.channels))
+
+
+def _of_model(model: Model, name: str) -> Parameter:
+    units, nominal = getattr(model, "parameter_units", {}), getattr(model, "nominal", {})
+    if name in units:
+        return Parameter(name, str(units[name]))
+    if not isinstance(nominal, Mapping) or name not in nominal:
+        return Parameter(name)
+    unit = str(getattr(model, "nominal_units", {}).get(name, ""))
+    value = nominal[name] / (find_unit(unit).factor if unit in UNITS else 1.0)
+    # the nominal value itself where its unit is not known
+    return Parameter(name, "-", 1.0, 1.0, f"{value:.4g} {unit}".rstrip(" -"))
+
+
+def channels_of_deviations(noise: Noise, default: Sequence[Channel]) -> dict[str, Channel]:
+    """Channel of each noise parameter that is a standard deviation in the unit of a channel, by name.
+
+    `default`: the channels of the model, for a noise that does not specify its own.
+    """
+    sampled = sampled_noise(noise)
+    if isinstance(sampled, EventNoise):
+        rows = [sampled.channels[row] for _, row in sampled.levels]
+        return dict(zip(sampled.parameter_names, rows, strict=True))
+    return {f"sigma_{channel.name}": channel for channel in noise_channels(sampled, default)}
+
+
+def _of_noise(noise: Noise, default: Sequence[Channel]) -> list[Parameter]:
+    sampled, channels, described = sampled_noise(noise), channels_of_deviations(noise, default), []
+    for name in noise.parameter_names:
+        if name in channels:
+            channel = channels[name]
+            described.append(Parameter(name, channel.unit, find_unit(channel.unit, channel.dimension).factor))
+        elif name.startswith("time_shift_"):
+            described.append(Parameter(name, "s"))
+        else:
+            dimensionless = name.startswith("rho_") or isinstance(sampled, SharedGaussianNoise | RelativeNoise)
+            described.append(Parameter(name, "-" if dimensionless else ""))
+    return described

@@ -1,0 +1,247 @@
+"""Measurements, replicated measurements and the log-likelihood of blocks, as exchange formats such as arviz need them.
+
+Samplers know no structures. They ask a posterior for these plain arrays by the names of its methods.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..signals.channels import Channel
+from ..signals.comparison import Comparison
+from ..signals.records import Record
+from ..simulation.model import SimulationFailed
+from .block_likelihood import BlockLogLikelihood, block_log_likelihood, choose_blocks, describe_blocks
+from .event_noise import EventNoise
+from .joint import JointLikelihood
+from .likelihood import FELikelihood
+from .marginal_noise import MarginalNoise
+from .noise_draws import SampleNoise, sample_noise
+from .time_shift_noise import TimeShiftNoise
+
+if TYPE_CHECKING:
+    from .noise import Noise
+
+__all__ = ["MeasuredData", "MeasuredHistory", "PredictiveDraws", "measured_data", "predictive_draws"]
+
+
+class MeasuredHistory(NamedTuple):
+    """One measured channel, or one component of the excitation.
+
+    Attributes
+    ----------
+    name : str
+        Name of the channel; with the name of its likelihood before it for a `JointLikelihood`.
+    channel : Channel
+        Quantity and units; `values` are in ``channel.si_unit``.
+    time : ndarray, shape (n_samples,)
+        Times [s].
+    values : ndarray, shape (n_samples,)
+        Samples [SI], without those that are missing.
+    """
+
+    name: str
+    channel: Channel
+    time: np.ndarray
+    values: np.ndarray
+
+
+class MeasuredData(NamedTuple):
+    """What a posterior was conditioned on.
+
+    Attributes
+    ----------
+    channels : tuple of MeasuredHistory
+        The measurements.
+    excitations : tuple of MeasuredHistory
+        Records of the excitation, where the model has any.
+    time_steps : dict of str to float
+        Time step of each channel [s].
+    """
+
+    channels: tuple[MeasuredHistory, ...]
+    excitations: tuple[MeasuredHistory, ...]
+    time_steps: dict[str, float]
+
+
+class PredictiveDraws(NamedTuple):
+    """Predictions of the measurements by samples of the posterior.
+
+    Attributes
+    ----------
+    responses : dict of str to ndarray, shape (n, n_samples)
+        Simulated response at the measured samples [SI], by the names of `MeasuredHistory`.
+    replicates : dict of str to ndarray, shape (n, n_samples)
+        Response plus one draw of the noise: measurements that the sample predicts [SI]. Empty where the noise cannot be
+        drawn from.
+    blocks : BlockLogLikelihood
+        Log-likelihood in blocks of time.
+    notes : tuple of str
+        What is left out, and why.
+    """
+
+    responses: dict[str, np.ndarray]
+    replicates: dict[str, np.ndarray]
+    blocks: BlockLogLikelihood
+    notes: tuple[str, ...]
+
+
+def measured_data(likelihood: FELikelihood | JointLikelihood) -> MeasuredData:
+    """Measurements and excitation of a likelihood; nothing is simulated."""
+    channels, excitations, steps = [], [], {}
+    for prefix, each, _ in _named_parts(likelihood):
+        for channel, step, row in zip(
+            each.measurements.channels, each.measurements.steps, _compared(each), strict=True
+        ):
+            there, name = ~np.isnan(row), f"{prefix}{channel.name}"
+            channels.append(MeasuredHistory(name, channel, each.measurements.times(channel.name)[there], row[there]))
+            steps[name] = float(step)
+        for key, record in _records_of(each.model):
+            channel = Channel(key, "acceleration", "m/s2")
+            excitations.append(MeasuredHistory(f"{prefix}{key}", channel, record.time, record.acceleration))
+    return MeasuredData(tuple(channels), tuple(excitations), steps)
+
+
+def predictive_draws(
+    likelihood: FELikelihood | JointLikelihood, samples: np.ndarray, block: float | None = None, seed: int = 0
+) -> PredictiveDraws:
+    """Responses, replicated measurements and block log-likelihood of samples, see `Posterior.predictive_draws`."""
+    samples = np.atleast_2d(np.asarray(samples, dtype=float))
+    if samples.shape[1] != likelihood.ndim or not len(samples):
+        raise ValueError(f"expected samples of shape (n, {likelihood.ndim}); got {samples.shape}")
+    rng = np.random.default_rng(seed)
+    responses: dict[str, np.ndarray] = {}
+    replicates: dict[str, np.ndarray] = {}
+    notes, blocks = [], []
+    for prefix, each, columns in _named_parts(likelihood):
+        noise, rows = _with_noise_parameters(each, samples[:, columns], rng)
+        simulated, values = _responses(each, rows), _compared(each)
+        residuals = _residuals(each, rows, simulated)
+        parameters = rows[:, len(each.model.parameter_names) :]
+        errors = _errors(each, noise, parameters, simulated, rng)
+        if errors is None:
+            notes.append(f"{prefix}no replicated measurements: {type(noise).__name__} cannot be drawn from")
+        for place, channel in enumerate(each.measurements.channels):
+            there, name = ~np.isnan(values[place]), f"{prefix}{channel.name}"
+            responses[name] = (residuals[:, place] + values[place])[:, there]
+            if errors is not None:
+                replicates[name] = responses[name] + errors[:, place, there]
+        blocks.append(_blocks(each, noise, values, residuals, parameters, block, prefix.rstrip("_")))
+    joined = BlockLogLikelihood(
+        np.concatenate([each.values for each in blocks], axis=1),
+        np.concatenate([each.starts for each in blocks]),
+        np.concatenate([each.stops for each in blocks]),
+        tuple(name for each in blocks for name in each.parts),
+        max(each.seconds for each in blocks),
+        max((each.note for each in blocks), key=len),
+    )
+    return PredictiveDraws(responses, replicates, joined, tuple(notes))
+
+
+def _named_parts(likelihood: FELikelihood | JointLikelihood) -> Iterator[tuple[str, FELikelihood, list[int]]]:
+    names = [f"{key}_" for key in likelihood.likelihoods] if isinstance(likelihood, JointLikelihood) else [""]
+    for name, (part, columns) in zip(names, likelihood.parts(), strict=True):
+        yield name, part, columns
+
+
+def _compared(likelihood: FELikelihood) -> np.ndarray:
+    """The samples that are compared (n_channels, n_samples) [SI], NaN where there is none."""
+    return getattr(likelihood.measured, "values", likelihood.measured)
+
+
+def _records_of(model: object) -> list[tuple[str, Record]]:
+    found = []
+    for name in ("record", "vertical", "loading", "supports"):  # of the models of this package; optional in others
+        excitation = getattr(model, name, None)
+        several = isinstance(excitation, tuple | list)
+        for place, each in enumerate(excitation if several else (excitation,)):
+            if isinstance(each, Record):
+                found.append((f"{name}_{place}" if several else name, each))
+    return found
+
+
+def _with_noise_parameters(
+    likelihood: FELikelihood, rows: np.ndarray, rng: np.random.Generator
+) -> tuple["Noise", np.ndarray]:
+    """The noise whose parameters are in the returned rows: those that were integrated out are drawn."""
+    if not isinstance(likelihood.noise, MarginalNoise):
+        return likelihood.noise, rows
+    return likelihood.noise.noise, np.stack(list(likelihood.draw_noise(rows, rng).values()), axis=1)
+
+
+def _responses(likelihood: FELikelihood, rows: np.ndarray) -> np.ndarray:
+    """Simulated response of each row at the steps of the model, (n, n_channels, n_steps) [SI]."""
+    batch = likelihood.simulate(rows[:, : len(likelihood.model.parameter_names)])
+    if failed := [reason for reason in batch.reasons if reason]:
+        raise SimulationFailed(
+            f"{len(failed)} of {len(rows)} samples of the posterior cannot be simulated; the first reason: "
+            f"{failed[0]}. Leave these samples out, or simulate again if the cause was not the model"
+        )
+    return batch.response
+
+
+def _residuals(likelihood: FELikelihood, rows: np.ndarray, responses: np.ndarray) -> np.ndarray:
+    """Simulated minus measured response of each row, (n, n_channels, n_samples) [SI], NaN where a sample is missing."""
+    if not isinstance(likelihood.measured, Comparison):
+        return responses - likelihood.measured
+    if not isinstance(likelihood.noise, TimeShiftNoise):
+        return np.stack([likelihood.measured.residuals(response) for response in responses])
+    measurements, found = likelihood.measurements, []
+    for response, row in zip(responses, rows, strict=True):
+        values = dict(zip(likelihood.parameter_names, row, strict=True))
+        times = {name: measurements.times(name) - values[f"time_shift_{name}"] for name in likelihood.noise.time_shifts}
+        found.append(likelihood.measured.residuals_at(response, likelihood.model.dt, measurements.channels, times))
+    return np.stack(found)
+
+
+def _errors(
+    likelihood: FELikelihood,
+    noise: "Noise",
+    parameters: np.ndarray,
+    responses: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray | None:
+    """One draw of the errors per row, (n, n_channels, n_samples) [SI]; None for a noise that cannot be drawn from."""
+    n_channels, n_samples = _compared(likelihood).shape
+    if isinstance(noise, EventNoise):
+        deviations = np.nan_to_num(noise.deviations_per_event(parameters))
+        drawn = SampleNoise(deviations, None, tuple(slice(*window) for window in noise.windows))
+    elif hasattr(noise, "standard_deviations"):
+        drawn = sample_noise(noise, parameters, n_channels, likelihood.model.dt)
+    else:
+        return None
+    if drawn.of_response is not None and isinstance(likelihood.measured, Comparison):
+        # deviations at the steps of the model, then at the times of the samples, where interpolation may overshoot
+        drawn = drawn._replace(of_response=partial(_deviations_at_samples, likelihood.measured, drawn.of_response))
+    return np.stack([drawn.draw(row, n_samples, rng, response) for row, response in enumerate(responses)])
+
+
+def _deviations_at_samples(
+    comparison: Comparison,
+    of_response: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    parameters: np.ndarray,
+    response: np.ndarray,
+) -> np.ndarray:
+    return np.maximum(comparison.at_samples(np.ascontiguousarray(of_response(parameters, response))), 0.0)
+
+
+def _blocks(
+    likelihood: FELikelihood,
+    noise: "Noise",
+    values: np.ndarray,
+    residuals: np.ndarray,
+    parameters: np.ndarray,
+    block: float | None,
+    name: str,
+) -> BlockLogLikelihood:
+    if isinstance(noise, TimeShiftNoise):  # the residuals are those at the shifts already
+        parameters, noise = parameters[:, : len(noise.noise.parameter_names)], noise.noise
+    whole = np.array([np.inf])
+    total = block_log_likelihood(noise, likelihood.measurements, values, residuals, parameters, whole)[:, 0]
+    starts, stops = choose_blocks(likelihood.measurements, values, residuals[np.argmax(total)], block)
+    terms = block_log_likelihood(noise, likelihood.measurements, values, residuals, parameters, stops)
+    seconds = float(np.max(stops - starts))
+    note = describe_blocks(seconds, block is None, noise)
+    return BlockLogLikelihood(terms, starts, stops, (name,) * len(stops), seconds, note)

@@ -1,0 +1,342 @@
+"""Scores of predictions: closed forms, propriety, missing samples, tables; controls with wrong predictions."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.prediction.propagation import propagate
+from fe_likelihoods.prediction.quantities import final_value, peak, rms
+from fe_likelihoods.prediction.score_tables import envelope, score_values, strong_part
+from fe_likelihoods.prediction.scores import (
+    crps_normal,
+    crps_samples,
+    interval_score,
+    log_score_normal,
+    pit_normal,
+    pit_samples,
+    share_within,
+)
+from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.relative_noise import RelativeNoise
+from fe_likelihoods.signals.channels import Channel, Measurements
+
+PAIR = (Channel("top", "displacement", "mm"), Channel("base", "acceleration", "g"))
+
+
+@pytest.mark.parametrize("y", (-3.0, 0.2, 1.7))
+def test_scores_of_a_normal_distribution_are_those_of_its_definitions(y):
+    mean, sd = 0.5, 0.8
+    below = integrate.quad(lambda x: stats.norm.cdf(x, mean, sd) ** 2, -12.0, y)[0]
+    above = integrate.quad(lambda x: stats.norm.sf(x, mean, sd) ** 2, y, 12.0)[0]
+    assert crps_normal(mean, sd, y) == pytest.approx(below + above, abs=1e-7)
+    assert log_score_normal(mean, sd, y) == pytest.approx(-stats.norm.logpdf(y, mean, sd), rel=1e-12)
+    assert pit_normal(mean, sd, y) == pytest.approx(stats.norm.cdf(y, mean, sd), rel=1e-12)
+
+
+def test_a_prediction_without_spread_scores_its_absolute_error():
+    assert crps_normal(1.0, 0.0, 3.5) == 2.5
+    assert crps_samples([1.0, 1.0, 1.0], 3.5) == 2.5
+    assert log_score_normal(1.0, 0.0, 3.5) == np.inf
+
+
+def test_crps_of_samples_is_the_sum_over_pairs_and_unbiased(rng):
+    values, y = rng.normal(size=(7, 3)), np.array([0.0, 1.0, -2.0])
+    pairs = np.abs(values[:, None] - values[None]).sum(axis=(0, 1)) / (2.0 * 7 * 6)
+    np.testing.assert_allclose(crps_samples(values, y), np.abs(values - y).mean(axis=0) - pairs, rtol=1e-12)
+    few = crps_samples(rng.normal(size=(5, 20_000)), np.full(20_000, 0.7))
+    assert abs(few.mean() - crps_normal(0.0, 1.0, 0.7)) < 4.0 * few.std() / np.sqrt(len(few))
+
+
+def test_interval_score_by_hand():
+    np.testing.assert_allclose(interval_score(1.0, 3.0, [2.0, 0.5, 4.0], 0.9), [2.0, 2.0 + 20 * 0.5, 2.0 + 20 * 1.0])
+    with pytest.raises(ValueError, match="level must be a probability"):
+        interval_score(1.0, 3.0, 2.0, 90)
+
+
+def test_scores_are_proper_and_coverage_is_not(rng):
+    """The true distribution has the smallest expected score; a band ten times too wide has the largest coverage."""
+    y = rng.normal(size=20_000)
+    half = stats.norm.ppf(0.95)
+
+    def scores(mean, sd):
+        band = mean - half * sd, mean + half * sd
+        return crps_normal(mean, sd, y), log_score_normal(mean, sd, y), interval_score(*band, y, 0.9)
+
+    truth = scores(0.0, 1.0)
+    for wrong in ((0.3, 1.0), (0.0, 0.6), (0.0, 1.6), (0.0, 10.0)):
+        for right, other in zip(truth, scores(*wrong), strict=True):
+            difference = other - right
+            assert difference.mean() > 4.0 * difference.std() / np.sqrt(len(y)), wrong
+    assert np.mean(np.abs(y) < 10.0 * half) > np.mean(np.abs(y) < half) + 0.05
+
+
+def test_crps_of_samples_is_proper(rng):
+    y = rng.gumbel(size=4000)
+    right = crps_samples(rng.gumbel(size=(50, 4000)), y)
+    for wrong in (rng.gumbel(0.4, size=(50, 4000)), rng.gumbel(scale=2.0, size=(50, 4000)), np.full((50, 4000), 0.6)):
+        difference = crps_samples(wrong, y) - right
+        assert difference.mean() > 4.0 * difference.std() / np.sqrt(len(y))
+
+
+def test_pit_of_samples_is_uniform_for_the_true_distribution_alone(rng):
+    pit = pit_samples(rng.normal(size=(99, 3000)), rng.normal(size=3000))
+    assert stats.kstest(pit, "uniform").pvalue > 1e-3
+    narrow = pit_samples(0.5 * rng.normal(size=(99, 3000)), rng.normal(size=3000))
+    assert stats.kstest(narrow, "uniform").pvalue < 1e-10
+    assert abs(share_within(pit, 0.9) - 0.9) < 4.0 * np.sqrt(0.09 / 3000)
+    assert share_within(narrow, 0.9) < 0.65
+    assert 0.0 < pit_samples([[1.0], [2.0]], [9.0])[0] < 1.0
+
+
+def test_missing_values_have_no_score():
+    observed = np.array([np.nan, 1.0])
+    for scores in (
+        crps_normal(0.0, 1.0, observed),
+        log_score_normal(0.0, 1.0, observed),
+        log_score_normal(0.0, [0.0, 1.0], observed),
+        interval_score(-1.0, 1.0, observed, 0.9),
+        pit_normal(0.0, 1.0, observed),
+        pit_samples(np.zeros((3, 2)), observed),
+        crps_samples(np.zeros((3, 2)), observed),
+    ):
+        assert np.isnan(scores[0]) and np.isfinite(scores[1])
+
+
+def test_what_is_no_distribution_or_interval_is_refused():
+    with pytest.raises(ValueError, match="2 of 3 are above: exchange them"):
+        interval_score([1.0, 1.0, np.nan], [-1.0, 0.5, 2.0], 0.0, 0.9)
+    for score in (crps_normal, log_score_normal, pit_normal):
+        with pytest.raises(ValueError, match=r"zero or more; the smallest is -1\.0"):
+            score(0.0, [1.0, -1.0, np.nan], 0.3)
+    np.testing.assert_array_equal(pit_samples([[1.0, 1.0], [np.nan, 2.0]], [2.0, 1.5]), [np.nan, 0.5])
+    assert np.isnan(crps_samples([1.0, np.nan, 3.0], 2.0))
+    with pytest.raises(ValueError, match="must be above 1"):
+        crps_samples([1.0, 2.0], 1.0, effective_sample_size=1.0)
+
+
+def test_crps_of_copies_is_unbiased_for_the_effective_sample_size(rng):
+    """The default is too large for copies, by the stated share of the score of a calibrated normal prediction."""
+    copies = np.repeat(rng.normal(size=(20, 20_000)), 20, axis=0)
+    y = rng.normal(size=20_000)
+    exact = crps_normal(0.0, 1.0, y)
+    right, wrong = (crps_samples(copies, y, n) - exact for n in (20, None))
+    assert abs(right.mean()) < 4.0 * right.std() / np.sqrt(len(y))
+    share = wrong.mean() / exact.mean()
+    assert abs(share - (1 / 20 - 1 / 400)) < 4.0 * wrong.std() / np.sqrt(len(y)) / exact.mean()
+
+
+@pytest.mark.parametrize(("n", "level"), ((10, 0.9), (19, 0.9), (20, 0.9), (101, 0.9), (30, 0.5)))
+def test_intervals_from_few_samples_have_their_level_and_are_those_of_the_pit(n, level, rng):
+    values, y = rng.normal(size=(2, n, 20_000))[0], rng.normal(size=20_000)
+    scores = score_values([""] * 20_000, ["SI"] * 20_000, values, y, level)
+    np.testing.assert_array_equal(scores.within, (scores.lower <= y) & (y <= scores.upper))
+    assert scores.within.mean() == share_within(scores.pit, level)
+    nearest = 1.0 / (n + 1.0)  # half a rank at both ends
+    assert abs(scores.within.mean() - level) < nearest + 4.0 * np.sqrt(level * (1 - level) / 20_000)
+
+
+def test_share_within_leaves_missing_values_out_and_refuses_others():
+    assert share_within([0.1, np.nan, 0.4, 0.97], 0.9) == pytest.approx(2 / 3)
+    for bad in ([], [np.nan], [1.2]):
+        with pytest.raises(ValueError, match="PIT values between 0 and 1"):
+            share_within(bad, 0.9)
+    with pytest.raises(ValueError, match="samples \\(n, ...\\)"):
+        pit_samples([[1.0, 2.0]], [1.0, 2.0])
+
+
+def test_envelope_and_strong_part():
+    time = np.arange(1000) * 0.01
+    history = np.where(np.abs(time - 5.0) < 2.0, 2.0, 0.01) * np.sin(2.0 * np.pi * 5.0 * time)
+    around = envelope(history[None])[0]
+    np.testing.assert_allclose(around[400:600], 2.0, rtol=0.05)
+    strong = strong_part(history)
+    assert time[strong][0] == pytest.approx(3.2, abs=0.06) and time[strong][-1] == pytest.approx(6.8, abs=0.06)
+
+
+@pytest.fixture
+def oscillator(record):
+    return LinearOscillator(record)
+
+
+def noisy(oscillator, rng, sigma):
+    response = oscillator.simulate([1.1, 0.9])
+    return response, Measurements(
+        oscillator.channels, oscillator.dt, response + np.array(sigma)[:, None] * rng.normal(size=response.shape)
+    )
+
+
+def posterior_of(oscillator, measured):
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
+    prior |= {"sigma_acceleration": HalfNormal(0.5), "sigma_displacement": HalfNormal(0.05)}
+    return Posterior(FELikelihood(oscillator, measured), prior)
+
+
+SIGMA = (0.05, 0.0003)
+
+
+def samples(n, factor=1.0):
+    return np.tile([1.1, 0.9, factor * SIGMA[0], factor * SIGMA[1]], (n, 1))
+
+
+def test_scores_of_histories_are_averages_over_the_measured_samples(oscillator, rng):
+    _, measured = noisy(oscillator, rng, SIGMA)
+    values = measured.values.copy()
+    values[0, 5:9] = np.nan
+    measured = Measurements(measured.channels, measured.dt, values)
+    prediction = propagate(posterior_of(oscillator, measured), samples(200), noise=True, seed=1, progress=False)
+    scores = prediction.score(measured)
+    there = np.isfinite(values)
+    assert scores.samples.tolist() == [46, 50]
+    for k in range(2):
+        mean, sd, y = (each[k, there[k]] for each in (prediction.mean, prediction.sd, values))
+        lower, upper = (prediction.quantile(p)[k, there[k]] for p in (0.05, 0.95))
+        assert scores.crps[k] == pytest.approx(crps_normal(mean, sd, y).mean(), rel=1e-12)
+        assert scores.log_score[k] == pytest.approx(log_score_normal(mean, sd, y).mean(), rel=1e-12)
+        assert scores.interval_score[k] == pytest.approx(interval_score(lower, upper, y, 0.9).mean(), rel=1e-12)
+        assert scores.pit[k].sum() == pytest.approx(1.0)
+    np.testing.assert_array_equal(scores.coverage, prediction.coverage(measured))
+    np.testing.assert_allclose(scores.rrmse, prediction.rrmse(measured), rtol=1e-12)
+    assert str(scores).splitlines()[1].split()[:2] == ["acceleration", oscillator.channels[0].unit]
+
+
+def test_the_true_noise_scores_best_and_covers_every_level(rng):
+    from fe_likelihoods.signals.records import Record
+
+    oscillator = LinearOscillator(Record("long", 0.02, rng.normal(size=3000)))
+    response, measured = noisy(oscillator, rng, SIGMA)
+    posterior = posterior_of(oscillator, measured)
+    right, narrow, wide = (
+        propagate(posterior, samples(400, f), noise=True, seed=1, progress=False).score(measured) for f in (1, 0.3, 4)
+    )
+    for name in ("crps", "log_score", "interval_score"):
+        assert (getattr(right, name) < getattr(narrow, name)).all() and (
+            getattr(right, name) < getattr(wide, name)
+        ).all()
+    error = 4.0 * np.sqrt(0.09 / 300)
+    assert (np.abs(right.coverage - 0.9) < error).all() and (np.abs(right.coverage_strong - 0.9) < error).all()
+    assert (narrow.coverage < 0.6).all() and (wide.coverage > 0.98).all()
+    assert (np.abs(right.pit - 0.1) < 4.0 * np.sqrt(0.09 / 3000)).all()
+    assert (narrow.pit[:, [0, -1]] > 0.2).all() and (wide.pit[:, 4:6] > 0.15).all()
+
+
+def test_scores_of_peaks_and_other_numbers(oscillator, rng):
+    response, measured = noisy(oscillator, rng, SIGMA)
+    posterior = posterior_of(oscillator, measured)
+    for quantity, expected in (
+        (peak("displacement"), np.abs(measured.values[1]).max()),
+        (rms("displacement"), np.sqrt(np.mean(measured.values[1] ** 2))),
+        (final_value("displacement", 5), measured.values[1, -5:].mean()),
+    ):
+        prediction = propagate(posterior, samples(100), quantity=quantity, noise=True, seed=1, progress=False)
+        scores = prediction.score(measured)
+        assert scores.measured[0] == pytest.approx(expected, rel=1e-12)
+        assert scores.crps[0] == pytest.approx(crps_samples(prediction.values, expected), rel=1e-12)
+        assert scores.within[0] == (scores.lower[0] <= expected <= scores.upper[0])
+        assert prediction.score(expected)[3:] == scores[3:]
+        assert str(scores).splitlines()[1].startswith("displacement")
+    both = propagate(
+        posterior, samples(100), quantity=[peak("displacement"), peak("acceleration")], noise=True, progress=False
+    )
+    assert both.score(measured).names == ("displacement", "acceleration")
+
+
+def test_what_cannot_be_scored_is_refused(oscillator, rng):
+    _, measured = noisy(oscillator, rng, SIGMA)
+    posterior = posterior_of(oscillator, measured)
+    histories = propagate(posterior, samples(30), noise=True, progress=False)
+    with pytest.raises(ValueError, match="needs Measurements"):
+        histories.score([1.0, 2.0])
+    with pytest.raises(ValueError, match="no quantile"):
+        histories.score(measured, level=0.5)
+    with pytest.raises(ValueError, match="level must be a probability"):
+        histories.score(measured, level=90)
+    whole = propagate(posterior, samples(30), quantity=lambda response: np.abs(response).max(axis=1), progress=False)
+    with pytest.raises(ValueError, match="give the measured values"):
+        whole.score(measured)
+    assert whole.score([1.0, 0.01]).units == ("SI", "SI")
+    with pytest.raises(ValueError, match="of the shape of the quantity"):
+        whole.score(1.0)
+    top = propagate(posterior, samples(30), quantity=peak("displacement"), progress=False)
+    gaps = measured.values.copy()
+    gaps[1, 3] = np.nan
+    with pytest.raises(ValueError, match="samples of channel 'displacement' are missing"):
+        top.score(Measurements(measured.channels, measured.dt, gaps))
+    with pytest.raises(ValueError, match="whole number"):
+        final_value("displacement", 0)
+
+
+def test_samples_at_rest_are_left_out_of_log_score_and_pit(rng):
+    """A windowed share of the response predicts no noise before the motion: the score counts and names such samples."""
+    n = 600
+    shape = np.where(np.arange(n) < 200, 0.0, np.sin(0.3 * np.arange(n)))
+    model = FunctionModel(lambda theta: [theta[0] * shape, theta[0] * np.cos(0.3 * np.arange(n))], ["a"], PAIR, 0.02, n)
+    values = model.simulate([1.0]) + np.array([[1e-3], [0.3]]) * rng.normal(size=(2, n))
+    measured = Measurements(PAIR, 0.02, values)
+    prior = {"a": TruncatedNormal(1.0, 0.3), "share_top": HalfNormal(0.5), "share_base": HalfNormal(0.5)}
+    rows = np.tile([1.0, 0.3, 0.3], (100, 1))
+
+    def predicted(**options):
+        noise = RelativeNoise.of(measured, window=0.1, **options)
+        return propagate(
+            Posterior(FELikelihood(model, measured, noise), prior), rows, noise=True, seed=1, progress=False
+        )
+
+    with pytest.warns(UserWarning, match=r"is zero: top \(198 of 600\)\. .*sensor="):
+        scores = predicted().score(measured)
+    assert scores.without_spread.tolist() == [198, 0] and str(scores).endswith("is zero: 198 of top")
+    assert np.isfinite(scores.log_score).all() and np.isfinite(scores.crps).all()
+    np.testing.assert_allclose(scores.pit.sum(axis=1), 1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not predicted(sensor={"top": 1e-3}).score(measured).without_spread.any()
+
+
+def test_few_samples_are_refused_or_warned_of(oscillator, rng):
+    _, measured = noisy(oscillator, rng, SIGMA)
+    posterior = posterior_of(oscillator, measured)
+
+    def predicted(n, **options):
+        return propagate(posterior, samples(n), noise=True, seed=1, progress=False, **options)
+
+    with pytest.raises(ValueError, match="expected 2 samples or more, and 20 for intervals of 90 %; got 1"):
+        predicted(1).score(measured)
+    with pytest.raises(ValueError, match="expected 3 samples or more"):
+        predicted(2, quantity=peak("displacement")).score(measured)
+    for options in ({}, {"quantity": peak("displacement")}):
+        with pytest.warns(UserWarning, match="from 19 samples and do not have their level of 0.9"):
+            predicted(19, **options).score(measured)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            predicted(20, **options).score(measured)
+
+
+def test_quantities_are_scored_for_the_effective_sample_size_of_the_prediction(oscillator, rng):
+    _, measured = noisy(oscillator, rng, SIGMA)
+    options = {"quantity": peak("displacement"), "noise": True, "seed": 1, "progress": False}
+    posterior = posterior_of(oscillator, measured)
+    prediction = propagate(posterior, samples(100), effective_sample_size=10.0, **options)
+    scores, values = prediction.score(measured), prediction.values[:, None]
+    assert scores.crps[0] == pytest.approx(crps_samples(values, scores.measured, 10.0)[0], rel=1e-12)
+    assert scores.crps[0] < crps_samples(values, scores.measured)[0]
+    expected = log_score_normal(values.mean(), values.std(ddof=1), scores.measured)
+    assert scores.log_score[0] == pytest.approx(expected[0], rel=1e-12)
+
+
+def test_channels_with_steps_of_their_own_are_scored_at_their_samples(oscillator, rng):
+    response, _ = noisy(oscillator, rng, SIGMA)
+    coarse = Measurements(
+        (Channel("displacement", "relative displacement", "mm"),), 2.0 * oscillator.dt, response[1:, ::2]
+    )
+    prediction = propagate(
+        posterior_of(oscillator, noisy(oscillator, rng, SIGMA)[1]), samples(50), quantity="displacement", progress=False
+    )
+    with pytest.warns(UserWarning, match=r"noise=True"):  # equal samples without noise
+        scores = prediction.score(coarse)
+    assert scores.without_spread.tolist() == [25] and np.isnan(scores.log_score[0])
+    assert scores.samples.tolist() == [25] and scores.rrmse[0] < 1e-9

@@ -1,0 +1,207 @@
+"""Noise that is a share of the response level: likelihood, level of a response, predictions under other motions."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.prediction.propagation import propagate
+from fe_likelihoods.prediction.quantities import rms
+from fe_likelihoods.probability.block_likelihood import block_log_likelihood
+from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import GaussianNoise
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.relative_noise import RelativeNoise, local_level
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+
+TOP = Channel("top", "displacement", "mm")
+
+
+@pytest.fixture
+def record(rng):
+    time = 0.02 * np.arange(1500)
+    return Record("burst", 0.02, np.exp(-(((time - 10.0) / 3.0) ** 2)) * rng.standard_normal(1500))
+
+
+def posterior_of(model, measured, **options):
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
+    noise = RelativeNoise.of(measured, **options)
+    return Posterior(FELikelihood(model, measured, noise), prior | {n: HalfNormal(0.5) for n in noise.parameter_names})
+
+
+def test_the_likelihood_is_that_of_white_noise_with_the_scaled_deviations(rng):
+    channels = (TOP, Channel("base", "acceleration", "g"))
+    values = rng.standard_normal((2, 40)) * [[0.01], [2.0]]
+    values[0, 3] = np.nan
+    measured = Measurements(channels, 0.01, values)
+    misfit, shares = np.array([[1e-4, 3.0], [np.nan, 1.0]]), np.array([[0.2, 0.3], [0.2, 0.3]])
+    levels = np.sqrt(np.nanmean(values**2, axis=1))
+    for options in ({}, {"sensor": (0.001, 0.1)}, {"effective_samples": (20, 30)}):
+        noise = RelativeNoise.of(measured, **options)
+        expected = GaussianNoise(channels, **options).log_likelihood(misfit, 40, shares * levels)
+        np.testing.assert_array_equal(noise.log_likelihood(misfit, 40, shares), expected)
+        assert noise.log_likelihood(misfit, 40, -shares)[0] == -np.inf
+        assert noise.log_likelihood(misfit, 40, [[0.2, 1.0], [0.2, 1.0]])[0] == -np.inf
+    assert noise.parameter_names == ("share_top", "share_base")
+    sensor = RelativeNoise.of(measured, sensor={"base": 0.1}).standard_deviations(shares)
+    np.testing.assert_allclose(sensor[0], [0.2 * levels[0], np.hypot(0.1, 0.3 * levels[1])])
+    assert repr(noise) != repr(RelativeNoise.of(measured)) != repr(RelativeNoise.of(measured, window=1.0))
+
+
+def test_level_of_a_response():
+    time = 0.01 * np.arange(2000)
+    history = np.where(time < 10.0, 3.0, 0.1) * np.sin(2.0 * np.pi * 5.0 * time)
+    both = np.stack([history, np.ones(2000)])
+    np.testing.assert_allclose(local_level(both, None)[:, 0], np.sqrt(np.mean(both**2, axis=1)))
+    level = local_level(both, 101.0)
+    np.testing.assert_allclose(level[0, 100:900], 3.0 / np.sqrt(2.0), rtol=0.01)
+    np.testing.assert_allclose(level[0, 1100:1900], 0.1 / np.sqrt(2.0), rtol=0.01)
+    np.testing.assert_allclose(level[1], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(local_level(both, 1.0), np.abs(both), rtol=1e-6, atol=1e-6)
+    # a mean square is kept, so that the share of the whole motion is that of its parts
+    assert np.mean(level[0] ** 2) == pytest.approx(np.mean(history**2), rel=0.02)
+
+
+@pytest.mark.parametrize("window", (None, 1.0))
+def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(record, window):
+    model = LinearOscillator(record)
+    response = model.simulate([1.0, 1.0])
+    measured = Measurements(model.channels, model.dt, response)
+    floor = {"displacement": 1e-6}
+    posterior = posterior_of(model, measured, window=window, sensor=floor)
+    samples = np.tile([1.0, 1.0, 0.3, 0.2], (300, 1))
+    options = {"noise": True, "seed": 1, "progress": False}
+    same = propagate(posterior, samples, **options)
+    weak = propagate(posterior, samples, record=record.scale(0.1), **options)
+    np.testing.assert_allclose(weak.sd[0], 0.1 * same.sd[0], rtol=1e-9)
+    expected = 0.3 / np.sqrt(1.0 - 0.3**2) * local_level(response, None if window is None else window / model.dt)[0]
+    np.testing.assert_allclose(same.sd[0], expected, rtol=1e-9)
+    assert weak.sd[1].min() >= 1e-6
+    np.testing.assert_allclose(weak.mean, 0.1 * same.mean, rtol=1e-9, atol=1e-12)  # exact in the noise
+    if window:
+        assert same.sd[0, 500] > 20.0 * same.sd[0, 0]
+    # control: noise in SI units keeps its level
+    absolute = Posterior(
+        FELikelihood(model, measured, GaussianNoise(model.channels)),
+        posterior.prior.subset(["stiffness", "damping"]).distributions
+        | {f"sigma_{c.name}": HalfNormal(1.0) for c in model.channels},
+    )
+    with pytest.warns(UserWarning, match=r"another level .*acceleration \(0\.1 times\).*RelativeNoise"):
+        fixed = propagate(absolute, np.tile([1.0, 1.0, 0.3, 0.2], (300, 1)), record=record.scale(0.1), **options)
+    np.testing.assert_allclose(fixed.sd[0], 0.3, rtol=1e-9)
+    with warnings.catch_warnings():  # neither noise that scales, nor a similar level
+        warnings.simplefilter("error")
+        propagate(posterior, samples[:20], record=record.scale(0.1), **options)
+        propagate(absolute, samples[:20], record=record.scale(0.5), **options)
+
+
+def test_draws_have_the_stated_standard_deviations_whatever_the_batch_and_the_channels(record):
+    model = LinearOscillator(record)
+    measured = Measurements(model.channels, model.dt, model.simulate([1.0, 1.0]))
+    posterior = posterior_of(model, measured, window=2.0)
+    samples = np.tile([1.0, 1.0, 0.3, 0.2], (400, 1)) * np.linspace(0.99, 1.01, 400)[:, None]
+    options = {"noise": True, "seed": 3, "progress": False}
+    whole = propagate(posterior, samples, **options)
+    one = propagate(posterior, samples, quantity="displacement", batch=7, **options)
+    np.testing.assert_allclose(one.quantiles[:, 0], whole.quantiles[:, 1], rtol=1e-9)
+    np.testing.assert_allclose(one.variance[0], whole.variance[1], rtol=1e-9)
+    spread = (whole.quantile(0.95) - whole.quantile(0.05)) / (2.0 * 1.6449 * whole.sd)
+    assert np.abs(np.mean(spread[:, 100:-100], axis=1) - 1.0).max() < 0.02
+    energy = propagate(posterior, samples, quantity=rms("acceleration"), **options)
+    assert energy.mean == pytest.approx(measured.values[0].std() / np.sqrt(1.0 - 0.3**2), rel=0.02)
+
+
+def test_shares_that_were_found_with_one_motion_cover_another_ten_times_weaker(record, rng):
+    """Synthetic truth with errors of 20 % of the local level; the posterior's share is the ratio of error to signal."""
+    weaker = record.scale(0.1)
+
+    def motion(of):
+        response = LinearOscillator(of).simulate([1.0, 1.0])
+        error = 0.2 * local_level(response, 50.0) * rng.standard_normal(response.shape)
+        return Measurements(LinearOscillator(of).channels, of.dt, response + error)
+
+    model, measured = LinearOscillator(record), motion(record)
+    posterior = posterior_of(model, measured, window=1.0)
+    misfit = posterior.likelihood.misfit([[1.0, 1.0]])[0]
+    shares = np.sqrt(misfit / measured.n_steps) / posterior.likelihood.noise.levels
+    np.testing.assert_allclose(shares, 0.2, rtol=0.15)
+    samples = np.tile([1.0, 1.0, *shares], (400, 1))
+    prediction = propagate(posterior, samples, record=weaker, noise=True, seed=1, progress=False)
+    scores = prediction.score(motion(weaker))
+    assert (np.abs(scores.coverage - 0.9) < 0.06).all() and (np.abs(scores.coverage_strong - 0.9) < 0.06).all()
+
+
+@pytest.mark.parametrize("sensor", (0.0, 0.005))
+def test_a_large_share_covers_another_motion_because_the_measured_level_contains_the_error(sensor, rng):
+    """Errors of 50 to 200 % of the response: a share of the response alone would make the bands too narrow."""
+    n, ratio = 4000, np.array([0.5, 1.0, 2.0])
+    shape = 0.01 * np.cos(0.3 * np.arange(n))
+    deviations = np.hypot(sensor, ratio * np.sqrt(np.mean(shape**2)))
+    channels = [Channel(f"c{k}", "displacement", "mm") for k in range(3)]
+    errors = deviations[:, None] * rng.standard_normal((3, n))
+    measured = Measurements(channels, 0.02, shape + errors)
+    noise = RelativeNoise.of(measured, sensor=sensor * np.ones(3) if sensor else None)
+    misfit = np.sum(errors**2, axis=1)
+    shares = np.sqrt(misfit / n - sensor**2) / noise.levels  # at the maximum of the likelihood
+    found = noise.response_deviations(shares, np.tile(shape, (3, 1)), 0.02)[:, 0]
+    np.testing.assert_allclose(found, deviations, rtol=0.06)
+    narrow = np.hypot(sensor, shares * np.sqrt(np.mean(shape**2)))  # control: without the error in the level
+    assert narrow[1] < 0.9 * deviations[1] and narrow[2] < 0.7 * deviations[2]
+
+
+@pytest.mark.parametrize("own_times", (False, True))
+def test_replicated_measurements_have_the_noise_of_a_prediction(record, own_times):
+    """Strong and quiet parts of the response have the same noise in both, also where samples have their own times."""
+    model = LinearOscillator(record)
+    response = model.simulate([1.0, 1.0])
+    if own_times:  # every second step, and gaps
+        response = response[:, 1::2].copy()
+        response[0, 100:110] = np.nan
+        measured = Measurements(model.channels, 2.0 * model.dt, response, start=model.dt)
+    else:
+        measured = Measurements(model.channels, model.dt, response)
+    posterior = posterior_of(model, measured, window=1.0)
+    samples = np.tile([1.0, 1.0, 0.6, 0.2], (400, 1))
+    sd = propagate(posterior, samples, noise=True, seed=1, progress=False).sd
+    draws = posterior.predictive_draws(samples)
+    for k, name in enumerate(("acceleration", "displacement")):
+        there = np.isfinite(measured.values[k])
+        errors = draws.replicates[name] - draws.responses[name]
+        expected = (sd[k, 1::2] if own_times else sd[k])[there]
+        ratio = errors.std(axis=0) / expected
+        assert abs(ratio.mean() - 1.0) < 0.01 and np.abs(ratio - 1.0).max() < 5.0 / np.sqrt(800)
+        assert expected.max() > 10.0 * expected.min()  # control: one level would differ
+
+
+def test_what_has_no_level_is_refused():
+    for levels in ([0.0], [np.nan], [1.0, 2.0]):
+        with pytest.raises(ValueError, match="one positive response level"):
+            RelativeNoise((TOP,), levels)
+    with pytest.raises(ValueError, match="window must be a positive length"):
+        RelativeNoise((TOP,), [1.0], window=0.0)
+    model = FunctionModel(lambda theta: [theta[0] * np.ones(5)], ["a"], [TOP], 0.1, 5)
+    likelihood = FELikelihood(model, Measurements((TOP,), 0.1, [np.ones(5)]), RelativeNoise((TOP,), [1.0]))
+    posterior = Posterior(likelihood, {"a": TruncatedNormal(1.0, 0.1), "share_top": HalfNormal(0.2)})
+    assert [each.unit for each in posterior.parameters][-1] == "-"
+    with pytest.raises(ValueError, match="positive standard deviation"):
+        propagate(posterior, [[1.0, -0.1]], noise=True, progress=False)
+    with pytest.raises(ValueError, match="positive standard deviation"):
+        propagate(posterior, [[1.0, 1.0]], noise=True, progress=False)
+
+
+def test_blocks_of_time_count_a_sample_as_in_the_whole_measurements(rng):
+    measured = Measurements((TOP,), 0.1, rng.standard_normal((1, 200)))
+    residuals = 0.3 * rng.standard_normal((3, 1, 200))
+    stops = np.array([5.0, 12.0, np.inf])
+    noise = RelativeNoise.of(measured, effective_samples=(50,))
+    white = GaussianNoise((TOP,), effective_samples=(50,))
+    shares = np.full((3, 1), 0.3)
+    terms, expected = (
+        block_log_likelihood(each, measured, measured.values, residuals, parameters, stops)
+        for each, parameters in ((noise, shares), (white, shares * noise.levels[0]))
+    )
+    np.testing.assert_allclose(terms, expected, rtol=1e-12)
