@@ -37,12 +37,16 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .prediction.damage import Damage, LimitState, damage, limit_states
     from .prediction.damage_measures import DamageMeasures, damage_measures, damage_outputs
     from .prediction.fragility import Fragility, fit_fragility, fragility, peak_ground_acceleration
+    from .prediction.new_event import EventRatios, event_ratio, predict_new_event
     from .prediction.park_ang import ParkAng, park_ang_constants
     from .prediction.prediction import Prediction
     from .prediction.propagation import fit_measures, propagate
-    from .prediction.quantities import peak
+    from .prediction.quantities import final_value, peak, rms
     from .prediction.reliability import Exceedance, exceedance
+    from .prediction.score_tables import HistoryScores, QuantityScores
+    from .prediction.scores import crps_normal, crps_samples, interval_score, log_score_normal, share_within
     from .probability.autoregressive_noise import AutoregressiveNoise
+    from .probability.block_likelihood import BlockLogLikelihood
     from .probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
     from .probability.event_noise import EventNoise
     from .probability.failures import TooManyFailures
@@ -54,17 +58,22 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.mixture_prior import MixtureDistribution, fit_mixture
     from .probability.multivariate import MultivariateDistribution, MultivariateNormal, TruncatedMultivariateNormal
     from .probability.noise import GaussianNoise, Noise, SharedGaussianNoise
+    from .probability.parameters import Parameter
     from .probability.posterior import Posterior
+    from .probability.predictive_draws import MeasuredData, MeasuredHistory, PredictiveDraws
     from .probability.priors import Prior
+    from .probability.relative_noise import RelativeNoise
     from .probability.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
     from .probability.stored_posterior import StoredPosterior
     from .probability.time_shift_noise import TimeShiftNoise
+    from .reporting.report import report
     from .signals.alignment import Alignment, align
     from .signals.channels import Channel, Measurements
     from .signals.datasets import Dataset, read_dataset, write_dataset
     from .signals.durations import growing_durations
     from .signals.error_measures import rrmse
     from .signals.events import Events, EventWindow
+    from .signals.fits import plot_fit
     from .signals.measurement_readers import ImposedTest, read_columns, read_imposed_test
     from .signals.readers import (
         read_at2,
@@ -78,6 +87,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     )
     from .signals.records import DisplacementHistory, Record
     from .signals.response_spectrum import ResponseSpectrum, response_spectrum
+    from .simulation.dask_executor import DaskExecutor
     from .simulation.disk_cache import SimulationCache
     from .simulation.faults import TransientReason
     from .simulation.local_pool import LocalPool
@@ -91,6 +101,7 @@ __all__ = [
     "AveragedPrediction",
     "Bars",
     "Bearing",
+    "BlockLogLikelihood",
     "BridgeDeck",
     "Channel",
     "Concrete",
@@ -98,10 +109,12 @@ __all__ = [
     "Damage",
     "DamageMeasures",
     "Damper",
+    "DaskExecutor",
     "Dataset",
     "DisplacementHistory",
     "Distribution",
     "EventNoise",
+    "EventRatios",
     "EventWindow",
     "Events",
     "Exceedance",
@@ -113,6 +126,7 @@ __all__ = [
     "HalfNormal",
     "HierarchicalPosterior",
     "Hierarchy",
+    "HistoryScores",
     "Hoops",
     "ImposedTest",
     "IsolatedBridge",
@@ -124,6 +138,8 @@ __all__ = [
     "LogNormal",
     "MarginalNoise",
     "MaterialCurve",
+    "MeasuredData",
+    "MeasuredHistory",
     "Measurements",
     "MixtureDistribution",
     "Mode",
@@ -134,14 +150,18 @@ __all__ = [
     "MultivariateNormal",
     "Noise",
     "OpenSeesModel",
+    "Parameter",
     "ParkAng",
     "Patches",
     "Pier",
     "Posterior",
     "Prediction",
+    "PredictiveDraws",
     "Prior",
+    "QuantityScores",
     "RCColumn",
     "Record",
+    "RelativeNoise",
     "ResidualChecks",
     "ResponseEmulator",
     "ResponseGuide",
@@ -165,11 +185,15 @@ __all__ = [
     "Varying",
     "align",
     "average_predictions",
+    "crps_normal",
+    "crps_samples",
     "damage",
     "damage_measures",
     "damage_outputs",
     "effective_samples",
+    "event_ratio",
     "exceedance",
+    "final_value",
     "find_modes",
     "fit_fragility",
     "fit_measures",
@@ -178,7 +202,9 @@ __all__ = [
     "from_si",
     "growing_durations",
     "innovations",
+    "interval_score",
     "limit_states",
+    "log_score_normal",
     "material_curves",
     "moment_curvature",
     "nautilus_prior",
@@ -187,6 +213,7 @@ __all__ = [
     "peak_ground_acceleration",
     "plot_bands",
     "plot_damage",
+    "plot_fit",
     "plot_fragility",
     "plot_histories",
     "plot_loop",
@@ -194,6 +221,7 @@ __all__ = [
     "plot_moment_curvature",
     "plot_residuals",
     "plot_sensors",
+    "predict_new_event",
     "problems",
     "propagate",
     "read_at2",
@@ -207,10 +235,13 @@ __all__ = [
     "read_record",
     "read_smc",
     "read_v2",
+    "report",
     "residual_checks",
     "response_spectrum",
+    "rms",
     "rrmse",
     "serve",
+    "share_within",
     "table_motion",
     "to_bilby",
     "to_pints",
@@ -302,21 +333,19 @@ _EXPORTS = {
         "fragility",
         "peak_ground_acceleration",
     ),
+    "prediction.new_event": ("EventRatios", "event_ratio", "predict_new_event"),
     "prediction.park_ang": (
         "ParkAng",
         "park_ang_constants",
     ),
     "prediction.prediction": ("Prediction",),
-    "prediction.propagation": (
-        "fit_measures",
-        "propagate",
-    ),
-    "prediction.quantities": ("peak",),
-    "prediction.reliability": (
-        "Exceedance",
-        "exceedance",
-    ),
+    "prediction.propagation": ("fit_measures", "propagate"),
+    "prediction.quantities": ("final_value", "peak", "rms"),
+    "prediction.reliability": ("Exceedance", "exceedance"),
+    "prediction.score_tables": ("HistoryScores", "QuantityScores"),
+    "prediction.scores": ("crps_normal", "crps_samples", "interval_score", "log_score_normal", "share_within"),
     "probability.autoregressive_noise": ("AutoregressiveNoise",),
+    "probability.block_likelihood": ("BlockLogLikelihood",),
     "probability.distributions": (
         "Distribution",
         "HalfNormal",
@@ -348,8 +377,15 @@ _EXPORTS = {
         "Noise",
         "SharedGaussianNoise",
     ),
+    "probability.parameters": ("Parameter",),
     "probability.posterior": ("Posterior",),
+    "probability.predictive_draws": (
+        "MeasuredData",
+        "MeasuredHistory",
+        "PredictiveDraws",
+    ),
     "probability.priors": ("Prior",),
+    "probability.relative_noise": ("RelativeNoise",),
     "probability.residuals": (
         "ResidualChecks",
         "effective_samples",
@@ -359,6 +395,7 @@ _EXPORTS = {
     ),
     "probability.stored_posterior": ("StoredPosterior",),
     "probability.time_shift_noise": ("TimeShiftNoise",),
+    "reporting.report": ("report",),
     "signals.alignment": (
         "Alignment",
         "align",
@@ -378,6 +415,7 @@ _EXPORTS = {
         "EventWindow",
         "Events",
     ),
+    "signals.fits": ("plot_fit",),
     "signals.measurement_readers": (
         "ImposedTest",
         "read_columns",
@@ -401,6 +439,7 @@ _EXPORTS = {
         "ResponseSpectrum",
         "response_spectrum",
     ),
+    "simulation.dask_executor": ("DaskExecutor",),
     "simulation.disk_cache": ("SimulationCache",),
     "simulation.faults": ("TransientReason",),
     "simulation.local_pool": ("LocalPool",),

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import multiprocessing
 import os
 import shutil
 import stat
@@ -20,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numba
+from numba.core import event
 
 __all__ = ["kernel", "CACHE_FOLDER", "KERNEL_HASH", "SUM_REORDERING"]
 
@@ -108,6 +110,39 @@ def _find_cache_folder() -> str | None:
 
 CACHE_FOLDER: str | None = _find_cache_folder()
 """Folder of the machine code; None if there is none."""
+
+
+def _is_worker() -> bool:
+    """Whether this process was started by a pool: of this library, or by `multiprocessing` (as those of dask are)."""
+    marked = any(name.startswith("FE_LIKELIHOODS_RUN_") for name in os.environ)
+    return marked or multiprocessing.parent_process() is not None
+
+
+class _Announcer(event.Listener):
+    """Logs once per process that kernels are compiled, since a user waits meanwhile; silent in workers.
+
+    numba reports a compilation only where the machine code is not in the cache.
+    """
+
+    def __init__(self) -> None:
+        self._has_announced = False
+
+    def on_start(self, event: event.Event) -> None:
+        """A function begins to be compiled."""
+        package = event.data["dispatcher"].py_func.__module__.rpartition(".")[0]
+        if self._has_announced or package != __package__ or CACHE_FOLDER is None or _is_worker():
+            return
+        self._has_announced = True
+        logger.warning(
+            "Compiling the kernels, once: this takes up to about half a minute. The machine code is kept in %s",
+            CACHE_FOLDER,
+        )
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing is said at the end: the run goes on."""
+
+
+event.register("numba:compile", _Announcer())
 
 
 def kernel(

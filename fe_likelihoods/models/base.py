@@ -112,6 +112,7 @@ class BuiltInModel(StructuralModel):
 
     parameters: tuple[str, ...]
     response_tolerance: ClassVar[float] = 0.0  # the same bits in every process
+    _nominal_units: ClassVar[dict[str, str]] = {}
     _display_fields: ClassVar[tuple[str, ...]] = ("outputs", "unit", "units")
     _code_version: ClassVar[str] = ""
 
@@ -124,6 +125,11 @@ class BuiltInModel(StructuralModel):
     def nominal(self) -> dict[str, float]:
         """Nominal values of all parameters [SI]."""
         raise NotImplementedError
+
+    @property
+    def nominal_units(self) -> dict[str, str]:
+        """Units in which the nominal values are shown, by parameter."""
+        return self._nominal_units
 
     @property
     def fingerprint(self) -> str:

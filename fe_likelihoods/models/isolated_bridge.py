@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -51,6 +51,11 @@ if TYPE_CHECKING:
 __all__ = ["PARAMETERS", "BridgeHistory", "IsolatedBridge"]
 
 PARAMETERS = ("fmin_1", "df_1", "a_1", "fmin_2", "df_2", "a_2", "Kd_1", "C0_1", "Kd_2", "C0_2")
+_NOMINAL_UNITS = {
+    f"{name}_{pier}": unit
+    for pier in (1, 2)
+    for name, unit in zip(("a", "Kd", "C0"), ("s/m", "N/m", "N s/m"), strict=True)
+}
 _EXCHANGED = [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]  # PARAMETERS with the devices of the two piers exchanged
 _LONGEST_STEP = {"bouc-wen": 0.25e-3, "elastic-plastic": 0.05e-3, "coulomb": 0.025e-3}  # of the default [s]
 _STATE_ROWS = (
@@ -179,6 +184,7 @@ class IsolatedBridge(ThreadedModel):
     rubber: Rubber = Rubber()
     outputs: tuple[str, ...] | int | None = None
     parameters: tuple[str, ...] = PARAMETERS
+    _nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     friction: str = "bouc-wen"
     step: float | None = None
     every: int = 1

@@ -53,6 +53,8 @@ class LinearOscillator(StructuralModel):
         Channel("acceleration", "absolute acceleration", "g"),
         Channel("displacement", "relative displacement", "cm"),
     )
+    # no `nominal`: a joint likelihood may have one multiple for oscillators with different periods
+    parameter_units = {"stiffness": "x nominal", "damping": "x nominal"}
     path_dependent = False
     response_tolerance = 0.0  # the same bits in every process
 

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -73,6 +73,9 @@ PARAMETERS = {
     "mass": "mass at the top [kg]",
     "penetration": "length of strain penetration into the foundation [m]",
 }
+_NOMINAL_UNITS = dict(
+    zip(PARAMETERS, ("GPa", "GPa", "1/s", "s", "MPa", "MPa", "MPa", "MPa", "GPa", "kg", "m"), strict=True)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +203,7 @@ class RCColumn(ThreadedModel):
     max_increment: float | None = None
     outputs: tuple[str, ...] | None = None
     units: tuple[tuple[str, str], ...] = ()
+    _nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     tolerance: float = 1e-8
     element_tolerance: float = 1e-10
     max_iterations: int = 20

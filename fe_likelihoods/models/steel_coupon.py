@@ -64,6 +64,7 @@ class SteelCoupon(BuiltInModel):
 
     _code_version: ClassVar[str] = KERNEL_HASH
     _time_label: ClassVar[str] = "step"
+    _nominal_units: ClassVar[dict[str, str]] = {"fy": "MPa", "fu": "MPa", "Es": "GPa", "Esh": "GPa"}
 
     def __post_init__(self) -> None:
         strain = np.array(self.strain, dtype=float)

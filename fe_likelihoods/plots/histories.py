@@ -7,6 +7,7 @@ accept are described in `fe_likelihoods.plots.protocols`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -255,7 +256,7 @@ def plot_residual_checks(
     dt : float
         Time step [s].
     checks : ResidualChecksLike
-        Lag-one correlation and effective number of samples per channel.
+        Lag-one correlation, effective number of samples and verdict in words, per channel.
     correlation : ndarray, shape (n_channels, n_steps)
         Autocorrelation at lags 0, 1, ... samples [-].
 
@@ -279,7 +280,7 @@ def plot_residual_checks(
         n_channels,
         3,
         squeeze=False,
-        figsize=(11.0, 1.0 + 2.0 * n_channels),
+        figsize=(12.0, 1.0 + 2.5 * n_channels),
         layout="constrained",
         width_ratios=(2, 1, 1),
     )
@@ -290,15 +291,18 @@ def plot_residual_checks(
         samples = len(values)
         normal = ndtri((np.arange(samples) + 0.5) / samples)
         history.set_ylabel(channel_label(channels[k]))
+        history.set_title(fill(checks.sentences[k], 80), fontsize="small", loc="left")
         # Beyond about ten correlation times the estimated autocorrelation is noise.
         shown = min(n, 20 + int(10.0 * samples / checks.n_effective[k]))
         band = 1.96 / np.sqrt(samples)
         lags.fill_between([0.0, (shown - 1) * dt], -band, band, color=GREY, alpha=0.3)
+        lags.set_ylabel("autocorrelation [-]")
         lags.plot(np.arange(shown) * dt, correlation[k, :shown], color=BLUE, linewidth=0.9)
         lags.set_title(
-            f"lag-one correlation {checks.lag_one[k]:.2f}, {checks.n_effective[k]:.0f} effective samples of {samples}",
-            fontsize="x-small",
+            f"lag-one correlation {checks.lag_one[k]:.2f}\n{checks.n_effective[k]:.0f} effective samples of {samples}",
+            fontsize="small",
         )
+        quantiles.set_title("line: normal", fontsize="small")
         quantiles.plot(normal, values.mean() + values.std() * normal, color=GREY, linewidth=0.9)
         quantiles.plot(normal, values, ".", color=BLUE, markersize=2)
         for axes in (history, lags, quantiles):

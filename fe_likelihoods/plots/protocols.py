@@ -152,6 +152,10 @@ class ResidualChecksLike(Protocol):
     lag_one: np.ndarray
     n_effective: np.ndarray
 
+    @property
+    def sentences(self) -> Sequence[str]:
+        """Verdict on each channel, in words."""
+
 
 class HistoryLike(Protocol):
     """Named histories of one simulation [SI], such as the result of ``RCColumn.history``."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..units import DIMENSIONS, find_unit
+from ..units import DIMENSIONS, find_unit, from_si
 from .error_measures import rrmse
 from .sampling import check_step, same_sampling, sample_window
 
@@ -330,10 +330,37 @@ class Measurements:
         """
         from ..plots.histories import plot_histories
 
-        errors = {} if response is None else self._errors(response)
+        errors = {} if response is None else self.rrmse_of(response)
         return plot_histories(self, response, channels, errors=errors, **options)
 
-    def _errors(self, response: "Measurements") -> dict[str, float]:
+    def _repr_html_(self) -> str:
+        """In notebooks: one row per channel, in the display unit of the channel."""
+        from ..plots.html import html_history, html_object, html_table
+
+        header = (
+            "channel",
+            "quantity",
+            "unit",
+            "samples",
+            "missing",
+            "first [s]",
+            "step [s]",
+            "peak",
+            "RMS",
+            "history",
+        )
+        rows = []
+        for channel, values, step, start in zip(self.channels, self.values, self.steps, self.starts, strict=True):
+            there = np.flatnonzero(~np.isnan(values))
+            inside = values[there[0] : there[-1] + 1]
+            shown = from_si(values[there], channel.unit, channel.dimension)
+            begun = start + step * float(there[0])
+            sizes = float(np.abs(shown).max()), float(np.sqrt(np.mean(shown**2)))
+            counts = len(there), len(inside) - len(there), begun, step
+            rows.append((channel.name, channel.quantity, channel.unit, *counts, *sizes, html_history(inside)))
+        return html_object(f"Measurements of {self.n_channels} channels", [self.description], html_table(header, rows))
+
+    def rrmse_of(self, response: "Measurements") -> dict[str, float]:
         """Return the RRMSE of each channel that both have [-]; none if the times differ or the channel is zero."""
         simulated = {channel.name for channel in response.channels}
         common = [channel.name for channel in self.channels if channel.name in simulated]

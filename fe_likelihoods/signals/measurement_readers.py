@@ -168,7 +168,7 @@ def _channel_values(
     if isinstance(columns, str) or not len(channels) == len(columns) == len(given):
         raise ValueError(
             f"expected one column and one unit for each of {len(channels)} channels, got columns {columns!r}, "
-            f"units {units!r}"
+            f"units {units!r}; the unit of the times is given by time_unit="
         )
     rows = []
     for channel, column, unit in zip(channels, columns, given, strict=True):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..units import from_si
 from .response_spectrum import ResponseSpectrum, response_spectrum
 from .sampling import array_digest, check_samples, check_step, rest_samples, same_step, sample_window
 
@@ -267,6 +268,15 @@ class Record:
 
         spectra = [self.spectrum(periods, ratio) for ratio in damping_ratios]
         return plot_spectra(spectra, axes, quantity, unit, self.name)
+
+    def _repr_html_(self) -> str:
+        """In notebooks: step, duration and peak, and the motion."""
+        from ..plots.html import html_history, html_object, html_table
+
+        peak = float(np.abs(self.acceleration).max())
+        header = ("samples", "step [s]", "duration [s]", "peak [g]", "peak [m/s²]", "ground acceleration")
+        row = (self.n_steps, self.dt, self.duration, float(from_si(peak, "g")), peak, html_history(self.acceleration))
+        return html_object(f"Record {self.name}", [self.source], html_table(header, [row]))
 
     def _source(self, note: str) -> str:
         return f"{self.source}; {note}" if self.source else note

@@ -139,7 +139,8 @@ def value_column(table: Table, column: str | None = None) -> int:
     if not table.names and table.values.shape[1] - n_other > 1:
         raise ValueError(
             f"{table.file} has {table.values.shape[1]} columns and no header line; write one such as 'time_s,acc_g'"
-            ", or give time_unit= if there are two columns, times and values"
+            ", or give time_unit= if there are two columns, times and values. Numbers with decimal commas need another "
+            "separator between columns, such as ';'"
         )
     candidates = [
         i for i in range(table.values.shape[1]) if i not in {_time_column(table)} | table.clocks | table.dates

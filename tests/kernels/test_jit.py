@@ -85,6 +85,38 @@ def test_an_edit_in_a_called_kernel_is_noticed(copied, tmp_path):
     assert len(list(cache.iterdir())) == 2
 
 
+CALL_TWICE = "from kernels import caller; caller.call(2.0); caller.call(2)"  # two types: compiled twice
+IN_A_WORKER = (
+    "import multiprocessing\n"
+    "def call():\n    from kernels import caller; caller.call(2.0)\n"
+    "process = multiprocessing.get_context('fork').Process(target=call); process.start(); process.join()\n"
+    "assert process.exitcode == 0"
+)
+
+
+def messages(copied, code, cache, **environment):
+    """What a new process that compiles the copied kernels shows on stderr."""
+    settings = {"FE_LIKELIHOODS_CACHE": str(cache), "NUMBA_DISABLE_JIT": "0", "PYTHONPATH": str(copied.parent)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | settings | environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stderr.splitlines()
+
+
+def test_a_compilation_announces_itself_once_and_only_if_it_is_made(copied, tmp_path):
+    (line,) = messages(copied, CALL_TWICE, tmp_path / "cache")
+    assert line.startswith("Compiling the kernels, once: ") and str(tmp_path / "cache") in line
+    assert messages(copied, CALL_TWICE, tmp_path / "cache") == []
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork")
+@pytest.mark.parametrize(("code", "mark"), [(IN_A_WORKER, {}), (CALL_TWICE, {"FE_LIKELIHOODS_RUN_1": "1"})])
+def test_workers_announce_no_compilation(copied, tmp_path, code, mark):
+    assert messages(copied, code, tmp_path / "cache", **mark) == []
+    assert any((tmp_path / "cache").rglob("*.nbc"))  # it was compiled
+
+
 @pytest.mark.parametrize("change", ["content", "name", "new file"])
 def test_any_change_of_the_sources_changes_the_hash(copied, change):
     before = result_of_hash(copied)

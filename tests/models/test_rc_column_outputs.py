@@ -18,7 +18,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column_outputs import Sections, parse_outputs
-from fe_likelihoods.problems import bridge_column_data
+from fe_likelihoods.problems import bridge_column, bridge_column_data
 
 SENSORS = ("base_moment", "base_shear", "axial_force", "curvature@0.3", "strain@0.3:-0.55", "rotation@0:0.6")
 
@@ -197,3 +197,12 @@ def test_the_loading_decides_which_outputs_of_the_top_there_are():
     sections = Sections(7.0, 0.5, 1, gauss_lobatto(3)[0])
     with pytest.raises(ValueError, match="once"):
         parse_outputs(("base_moment", "base_moment"), sections, ("force",))
+
+
+def test_measurements_of_some_channels_name_the_outputs_to_choose():
+    data = bridge_column_data()
+    measured = data.measurements.select(["acceleration"])
+    with pytest.raises(ValueError, match=r"make the model with outputs=\('acceleration',\)"):
+        bridge_column(record=data.record, measurements=measured)
+    posterior = bridge_column(record=data.record, measurements=measured, outputs=("acceleration",))
+    assert posterior.parameter_names[-1] == "sigma_acceleration"

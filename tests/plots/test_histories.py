@@ -137,3 +137,4 @@ def test_residuals(rng):
         assert f"{checks.n_effective[k]:.0f} effective samples of 300" in lags.get_title()
         np.testing.assert_allclose(quantiles.lines[1].get_ydata(), np.sort(factor * residuals[k]))
         assert all(shows(axes, axes.lines) for axes in (history, lags, quantiles))
+        assert history.get_title(loc="left").replace("\n", " ") == checks.sentences[k]

@@ -1,0 +1,224 @@
+"""The record and the measurements that a TOML file names."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..signals.channels import Channel, Measurements
+from ..signals.datasets import Dataset, read_dataset
+from ..signals.measurement_readers import read_columns
+from ..signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_record, read_smc, read_v2
+from ..signals.records import Record
+from .job import Job
+from .schema import did_you_mean
+
+__all__ = ["BUNDLED", "FEWEST_SAMPLES", "is_dataset", "read_base_motion", "read_bundled", "read_measured", "within"]
+
+BUNDLED = {
+    "column-eq1": ("bridge_column_data", (1,)),
+    "column-eq1-eq2": ("bridge_column_data", (2,)),
+    "bridge-twin": ("isolated_bridge_data", ("twin",)),
+    "bridge-means": ("isolated_bridge_data", ("means",)),
+}
+"""Bundled synthetic data sets: function in `fe_likelihoods.problems`, and its arguments."""
+
+_FORMATS: dict[str, tuple[Callable[..., Record], tuple[str, ...]]] = {
+    "at2": (read_at2, ("units",)),
+    "v2": (read_v2, ("channel",)),
+    "smc": (read_smc, ()),
+    "geonet": (read_geonet, ("column",)),
+    "knet": (read_knet, ()),
+    "esm": (read_esm, ()),
+    "csv": (read_csv, ("units", "dt", "column", "time_unit", "skip")),
+    "dataset": (read_dataset, ()),
+}
+_TABLE_KEYS = ("dt", "time_unit", "skip")
+_HDF5 = (".h5", ".hdf5")
+
+
+def read_bundled(job: Job, section: str) -> Dataset:
+    """The bundled data set that a section names; ValueError for an unknown name."""
+    from .. import problems
+
+    name = getattr(job, section)["bundled"]
+    if name not in BUNDLED:
+        raise ValueError(
+            f"{job.where(section)} bundled: unknown synthetic data {name!r}; {did_you_mean(name, tuple(BUNDLED))}"
+        )
+    function, arguments = BUNDLED[name]
+    return vars(problems)[function](*arguments)
+
+
+def is_dataset(job: Job, section: str) -> bool:
+    """Whether the file of a section is a data set in HDF5, which has record and measurements."""
+    given = getattr(job, section)
+    return "bundled" in given or Path(given.get("file", "")).suffix.lower() in _HDF5
+
+
+def _one_source(job: Job, section: str) -> None:
+    given = getattr(job, section)
+    if ("file" in given) == ("bundled" in given):
+        found = "both" if "file" in given else "none"
+        raise ValueError(f"{job.where(section)} file: expected file = ... or bundled = ...; got {found} of them")
+
+
+def read_base_motion(job: Job) -> Record | None:
+    """The excitation, scaled but neither shortened nor resampled, or None without a section ``[record]``.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist or cannot be read; the message names the key.
+    """
+    given = job.record
+    if not given:
+        if job.kind in ("column", "bridge", "oscillator", "frame"):
+            raise ValueError(f"{job.where('record')} file: this key is missing; the {job.kind} needs a base motion")
+        return None
+    _one_source(job, "record")
+    if "bundled" in given:
+        record = read_bundled(job, "record").record
+    else:
+        path = job.path("record", "file", given["file"])
+        record = _within_messages(job, "record", lambda: _read_record(job, path))
+    return record.scale(given["scale"]) if "scale" in given else record
+
+
+def _read_record(job: Job, path: Path) -> Record:
+    given = job.record
+    name = given.get("format", "dataset" if path.suffix.lower() in _HDF5 else None)
+    if name is None and any(key in given for key in _TABLE_KEYS):
+        name = "csv"
+    if name is None:
+        channel = given.get("channel", given.get("column"))
+        return read_record(path, channel, given.get("units"))
+    if name not in _FORMATS:
+        raise ValueError(f"format: unknown format {name!r}; {did_you_mean(name, tuple(_FORMATS))}")
+    reader, names = _FORMATS[name]
+    options = {key: given[key] for key in (*names, "channel", "column", "units", *_TABLE_KEYS) if key in given}
+    if unused := sorted(set(options) - set(names)):
+        raise ValueError(f"{unused[0]}: a file of format {name} has no such choice; leave it out")
+    if name == "geonet" and "column" in options:
+        options["component"] = options.pop("column")
+    found = reader(path, **options)
+    return found.record if isinstance(found, Dataset) else found
+
+
+def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) -> Measurements:
+    """The measurements of channels of a model, without samples before and after the record.
+
+    Raises
+    ------
+    ValueError
+        If the file does not exist, cannot be read or lacks a column; the message names the key.
+    """
+    given = job.measurements
+    if not given:
+        raise ValueError(
+            f"{job.where('measurements')} file: this key is missing; give the measured response, such as "
+            'file = "top.csv"'
+        )
+    _one_source(job, "measurements")
+    if is_dataset(job, "measurements"):
+        measured = (
+            read_bundled(job, "measurements").measurements
+            if "bundled" in given
+            else _within_messages(
+                job, "measurements", lambda: read_dataset(job.path("measurements", "file", given["file"]))
+            ).measurements
+        )
+    else:
+        path = job.path("measurements", "file", given["file"])
+        measured = _within_messages(job, "measurements", lambda: _read_columns(path, given, channels))
+    if "channels" in given:
+        measured = _within_messages(job, "measurements", lambda: measured.select(given["channels"]), "channels: ")
+    if record is None or is_dataset(job, "measurements"):
+        return measured
+    return _within_messages(job, "measurements", lambda: within(measured, record), "zero: ")
+
+
+def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]) -> Measurements:
+    by_name = {channel.name: channel for channel in channels}
+    columns, units = given.get("columns", {name: name for name in by_name}), given.get("units", {})
+    for key, names, known in (("columns", columns, tuple(by_name)), ("units", units, tuple(columns))):
+        for name in names:
+            if name not in known:
+                raise ValueError(f"{key}: unknown channel {name!r}; {did_you_mean(name, known)}")
+    chosen = [name for name in by_name if name in columns]
+    if missing := [name for name in by_name if name not in columns]:
+        raise ValueError(
+            f"columns: expected a column for each channel of the model, {', '.join(by_name)}; there is none for "
+            f"{', '.join(missing)}"
+        )
+    options = {key: given[key] for key in ("dt", "time_unit", "skip", "zero", "missing") if key in given}
+    return read_columns(
+        path,
+        [by_name[name] for name in chosen],
+        [columns[name] for name in chosen],
+        [units.get(name) for name in chosen],
+        description=f"measurements of {path.name}",
+        **options,
+    )
+
+
+def _within_messages(job: Job, section: str, read: Callable[[], Any], key: str = "") -> Any:
+    """Errors of a reader, with file and section before them."""
+    try:
+        return read()
+    except ValueError as error:
+        if str(error).startswith(f"{job.file.name}: ["):
+            raise
+        raise ValueError(f"{job.where(section)} {key}{error}") from error
+
+
+FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record
+
+
+def within(measurements: Measurements, record: Record) -> Measurements:
+    """The samples between the first and the last one of a record, with NaN where the measurements are shorter.
+
+    Parameters
+    ----------
+    measurements : Measurements
+    record : Record
+
+    Returns
+    -------
+    Measurements
+        Its description says how many samples were left out, with a caution where these are more than half of them, and
+        how much is missing at the end.
+
+    Raises
+    ------
+    ValueError
+        If a channel has no sample within the record, or fewer than `FEWEST_SAMPLES` while others were left out.
+    """
+    end, rows, starts, notes = record.time[-1], [], [], []
+    for channel, values, step in zip(measurements.channels, measurements.values, measurements.steps, strict=True):
+        times = measurements.times(channel.name)
+        inside = np.flatnonzero((times >= -1e-6 * step) & (times <= end + 1e-6 * step))
+        found, used = np.isfinite(values).sum(), np.isfinite(values[inside]).sum()
+        outside = found - used
+        if not np.isfinite(values[inside]).any():
+            raise ValueError(
+                f"channel {channel.name!r} was measured from {times[0]:g} to {times[-1]:g} s and has no sample within "
+                f"the record, 0 to {end:g} s; set zero in [measurements] to the time in the file at which the base "
+                "motion begins"
+            )
+        share = f"{used} of {found} samples of {channel.name} lie within the record"
+        if outside and used < FEWEST_SAMPLES:
+            raise ValueError(
+                f"{share}, 0 to {end:g} s; expected {FEWEST_SAMPLES} or more. They were measured from {times[0]:g} to "
+                f"{times[-1]:g} s: check time_unit and zero in [measurements], and the record"
+            )
+        missing = int((end - times[inside[-1]]) / step + 1e-6)
+        rows.append(np.append(values[inside], np.full(missing, np.nan)))
+        starts.append(0.0 if abs(times[inside[0]]) <= 1e-6 * step else float(times[inside[0]]))
+        notes += [f"without {outside} samples of {channel.name} before or after the record"] if outside else []
+        if outside > used:
+            notes.append(f"CAUTION: only {share}: check time_unit and zero in [measurements], and the record")
+        notes += [f"{channel.name} ends {missing * step:.3g} s before the record"] if missing else []
+    text = ", ".join([measurements.description, *notes])
+    return Measurements(measurements.channels, measurements.steps, rows, text, starts)

@@ -1,0 +1,29 @@
+"""Messages of the library in the words of the TOML file, for users who call no Python function."""
+
+import re
+
+__all__ = ["in_toml_terms"]
+
+_TERMS = (
+    (r"with Measurements\.select\b", "of `channels` in [measurements]"),
+    (r"\bmissing=\(([^()]*?),?\)", r"missing = [\1]"),
+    (
+        r"set the attribute max_simulations of the sampler to a larger number, or make a new sampler with the same "
+        r"file, and call run_mcmc again",
+        "set max_simulations in [budget] to a larger number and give the same command again",
+    ),
+    (r"Record\.trim\(start, stop\) and Measurements\.trim\(start, stop\)", "`duration` in [record]"),
+    (r"\(fe_likelihoods\.units\.to_si converts\)", 'or a text with a unit, such as "1.2 m"'),
+    (
+        r"see the failures that log_prob_fn reports \(posterior\.report\(\) for a posterior of fe_likelihoods\)",
+        "see the first failure in the messages above",
+    ),
+    (r"with guide=posterior\.guide\(\)", "with guide = true           "),  # a table: of the same width
+)
+
+
+def in_toml_terms(message: str) -> str:
+    """A message with the keys of the TOML file instead of functions and attributes of the library."""
+    for pattern, words in _TERMS:
+        message = re.sub(pattern, words, message)
+    return message

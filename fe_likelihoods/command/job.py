@@ -1,0 +1,146 @@
+"""An update as its TOML file describes it, read and checked before anything is computed."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .priors import parse_prior
+from .schema import FREE_SECTIONS, MODELS, PARTS, SECTIONS, Key, did_you_mean, read_keys
+
+__all__ = ["Job", "parse_job", "read_job"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """Contents of a TOML file. Values are in SI units; files are relative to `folder`.
+
+    Attributes
+    ----------
+    file : Path
+        The TOML file.
+    text : str
+        Its text.
+    folder : Path
+        Folder that files in it are relative to.
+    kind : str
+        Kind of the model, a key of `fe_likelihoods.command.schema.MODELS`.
+    model, record, measurements, sampler, budget, prediction : dict
+        Keys of the sections.
+    priors : dict of str to str
+        Distributions as text, by parameter.
+    noise : str
+        Kind of the noise.
+    """
+
+    file: Path
+    text: str
+    folder: Path
+    kind: str
+    model: dict[str, Any]
+    record: dict[str, Any]
+    measurements: dict[str, Any]
+    priors: dict[str, str]
+    noise: str
+    sampler: dict[str, Any]
+    budget: dict[str, Any]
+    prediction: dict[str, Any]
+
+    def where(self, section: str) -> str:
+        """File and section, for messages."""
+        return f"{self.file.name}: [{section}]"
+
+    def path(self, section: str, key: str, name: str) -> Path:
+        """An existing file that a key names; ValueError if there is none."""
+        path = self.folder / Path(name).expanduser()
+        if path.is_dir():
+            raise ValueError(f"{self.where(section)} {key}: expected a file; {name!r} is a folder")
+        if not path.is_file():
+            near = (
+                did_you_mean(path.name, sorted(p.name for p in path.parent.iterdir() if p.is_file()))
+                if (path.parent.is_dir())
+                else f"there is no folder {path.parent}"
+            )
+            raise ValueError(f"{self.where(section)} {key}: there is no file {path}; {near}")
+        return path
+
+
+def read_job(file: str | Path) -> Job:
+    """Read a TOML file.
+
+    Parameters
+    ----------
+    file : path
+
+    Returns
+    -------
+    Job
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read, or a section, a key or a value is wrong; the message names the key.
+    """
+    file = Path(file)
+    try:
+        text = file.read_text(encoding="utf-8-sig")  # editors of Windows write a byte order mark
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not a text in UTF-8"
+        raise ValueError(
+            f"cannot read {file}: {reason}; give the TOML file of an update (`fe-likelihoods new column DIR` makes one)"
+        ) from error
+    return parse_job(text, file, file.parent)
+
+
+def parse_job(text: str, file: Path, folder: Path) -> Job:
+    """As `read_job`, from the text of a file whose paths are relative to `folder`."""
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(
+            f"{file.name}: not a TOML file: {error}; a text needs quotes, a section is a line such as [record]"
+        ) from error
+    sections = (*FREE_SECTIONS, *SECTIONS)
+    for name, value in content.items():
+        if name not in sections:
+            raise ValueError(f"{file.name}: [{name}]: unknown section; {did_you_mean(name, sections)}")
+        if not isinstance(value, dict):
+            raise ValueError(f"{file.name}: {name}: expected a section [{name}]; got {value!r}")
+    if "model" not in content:
+        raise ValueError(f"{file.name}: [model]: this section is missing; it says what the structure is")
+    kind, model = _read_model(content["model"], file.name)
+    values = {name: read_keys(content.get(name, {}), keys, f"{file.name}: [{name}]") for name, keys in SECTIONS.items()}
+    priors = content.get("priors", {})
+    for name, prior in priors.items():
+        try:
+            parse_prior(prior)
+        except ValueError as error:
+            raise ValueError(f"{file.name}: [priors] {name}: {error}") from None
+    noise = values.pop("noise").get("kind", "per channel")
+    kinds = ("per channel", "autoregressive", "shared", "per event", "marginal")
+    if noise not in kinds:
+        raise ValueError(f"{file.name}: [noise] kind: unknown noise {noise!r}; {did_you_mean(noise, kinds)}")
+    return Job(file, text, folder, kind, model, priors=priors, noise=noise, **values)
+
+
+def _read_model(given: dict[str, Any], file: str) -> tuple[str, dict[str, Any]]:
+    kind = given.get("kind")
+    if kind not in MODELS:
+        known = f"known are {', '.join(MODELS)}" if not isinstance(kind, str) else did_you_mean(kind, tuple(MODELS))
+        raise ValueError(f"{file}: [model] kind: expected the kind of the structure; got {kind!r}; {known}")
+    parts = PARTS.get(kind, {})
+    keys = (*MODELS[kind], Key("kind", "text", "kind of the structure"), *(Key(name, "text", "") for name in parts))
+    plain = {name: value for name, value in given.items() if name not in parts}
+    for name in plain:  # the names of parts are proposed as well
+        if name not in {key.name for key in keys}:
+            raise ValueError(
+                f"{file}: [model] {name}: unknown key of kind {kind}; {did_you_mean(name, [key.name for key in keys])}"
+            )
+    values = read_keys(plain, (*MODELS[kind], Key("kind", "text", "kind of the structure", True)), f"{file}: [model]")
+    for name, part_keys in parts.items():
+        if name in given:
+            if not isinstance(given[name], dict):
+                raise ValueError(f"{file}: [model] {name}: expected a section [model.{name}]; got {given[name]!r}")
+            values[name] = read_keys(given[name], part_keys, f"{file}: [model.{name}]")
+    values.pop("kind")
+    return kind, values

@@ -1,0 +1,192 @@
+"""Commands of the console script ``fe-likelihoods``.
+
+The modules that do the work are imported inside the commands, so that ``--help`` answers at once.
+
+Exit codes: 0 when a command has done its work, 1 for an error in the file, the data or the options, 3 when a run has
+ended and its verdict is "not usable", 130 after Ctrl-C.
+"""
+
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+__all__ = ["NOT_USABLE", "main"]
+
+ERROR, INTERRUPTED = 1, 130
+NOT_USABLE = 3
+_FILE = click.Path(path_type=Path)
+_KINDS = ("column", "bridge", "opensees", "function")
+
+
+class _Commands(click.Group):
+    """A group whose errors are one message without a traceback, unless ``--debug`` is given."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        click.UsageError.exit_code = ERROR
+        return super().main(*args, **kwargs)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            message = ctx.obj.get("interrupted", "Interrupted: nothing was changed.")
+            click.echo(f"\n{message}", err=True)
+            ctx.exit(INTERRUPTED)
+        except (ValueError, OSError, RuntimeError, ImportError) as error:
+            if ctx.params["debug"] or isinstance(error, RuntimeError) and type(error).__module__.startswith("click"):
+                raise
+            from .hints import in_toml_terms
+
+            click.echo(f"Error: {in_toml_terms(str(error))}", err=True)
+            ctx.exit(ERROR)
+
+
+@click.group(cls=_Commands, context_settings={"show_default": True, "help_option_names": ["-h", "--help"]})
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+@click.version_option(package_name="fe-likelihoods")
+@click.pass_context
+def main(ctx: click.Context, debug: bool) -> None:
+    """Update a structural model with measurements: one TOML file, one command, one report.
+
+    \b
+    fe-likelihoods new column my-column       a commented TOML file to start from
+    fe-likelihoods check my-column/column.toml
+    fe-likelihoods run my-column/column.toml
+
+    Exit codes: 0 done; 1 error in file, data or options; 3 the run has ended and its result is not usable; 130 Ctrl-C.
+    """
+    ctx.obj = {}
+
+
+@main.command()
+@click.argument("file", type=_FILE)
+@click.option("--out", type=_FILE, help="Folder of the run.", show_default="results-NAME for NAME.toml")
+@click.option("--resume", is_flag=True, help="Continue the run in the folder; an error if there is none.")
+@click.option("--overwrite", is_flag=True, help="Delete the run in the folder and start again.")
+@click.option("--quiet", is_flag=True, help="Show no progress bars.")
+@click.pass_context
+def run(ctx: click.Context, file: Path, out: Path | None, resume: bool, overwrite: bool, quiet: bool) -> None:
+    """Sample the posterior that FILE (TOML) describes; write report, tables and samples to a folder.
+
+    The same command continues a run that was killed. A folder with a run of other settings is refused; [budget] and
+    [prediction] may change.
+    """
+    from .runs import default_folder, run_job
+
+    folder = out or default_folder(file)
+    again = shlex.join(["fe-likelihoods", "run", str(file), *([] if out is None else ["--out", str(out)])])
+    if resume and overwrite:
+        raise click.UsageError("--resume continues the run and --overwrite deletes it: give one of them")
+    ctx.obj["interrupted"] = f"Interrupted. What was computed is kept in {folder}/; go on with: {again}"
+    outcome = run_job(file, out, resume, overwrite, progress=not quiet)
+    _show(outcome)
+    ctx.exit(NOT_USABLE if outcome.sampler.verdict.status == "not usable" else 0)
+
+
+def _show(outcome: Any) -> None:
+    click.echo((outcome.folder / "summary.txt").read_text(encoding="utf-8").rstrip())
+    description = outcome.problem.posterior.likelihood.measurements.description
+    if "CAUTION" in description:
+        click.echo(f"Measurements: {description}")
+    _say_assumed(outcome.problem)
+    click.echo(f"Written to {outcome.folder}/: {', '.join(outcome.files)}")
+
+
+def _say_assumed(problem: Any) -> None:
+    for parameter in problem.posterior.parameters:
+        if parameter.name in problem.assumed:
+            prior = problem.assumed[parameter.name]
+            mean, sd = (parameter.shown(value) for value in prior.moments)
+            click.echo(
+                f"Assumed, since the file does not give it: prior of {parameter.label}: {type(prior).__name__}, mean "
+                f"{mean:.3g}, standard deviation {sd:.3g}"
+            )
+
+
+@main.command()
+@click.argument("file", type=_FILE)
+@click.option("--out", type=_FILE, help="PNG file of the prior predictive picture.", show_default="check-NAME.png")
+def check(file: Path, out: Path | None) -> None:
+    """Read FILE and its data, make one simulation, and say what a run will do and cost.
+
+    A picture compares the measurements with simulations at draws of the prior: the measurements should lie within
+    their band.
+    """
+    from .checking import check_job
+    from .hints import in_toml_terms
+
+    check_job(file, out or Path(f"check-{file.stem}.png"), lambda line: click.echo(in_toml_terms(line)))
+
+
+@main.command()
+@click.argument("run", type=_FILE, metavar="RUN")
+def report(run: Path) -> None:
+    """Make report and tables of RUN again, a folder that `run` made or a file in it, without new samples."""
+    from .runs import report_run
+
+    _show(report_run(run))
+
+
+@main.command()
+@click.argument("kind", type=click.Choice(_KINDS))
+@click.argument("folder", type=_FILE)
+def new(kind: str, folder: Path) -> None:
+    """Write a commented TOML file of KIND to FOLDER to start from; it runs as it is, with synthetic data."""
+    from .starting import write_templates
+
+    files = write_templates(kind, folder)
+    click.echo(f"Written to {folder}/: {', '.join(files)}. The data are SYNTHETIC.")
+    click.echo(f"Next: fe-likelihoods check {folder / kind}.toml")
+
+
+@main.group()
+def cache() -> None:
+    """Look after a cache of simulations (simulations.sqlite in the folder of a run)."""
+
+
+def _cache_command(name: str) -> Callable:
+    return lambda function: cache.command(name)(click.argument("file", type=_FILE)(function))
+
+
+@_cache_command("info")
+def info(file: Path) -> None:
+    """Numbers of simulations and failures, computing time and size of FILE."""
+    from .caches import describe
+
+    click.echo(describe(file))
+
+
+@_cache_command("verify")
+@click.option("--settings", type=_FILE, help="TOML file: also simulate stored points of its model again and compare.")
+def verify(file: Path, settings: Path | None) -> None:
+    """Compare every row of FILE with its checksum; with --settings, some of them with new simulations.
+
+    Exit code 1 if FILE is damaged; it is not changed.
+    """
+    from .caches import verify_cache
+
+    found = verify_cache(file, settings)
+    click.echo(found.text)
+    sys.exit(0 if found.good else ERROR)
+
+
+@_cache_command("export")
+@click.option("--out", type=_FILE, help="HDF5 file.", show_default="FILE with the ending .h5")
+def export(file: Path, out: Path | None) -> None:
+    """Write all simulations of FILE to an HDF5 file, to archive or to copy them."""
+    from .caches import export_cache
+
+    click.echo(export_cache(file, out or file.with_suffix(".h5")))
+
+
+@_cache_command("salvage")
+@click.option("--out", type=_FILE, help="New cache.", show_default="FILE with -salvaged in its name")
+def salvage(file: Path, out: Path | None) -> None:
+    """Copy the readable simulations and responses of a damaged FILE to a new cache; FILE is not changed."""
+    from .caches import salvage_cache
+
+    click.echo(salvage_cache(file, out or file.with_name(f"{file.stem}-salvaged{file.suffix}")))

@@ -1,0 +1,309 @@
+"""The model and the posterior that a TOML file describes."""
+
+import importlib
+import importlib.util
+import math
+import re
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..probability.autoregressive_noise import AutoregressiveNoise
+from ..probability.distributions import Distribution, HalfNormal, Uniform
+from ..probability.likelihood import FELikelihood
+from ..probability.noise import GaussianNoise, SharedGaussianNoise
+from ..probability.parameters import channels_of_deviations
+from ..probability.posterior import Posterior
+from ..signals.channels import Channel, Measurements
+from ..signals.records import Record
+from ..simulation.disk_cache import SimulationCache
+from ..simulation.model import Model
+from .data import is_dataset, read_base_motion, read_bundled, read_measured
+from .job import Job
+from .priors import parse_prior
+from .schema import PARTS, did_you_mean
+
+__all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of"]
+
+USER_MODELS = ("function", "opensees", "executable")
+NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
+
+
+class Problem(NamedTuple):
+    """What a TOML file describes.
+
+    Attributes
+    ----------
+    posterior : Posterior
+    record : Record or None
+        The excitation as it is used.
+    assumed : dict of str to Distribution
+        Priors of noise parameters that the file does not give.
+    truth : dict of str to float or None
+        True values of the parameters of bundled synthetic data that are known.
+    """
+
+    posterior: Posterior
+    record: Record | None
+    assumed: dict[str, Distribution]
+    truth: dict[str, float] | None = None
+
+
+def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
+    """Read the data, make the model and the posterior.
+
+    Parameters
+    ----------
+    job : Job
+    cache : SimulationCache, optional
+        Cache of the simulations.
+
+    Returns
+    -------
+    Problem
+
+    Raises
+    ------
+    ValueError
+        If a file, a value or a combination of them is wrong; the message names section and key.
+    """
+    record = read_base_motion(job)
+    sensors = _all_channels(job, record)
+    measured = read_measured(job, sensors, record)
+    record, measured = _reduced(job, record, measured)
+    model = _located(job, "model", lambda: _make_model(job, record, measured))
+    workers = job.budget.get("workers")
+    if workers is not None and job.kind not in USER_MODELS:
+        raise ValueError(
+            f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
+        )
+    law = _located(job, "noise", lambda: _make_noise(job, model, measured))
+    likelihood = _located(job, "measurements", lambda: FELikelihood(model, measured, law, pool=workers, cache=cache))
+    priors, assumed = _make_priors(job, likelihood)
+    posterior = Posterior(likelihood, priors)
+    posterior = posterior.marginal() if job.noise == "marginal" else posterior
+    return Problem(posterior, record, assumed, _truth(job, posterior, record))
+
+
+def _truth(job: Job, posterior: Posterior, record: Record | None) -> dict[str, float] | None:
+    """True values of bundled data: multiples of the nominal values of the built-in structure, where it has these."""
+    if "bundled" not in job.measurements or job.kind not in ("column", "bridge"):
+        return None
+    model = posterior.likelihood.model
+    usual = type(model).lhpost(record) if job.kind == "column" else type(model)(record)
+    truth = read_bundled(job, "measurements").attributes["truth"]
+    changed = {name for name, value in usual.nominal.items() if not math.isclose(model.nominal[name], value)}
+    return {name: truth[name] for name in posterior.parameter_names if name in truth and name not in changed} or None
+
+
+def _located(job: Job, section: str, make: Callable[[], Any]) -> Any:
+    """Errors with file and section before them."""
+    try:
+        return make()
+    except ValueError as error:
+        raise (
+            error if str(error).startswith(f"{job.file.name}:") else ValueError(f"{job.where(section)} {error}")
+        ) from error
+
+
+def _all_channels(job: Job, record: Record | None) -> tuple[Channel, ...]:
+    """Channels that the measurements may have."""
+    if is_dataset(job, "measurements"):
+        return ()  # the data set has its channels
+    if job.kind in USER_MODELS:
+        return _user_channels(job)
+    names = tuple(job.measurements.get("columns", ())) or None
+    return _located(job, "model", lambda: _built_in(job, record, names).channels)
+
+
+def _reduced(job: Job, record: Record | None, measured: Measurements) -> tuple[Record | None, Measurements]:
+    """The first part of the data, and one sample in so many."""
+    duration, every = job.record.get("duration"), job.record.get("every", 1)
+
+    def reduce() -> tuple[Record | None, Measurements]:
+        shorter, fewer = record, measured
+        if duration is not None:
+            shorter, fewer = shorter.trim(0.0, duration), fewer.trim(0.0, duration)
+        if every != 1:
+            shorter, fewer = shorter.resample(shorter.dt * every), fewer.decimate(every)
+        return shorter, fewer
+
+    return (record, measured) if record is None else _located(job, "record", reduce)
+
+
+def _make_model(job: Job, record: Record | None, measured: Measurements) -> Model:
+    if job.kind in USER_MODELS:
+        return _user_model(job, record)
+    return _built_in(job, record, tuple(channel.name for channel in measured.channels), measured)
+
+
+def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: Measurements | None = None) -> Model:
+    values = dict(job.model)
+    if job.kind == "column":
+        from ..models.rc_column import PARAMETERS, RCColumn
+
+        usual = RCColumn.lhpost(record)
+        for part in PARTS["column"]:
+            if part in values:
+                values[part] = _changed(job, part, getattr(usual, part), values[part])
+        if "units" in values:
+            values["units"] = tuple((dict(usual.units) | values["units"]).items())
+        _check_names(job, "parameters", values.get("parameters", ()), tuple(PARAMETERS))
+        return RCColumn.lhpost(record, **values, outputs=names)
+    if job.kind == "bridge":
+        from ..models.isolated_bridge import IsolatedBridge
+
+        usual = IsolatedBridge(record)
+        for part in ("pier", "bearing", "damper"):
+            pair = getattr(usual, f"{part}s")
+            values[f"{part}s"] = tuple(
+                _changed(job, f"{part}_{i}", pair[i - 1], values.pop(f"{part}_{i}", {})) for i in (1, 2)
+            )
+        if measured is not None:
+            values["every"] = max(1, round(measured.dt / record.dt))
+        _check_names(job, "parameters", values.get("parameters", ()), usual.parameter_names)
+        return IsolatedBridge(record, **values, outputs=names)
+    if job.kind == "oscillator":
+        from ..models.linear_oscillator import LinearOscillator
+
+        return LinearOscillator(record, **values)
+    from ..models.linear_structure import LinearStructure
+    from ..models.linear_structure_parts import ShearFrame
+
+    return LinearStructure(ShearFrame(**values), record)
+
+
+def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:
+    """A part of the built-in structure with the values of the file."""
+    changes = dict(changes)
+    if part in ("bars", "hoops") and "diameter" in changes:
+        changes.setdefault("area", None)  # that of the new diameter
+    try:
+        return replace(usual, **changes)
+    except ValueError as error:
+        raise ValueError(f"{job.file.name}: [model.{part}] {error}") from error
+
+
+def _check_names(job: Job, key: str, names: Any, known: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in known:
+            raise ValueError(f"{job.where('model')} {key}: unknown {name!r}; {did_you_mean(name, known)}")
+
+
+def _user_channels(job: Job) -> tuple[Channel, ...]:
+    channels = []
+    for name, text in job.model["channels"].items():
+        match = re.fullmatch(r"\s*(.+?)\s*\[(.+)\]\s*", text)
+        try:
+            if match is None:
+                raise ValueError(f'expected quantity and unit, such as "displacement [mm]"; got {text!r}')
+            channels.append(Channel(name, match[1], match[2].strip()))
+        except ValueError as error:
+            raise ValueError(f"{job.where('model')} channels: {name}: {error}") from None
+    return tuple(channels)
+
+
+def _user_model(job: Job, record: Record | None) -> Model:
+    given = dict(job.model)
+    names, channels = given.pop("parameters"), _user_channels(job)
+    given.pop("channels")
+    given["depends_on"] = [job.path("model", "depends_on", name) for name in given.get("depends_on", ())]
+    common = {"record": record} | given
+    if job.kind == "executable":
+        from ..models.executable import ExecutableModel
+
+        for key in ("templates", "files"):
+            if key in common:
+                common[key] = {name: job.path("model", key, file) for name, file in common[key].items()}
+        command = [
+            str(path.resolve()) if (path := job.folder / word).is_file() else word for word in common.pop("command")
+        ]
+        return ExecutableModel(command, common.pop("templates"), common.pop("output"), names, channels, **common)
+    function = load_function(job, common.pop("function"))
+    if job.kind == "opensees":
+        from ..models.opensees import OpenSeesModel
+
+        return OpenSeesModel(function, names, channels, **common)
+    from ..models.function import FunctionModel
+
+    return FunctionModel(function, names, channels, **common)
+
+
+def load_function(job: Job, text: str) -> Callable:
+    """The function that ``"file.py:name"`` names, from a module that worker processes can import too.
+
+    Raises
+    ------
+    ValueError
+        If the file or the function does not exist, the file cannot be imported, or another module has its name.
+    """
+    where = f"{job.where('model')} function:"
+    file, _, name = text.rpartition(":")
+    if not file or not name.isidentifier():
+        raise ValueError(f'{where} expected "file.py:name of the function"; got {text!r}')
+    path = job.path("model", "function", file).resolve()
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))
+    importlib.invalidate_caches()
+    found = importlib.util.find_spec(path.stem) if path.stem.isidentifier() else None
+    if found is None or found.origin is None or Path(found.origin).resolve() != path:
+        raise ValueError(f"{where} {path.name} cannot be imported by its name; rename it, for example to my_model.py")
+    try:
+        module = importlib.import_module(path.stem)
+    except Exception as error:
+        raise ValueError(f"{where} {path.name} cannot be imported: {type(error).__name__}: {error}") from error
+    function = vars(module).get(name)
+    if not callable(function):
+        names = tuple(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
+        raise ValueError(f"{where} {path.name} has no function {name!r}; {did_you_mean(name, names)}")
+    return function
+
+
+def _make_noise(job: Job, model: Model, measured: Measurements) -> Any:
+    if job.noise == "per event":
+        return "per event"
+    if job.noise == "shared":
+        return SharedGaussianNoise.of(measured.select([channel.name for channel in model.channels]))
+    return (AutoregressiveNoise if job.noise == "autoregressive" else GaussianNoise)(model.channels)
+
+
+def _make_priors(job: Job, likelihood: FELikelihood) -> tuple[dict[str, Distribution], dict[str, Distribution]]:
+    """The priors of all parameters, and those of them that the file does not give."""
+    names, structural = likelihood.parameter_names, tuple(likelihood.model.parameter_names)
+    channels = noise_channels_of(likelihood)
+    for name in job.priors:
+        if name not in names:
+            raise ValueError(
+                f"{job.where('priors')} {name}: the model has no such parameter; {did_you_mean(name, names)}"
+            )
+    given = {}
+    for name, text in job.priors.items():
+        try:
+            given[name] = parse_prior(text, channels[name].dimension if name in channels else None)
+        except ValueError as error:
+            raise ValueError(f"{job.where('priors')} {name}: {error}") from None
+    if missing := [name for name in structural if name not in given]:
+        raise ValueError(
+            f"{job.where('priors')} {missing[0]}: this prior is missing; write for example "
+            f'{missing[0]} = "normal(1, 0.3)"'
+        )
+    assumed = {
+        name: _default_prior(name, channels.get(name), likelihood.measurements) for name in names if name not in given
+    }
+    return {name: (given | assumed)[name] for name in names}, assumed
+
+
+def noise_channels_of(likelihood: FELikelihood) -> dict[str, Channel]:
+    """Channel of each parameter that is the noise level of a channel, by name."""
+    return channels_of_deviations(likelihood.noise, likelihood.model.channels)
+
+
+def _default_prior(name: str, channel: Channel | None, measured: Measurements) -> Distribution:
+    if name.startswith("rho_"):
+        return Uniform(-1.0, 1.0)
+    if channel is None:
+        return HalfNormal(NOISE_SCALE)
+    rms = SharedGaussianNoise.of(measured.select([channel.name])).scales[0]
+    return HalfNormal(float(f"{NOISE_SCALE * rms:.3g}") if math.isfinite(rms) and rms > 0.0 else 1.0)

@@ -1,0 +1,132 @@
+"""Files of a finished run: tables as text and CSV, samples for arviz, the prediction, and the report."""
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..prediction.prediction import Prediction
+from ..probability.likelihood import FELikelihood
+from ..probability.posterior import Posterior
+from ..signals.error_measures import rrmse
+from .hints import in_toml_terms
+
+__all__ = ["read_prediction", "write_prediction", "write_report", "write_samples", "write_tables"]
+
+_ARRAYS = ("mean", "variance", "standard_error", "quantiles", "quantile_error", "failed")
+
+
+def write_tables(folder: Path, sampler: Any, posterior: Posterior) -> tuple[str, ...]:
+    """Write the moments of the parameters, the stages and the errors of the fit.
+
+    Parameters
+    ----------
+    folder : Path
+    sampler : object
+        Sampler that has run.
+    posterior : Posterior
+
+    Returns
+    -------
+    tuple of str
+        Names of the files.
+    """
+    from samplers import ladder_table, summary
+
+    samples = sampler.get_chain(flat=True)
+    shown = np.stack([p.shown(column) for p, column in zip(posterior.parameters, samples.T, strict=True)], axis=1)
+    errors = sampler.mean_error() / np.array([p.factor for p in posterior.parameters])
+    labels = [parameter.label for parameter in posterior.parameters]
+    moments = summary(shown, labels, mean_error=errors)
+    low, median, high = np.quantile(shown, [0.05, 0.5, 0.95], axis=0)
+    evidence = f"log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}"
+    fit = _fit_rows(posterior, samples)
+    runs = _model_runs(posterior.likelihood, sampler.simulations)
+    lines = [str(moments), "", evidence, in_toml_terms(str(sampler.verdict)), *runs, "", "Relative RMS error of the response (RRMSE):"]
+    lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
+    (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    columns = ("parameter", "mean", "mean_error", "sd", "cv", "q05", "median", "q95", "nominal")
+    nominal = [parameter.shown(parameter.nominal) for parameter in posterior.parameters]
+    values = (labels, moments.mean, errors, moments.sd, moments.cv, low, median, high, nominal)
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+    _write_csv(folder / "summary.csv", rows)
+    _write_csv(folder / "fit.csv", fit)
+    (folder / "stages.txt").write_text(ladder_table(sampler) + "\n", encoding="utf-8")
+    return ("summary.txt", "summary.csv", "fit.csv", "stages.txt")
+
+
+def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
+    """How many runs of the model are stored, where a guide has made some of a part of the record, as a line of text."""
+    if likelihood.cache is None or float(simulations).is_integer():
+        return []
+    stored = likelihood.cache.info()
+    return [
+        f"{stored.simulations} runs of the model are stored, {stored.failures} of which failed, those for tables, report "
+        f"and predictions included. The sampling counts as {simulations:.0f} full simulations, since the guide starts "
+        "with short parts of the record."
+    ]
+
+
+def _fit_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]:
+    """RRMSE of every channel at the posterior mean; one simulation."""
+    likelihood = posterior.likelihood
+    n = len(likelihood.model.parameter_names)
+    residuals = likelihood.residuals(samples[:, :n].mean(axis=0)) if likelihood.ndim == n else likelihood.residuals(
+        samples.mean(axis=0)
+    )
+    measured = likelihood.measurements
+    errors = rrmse(measured.values - residuals, measured.values)
+    return [
+        {"channel": channel.name, "rrmse": float(error)}
+        for channel, error in zip(measured.channels, errors, strict=True)
+    ]
+
+
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_samples(folder: Path, sampler: Any, posterior: Posterior, prediction: Prediction | None, draws: int) -> str:
+    """Write the samples in netCDF, with the responses of `draws` of them; return the name of the file."""
+    from samplers import to_arviz
+
+    data = to_arviz(sampler, posterior if draws else None, prediction, **({"draws": draws} if draws else {}))
+    data.to_netcdf(str(folder / "posterior.nc"))
+    return "posterior.nc"
+
+
+def write_report(path: Path, sampler: Any, posterior: Posterior, prediction: Prediction | None, again: str, truth: Mapping[str, float] | None) -> str:
+    """Write the report in HTML, with the command that makes it again; return the name of the file."""
+    from ..reporting.report import report
+
+    report(sampler, posterior, prediction, path, truth=truth, repeat=again)
+    return path.name
+
+
+def read_prediction(path: Path, posterior: Posterior) -> Prediction | None:
+    """The stored prediction of a run, or None if there is none."""
+    if not path.is_file():
+        return None
+    with np.load(path) as stored:
+        others = json.loads(str(stored["others"]))
+        arrays = {name: stored[name] for name in _ARRAYS}
+    others = {name: tuple(value) if isinstance(value, list) else value for name, value in others.items()}
+    return Prediction(**arrays, **others, channels=tuple(posterior.likelihood.model.channels), values=None)
+
+
+def write_prediction(path: Path, prediction: Prediction) -> None:
+    """Write a prediction of histories, compressed."""
+    others = {
+        field.name: getattr(prediction, field.name)
+        for field in fields(prediction)
+        if field.name not in (*_ARRAYS, "channels", "values", "quantity")
+    }
+    arrays = {name: getattr(prediction, name) for name in _ARRAYS}
+    np.savez_compressed(path, others=json.dumps(others), **arrays)

@@ -1,0 +1,270 @@
+"""Runs in a folder: one that is new, one that is continued, and the report of a stored one.
+
+A folder has the run itself (``run.h5`` and its journal), the cache of simulations, a copy of the TOML file, and the
+results. A run that was killed goes on from the journal, with the results of an uninterrupted run.
+"""
+
+import contextlib
+import json
+import logging
+import shlex
+import shutil
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..prediction.prediction import Prediction
+from ..simulation.disk_cache import SimulationCache
+from .job import Job, parse_job, read_job
+from .models import Problem, make_problem
+from .results import read_prediction, write_prediction, write_report, write_samples, write_tables
+
+__all__ = ["Outcome", "default_folder", "make_sampler", "report_run", "run_job"]
+
+SETTINGS, ORIGIN, CHAIN, CACHE = "settings.toml", "origin.json", "run.h5", "simulations.sqlite"
+CHANGEABLE = ("budget", "prediction")  # sections that do not change what a run has computed so far
+DRAWS, STEPS = 100, 4  # of predictions, of the chain
+PRESETS = {
+    "ramancha2022": "RAMANCHA_2022_LITERAL",
+    "ramancha2022-constant": "RAMANCHA_2022_CONSTANT",
+    "ching-chen-2007": "CHING_CHEN_2007",
+}
+
+
+class Outcome(NamedTuple):
+    """What a run has left.
+
+    Attributes
+    ----------
+    folder : Path
+        Its folder.
+    sampler : object
+        The sampler.
+    problem : Problem
+    files : tuple of str
+        Names of the files of the results.
+    """
+
+    folder: Path
+    sampler: Any
+    problem: Problem
+    files: tuple[str, ...]
+
+
+def default_folder(file: Path) -> Path:
+    """Folder of the results of a TOML file, in the current folder: ``results-column`` for ``column.toml``."""
+    return Path(f"results-{file.stem}")
+
+
+def make_sampler(job: Job, problem: Problem, backend: Any = None) -> Any:
+    """Make the sampler of a TOML file, with a backend or in memory.
+
+    Raises
+    ------
+    ValueError
+        If a setting is impossible; the message names the section.
+    """
+    import samplers
+
+    given = dict(job.sampler)
+    kind, preset = given.pop("kind", "smc"), given.pop("preset", None)
+    kinds = {"smc": samplers.SMCSampler, "tmcmc": samplers.TMCMCSampler}
+    where = job.where("sampler")
+    if kind not in kinds:
+        raise ValueError(f"{where} kind: expected one of {', '.join(kinds)}; got {kind!r}")
+    if preset is not None and preset not in PRESETS:
+        raise ValueError(f"{where} preset: expected one of {', '.join(PRESETS)}; got {preset!r}")
+    settings = {} if preset is None else dict(getattr(samplers.presets, PRESETS[preset]))
+    walkers, seed, guided = given.pop("walkers", 500), given.pop("seed", 1), given.pop("guide", False)
+    given.pop("steps", None)
+    posterior = problem.posterior
+    try:
+        return kinds[kind](
+            walkers,
+            posterior.ndim,
+            posterior,
+            backend=backend,
+            vectorize=True,
+            seed=seed,
+            guide=posterior.guide() if guided else None,
+            max_simulations=job.budget.get("max_simulations"),
+            **(settings | given),
+        )
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where} {error}") from error
+
+
+def run_job(
+    file: Path, folder: Path | None = None, resume: bool = False, overwrite: bool = False, progress: bool = True
+) -> Outcome:
+    """Start or continue the run of a TOML file, and write its results.
+
+    Parameters
+    ----------
+    file : Path
+        The TOML file.
+    folder : Path, optional
+        Folder of the run. Default: `default_folder`.
+    resume : bool
+        Refuse to start a new run.
+    overwrite : bool
+        Delete the run that the folder contains.
+    progress : bool
+        Whether to show progress bars.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    ValueError
+        If anything in the file is wrong, or the folder contains the run of other settings.
+    """
+    import emcee
+
+    job = read_job(file)
+    folder = folder or default_folder(file)
+    tried = make_problem(job)
+    make_sampler(job, tried)  # before the folder is touched
+    _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
+    problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
+    sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
+    sampler.run_mcmc(None, job.sampler.get("steps", STEPS), progress=progress)
+    prediction = _predict(job, problem, sampler, progress)
+    if prediction is not None:
+        write_prediction(folder / "prediction.npz", prediction)
+    draws = job.prediction.get("draws", DRAWS)
+    samples = write_samples(folder, sampler, problem.posterior, prediction, draws)
+    return Outcome(folder, sampler, problem, (*_write(folder, job.file, sampler, problem, prediction), samples))
+
+
+def report_run(path: Path) -> Outcome:
+    """Make the tables and the report of a stored run again, without new samples.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of a run, or a file in it.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    ValueError
+        If it is not such a folder, its data are no longer there, or the run has no samples yet.
+    """
+    import emcee
+
+    folder = path if path.is_dir() else path.parent
+    if not (folder / SETTINGS).is_file() or not (folder / CHAIN).is_file():
+        raise ValueError(
+            f"{folder} is not the folder of a run: it has no {SETTINGS} or {CHAIN}; give the folder that "
+            "`fe-likelihoods run` made"
+        )
+    origin = json.loads((folder / ORIGIN).read_text(encoding="utf-8"))
+    job = parse_job((folder / SETTINGS).read_text(encoding="utf-8"), folder / SETTINGS, Path(origin["folder"]))
+    cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
+    problem = make_problem(job, cache)
+    sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
+    if sampler.iteration == 0:
+        raise ValueError(
+            f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
+            f"{folder}"
+        )
+    steps = job.sampler.get("steps", STEPS)
+    if sampler.iteration >= steps:
+        # the journal repeats the run without an evaluation; the chain alone has lost which walkers are copies
+        with _without_messages("samplers.storage.resumption"):
+            sampler.run_mcmc(None, steps, progress=False)
+    prediction = read_prediction(folder / "prediction.npz", problem.posterior)
+    return Outcome(folder, sampler, problem, _write(folder, Path(origin["file"]), sampler, problem, prediction))
+
+
+@contextlib.contextmanager
+def _without_messages(name: str) -> Iterator[None]:
+    """Without the warnings of a logger: that a run continues, and that it is complete, is no news in a report."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _write(folder: Path, file: Path, sampler: Any, problem: Problem, prediction: Prediction | None) -> tuple[str, ...]:
+    """Write the report and the tables; return the names of the files."""
+    posterior, again = problem.posterior, shlex.join(["fe-likelihoods", "run", str(file), "--out", str(folder)])
+    report = write_report(folder / "report.html", sampler, posterior, prediction, again, problem.truth)
+    return (report, *write_tables(folder, sampler, posterior))
+
+
+def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:
+    """Make the folder, or check that it contains a run of the same settings and of the posterior with a fingerprint."""
+    settings = folder / SETTINGS
+    if overwrite and settings.is_file():
+        shutil.rmtree(folder)
+    if settings.is_file():
+        changed = _changes(settings.read_text(encoding="utf-8"), job.text)
+        if changed:
+            raise ValueError(
+                f"{folder} contains a run with other settings: {', '.join(changed)} differ from {job.file.name}. Give "
+                "another folder with --out, or delete that run with --overwrite"
+            )
+        stored = json.loads((folder / ORIGIN).read_text(encoding="utf-8"))
+        if stored.get("posterior", fingerprint) != fingerprint:
+            raise ValueError(
+                f"{folder} contains a run with other data or another model, of {stored['file']}. Give another folder "
+                "with --out, or delete that run with --overwrite"
+            )
+    elif resume:
+        raise ValueError(f"{folder} contains no run to resume; leave out --resume to start one")
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} exists and is not the folder of a run; give another one with --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"cannot make the folder {folder}: {error.strerror}; give another one with --out") from error
+    settings.write_text(job.text, encoding="utf-8")
+    origin = {"file": str(job.file.resolve()), "folder": str(job.folder.resolve()), "posterior": fingerprint}
+    (folder / ORIGIN).write_text(json.dumps(origin, indent=2) + "\n", encoding="utf-8")
+
+
+def _changes(old: str, new: str) -> list[str]:
+    """Keys whose values differ, except in sections that a continued run may change."""
+    before, after = (tomllib.loads(text) for text in (old, new))
+    found = []
+    for section in sorted({*before, *after} - {*CHANGEABLE}):
+        ours, theirs = before.get(section, {}), after.get(section, {})
+        found += [f"[{section}] {key}" for key in sorted({*ours, *theirs}) if ours.get(key) != theirs.get(key)]
+    return found
+
+
+def _predict(job: Job, problem: Problem, sampler: Any, progress: bool) -> Prediction | None:
+    from ..prediction.propagation import propagate
+
+    n = job.prediction.get("draws", DRAWS)
+    if n < 1:
+        return None
+    samples = sampler.get_chain(flat=True)
+    rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
+    posterior, drawn = problem.posterior, samples[rows]
+    if job.noise == "marginal":
+        drawn = posterior.draw_noise(drawn, job.sampler.get("seed", 1))
+    try:
+        return propagate(
+            posterior,
+            drawn,
+            noise=job.prediction.get("noise", False),
+            quantiles=tuple(job.prediction.get("quantiles", (0.05, 0.5, 0.95))),
+            seed=job.sampler.get("seed", 1),
+            progress=progress,
+        )
+    except ValueError as error:
+        raise ValueError(f"{job.where('prediction')} {error}") from error

@@ -1,0 +1,317 @@
+"""What a reader has to know before trusting a result: each doubt in plain words, with what to do about it."""
+
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+
+from ..simulation.remarks import RemarkTable
+from .failures import Failures
+from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits
+from .run import LONGEST_AUTOCORRELATION, FinishedRun
+from .table import ParameterRow
+
+__all__ = ["Advice", "advise", "residual_sentence"]
+
+FEW_SAMPLES = 100.0  # effective, below which the ends of a 90 % interval rest on fewer than five samples each
+LARGE_MEAN_ERROR = 0.2  # of the standard deviation
+NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, as a share of the 90 % interval
+SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior
+FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
+LARGE_FAILURE_SHARE = 0.05
+LARGE_ERROR = 0.5  # RRMSE above which a channel is hardly reproduced
+STRONG_CORRELATION = 0.2  # lag-one correlation of residuals that changes the width of the posterior
+
+SEVERE, CAUTION, REMARK = "severe", "caution", "remark"
+
+
+class Advice(NamedTuple):
+    """One thing to know.
+
+    Attributes
+    ----------
+    level : {"severe", "caution", "remark"}
+        Whether it speaks against the result, limits it, or is good to know.
+    title : str
+        What was found, in a few words.
+    text : str
+        What it means.
+    action : str
+        What to do; may be empty.
+    """
+
+    level: str
+    title: str
+    text: str
+    action: str
+
+
+def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures) -> list[Advice]:
+    """All that a reader has to know, the most severe first.
+
+    A run that says nothing about the parameters gets no notes that compare its samples with prior, truth or noise.
+
+    Parameters
+    ----------
+    run : FinishedRun
+    rows : list of ParameterRow
+    fits : Fits
+    failed : Failures
+    """
+    found = [
+        *_of_the_verdict(run),
+        *_of_the_chain(run, rows),
+        *_of_failures(failed, run.is_inconclusive),
+        *_of_the_responses(fits),
+        *_of_the_model(run),
+        *_of_the_data(fits),
+    ]
+    if not run.is_inconclusive:
+        found += [*_of_the_noise(fits), *_of_the_prior(run, rows), *_of_the_truth(rows)]
+    return sorted(found, key=lambda each: (SEVERE, CAUTION, REMARK).index(each.level))
+
+
+def _of_the_verdict(run: FinishedRun) -> list[Advice]:
+    if not run.tempered:
+        return []
+    if run.verdict is None:
+        text = "The file of this run holds no verdict, so nothing is known about its convergence."
+        return [Advice(CAUTION, "No verdict", text, "Run it again with this version.")]
+    if run.verdict.status == "converged":
+        return []
+    severe = run.verdict.status == "not usable"
+    title = "The result is not usable" if severe else "The result is usable, with limits"
+    more = run.verdict.more_simulations
+    action = "Compare with a second run of another seed and more walkers before you use the numbers."
+    if more is None:
+        action = "How many more simulations are needed is not known. " + action
+    elif more > 0.0:
+        action = f"About {more:.0f} more simulations are needed: raise max_simulations and call run_mcmc again."
+    reasons = " ".join(f"{reason[0].upper()}{reason[1:]}." for reason in run.verdict.reasons)
+    return [Advice(SEVERE if severe else CAUTION, title, reasons, action)]
+
+
+def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
+    found, size = [], run.effective_sample_size
+    if not run.tempered:
+        found += _of_a_markov_chain(run)
+    if not size >= FEW_SAMPLES:
+        text = f"The {len(run.samples)} samples are worth about {size:.0f} independent ones: interval ends are rough."
+        if not np.isfinite(size):
+            text = f"How many independent samples the {len(run.samples)} samples are worth is not known."
+        found.append(Advice(CAUTION, "Few independent samples", text, "Make more iterations, or use more walkers."))
+    rough = [row.label for row in rows if row.mean_error > LARGE_MEAN_ERROR * row.sd]
+    if rough and size >= FEW_SAMPLES:
+        text = f"The error of the mean exceeds a fifth of the standard deviation for {', '.join(rough)}."
+        found.append(Advice(CAUTION, "Rough means", text, "Make more iterations, or use more walkers."))
+    if run.n_modes > 1:
+        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.diagnostics.modes)
+        text = (
+            f"The posterior has {run.n_modes} separate regions, with shares {shares}. Mean and standard deviation "
+            "describe none of them, and the fit below is that of the best sample."
+        )
+        action = "Look at the corner figure. Data of another kind, or a narrower prior, may tell the regions apart."
+        found.append(Advice(CAUTION, "Several modes", text, action))
+    return found
+
+
+def _of_a_markov_chain(run: FinishedRun) -> list[Advice]:
+    iterations, time, found = run.sampler.iteration - run.discard, run.autocorrelation_time, []
+    if not iterations >= LONGEST_AUTOCORRELATION * time:
+        known = f"its autocorrelation time is about {time:.0f} iterations"
+        if not np.isfinite(time):
+            known = "its autocorrelation time is not known"
+        text = (
+            f"The chain has {iterations} iterations, and {known}. A chain of fewer than {LONGEST_AUTOCORRELATION:.0f} "
+            "autocorrelation times gives no reliable error, and may still be on its way to the posterior."
+        )
+        found.append(
+            Advice(SEVERE, "The chain is short", text, "Continue it, or use SMCSampler for the same posterior.")
+        )
+    if run.discard == 0:
+        text = "All iterations are used, the first ones included, which depend on where the walkers started."
+        action = "Give report(..., discard=n) the number of iterations of the burn-in, if there was one."
+        found.append(Advice(CAUTION, "No burn-in was left out", text, action))
+    return found
+
+
+def _of_failures(failed: Failures, inconclusive: bool) -> list[Advice]:
+    if not failed.count:
+        return []
+    found, share = [], failed.count / max(failed.attempts, 1)
+    of_prior = f", among them {failed.prior_failed} of {failed.prior_draws} draws of the prior"
+    text = (
+        f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %)"
+        f"{of_prior if failed.prior_draws else ''}. A failed simulation counts as impossible: the posterior has no "
+        "samples there."
+    )
+    action = (
+        "See the table of failures. If the parameters there are plausible, mend the model and run again; if they are "
+        "not, a narrower prior saves these simulations."
+    )
+    largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
+    found.append(Advice(CAUTION if largest > LARGE_FAILURE_SHARE else REMARK, "Simulations failed", text, action))
+    if failed.borders and not inconclusive:
+        text = (
+            f"In the region of the samples, {failed.near_failed} of {failed.near} simulated points failed. The "
+            "failures, not the data, end the posterior there: its mean and its interval may be wrong."
+        )
+        action = (
+            "See in the table of failures where they happen. Mend the model or the settings of its solver there, and "
+            "run again. Only if these parameters are impossible, a bound of the prior may stand there instead."
+        )
+        found.append(Advice(SEVERE, "Failures border on the samples", text, action))
+    return found
+
+
+def _of_the_responses(fits: Fits) -> list[Advice]:
+    found = [
+        Advice(CAUTION, "A response is missing", f"{text}.", "Use another point or mend the model.")
+        for text in fits.failures
+    ]
+    poor = [
+        f"{_place(fit, each)} ({100.0 * each.after:.0f} %)"
+        for fit in fits.fits
+        for each in fit.channels
+        if each.after > LARGE_ERROR
+    ]
+    if poor:
+        text = f"After the update, the relative error (RRMSE) is still large: {_listed(poor)}."
+        action = (
+            "If the signal is not small against its noise, check units, signs, time offsets and the channel's place in "
+            "the model before you interpret the parameters."
+        )
+        found.append(Advice(CAUTION, "A channel is hardly reproduced", text, action))
+    return found
+
+
+def _of_the_noise(fits: Fits) -> list[Advice]:
+    found, doubtful = [], [(fit, each) for fit in fits.fits for each in fit.channels if each.checks is not None]
+    white = [_place(fit, each) for fit, each in doubtful if _is_correlated(each) and fit.noise == "white"]
+    if white:
+        text = (
+            f"Successive residuals are correlated in {_listed(white)}. The likelihood takes the errors as independent "
+            "from sample to sample, so the data count as more than they are, and the intervals are too narrow."
+        )
+        action = (
+            "Use AutoregressiveNoise or GaussianNoise(effective_samples=...), and look at the residuals for an effect "
+            "that the model lacks."
+        )
+        found.append(Advice(CAUTION, "The errors are not white noise", text, action))
+    left = [_place(fit, each) for fit, each in doubtful if _is_correlated(each) and fit.noise == "autoregressive"]
+    if left:
+        text = (
+            f"The innovations are still correlated in {_listed(left)}: the errors have more than one correlation time."
+        )
+        action = "Compare with GaussianNoise(effective_samples=...), and look for an effect that the model lacks."
+        found.append(Advice(CAUTION, "The noise model does not fit the errors", text, action))
+    strange = [_place(fit, each) for fit, each in doubtful if each.checks.normal[0] < SMALL_PROBABILITY]
+    if strange:
+        text = f"The residuals of {_listed(strange)} have heavier tails, or are more skew, than a normal distribution."
+        action = "Look for spikes, clipped samples, or parts of the record that the model does not reproduce."
+        found.append(Advice(REMARK, "The errors are not normal", text, action))
+    return found
+
+
+def _is_correlated(each: ChannelFit) -> bool:
+    return each.checks.white[0] < SMALL_PROBABILITY and abs(each.checks.lag_one[0]) > STRONG_CORRELATION
+
+
+def _of_the_prior(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
+    found, edges = [], []
+    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
+    for row in (row for row in rows if row not in flat):  # where the data say little, the prior is at its own edge
+        width = row.high - row.low
+        if width > 0.0 and row.low - row.lower < NEAR_BOUND * width:
+            edges.append(f"{row.label} at {row.lower:.4g}")
+        if width > 0.0 and row.upper - row.high < NEAR_BOUND * width:
+            edges.append(f"{row.label} at {row.upper:.4g}")
+    if edges:
+        text = f"The posterior reaches the edge of its prior: {_listed(edges)}. The bound, not the data, ends it there."
+        action = (
+            "If the bound is physical, nothing is wrong. Otherwise widen the prior, and ask what the parameter makes "
+            "up for in the model."
+        )
+        found.append(Advice(CAUTION, "At the edge of the prior", text, action))
+    if flat:
+        names = _listed([row.label for row in flat])
+        text = f"The posterior of {names} is nearly as wide as its prior: these data say little about it."
+        action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
+        found.append(Advice(REMARK, "Not informed by the data", text, action))
+    far = [row.label for row in rows if abs(row.mean - row.prior_mean) > FAR_FROM_PRIOR * row.prior_sd]
+    if far:
+        text = (
+            f"The posterior mean of {_listed(far)} is more than {FAR_FROM_PRIOR:.0f} standard deviations of the prior "
+            "away from the mean of the prior: prior and data disagree."
+        )
+        action = (
+            "Check the nominal value and the width of the prior; the parameter may make up for an error of the model."
+        )
+        found.append(Advice(CAUTION, "Far from the prior", text, action))
+    return found
+
+
+def _of_the_truth(rows: list[ParameterRow]) -> list[Advice]:
+    """A caution if fewer true values are within their intervals than chance explains."""
+    known = [row for row in rows if np.isfinite(row.truth)]
+    outside = [row.label for row in known if not row.low <= row.truth <= row.high]
+    # probability that so many 90 % intervals or more miss, if they were independent
+    n, k = len(known), len(outside)
+    if not k or sum(comb(n, j) * 0.1**j * 0.9 ** (n - j) for j in range(k, n + 1)) >= SMALL_PROBABILITY:
+        return []
+    text = (
+        f"The true values of {_listed(outside)} are outside of their 90 % intervals, {k} of {n}; about one in ten is "
+        "usual. The model that was updated is not the one that made the data."
+    )
+    action = "Expect the same of real data: intervals do not contain the error of the model. Try a finer model or step."
+    return [Advice(CAUTION, "True values are missed", text, action)]
+
+
+def _of_the_model(run: FinishedRun) -> list[Advice]:
+    found, likelihoods = [], [] if run.likelihood is None else [each for each, _ in run.likelihood.parts()]
+    for likelihood in likelihoods:
+        text = getattr(likelihood.model, "range_remark", "")
+        if not text and isinstance(likelihood.cache, RemarkTable) and hasattr(likelihood.model, "range_remark"):
+            text = likelihood.cache.look_up_remark(likelihood.model)
+        if text:
+            action = "See whether samples of the posterior are concerned, or only draws far from it."
+            found.append(
+                Advice(CAUTION, "Beyond the range of a law of the model", f"{text[0].upper()}{text[1:]}.", action)
+            )
+    return found
+
+
+def _of_the_data(fits: Fits) -> list[Advice]:
+    if not any("synthetic" in fit.measurements.description.lower() for fit in fits.fits):
+        return []
+    text = "The measurements were computed with a model, not measured. The result shows how the method works."
+    return [Advice(REMARK, "Synthetic data", text, "Say so wherever you show the numbers.")]
+
+
+def residual_sentence(fit: Fit, each: ChannelFit) -> str:
+    """What the residuals of one channel look like, in a sentence."""
+    where = _place(fit, each)
+    if each.checks is None:
+        return f"{where}: the residuals could not be checked (too few samples, or an exact fit)."
+    if fit.noise == "white":
+        return f"{where}: {each.checks.sentences[0]}"
+    lag, n = float(each.checks.lag_one[0]), float(each.checks.n_effective[0])
+    shape = "normal" if each.checks.normal[0] >= SMALL_PROBABILITY else "not normal: look at the tails"
+    if fit.noise == "effective":
+        text = (
+            f"{each.samples} samples are worth about {n:.0f} independent ones, and the likelihood counts fewer samples"
+        )
+        return f"{where}: the correlation from sample to sample is {lag:.2f}; {text}. Their distribution is {shape}."
+    colour = "still correlated" if _is_correlated(each) else "white or nearly so"
+    return (
+        f"{where}: what the noise model does not predict (the innovations) is {colour} (correlation {lag:.2f}); its "
+        f"distribution is {shape}."
+    )
+
+
+def _place(fit: Fit, each: ChannelFit) -> str:
+    return f"{each.channel.name} ({fit.title})" if fit.title else each.channel.name
+
+
+def _listed(texts: list[str]) -> str:
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"

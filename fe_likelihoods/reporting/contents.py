@@ -1,0 +1,250 @@
+"""The contents of a report in words and numbers, section by section, before they are put on a page."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..prediction.prediction import Prediction
+from ..probability.likelihood import FELikelihood
+from ..probability.marginal_noise import sampled_noise
+from .advice import SAME_AS_PRIOR, residual_sentence
+from .fits import Fits
+from .run import FinishedRun
+from .table import ParameterRow
+
+__all__ = [
+    "DataSet",
+    "PredictedValue",
+    "cost",
+    "data_sets",
+    "evidence",
+    "predicted_values",
+    "residual_sentences",
+    "summary_sentences",
+    "verdict_sentences",
+]
+
+LARGEST_SHAPE = 0.7  # weights of a larger Pareto shape have no useful mean (Vehtari et al. 2024, JMLR 25(72))
+
+
+class DataSet(NamedTuple):
+    """One data set: what was measured, and what it was compared with.
+
+    Attributes
+    ----------
+    name, model, excitation, description : str
+        Name in a joint likelihood, class of the model, name of the excitation, description of the measurements.
+    noise : str
+        The noise model.
+    channels : str
+        Names, units, numbers of samples and steps.
+    """
+
+    name: str
+    model: str
+    excitation: str
+    description: str
+    noise: str
+    channels: str
+
+
+class PredictedValue(NamedTuple):
+    """One number of a prediction that is not a history; quantiles in the order of `Prediction.probabilities`."""
+
+    name: str
+    mean: float
+    sd: float
+    quantiles: tuple[float, ...]
+
+
+def data_sets(run: FinishedRun) -> list[DataSet]:
+    """The data sets of a likelihood; empty for another posterior."""
+    if run.likelihood is None:
+        return []
+    keys = getattr(run.likelihood, "likelihoods", {"": None})
+    return [_data_set(key, likelihood) for key, (likelihood, _) in zip(keys, run.likelihood.parts(), strict=True)]
+
+
+def _data_set(key: str, likelihood: FELikelihood) -> DataSet:
+    model, measurements = likelihood.model, likelihood.measurements
+    excitations = (getattr(model, name, None) for name in ("record", "loading"))
+    excitation = next((each.name for each in excitations if isinstance(getattr(each, "name", None), str)), "")
+    samples = np.isfinite(measurements.values).sum(axis=1)
+    channels = [
+        f"{channel.name} [{channel.unit}], {count} samples at {step:g} s"
+        for channel, count, step in zip(measurements.channels, samples, measurements.steps, strict=True)
+    ]
+    sampled = sampled_noise(likelihood.noise)
+    noise = type(sampled).__name__ + ("" if sampled is likelihood.noise else ", its levels integrated out")
+    return DataSet(key, type(model).__name__, excitation, measurements.description, noise, "; ".join(channels))
+
+
+def summary_sentences(run: FinishedRun, rows: list[ParameterRow], fits: Fits, *, doubted: bool = False) -> list[str]:
+    """Three sentences: what was updated with which data, what was found, and whether to trust it."""
+    sets = data_sets(run)
+    if sets:
+        models = " and ".join(sorted({each.model for each in sets}))
+        n_channels = sum(len(likelihood.measurements.channels) for likelihood, _ in run.likelihood.parts())
+        channels = f"{n_channels} measured channel{'s' if n_channels > 1 else ''}"
+        what = f"{len(rows)} parameters of {models} and its noise were updated with {channels}"
+        what += f" of {len(sets)} data sets" if len(sets) > 1 else ""
+        what += " (synthetic data)." if any("synthetic" in each.description.lower() for each in sets) else "."
+    else:
+        what = f"{len(rows)} parameters were sampled from a log-density of the user's own."
+    trust = _trust(run, doubted)
+    fast = set(getattr(run.posterior, "fast_parameters", ()))
+    if run.is_inconclusive:
+        return [what, "Nothing can be said about the parameters yet: the table shows what the run has so far.", trust]
+    return [what, _finding([row for i, row in enumerate(rows) if i not in fast], fits), trust]
+
+
+def _finding(rows: list[ParameterRow], fits: Fits) -> str:
+    known = [(row.sd / row.prior_sd, row.name) for row in rows if row.prior_sd > 0.0]
+    found = ""
+    if known:
+        ratio, best = min(known)
+        found = (
+            f"The data inform {best} most: its standard deviation shrank to {100.0 * ratio:.2g} % of that of the prior"
+            if ratio < SAME_AS_PRIOR
+            else "No parameter has a standard deviation clearly smaller than that of its prior"
+        )
+    errors = [(each.before, each.after) for fit in fits.fits for each in fit.channels]
+    if errors and np.isfinite(errors).all():
+        before, after = 100.0 * np.mean(errors, axis=0)
+        fit = f"the mean relative error of the response went from {before:.3g} % to {after:.3g} %"
+        found = f"{found}; {fit}" if found else f"{fit[0].upper()}{fit[1:]}"
+    return f"{found}." if found else "Means and intervals of the parameters are in the table below."
+
+
+def _trust(run: FinishedRun, doubted: bool) -> str:
+    if run.tempered:
+        words = {
+            "converged": "Nothing that the run can observe speaks against the result",
+            "usable": "The result can be used with the limits that are named below",
+            "not usable": "Do not use these numbers before the doubts below are settled",
+        }
+        text = "The run has no stored verdict" if run.verdict is None else words[run.verdict.status]
+        if doubted and run.verdict is not None:
+            text = words["not usable"]
+        return f"{text} ({len(run.samples)} samples, worth about {run.effective_sample_size:.0f} independent ones)."
+    if np.isfinite(run.effective_sample_size):
+        return (
+            f"{len(run.samples)} samples of a Markov chain are worth about {run.effective_sample_size:.0f} independent "
+            "ones; a Markov chain gives no verdict of its own, and no evidence."
+        )
+    return "The chain is too short to say how many independent samples it is worth."
+
+
+def verdict_sentences(run: FinishedRun, rows: list[ParameterRow]) -> list[str]:
+    """The verdict of the sampler in its own words, and how many true values are in their intervals."""
+    sentences = [] if run.verdict is None else [f"Verdict of the sampler: {run.verdict}"]
+    known = [row for row in rows if np.isfinite(row.truth)]
+    if known and not run.is_inconclusive:
+        inside = sum(row.low <= row.truth <= row.high for row in known)
+        sentences.append(
+            f"{inside} of {len(known)} true values are within their 90 % intervals. (Nine in ten are to be expected if "
+            "model and noise are those of the data.)"
+        )
+    return sentences
+
+
+def evidence(run: FinishedRun) -> list[str]:
+    """The evidence with its check, in sentences."""
+    if not run.tempered:
+        return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
+    sampler, check = run.sampler, run.check
+    lines = [
+        f"Log-evidence {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2f}. Only differences between models "
+        "for the same data mean something: a difference of 3 is odds of 20 to 1."
+    ]
+    own, error = sampler.log_evidence_ladder, sampler.ladder[-1].log_evidence_error
+    if check is None and sampler.rounds:
+        draws, shape = sum(each.draws for each in sampler.rounds), run.diagnostics.pareto_shape
+        text = f"It is the mean weight of {draws} draws that a guide proposed."
+        if shape is not None:
+            good = "so the error can be trusted" if shape < LARGEST_SHAPE else "so the error cannot be trusted"
+            text += f" The Pareto shape of their weights is {shape:.2f} (the limit is {LARGEST_SHAPE}), {good}."
+        return [*lines, text]
+    if check is None:
+        why = " (check_draws=0)" if sampler.settings.check_draws == 0 else ""
+        if sampler.ended_at is not None:
+            why = f", because the limit of simulations ended the run at beta = {sampler.ended_at:.3g}"
+        return [*lines, f"It was not checked by independent draws{why}."]
+    text = (
+        f"Check: the tempering stages (or all weighted draws) give {own:.2f} ± {error:.2f}, {check.evaluations} "
+        f"independent draws give {check.log_evidence:.2f} ± {check.error:.2f}."
+    )
+    if not check.reliable:
+        verdict = (
+            f"The weights of these draws are uneven (effective sample size {check.effective_sample_size:.2g}, Pareto "
+            f"shape {check.pareto_shape:.2f}), so they confirm nothing."
+        )
+    elif abs(own - check.log_evidence) <= 3.0 * np.hypot(error, check.error):
+        verdict = "The two agree within three standard errors."
+    else:
+        verdict = "The two disagree by more than three standard errors: do not compare models by this evidence."
+    return [*lines, text, verdict]
+
+
+def residual_sentences(fits: Fits) -> list[str]:
+    """The checks of the residuals, one sentence per channel and event."""
+    return [residual_sentence(fit, each) for fit in fits.fits if fit.residuals is not None for each in fit.channels]
+
+
+def cost(run: FinishedRun, fits: Fits) -> list[tuple[str, str]]:
+    """Numbers of simulations, cache hits and wall times."""
+    rows, of_posterior = [], _report_of(run)
+    if run.tempered:
+        rows += [
+            ("simulations of the run", _count(run)),
+            ("evaluations of the log-density", f"{run.sampler.evaluations}"),
+            ("wall time of the sampler", _duration(run.sampler.seconds)),
+        ]
+    if of_posterior:
+        rows += [
+            ("simulations by this posterior in this process, without predictions", f"{of_posterior['simulations']}"),
+            ("wall time of these simulations", _duration(of_posterior["seconds"])),
+            ("answers from the cache", f"{of_posterior['cache_hits']}, {of_posterior['disk_hits']} of them from disk"),
+        ]
+        rows.append(("simulations for this report", f"{fits.simulations}"))
+    return rows
+
+
+def _count(run: FinishedRun) -> str:
+    """Number of simulations; those of short parts of the record count as fractions."""
+    text = f"{run.sampler.simulations:.0f}"
+    likelihoods = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
+    parts = sum(part.simulations for likelihood in likelihoods for part in likelihood.shortened)
+    if not parts:
+        return text
+    whole = sum(likelihood.simulations for likelihood in likelihoods)
+    return (
+        f"{whole + parts} runs of the model in this process, {parts} of them with short parts of the record, with "
+        f"which the guide starts; the run counts those as fractions, so it took {text} full simulations"
+    )
+
+
+def _report_of(run: FinishedRun) -> dict[str, Any]:
+    return run.likelihood.report() if run.likelihood is not None else {}
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.3g} s"
+    return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def predicted_values(prediction: Prediction) -> list[PredictedValue]:
+    """Mean, standard deviation and quantiles of quantities that are not histories [SI]; at most twenty."""
+    if prediction.dt is not None:
+        return []
+    mean, sd = np.ravel(prediction.mean), np.ravel(prediction.sd)
+    quantiles = np.reshape(prediction.quantiles, (len(prediction.probabilities), -1))
+    named = len(prediction.channels) == len(mean)  # quantities of channels, such as peak("top")
+    given = prediction.quantity if isinstance(prediction.quantity, list | tuple) else [prediction.quantity]
+    names = [str(each) for each in given] if named and len(given) == len(mean) else None
+    names = names or [f"quantity {i + 1}" for i in range(len(mean))]
+    return [
+        PredictedValue(name, float(mean[i]), float(sd[i]), tuple(quantiles[:, i].tolist()))
+        for i, name in enumerate(names[:20])
+    ]

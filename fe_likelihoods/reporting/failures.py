@@ -1,0 +1,211 @@
+"""Failed simulations of a run: how many, why, where in the space of the parameters, and whether near the samples.
+
+Failures are counted where simulations are counted: in the likelihood, with the simulations of the first parts of the
+record that a guide makes, or in the sampler for a log-density of the user's own.
+"""
+
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import ks_2samp
+
+from ..probability.likelihood import FELikelihood
+from .run import FinishedRun
+
+__all__ = ["Failure", "Failures", "failures"]
+
+FEWEST_TO_COMPARE = 5  # failures, below which their place is not a pattern
+CLEAR_SEPARATION = 0.5  # Kolmogorov-Smirnov distance between the failed and the successful points
+UNLIKELY = 0.01  # probability of such a distance by chance
+FEWEST_NEAR = 3  # failures among the samples
+LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
+INSIDE = 0.99  # share of the samples that are closer to their mean than the region that counts as theirs
+
+
+class Failure(NamedTuple):
+    """Failures for one reason: how many, and where.
+
+    Attributes
+    ----------
+    reason : str
+    count : int
+    where : str
+        The parameter that tells these failures from the successful simulations best, in words.
+    example : str
+        The parameters of one of them.
+    """
+
+    reason: str
+    count: int
+    where: str
+    example: str
+
+
+class Failures(NamedTuple):
+    """All failures, with the number of attempts.
+
+    Attributes
+    ----------
+    rows : tuple of Failure
+        By reason, the most frequent first.
+    count, attempts : int
+        Number of failures, and of all attempts.
+    remark : str
+        What is not known about them; empty if all are known.
+    prior_failed, prior_draws : int
+        Number of failures among the draws of the prior that the run began with, and of these draws; 0 of 0 if they are
+        not known.
+    near_failed, near : int
+        Number of failures among the samples of the posterior, and of all evaluated points there.
+    """
+
+    rows: tuple[Failure, ...]
+    count: int
+    attempts: int
+    remark: str = ""
+    prior_failed: int = 0
+    prior_draws: int = 0
+    near_failed: int = 0
+    near: int = 0
+
+    @property
+    def borders(self) -> bool:
+        """Whether failures border on the samples, so that they may end the posterior."""
+        return self.near_failed >= FEWEST_NEAR and self.near_failed > LARGE_SHARE_NEAR * self.near
+
+    @property
+    def sentence(self) -> str:
+        """What is said where there is no table of failures."""
+        return self.remark or "No simulation failed."
+
+
+class _Source(NamedTuple):
+    """Failed and successful points of one model, in some columns of the chain."""
+
+    columns: np.ndarray
+    failed: np.ndarray
+    reasons: list[str]
+    succeeded: np.ndarray
+    counts: Counter
+
+
+def failures(run: FinishedRun) -> Failures:
+    """Failed simulations by reason, the most frequent first, with the parameters at which they happened."""
+    if run.likelihood is None:
+        return _of_function(run)
+    found = [(part, _of_likelihood(run, part, columns)) for part, columns in run.likelihood.parts()]
+    sources = [source for _, source in found]
+    attempts = sum(each.simulations for part, _ in found for each in (part, *part.shortened))
+    remark = ""
+    if not all(_was_here(run, part, source) for part, source in found):
+        remark = (
+            "Not known: the simulations of this run were made in another process, or are no longer in memory, and "
+            "failures are counted in the process that simulates."
+        )
+    return _joined(run, sources, attempts, remark)
+
+
+def _of_likelihood(run: FinishedRun, likelihood: FELikelihood, columns: np.ndarray) -> _Source:
+    names = likelihood.model.parameter_names
+    logs = [likelihood, *likelihood.shortened]
+    records = [record for each in logs for record in each.failures]
+    return _Source(
+        np.asarray(columns)[: len(names)],
+        np.array([[record["parameters"][name] for name in names] for record in records]).reshape(-1, len(names)),
+        [record["reason"] for record in records],
+        likelihood.memory_cache.successes(len(names)),
+        sum((each.failure_reasons for each in logs), Counter()),
+    )
+
+
+def _of_function(run: FinishedRun) -> Failures:
+    if not run.tempered:
+        return Failures((), 0, 0, "Not known: neither the sampler nor the log-density counts failures.")
+    sampler, ndim = run.sampler, run.samples.shape[1]
+    failed = np.array([each["parameters"] for each in sampler.failures], dtype=float).reshape(-1, ndim)
+    reasons = [each["reason"] for each in sampler.failures]
+    counts = Counter(reasons)
+    draws = np.empty((0, ndim)) if sampler.prior_draws is None else sampler.prior_draws
+    draws = draws[~_are_among(draws, failed)]
+    source = _Source(np.arange(ndim), failed, reasons, np.concatenate([draws, run.samples]), counts)
+    remark = (
+        "No evaluation raised an exception or returned NaN. Whether a value of -inf stands for a failed simulation is "
+        "not known."
+    )
+    return _joined(run, [source], sampler.evaluations, remark, sampler.failure_count)
+
+
+def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str, count: int | None = None) -> Failures:
+    rows = [
+        Failure(reason, n, _where(run, source, reason), _example(run, source, reason))
+        for source in sources
+        for reason, n in source.counts.items()
+    ]
+    rows.sort(key=lambda row: -row.count)
+    count = sum(row.count for row in rows) if count is None else count
+    near = [_near_the_samples(run, source) for source in sources]
+    draws = getattr(run.sampler, "prior_draws", None)
+    prior = (0, 0)
+    # the first failures are recorded, and the draws of the prior are the first points
+    if draws is not None and (count <= sum(len(source.failed) for source in sources)):
+        bad = np.any([_are_among(draws[:, each.columns], each.failed) for each in sources], axis=0)
+        prior = (int(bad.sum()), len(draws))
+    return Failures(tuple(rows), count, max(attempts, count), remark, *prior, *max(near, key=lambda each: each[0]))
+
+
+def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Whether each of the points (n, k) is one of the others (m, k), to the last bit: (n,) bool."""
+    known = {row.tobytes() for row in np.ascontiguousarray(others) + 0.0}
+    return np.array([row.tobytes() in known for row in np.ascontiguousarray(points) + 0.0], dtype=bool)
+
+
+def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bool:
+    """Whether the samples of the run were simulated in this process: half of them are enough, a cache forgets."""
+    distinct = np.unique(run.samples[:, source.columns], axis=0)
+    return likelihood.simulations >= len(distinct) or _are_among(distinct, source.succeeded).mean() >= 0.5
+
+
+def _near_the_samples(run: FinishedRun, source: _Source) -> tuple[int, int]:
+    """Number of failures in the region of the samples, and of all distinct evaluated points there.
+
+    The region is an ellipsoid about the mean of the samples with their covariance, which holds 99 % of them.
+    """
+    samples = run.samples[:, source.columns]
+    inverse = np.linalg.pinv(np.atleast_2d(np.cov(samples, rowvar=False)), hermitian=True)
+
+    def distances(points: np.ndarray) -> np.ndarray:
+        offsets = points - samples.mean(axis=0)
+        return np.einsum("ij,jk,ik->i", offsets, inverse, offsets)
+
+    limit = np.quantile(distances(samples), INSIDE)
+    failed = int(np.count_nonzero(distances(np.unique(source.failed, axis=0)) <= limit)) if len(source.failed) else 0
+    successes = np.unique(np.concatenate([source.succeeded, samples]), axis=0)
+    return failed, failed + int(np.count_nonzero(distances(successes) <= limit))
+
+
+def _where(run: FinishedRun, source: _Source, reason: str) -> str:
+    """The parameter whose values tell the failures from the successes best, by the Kolmogorov-Smirnov distance."""
+    failed = source.failed[[each == reason for each in source.reasons]]
+    succeeded = np.concatenate([source.succeeded, run.samples[:, source.columns]])
+    if len(failed) < FEWEST_TO_COMPARE:
+        return "too few to see a pattern" if len(failed) else ""
+    tests = [ks_2samp(failed[:, i], succeeded[:, i]) for i in range(failed.shape[1])]
+    i = int(np.argmax([test.statistic for test in tests]))
+    test, name = tests[i], run.names[source.columns[i]]
+    if test.statistic < CLEAR_SEPARATION or test.pvalue > UNLIKELY:
+        return "no single parameter tells them from the successful ones"
+    place = test.statistic_location
+    low = test.statistic_sign > 0  # the failures have the smaller values
+    shares = [np.mean(values <= place if low else values > place) for values in (failed[:, i], succeeded[:, i])]
+    return (
+        f"at {name} {'up to' if low else 'above'} {place:.4g} ({100.0 * shares[0]:.3g} % of these failures, "
+        f"{100.0 * shares[1]:.3g} % of the successful points)"
+    )
+
+
+def _example(run: FinishedRun, source: _Source, reason: str) -> str:
+    if reason not in source.reasons:
+        return ""
+    point = source.failed[source.reasons.index(reason)]
+    return ", ".join(f"{run.names[c]} = {value:.4g}" for c, value in zip(source.columns, point, strict=True))

@@ -1,0 +1,220 @@
+"""The response before and after the update, for each data set and each event, with checks of the residuals.
+
+Responses are taken from the caches of the likelihood where they are there; `Fits.simulations` counts the others.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..probability.autoregressive_noise import AutoregressiveNoise
+from ..probability.event_noise import find_events
+from ..probability.likelihood import FELikelihood
+from ..probability.marginal_noise import sampled_noise
+from ..probability.residuals import ResidualChecks, innovations, residual_checks
+from ..signals.channels import Channel, Measurements
+from .run import FinishedRun
+
+__all__ = ["SMALL_PROBABILITY", "ChannelFit", "Fit", "Fits", "fit_data_sets"]
+
+SMALL_PROBABILITY = 0.01  # of white or normal residuals, below which a reader is told
+
+
+class ChannelFit(NamedTuple):
+    """How well one channel of one event is reproduced.
+
+    Attributes
+    ----------
+    channel : Channel
+    samples : int
+        Number of samples that are compared.
+    before, after : float
+        Relative root mean square error (RRMSE) [-]; NaN where there is no simulation.
+    checks : ResidualChecks or None
+        Of the residuals after the update, one entry; None where they cannot be checked.
+    """
+
+    channel: Channel
+    samples: int
+    before: float
+    after: float
+    checks: ResidualChecks | None
+
+
+class Fit(NamedTuple):
+    """Measurements and responses of one data set or event.
+
+    Attributes
+    ----------
+    title : str
+        Name of the data set and of the event; empty if there is one only.
+    measurements : Measurements
+        Of this event.
+    responses : dict of str to (n_channels, n_samples) float
+        Responses at the times of the samples [SI], by title: before and after the update.
+    residuals : (n_channels, n_samples) float, or None
+        Measured minus simulated after the update [SI].
+    channels : tuple of ChannelFit
+    noise : {"white", "autoregressive", "effective"}
+        How the likelihood treats successive errors: as independent, with a correlation (the innovations are checked
+        then), or as fewer independent ones.
+    """
+
+    title: str
+    measurements: Measurements
+    responses: dict[str, np.ndarray]
+    residuals: np.ndarray | None
+    channels: tuple[ChannelFit, ...]
+    noise: str
+
+
+class Fits(NamedTuple):
+    """The fits of all data sets and events.
+
+    Attributes
+    ----------
+    fits : tuple of Fit
+    before, after : str
+        What the two responses are, in words.
+    simulations : int
+        Simulations that were run for them.
+    failures : tuple of str
+        Simulations that failed, in words.
+    """
+
+    fits: tuple[Fit, ...]
+    before: str
+    after: str
+    simulations: int
+    failures: tuple[str, ...]
+
+
+def fit_data_sets(run: FinishedRun) -> Fits:
+    """Simulate two points of each data set, before and after the update, and compare them with the measurements.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        Of a posterior with a likelihood of this package.
+
+    Returns
+    -------
+    Fits
+        Empty for a posterior without one.
+    """
+    if run.likelihood is None:
+        return Fits((), "", "", 0, ())
+    start, start_name = _before(run)
+    before, after = f"before: {start_name}", f"after: {run.centre_name}"
+    fits, failures, simulations = [], [], run.likelihood.simulations
+    keys = getattr(run.likelihood, "likelihoods", {"": None})
+    for key, (likelihood, columns) in zip(keys, run.likelihood.parts(), strict=True):
+        point = run.centre[columns]
+        n = len(likelihood.model.parameter_names)
+        # time shifts of channels are those after the update in both
+        points = {before: np.concatenate([start[columns][:n], point[n:]]), after: point}
+        batch = likelihood.simulate(np.stack([theta[:n] for theta in points.values()]))
+        residuals = {}
+        for (title, theta), response, reason in zip(points.items(), batch.response, batch.reasons, strict=True):
+            if reason:
+                failures.append(f"{key}{', ' if key else ''}{title}: the simulation failed ({reason})")
+            else:
+                residuals[title] = likelihood.residuals_of(response, theta)
+        values = dict(zip(likelihood.parameter_names, point.tolist(), strict=True))
+        fits += _split(likelihood, key, residuals, before, after, values)
+    return Fits(tuple(fits), before, after, run.likelihood.simulations - simulations, tuple(failures))
+
+
+def _before(run: FinishedRun) -> tuple[np.ndarray, str]:
+    """The point that stands for the state of knowledge before the update (ndim,), and what it is."""
+    fast = set(run.posterior.fast_parameters)
+    nominal = np.array([parameter.nominal for parameter in run.parameters])
+    structural = [i for i in range(len(nominal)) if i not in fast]
+    if np.isfinite(nominal[structural]).all():
+        return nominal, "nominal values"
+    try:
+        median, name = run.posterior.prior_transform(np.full(len(nominal), 0.5)), "median of the prior"
+    except ValueError:  # a joint prior without such a map
+        median, name = np.median(run.posterior.sample_prior(1000, 0), axis=0), "median of draws of the prior"
+    known = np.isfinite(nominal)
+    return np.where(known, nominal, median), name if not known.any() else f"nominal values, where known, and {name}"
+
+
+def _split(
+    likelihood: FELikelihood,
+    key: str,
+    residuals: dict[str, np.ndarray],
+    before: str,
+    after: str,
+    values: dict[str, float],
+) -> list[Fit]:
+    """One fit per event."""
+    measured, events = likelihood.measurements, find_events(likelihood.model)
+    windows = [(key, None)]
+    if events is not None and len(events.windows) > 1:
+        windows = [(f"{key}, {window.name}" if key else window.name, window) for window in events.windows]
+    sampled = sampled_noise(likelihood.noise)
+    noise = "autoregressive" if isinstance(sampled, AutoregressiveNoise) else "white"
+    noise = "effective" if getattr(sampled, "effective_samples", None) is not None else noise
+    fits = []
+    for title, window in windows:
+        inside = np.ones(measured.values.shape, dtype=bool)
+        if window is not None:
+            times = np.stack([measured.times(channel.name) for channel in measured.channels])
+            half = 0.5 * np.array(measured.steps)[:, None]
+            inside = (times > window.start - half) & (times < window.end + half)
+        there = inside & np.isfinite(measured.values)
+        rows = np.flatnonzero(there.any(axis=1))
+        columns = np.flatnonzero(inside[rows].any(axis=0))
+        if not len(rows):
+            continue
+        part = Measurements(
+            tuple(measured.channels[row] for row in rows),
+            tuple(measured.steps[row] for row in rows),
+            np.where(inside, measured.values, np.nan)[np.ix_(rows, columns)],
+            measured.description,
+            tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
+        )
+        own = {name: np.where(inside, each, np.nan)[np.ix_(rows, columns)] for name, each in residuals.items()}
+        fits.append(
+            Fit(
+                title,
+                part,
+                {name: part.values - each for name, each in own.items()},
+                own.get(after),
+                tuple(_channel_fit(part, row, own, before, after, values, noise) for row in range(len(rows))),
+                noise,
+            )
+        )
+    return fits
+
+
+def _channel_fit(
+    part: Measurements,
+    row: int,
+    residuals: dict[str, np.ndarray],
+    before: str,
+    after: str,
+    values: dict[str, float],
+    noise: str,
+) -> ChannelFit:
+    channel, measured = part.channels[row], part.values[row]
+    errors = {name: _relative_error(each[row], measured) for name, each in residuals.items()}
+    checks = None
+    if after in residuals:
+        left = residuals[after][[row]]
+        try:
+            if noise == "autoregressive":
+                left = innovations(left, np.array([values[f"rho_{channel.name}"]]))
+            checks = residual_checks(left)
+        except (ValueError, KeyError):  # too few samples, no rho of this channel, or an exact fit: nothing to check
+            checks = None
+    samples = int(np.isfinite(measured).sum())
+    return ChannelFit(channel, samples, errors.get(before, np.nan), errors.get(after, np.nan), checks)
+
+
+def _relative_error(residuals: np.ndarray, measured: np.ndarray) -> float:
+    """RRMSE [-]; NaN for a channel that is zero at all samples."""
+    there = np.isfinite(measured) & np.isfinite(residuals)
+    power = float(np.square(measured[there]).sum())
+    return float(np.sqrt(np.square(residuals[there]).sum() / power)) if power > 0.0 else np.nan

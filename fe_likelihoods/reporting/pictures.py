@@ -1,0 +1,158 @@
+"""The figures of a report: drawn by the libraries' own functions, embedded as PNG, each with a caption to look by."""
+
+import base64
+import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from samplers import plot_corner, plot_ladder, plot_marginals, plot_run
+
+from ..prediction.prediction import Prediction
+from ..signals.fits import plot_fit
+from .fits import Fit
+from .run import FinishedRun
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Picture", "draw_fit", "draw_posterior", "draw_prediction", "draw_residuals", "draw_run"]
+
+LEGIBLE = 80  # pixels per inch at which the smallest labels can be read
+WIDEST = 1100  # pixels: fits on a page of 1200
+RESOLUTION = 110  # dots per inch: sharp at the width of a page, some tens of kB
+
+
+class Picture(NamedTuple):
+    """A figure of a report.
+
+    Attributes
+    ----------
+    title, caption, alt : str
+        Title, what to look for, and a description for readers who do not see it.
+    source : str
+        The PNG as a data URI; empty if it could not be drawn.
+    problem : str
+        Why it could not be drawn; empty otherwise.
+    width : int
+        Smallest width at which the labels can be read [pixel]; a narrower page scrolls.
+    """
+
+    title: str
+    caption: str
+    alt: str
+    source: str
+    problem: str
+    width: int = 0
+
+
+def _picture(title: str, caption: str, alt: str, draw: Callable[[], "Figure"]) -> Picture:
+    """Draw a figure and embed it; a ValueError of the drawing function becomes a sentence of the report."""
+    import matplotlib.pyplot as plt
+
+    try:
+        figure = draw()
+    except ValueError as error:
+        return Picture(title, caption, alt, "", f"This figure could not be drawn: {error}")
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=RESOLUTION, facecolor="white")
+    width = min(round(LEGIBLE * figure.get_figwidth()), WIDEST)
+    plt.close(figure)
+    source = f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+    return Picture(title, caption, alt, source, "", width)
+
+
+def draw_posterior(run: FinishedRun) -> list[Picture]:
+    """Prior and posterior of each parameter, and samples of all pairs."""
+    described = hasattr(run.posterior, "parameters")
+    options = {
+        "posterior": run.posterior if described else None,
+        "labels": None if described else run.names,
+        "truths": run.truth if np.isfinite(run.truth).any() else None,
+    }
+    return [
+        _picture(
+            "What the data have changed",
+            "Where the posterior is as wide as the prior, the data say nothing about the parameter. Where it leans "
+            "against the end of the prior, the prior decides.",
+            f"Prior and posterior density of {', '.join(run.names)}.",
+            lambda: plot_marginals(run.samples, **options),
+        ),
+        _picture(
+            "Pairs of parameters",
+            "A narrow, inclined cloud: the data determine a combination of two parameters better than each of them. "
+            "Separate clouds: separate explanations of the data. Arrows point to values outside of a panel.",
+            f"Posterior samples of each parameter and each pair of {', '.join(run.names)}.",
+            lambda: plot_corner(run.samples, **options),
+        ),
+    ]
+
+
+def draw_fit(fit: Fit) -> list[Picture]:
+    """Measured and simulated histories, before and after the update."""
+    if not fit.responses:
+        return []
+    return [
+        _picture(
+            "Measured and simulated response",
+            "After the update, the two lines should lie on one another at the strong peaks. RRMSE "
+            "is the relative root mean square error: 0 for a perfect fit, 100 % for a response of zero.",
+            f"Histories of {', '.join(channel.name for channel in fit.measurements.channels)}, "
+            f"{' and '.join(fit.responses)}.",
+            lambda: plot_fit(fit.measurements, fit.responses),
+        )
+    ]
+
+
+def draw_residuals(fit: Fit) -> list[Picture]:
+    """Residuals against time, their autocorrelation and quantiles."""
+    from ..probability.residuals import plot_residuals
+
+    if fit.residuals is None or not fit.measurements.simultaneous:
+        return []
+    return [
+        _picture(
+            "Residuals",
+            "Left: measured minus simulated; a pattern is something that the model lacks. Middle: outside of the "
+            "grey band, residuals depend on earlier ones. Right: points off the line are not normal.",
+            f"Residuals of {', '.join(channel.name for channel in fit.measurements.channels)}.",
+            lambda: plot_residuals(fit.residuals, fit.measurements.channels, fit.measurements.dt),
+        )
+    ]
+
+
+def draw_run(run: FinishedRun) -> list[Picture]:
+    """What the sampler did, and its tempering stages."""
+    if not run.tempered:
+        return []
+    pictures = [
+        _picture(
+            "What the sampler did",
+            "The log-probability of the walkers at the end should be level: a trend means that the run has not "
+            "converged. The log-evidence should settle within its error.",
+            "Evaluations of each phase, effective sample size, log-evidence and log-probability of the walkers.",
+            lambda: plot_run(run.sampler),
+        )
+    ]
+    if len(run.sampler.ladder) > 1:
+        caption = (
+            "From the prior (beta near 0) to the posterior (beta = 1). An effective sample size far below the number "
+            "of walkers, or an acceptance near zero, shows a stage that was too hard."
+        )
+        alt = "Exponent beta, effective sample size, acceptance and log-evidence of each tempering stage."
+        pictures.append(_picture("From the prior to the posterior", caption, alt, lambda: plot_ladder(run.sampler)))
+    return pictures
+
+
+def draw_prediction(prediction: Prediction, measurements: Any) -> list[Picture]:
+    """Predicted histories with their band."""
+    return [
+        _picture(
+            "Predicted histories",
+            "The band holds the predicted response with the stated probability. It contains the uncertainty of the "
+            "parameters, and the noise only if the legend says so.",
+            f"Predicted histories of {', '.join(channel.name for channel in prediction.channels)} with their band.",
+            lambda: prediction.plot(measurements),
+        )
+    ]

@@ -1,0 +1,240 @@
+"""One self-contained page about a finished run: what was found, whether to trust it, and how to repeat it."""
+
+import os
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..prediction.prediction import Prediction
+from ..signals.channels import Measurements
+from .advice import Advice, advise
+from .contents import (
+    DataSet,
+    PredictedValue,
+    cost,
+    data_sets,
+    evidence,
+    predicted_values,
+    residual_sentences,
+    summary_sentences,
+    verdict_sentences,
+)
+from .failures import Failures, failures
+from .fits import Fits, fit_data_sets
+from .origin import fingerprints, how_to_repeat, sampler_settings, versions
+from .pictures import Picture, draw_fit, draw_posterior, draw_prediction, draw_residuals, draw_run
+from .run import FinishedRun, read_run
+from .table import ParameterRow, parameter_rows
+
+__all__ = ["Contents", "Predicted", "report"]
+
+
+class Predicted(NamedTuple):
+    """A prediction in a report: figures of histories, or a table of other quantities."""
+
+    title: str
+    pictures: tuple[Picture, ...]
+    values: tuple[PredictedValue, ...]
+    probabilities: tuple[float, ...]
+    n_samples: int
+    n_failed: int
+    scores: str
+
+
+class Contents(NamedTuple):
+    """Everything that the template shows, in its order."""
+
+    title: str
+    date: str
+    status: str
+    summary: list[str]
+    advice: list[Advice]
+    data: list[DataSet]
+    rows: list[ParameterRow]
+    has_truth: bool
+    evidence: list[str]
+    fits: Fits
+    posterior_pictures: list[Picture]
+    fit_pictures: list[tuple[str, list[Picture]]]
+    run_pictures: list[Picture]
+    predictions: list[Predicted]
+    residuals: list[str]
+    verdict: list[str]
+    unknown: list[str]
+    inconclusive: bool
+    failures: Failures
+    cost: list[tuple[str, str]]
+    settings: list[tuple[str, str]]
+    versions: list[tuple[str, str]]
+    fingerprints: list[tuple[str, str]]
+    repeat: str
+
+
+def report(
+    sampler: Any,
+    posterior: Any = None,
+    prediction: Prediction | Mapping[str, Prediction] | None = None,
+    out: str | os.PathLike = "report.html",
+    *,
+    title: str = "",
+    names: Sequence[str] | None = None,
+    truth: Mapping[str, float] | Sequence[float] | None = None,
+    measured: Measurements | Mapping[str, Measurements] | None = None,
+    discard: int = 0,
+    thin: int = 1,
+    repeat: str = "",
+) -> Path:
+    """Write a report of a finished run: one HTML file without scripts or links to other files.
+
+    It contains a summary in words, every doubt with what to do about it, the table of the parameters, the evidence with
+    its check, figures, checks of the residuals, failures, cost, and what is needed to repeat the run. The response at
+    two points (before and after the update) is needed for the figures. Where the likelihood has not cached it, it is
+    simulated, and the report says how many simulations that took.
+
+    Parameters
+    ----------
+    sampler : SMCSampler, TMCMCSampler or emcee.EnsembleSampler
+        A sampler that has run.
+    posterior : Posterior or callable, optional
+        What was sampled. Default: the log-density of the sampler. A log-density of the user's own has no units, no data
+        and no fit; the report then leaves these sections out, and says so.
+    prediction : Prediction, or mapping of str to Prediction, optional
+        Results of `fe_likelihoods.propagate`, by title.
+    out : path
+        The file to write. Its folder is made where it does not exist.
+    title : str
+        Title of the page. Default: the name of the model.
+    names : sequence of str, optional
+        Names of the parameters, for a log-density that has none.
+    truth : mapping of str to float, or sequence of float, optional
+        True values of synthetic data, in the units of the samples.
+    measured : Measurements, or mapping of str to Measurements, optional
+        Measurements to draw with the predictions, by the title of the prediction.
+    discard, thin : int
+        Iterations of the chain to leave out at its beginning (burn-in), and of which to keep one in `thin`.
+    repeat : str
+        Commands that make the run again, for the last section. Default: lines of Python from what the sampler knows.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    ValueError
+        If the sampler has no chain, or names, true values, the posterior or the prediction do not fit; nothing is
+        simulated or written then.
+
+    Examples
+    --------
+    >>> report(sampler, posterior, propagate(posterior, samples), out="results/report.html")
+    """
+    run = read_run(sampler, posterior, names=names, truth=truth, discard=discard, thin=thin)
+    predictions = _predictions(prediction, measured)
+    path = Path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    page = render(gather(run, predictions, title, repeat))
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def gather(
+    run: FinishedRun,
+    predictions: Mapping[str, tuple[Prediction, Measurements | None]],
+    title: str = "",
+    repeat: str = "",
+) -> Contents:
+    """Make the contents of a report; simulates the response at two points where it is not cached."""
+    failed = failures(run)
+    fits, rows, sets = fit_data_sets(run), parameter_rows(run), data_sets(run)
+    models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"
+    notes = advise(run, rows, fits, failed)
+    doubted = any(note.level == "severe" for note in notes)
+    status = "unknown" if run.verdict is None else "not usable" if doubted else run.verdict.status
+    return Contents(
+        title=title or f"Bayesian updating of {models}",
+        date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        status=status,
+        summary=summary_sentences(run, rows, fits, doubted=doubted),
+        advice=notes,
+        data=sets,
+        rows=rows,
+        has_truth=bool(np.isfinite(run.truth).any()),
+        evidence=evidence(run),
+        fits=fits,
+        posterior_pictures=draw_posterior(run),
+        fit_pictures=[(fit.title, [*draw_fit(fit), *draw_residuals(fit)]) for fit in fits.fits],
+        run_pictures=draw_run(run),
+        predictions=[_predicted(name, *each) for name, each in predictions.items()],
+        residuals=[] if run.is_inconclusive else residual_sentences(fits),
+        verdict=verdict_sentences(run, rows),
+        unknown=[] if run.diagnostics is None else list(run.diagnostics.unknown),
+        inconclusive=run.is_inconclusive,
+        failures=failed,
+        cost=cost(run, fits),
+        settings=sampler_settings(run),
+        versions=versions(),
+        fingerprints=fingerprints(run),
+        repeat=repeat or how_to_repeat(run),
+    )
+
+
+def render(contents: Contents) -> str:
+    """The page as text. All texts are escaped."""
+    from jinja2 import Environment, StrictUndefined
+
+    template = resources.files(__package__).joinpath("templates/report.html").read_text(encoding="utf-8")
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"number": _number, "like": _like, "error": lambda x: _number(x, 2), "percent": _percent}
+    return environment.from_string(template).render(contents._asdict())
+
+
+def _number(value: float, digits: int = 4) -> str:
+    return f"{value:.{digits}g}".replace("-", "−") if np.isfinite(value) else "–"
+
+
+def _like(value: float, sd: float) -> str:
+    """A number with two digits of its standard deviation, and with four digits or more."""
+    if not (np.isfinite(value) and value and sd > 1e-12 * abs(value)):
+        return _number(value)
+    digits = int(np.floor(np.log10(abs(value))) - np.floor(np.log10(sd))) + 2
+    return f"{value:#.{max(digits, 4)}g}".rstrip(".").replace("-", "−")
+
+
+def _percent(value: float) -> str:
+    return f"{100.0 * value:.3g} %" if np.isfinite(value) else "–"
+
+
+def _predictions(prediction: Any, measured: Any) -> dict[str, tuple[Prediction, Measurements | None]]:
+    """Predictions with their measurements, by title; ValueError for other objects."""
+    named = {} if prediction is None else prediction if isinstance(prediction, Mapping) else {"Prediction": prediction}
+    known = measured if isinstance(measured, Mapping) else dict.fromkeys(named, measured)
+    for name, each in named.items():
+        if not isinstance(each, Prediction):
+            raise ValueError(f"prediction must be the result of propagate, or a mapping of such; {name!r} is {each!r}")
+    if unknown := [name for name in known if name not in named]:
+        raise ValueError(f"measured has {', '.join(unknown)}, but the predictions are {', '.join(named) or 'none'}")
+    return {name: (each, known.get(name)) for name, each in named.items()}
+
+
+def _predicted(name: str, prediction: Prediction, measurements: Measurements | None) -> Predicted:
+    pictures = draw_prediction(prediction, measurements) if prediction.dt is not None else []
+    values, counts = tuple(predicted_values(prediction)), (prediction.n_samples, prediction.n_failed)
+    return Predicted(
+        name, tuple(pictures), values, prediction.probabilities, *counts, _scores(prediction, measurements)
+    )
+
+
+def _scores(prediction: Prediction, measurements: Measurements | None) -> str:
+    """Table of the scores of a prediction with noise; empty without measurements or noise, or why there is none."""
+    if measurements is None or not prediction.noise:
+        return ""
+    try:
+        return str(prediction.score(measurements))
+    except ValueError as error:
+        return f"no scores: {error}"

@@ -1,0 +1,245 @@
+"""What a report needs of a finished run, read from the sampler and the posterior in one place.
+
+A posterior of this package knows the units of its parameters, its prior and its data. A plain function knows none of
+them; what is missing is empty or NaN here, and the report leaves it out.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from emcee import EnsembleSampler
+
+from samplers import Diagnostics, EvidenceCheck, Verdict
+
+from ..probability.joint import JointLikelihood
+from ..probability.likelihood import FELikelihood
+from ..probability.parameters import Parameter
+from ..probability.priors import Prior
+
+__all__ = ["FinishedRun", "read_run"]
+
+LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee recommends
+
+
+class FinishedRun(NamedTuple):
+    """A run, as a report reads it.
+
+    Attributes
+    ----------
+    sampler : emcee.EnsembleSampler
+        The sampler; tempered samplers are subclasses.
+    posterior : object, or None
+        The posterior; None if the sampler's log-density is a plain function.
+    likelihood : FELikelihood, JointLikelihood or None
+        Its likelihood, None for a posterior without data of this package.
+    prior : Prior or None
+        Its prior.
+    parameters : tuple of Parameter
+        Units, nominal values and labels.
+    samples : (n, ndim) float
+        Samples of the posterior [unit of the parameter].
+    log_prob : (n,) float
+        Their log-probabilities.
+    mean_error : (ndim,) float
+        Monte Carlo standard error of the mean; NaN where it is not known.
+    effective_sample_size : float
+        Number of independent samples with the same error of the mean, for the parameter where it is smallest.
+    truth : (ndim,) float
+        True values, NaN where none are known.
+    discard, thin : int
+        Iterations that were left out at the beginning of the chain, and of which one in `thin` was kept.
+    tempered : bool
+        Whether the sampler has a ladder, an evidence and a verdict.
+    diagnostics : Diagnostics or None
+        Of a tempered sampler.
+    verdict : Verdict or None
+        Of a tempered sampler; None for a chain without one.
+    check : EvidenceCheck or None
+        The independent estimate of the evidence.
+    autocorrelation_time : float
+        Largest autocorrelation time of emcee's own sampler, in iterations; NaN for tempered samplers.
+    """
+
+    sampler: EnsembleSampler
+    posterior: Any
+    likelihood: FELikelihood | JointLikelihood | None
+    prior: Prior | None
+    parameters: tuple[Parameter, ...]
+    samples: np.ndarray
+    log_prob: np.ndarray
+    mean_error: np.ndarray
+    effective_sample_size: float
+    truth: np.ndarray
+    discard: int
+    thin: int
+    tempered: bool
+    diagnostics: Diagnostics | None
+    verdict: Verdict | None
+    check: EvidenceCheck | None
+    autocorrelation_time: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def is_inconclusive(self) -> bool:
+        """Whether nothing can be said about the parameters: the verdict is "not usable", or the chain is too short."""
+        if self.tempered:
+            return self.verdict is not None and self.verdict.status == "not usable"
+        return not self.sampler.iteration - self.discard >= LONGEST_AUTOCORRELATION * self.autocorrelation_time
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes in which the run has points; one where that is not known."""
+        return 1 if self.diagnostics is None else len(self.diagnostics.modes)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The point that stands for the posterior (ndim,): its mean, or the best sample of several modes."""
+        best = self.samples[int(np.argmax(self.log_prob))]
+        return best if self.n_modes > 1 else self.samples.mean(axis=0)
+
+    @property
+    def centre_name(self) -> str:
+        """What `centre` is, in words."""
+        return "sample of highest posterior density" if self.n_modes > 1 else "posterior mean"
+
+
+def read_run(
+    sampler: EnsembleSampler,
+    posterior: Any = None,
+    *,
+    names: Sequence[str] | None = None,
+    truth: Mapping[str, float] | Sequence[float] | None = None,
+    discard: int = 0,
+    thin: int = 1,
+) -> FinishedRun:
+    """Read a finished run.
+
+    Parameters
+    ----------
+    sampler : emcee.EnsembleSampler
+        A sampler that has run, of this project or of emcee.
+    posterior : Posterior or callable, optional
+        What was sampled. Default: the log-density of the sampler.
+    names : sequence of str, optional
+        Names of the parameters, for a posterior without names.
+    truth : mapping of str to float, or sequence of float, optional
+        True values of synthetic data, in the units of the samples.
+    discard, thin : int
+        As in `emcee.EnsembleSampler.get_chain`.
+
+    Returns
+    -------
+    FinishedRun
+
+    Raises
+    ------
+    ValueError
+        If the sampler has no chain, or names, true values or the posterior do not match it.
+    """
+    if not isinstance(sampler, EnsembleSampler):
+        raise ValueError(
+            f"report needs a sampler that has run (SMCSampler, TMCMCSampler or emcee.EnsembleSampler); got {sampler!r}"
+        )
+    if not 0 <= discard < sampler.iteration or thin < 1:
+        raise ValueError(
+            f"report needs a chain: the sampler has made {sampler.iteration} iterations, and discard={discard}, "
+            f"thin={thin} leave none. Call run_mcmc with one step or more, and discard fewer iterations"
+        )
+    posterior = getattr(sampler.log_prob_fn, "f", None) if posterior is None else posterior
+    samples = sampler.get_chain(flat=True, discard=discard, thin=thin)
+    parameters = _parameters(sampler, posterior, names)
+    if len(parameters) != samples.shape[1]:
+        raise ValueError(
+            f"the chain has {samples.shape[1]} parameters, but the posterior or names= has {len(parameters)} "
+            f"({', '.join(each.name for each in parameters)}): give the posterior that was sampled"
+        )
+    tempered = hasattr(sampler, "ladder") and bool(sampler.ladder)
+    autocorrelation = np.nan if tempered else _autocorrelation_time(sampler, discard)
+    mean_error, size = _errors(sampler, samples, tempered, autocorrelation, discard, thin)
+    likelihood, prior = getattr(posterior, "likelihood", None), getattr(posterior, "prior", None)
+    return FinishedRun(
+        sampler=sampler,
+        posterior=posterior,
+        likelihood=likelihood if isinstance(likelihood, FELikelihood | JointLikelihood) else None,
+        prior=prior if isinstance(prior, Prior) else None,
+        parameters=parameters,
+        samples=samples,
+        log_prob=sampler.get_log_prob(flat=True, discard=discard, thin=thin),
+        mean_error=mean_error,
+        effective_sample_size=size,
+        truth=_truth(truth, [each.name for each in parameters]),
+        discard=discard,
+        thin=thin,
+        tempered=tempered,
+        diagnostics=sampler.diagnostics if tempered else None,
+        verdict=_verdict(sampler) if tempered else None,
+        check=sampler.log_evidence_check if tempered else None,
+        autocorrelation_time=autocorrelation,
+    )
+
+
+def _parameters(sampler: EnsembleSampler, posterior: Any, names: Sequence[str] | None) -> tuple[Parameter, ...]:
+    if (described := getattr(posterior, "parameters", None)) is not None and names is None:
+        return tuple(described)
+    known = names or getattr(posterior, "parameter_names", None) or _names_of(sampler)
+    return tuple(Parameter(str(name)) for name in known)
+
+
+def _names_of(sampler: EnsembleSampler) -> list[str]:
+    """Names that emcee's sampler was given, x0, x1, ... by default."""
+    names = [f"x{i}" for i in range(sampler.ndim)]
+    for name, places in (sampler.parameter_names if sampler.params_are_named else {}).items():
+        places = np.atleast_1d(places)
+        for k, place in enumerate(places):
+            names[place] = name if len(places) == 1 else f"{name}_{k}"
+    return names
+
+
+def _verdict(sampler: EnsembleSampler) -> Verdict | None:
+    """The verdict; None for a chain whose file has none."""
+    try:
+        return sampler.verdict
+    except ValueError:
+        return None
+
+
+def _truth(truth: Mapping[str, float] | Sequence[float] | None, names: Sequence[str]) -> np.ndarray:
+    if truth is None:
+        return np.full(len(names), np.nan)
+    if isinstance(truth, Mapping):
+        if unknown := [name for name in truth if name not in names]:
+            raise ValueError(f"truth has the unknown parameters {', '.join(unknown)}; known are {', '.join(names)}")
+        return np.array([float(truth.get(name, np.nan)) for name in names])
+    values = np.asarray(truth, dtype=float)
+    if values.shape != (len(names),):
+        raise ValueError(
+            f"truth must be a mapping of names to values, or {len(names)} numbers in the order {', '.join(names)}; "
+            f"got shape {values.shape}"
+        )
+    return values
+
+
+def _autocorrelation_time(sampler: EnsembleSampler, discard: int) -> float:
+    """Largest integrated autocorrelation time [iterations]; NaN where the chain is too short for any estimate."""
+    with np.errstate(all="ignore"):
+        times = sampler.get_autocorr_time(discard=discard, tol=0)
+    return float(np.max(times)) if np.isfinite(times).all() else np.nan
+
+
+def _errors(
+    sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, autocorrelation: float, discard: int, thin: int
+) -> tuple[np.ndarray, float]:
+    """Standard errors of the means (ndim,), and the effective sample size of the worst parameter."""
+    spread = samples.std(axis=0)
+    if tempered:
+        error = sampler.mean_error(discard=discard, thin=thin)
+        size = float(np.min((spread / error)[error > 0.0] ** 2, initial=len(samples)))
+        return error, size
+    iterations = sampler.iteration - discard
+    size = min(iterations * sampler.nwalkers / autocorrelation, float(len(samples)))  # min keeps a first NaN
+    return spread / np.sqrt(size), float(size)

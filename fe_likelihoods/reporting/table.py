@@ -1,0 +1,116 @@
+"""The table of the parameters: prior, posterior with its errors, nominal and true value, in the units of a reader."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from ..probability.priors import Prior
+from .run import FinishedRun
+
+__all__ = ["ParameterRow", "describe_prior", "parameter_rows"]
+
+
+class ParameterRow(NamedTuple):
+    """One parameter, all values in the unit of its label.
+
+    Attributes
+    ----------
+    name, label, unit : str
+        Name, name with unit, and unit alone; empty where it is not known.
+    prior : str
+        Prior distribution in words; empty where it is not known.
+    prior_mean, prior_sd : float
+        Moments of the prior; NaN where they are not known.
+    mean, mean_error, sd : float
+        Posterior mean, its Monte Carlo standard error, and posterior standard deviation.
+    cv : float
+        Coefficient of variation [-]; NaN for a mean of zero.
+    low, high : float
+        Ends of the 90 % interval: the 5 % and 95 % quantiles.
+    nominal, truth : float
+        Nominal and true value; NaN where there is none.
+    lower, upper : float
+        Bounds of the prior; infinite where there is none or the prior is not known.
+    """
+
+    name: str
+    label: str
+    unit: str
+    prior: str
+    prior_mean: float
+    prior_sd: float
+    mean: float
+    mean_error: float
+    sd: float
+    cv: float
+    low: float
+    high: float
+    nominal: float
+    truth: float
+    lower: float
+    upper: float
+
+
+def parameter_rows(run: FinishedRun) -> list[ParameterRow]:
+    """One row per parameter, in the order of the chain."""
+    mean, sd = run.samples.mean(axis=0), run.samples.std(axis=0)
+    low, high = np.quantile(run.samples, [0.05, 0.95], axis=0)
+    rows, known = [], [] if run.prior is None else run.prior.table()[1]
+    for i, parameter in enumerate(run.parameters):
+        text, moments, bounds = "", (np.nan, np.nan), (-np.inf, np.inf)
+        if run.prior is not None:
+            text = _words_of(run.prior, parameter.name, parameter.factor)
+            moments, bounds = known[i][2:4], known[i][4:6]
+        numbers = mean[i], run.mean_error[i], sd[i]
+        shown = [float(each) for each in parameter.shown([*moments, *numbers])]
+        others = [float(each) for each in parameter.shown([low[i], high[i], parameter.nominal, run.truth[i], *bounds])]
+        cv = float(sd[i] / abs(mean[i])) if mean[i] else np.nan
+        unit = parameter.label.removeprefix(parameter.name).strip()
+        rows.append(ParameterRow(parameter.name, parameter.label, unit, text, *shown, cv, *others))
+    return rows
+
+
+def _words_of(prior: Prior, name: str, factor: float) -> str:
+    for key, distribution in prior.distributions.items():
+        if key == name:
+            return describe_prior(distribution, factor)
+        if isinstance(key, tuple) and name in key:
+            return f"{type(distribution).__name__}, jointly with {', '.join(other for other in key if other != name)}"
+    return ""
+
+
+def describe_prior(distribution: Distribution, factor: float = 1.0) -> str:
+    """A distribution in words: "normal (1, 0.25), above 0".
+
+    Parameters
+    ----------
+    distribution : Distribution
+    factor : float
+        Size of the unit of the text in that of the distribution.
+    """
+    if isinstance(distribution, TruncatedNormal):
+        text = f"normal, mean {distribution.mean / factor:.4g}, sd {distribution.sd / factor:.4g}"
+        return text + _limits(distribution, factor)
+    if isinstance(distribution, HalfNormal):
+        return f"half-normal, scale {distribution.sd / factor:.4g}"
+    if isinstance(distribution, Uniform):
+        return f"uniform from {distribution.low / factor:.4g} to {distribution.high / factor:.4g}"
+    if isinstance(distribution, LogNormal):
+        return f"lognormal, median {distribution.median / factor:.4g}, sd of the logarithm {distribution.log_sd:.3g}"
+    mean, sd = distribution.moments
+    return f"{_name(distribution)}, mean {mean / factor:.4g}, sd {sd / factor:.4g}" + _limits(distribution, factor)
+
+
+def _name(distribution: Distribution) -> str:
+    frozen = getattr(distribution, "frozen", None)
+    return type(distribution).__name__ if frozen is None else f"{frozen.dist.name} (scipy)"
+
+
+def _limits(distribution: Distribution, factor: float) -> str:
+    lower, upper = (bound / factor for bound in distribution.bounds)
+    if np.isfinite(lower) and np.isfinite(upper):
+        return f", between {lower:.4g} and {upper:.4g}"
+    if np.isfinite(lower):
+        return f", above {lower:.4g}"
+    return f", below {upper:.4g}" if np.isfinite(upper) else ""

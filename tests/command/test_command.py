@@ -1,0 +1,380 @@
+"""The commands as a user calls them: their files, their messages, their exit codes."""
+
+import dataclasses
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from fe_likelihoods import SimulationCache
+from fe_likelihoods.command.hints import in_toml_terms
+from fe_likelihoods.command.job import parse_job, read_job
+from fe_likelihoods.command.main import main
+from fe_likelihoods.command.models import make_problem
+from fe_likelihoods.command.priors import parse_prior
+from fe_likelihoods.command.schema import MODELS, PARTS, read_quantity
+from fe_likelihoods.command.starting import TEMPLATES
+from fe_likelihoods.models.isolated_bridge_parts import Bearing, Damper, Pier
+from fe_likelihoods.models.rc_column import RCColumn
+from fe_likelihoods.models.rc_column_parts import Bars, Concrete, Hoops, Steel
+from tests.command.key_tables import PAGE, key_tables
+
+ROOT = Path(__file__).resolve().parents[2]
+OSCILLATOR = """
+[model]
+kind = "oscillator"
+period = "0.8 s"
+[record]
+file = "base.csv"
+[measurements]
+file = "top.csv"
+columns = {acceleration = "top [g]", displacement = "top [mm]"}
+[priors]
+stiffness = "normal(1, 0.3)"
+damping = "normal(1, 0.3)"
+sigma_acceleration = "half-normal(0.1 g)"
+sigma_displacement = "half-normal(5 mm)"
+[sampler]
+walkers = 20
+steps = 2
+guide = true
+[prediction]
+draws = 10
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the test of an oscillator, which is the current one."""
+    from fe_likelihoods import LinearOscillator, table_motion
+
+    record = table_motion().trim(0.0, 6.0).resample(0.02)
+    response = LinearOscillator(record, 0.8).simulate([1.1, 0.9]) / [[9.80665], [1e-3]]
+    base = [f"{t:.2f},{a!r}" for t, a in zip(record.time, record.acceleration.tolist(), strict=True)]
+    rows = enumerate(zip(record.time, *response, strict=True))
+    top = [f"{t:.2f},{a + 0.01 * (-1) ** (k // 2):.6f},{d + (-1) ** k:.4f}" for k, (t, a, d) in rows]
+    (tmp_path / "base.csv").write_text("\n".join(["time_s,base_m_s2", *base]))
+    (tmp_path / "top.csv").write_text("\n".join(["time_s,top [g],top [mm]", *top]))
+    (tmp_path / "oscillator.toml").write_text(OSCILLATOR)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(*arguments: str, code: int = 0) -> str:
+    """Output of a command that ends with an exit code."""
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def test_help_imports_neither_numba_nor_matplotlib():
+    code = (
+        "import sys, fe_likelihoods.command.main as m\n"
+        "try: m.main(['--help'])\nexcept SystemExit: pass\n"
+        "print(sorted({'numba', 'matplotlib', 'scipy', 'numpy', 'emcee'} & set(sys.modules)))"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "[]"
+    for name in ("new", "check", "run", "report", "cache"):
+        assert f"  {name} " in output
+
+
+def test_keys_are_those_of_the_models():
+    """Every key of a model is an argument of its class, and the other way round."""
+    others = {"loading", "outputs", "concrete", "steel", "bars", "hoops", "max_increment"}  # the last: imposed tests
+    column = {field.name for field in dataclasses.fields(RCColumn)} - others
+    assert {key.name for key in MODELS["column"]} == column
+    classes = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops}
+    classes |= {"pier_1": Pier, "bearing_1": Bearing, "damper_2": Damper}
+    for name, cls in classes.items():
+        keys = (PARTS["column"] | PARTS["bridge"])[name]
+        assert {key.name for key in keys} == {field.name for field in dataclasses.fields(cls)}, name
+
+
+def test_the_documentation_has_the_keys():
+    assert key_tables() in PAGE.read_text(), "python -m tests.command.key_tables writes them again"
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_new_writes_files_that_can_be_read(kind, tmp_path):
+    assert "SYNTHETIC" in call("new", kind, str(tmp_path / "a"))
+    assert {path.name for path in (tmp_path / "a").iterdir()} == set(TEMPLATES[kind])
+    assert read_job(tmp_path / "a" / f"{kind}.toml").kind == kind
+    assert "already contains" in call("new", kind, str(tmp_path / "a"), code=1)
+
+
+@pytest.mark.parametrize("kind", ["function", "opensees"])
+def test_templates_find_the_true_values_of_their_data(kind, tmp_path):
+    """One step of Gauss and Newton from the true values stays within 3 standard errors; a long time step does not."""
+    if kind == "opensees":
+        pytest.importorskip("openseespy")
+    shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
+    text = (tmp_path / f"my_{kind}.py").read_text()
+    shifts = []
+    for name, coarse in (("fine", text), ("coarse", re.sub(r"(?m)^SUBSTEPS = \d+", "SUBSTEPS = 1", text))):
+        module = f"my_{kind}_{name}"
+        (tmp_path / f"{module}.py").write_text(coarse)
+        (tmp_path / f"{name}.toml").write_text(
+            (tmp_path / f"{kind}.toml").read_text().replace(f"my_{kind}.py", f"{module}.py")
+        )
+        likelihood = make_problem(read_job(tmp_path / f"{name}.toml")).posterior.likelihood
+        true, step = np.array([1.15, 0.85]), 1e-3
+        points = [true, *(true + step * np.eye(2))]
+        responses = np.array([likelihood.model.simulate(point) for point in points])
+        residuals = likelihood.measurements.values - responses
+        weighted = (residuals / residuals[0].std(axis=1, keepdims=True)).reshape(3, -1)
+        slopes = (weighted[1:] - weighted[0]).T / step
+        errors = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+        shifts.append(np.abs(np.linalg.lstsq(slopes, -weighted[0])[0] / errors).max())
+    assert shifts[0] < 3.0 < shifts[1]
+
+
+def test_check_says_what_was_read_and_what_a_run_costs(folder):
+    output = call("check", "oscillator.toml")
+    assert "Record: base, 301 samples at 0.02 s" in output
+    assert "displacement: 301 samples" in output and "One simulation takes" in output
+    assert (folder / "check-oscillator.png").stat().st_size > 10_000
+    assert not (folder / "results-oscillator").exists()
+
+
+def test_run_writes_its_files_and_is_not_repeated(folder, caplog):
+    output = call("run", "oscillator.toml", "--quiet")
+    assert "log-evidence" in output and "Written to results-oscillator/" in output
+    results = folder / "results-oscillator"
+    for name in (
+        "report.html",
+        "summary.txt",
+        "summary.csv",
+        "fit.csv",
+        "stages.txt",
+        "posterior.nc",
+        "run.h5",
+        "settings.toml",
+    ):
+        assert (results / name).stat().st_size > 0, name
+    first = (results / "summary.csv").read_text()
+    told = (results / "summary.txt").read_text()
+    stored, counted = (int(re.search(words, told)[1]) for words in (r"(\d+) runs of the model", r"as (\d+) full simul"))
+    assert stored == SimulationCache(results / "simulations.sqlite").info().simulations > counted
+    assert f" from {counted} simulations." in told
+    assert "sigma_displacement [cm]" in first
+    assert "prior of sigma" not in output
+    assert "Written to" in call("run", "oscillator.toml", "--quiet")
+    caplog.clear()
+    assert (results / "summary.csv").read_text() == first
+    (results / "summary.csv").unlink()
+    call("report", "results-oscillator/run.h5")
+    assert "nothing is added" not in caplog.text and "Continuing" not in caplog.text
+    assert (results / "summary.csv").read_text() == first
+
+    text = OSCILLATOR.replace("walkers = 20", "walkers = 24")
+    (folder / "oscillator.toml").write_text(text)
+    message = call("run", "oscillator.toml", "--quiet", code=1)
+    assert "[sampler] walkers differ" in message and "--overwrite" in message
+    assert (results / "summary.csv").read_text() == first
+    assert "contains no run to resume" in call("run", "oscillator.toml", "--resume", "--out", "other", code=1)
+    call("run", "oscillator.toml", "--quiet", "--overwrite")
+    assert (results / "summary.csv").read_text() != first
+
+
+def test_another_file_of_the_same_name_is_refused(folder):
+    """Its settings are the same, its data are not."""
+    call("run", "oscillator.toml", "--quiet")
+    (folder / "other").mkdir()
+    for name in ("oscillator.toml", "top.csv"):
+        (folder / "other" / name).write_text((folder / name).read_text())
+    lines = (folder / "base.csv").read_text().splitlines()
+    (folder / "other" / "base.csv").write_text("\n".join([*lines[:-1], "6.00,0.1"]))
+    before = (folder / "results-oscillator" / "origin.json").read_text()
+    output = call("run", "other/oscillator.toml", "--quiet", code=1)
+    assert "results-oscillator contains a run with other data or another model" in output and "--overwrite" in output
+    assert (folder / "results-oscillator" / "origin.json").read_text() == before
+
+
+def test_caches(folder):
+    call("run", "oscillator.toml", "--quiet")
+    file = "results-oscillator/simulations.sqlite"
+    assert "simulations " in call("cache", "info", file)
+    assert "0 of which do not match" in call("cache", "verify", file)
+    assert "stored points were simulated again" in call("cache", "verify", file, "--settings", "oscillator.toml")
+    assert "simulations written to all.h5" in call("cache", "export", file, "--out", "all.h5")
+    assert "0 could not be read" in call("cache", "salvage", file, "--out", "new.sqlite")
+    told, copied = (call("cache", "info", name).splitlines() for name in (file, "new.sqlite"))
+    assert told[1] == copied[1] and told[3] == copied[3] and not told[3].startswith("responses    0,")
+    assert "there is no file" in call("cache", "info", "nothing.sqlite", code=1)
+    assert not Path("nothing.sqlite").exists()
+
+
+def test_a_damaged_cache_is_told_and_not_changed(folder):
+    from fe_likelihoods import LinearOscillator, table_motion
+
+    model = LinearOscillator(table_motion().trim(0.0, 2.0).resample(0.02), 0.8)
+    cache, n = SimulationCache("cache.sqlite"), 200
+    thetas = np.random.default_rng(1).uniform(0.8, 1.2, (n, 2))
+    cache.store("key", thetas, 10, np.ones((n, 2)), [""] * n, 1.0)
+    cache.store_responses(model, thetas, np.ones((n, 2, model.n_steps)))
+    cache.close()
+    data = bytearray(Path("cache.sqlite").read_bytes())
+    leaves = [start for start in range(4096, len(data), 4096) if data[start] == 0x0D]
+    leaf = leaves[len(leaves) // 2]
+    data[leaf : leaf + 4096] = b"\xa5" * 4096
+    Path("cache.sqlite").write_bytes(data)
+    files = {path.name for path in folder.iterdir()}
+    for command in ("verify", "info", "export"):
+        output = call("cache", command, "cache.sqlite", code=1)
+        assert "is damaged" in output and "cache salvage cache.sqlite" in output
+    assert Path("cache.sqlite").read_bytes() == bytes(data) and {path.name for path in folder.iterdir()} == files
+    output = call("cache", "salvage", "cache.sqlite", "--out", "new.sqlite")
+    kept, lost, responses, lost_responses = (int(word) for word in output.split() if word.isdigit())
+    assert kept + lost == n == responses + lost_responses and 0 < lost + lost_responses < n
+    assert "good" not in output and SimulationCache("new.sqlite").info()[1:4] == (kept, 0, responses)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[record]", "[recrd]", r"oscillator.toml: [recrd]: unknown section; did you mean record?"),
+        ("[model]", "[model", "not a TOML file"),
+        ('"oscillator"', '"osculator"', "[model] kind: expected the kind of the structure; got 'osculator'; did you"),
+        ("period", "perod", "oscillator.toml: [model] perod: unknown key of kind oscillator; did you mean period?"),
+        ('"0.8 s"', '"0.8 mm"', "[model] period: expected a number in s, or a text with a unit such as '20 s'; got"),
+        ('"0.8 s"', '"0.8"', "[model] period: expected a number in s, or a text with a unit such as '20 s'; '0.8' has"),
+        ('"0.8 s"', "-0.8", "[model] LinearOscillator: period"),
+        ("base.csv", "bse.csv", "[record] file: there is no file"),
+        ("top [mm]", "top [in]", "[measurements] top.csv: expected one column of values named 'top [in]', the columns"),
+        ("displacement =", "displ =", "[measurements] columns: unknown channel 'displ'; did you mean displacement?"),
+        ('acceleration = "top [g]", ', "", "[measurements] columns: expected a column for each channel of the model"),
+        ("walkers = 20", "walkers = 2", "[sampler]"),
+        ("walkers = 20", 'walkers = "20"', "[sampler] walkers: expected a whole number of 1 or more; got '20'"),
+        ("steps = 2", "steps = 0", "[sampler] steps: expected a whole number of 1 or more; got 0"),
+        ("steps = 2", "steps = 2\nseed = -1", "[sampler] seed: expected a whole number of 0 or more; got -1"),
+        ("draws = 10", "draws = -5", "[prediction] draws: expected a whole number of 0 or more; got -5"),
+        ("draws = 10", "quantiles = [5, 50]", "[prediction] quantiles: expected a list of different numbers between 0"),
+        ("half-normal(5 mm)", "half-normal(5 kg)", "[priors] sigma_displacement: unknown unit 'kg'"),
+        ("half-normal(5 mm)", "half-normal(0.2 g)", "[priors] sigma_displacement: expected a unit of displacement"),
+        ("half-normal(5 mm)", "halfnormal(5)", "[priors] sigma_displacement: expected a distribution in quotes"),
+        ("damping =", "dampng =", "[priors] dampng: the model has no such parameter; did you mean damping?"),
+        ('damping = "normal(1, 0.3)"', "", '[priors] damping: this prior is missing; write for example damping = "n'),
+        ("guide = true", 'guide = true\nkind = "mcmc"', "[sampler] kind: expected one of smc, tmcmc; got 'mcmc'"),
+        ("[prediction]", "[budget]\nworkers = 2\n[prediction]", "[budget] workers: a built-in model uses all cores"),
+        ("[prediction]", '[noise]\nkind = "pink"\n[prediction]', "[noise] kind: unknown noise 'pink'"),
+    ],
+)
+def test_errors_name_the_key(folder, old, new, message):
+    assert old in OSCILLATOR
+    (folder / "oscillator.toml").write_text(OSCILLATOR.replace(old, new, 1))
+    output = call("run", "oscillator.toml", "--quiet", code=1)
+    assert output.startswith("Error: oscillator.toml: ") and message in output and "Traceback" not in output
+    assert output.count("oscillator.toml: ") == 1
+    assert not (folder / "results-oscillator").exists()
+
+
+def test_a_damaged_table_and_a_missing_file_are_named(folder):
+    (folder / "top.csv").write_text("time_s,top [g],top [mm]\n0.00,1.0,1\n0.02,1,abc\n0.04,1,1\n")
+    assert "[measurements] top.csv, line 3" in call("check", "oscillator.toml", code=1)
+    assert "cannot read nothing.toml: No such file" in call("run", "nothing.toml", code=1)
+    assert "No such option" in call("run", "oscillator.toml", "--ressume", code=1)
+
+
+def test_measurements_that_hardly_cover_the_record_are_told(folder):
+    """Times in milliseconds under a header in seconds, and a record that is much shorter than the measurements."""
+    lines = (folder / "top.csv").read_text().splitlines()
+    (folder / "top.csv").write_text("\n".join([lines[0], *(f"{20 * k},0.01,{k}" for k in range(301))]))
+    output = call("run", "oscillator.toml", code=1)
+    assert "[measurements] zero: 1 of 301 samples of acceleration lie within the record, 0 to 6 s" in output
+    assert "check time_unit" in output and not (folder / "results-oscillator").exists()
+
+    (folder / "top.csv").write_text("\n".join(lines))
+    (folder / "base.csv").write_text("\n".join((folder / "base.csv").read_text().splitlines()[:102]))
+    output = call("check", "oscillator.toml")
+    caution = "CAUTION: only 101 of 301 samples of acceleration lie within the record: check time_unit"
+    assert caution in output and caution in call("run", "oscillator.toml", "--quiet")
+    assert caution in (folder / "results-oscillator" / "report.html").read_text(encoding="utf-8")
+
+
+def test_files_and_folders_that_cannot_be_used_are_told(folder):
+    text = OSCILLATOR.replace('"top.csv"', '"."')
+    (folder / "oscillator.toml").write_text(text)
+    assert "[measurements] file: expected a file; '.' is a folder" in call("check", "oscillator.toml", code=1)
+    (folder / "oscillator.toml").write_text(OSCILLATOR, encoding="utf-8-sig")
+    (folder / "a file").write_text("")
+    output = call("run", "oscillator.toml", "--out", "a file/results", code=1)
+    assert "cannot make the folder a file/results: Not a directory; give another one with --out" in output
+    lines = (folder / "top.csv").read_text().splitlines()
+    (folder / "top.csv").write_text("\n".join([lines[0], *(",".join(3 * ["0,1"]) for _ in lines)]))
+    assert "decimal commas need another separator" in call("check", "oscillator.toml", code=1)
+    (folder / "top.csv").write_text("\n".join([lines[0], *(line.rpartition(",")[0] + ",nan" for line in lines[1:])]))
+    assert "leave these channels out of `channels` in [measurements]" in call("check", "oscillator.toml", code=1)
+
+
+def test_check_warns_of_what_is_likely_wrong(folder):
+    text = OSCILLATOR.replace("half-normal(5 mm)", "half-normal(10)").replace("guide = true", "")
+    lines = (folder / "top.csv").read_text().splitlines()
+    lines[5:15] = [line.rpartition(",")[0] + ",nan" for line in lines[5:15]]
+    (folder / "top.csv").write_text("\n".join(lines))
+    (folder / "oscillator.toml").write_text(text.replace("[prediction]", "[budget]\nmax_simulations = 5\n[prediction]"))
+    output = call("check", "oscillator.toml")
+    assert "displacement: 291 samples, 10 missing" in output
+    assert "larger than every measured value of displacement" in output and output.count("this noise is") == 1
+    assert "will probably end before beta = 1" in output and "posterior.guide()" not in output
+
+
+def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
+    shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    code = (tmp_path / "my_function.py").read_text().replace("    return response", "    return 1000.0 * response")
+    (tmp_path / "my_function_mm.py").write_text(code)
+    text = (tmp_path / "function.toml").read_text().replace("my_function.py", "my_function_mm.py")
+    (tmp_path / "function.toml").write_text(text)
+    assert "it must return SI units" in call("check", "function.toml")
+
+
+def test_messages_are_in_the_words_of_the_file():
+    """Those of the library name its functions and attributes, as long as they are the ones below."""
+    told = "99.25; give missing=(-9999, -999,) to read it as NaN, or missing=() if"
+    assert in_toml_terms(told) == "99.25; give missing = [-9999, -999] to read it as NaN, or missing = [] if"
+    sources = {
+        "samplers/tempering/verdict.py": "set the attribute max_simulations of the sampler to a larger number",
+        "fe_likelihoods/signals/channels.py": "leave these channels out with Measurements.select",
+        "fe_likelihoods/models/validation.py": "(fe_likelihoods.units.to_si converts)",
+        "samplers/cost.py": "with guide=posterior.guide()",
+    }
+    for file, words in sources.items():
+        assert words in (ROOT / file).read_text(encoding="utf-8"), file
+
+
+def test_debug_shows_where_an_error_was_raised(folder):
+    result = CliRunner().invoke(main, ["--debug", "run", "nothing.toml"])
+    assert isinstance(result.exception, ValueError)
+
+
+def test_quantities_and_priors_as_text():
+    assert read_quantity("48 in", "displacement") == pytest.approx(1.2192)
+    assert read_quantity(2, "time") == 2.0
+    assert read_quantity("0.5s", "time") == 0.5 and read_quantity("1e-3m", "displacement") == 1e-3
+    assert (
+        read_quantity("6.1ksi", "stress") == pytest.approx(42.06e6, rel=1e-3) and read_quantity(42e6, "stress") == 42e6
+    )
+    with pytest.raises(ValueError, match='a plain number is in Pa, and 6.1 Pa .* "6.1 ksi"'):
+        read_quantity(6.1, "stress")
+    assert parse_prior("half-normal(5mm)", "displacement").sd == 5e-3
+    assert parse_prior("half-normal(0.1 g)", "acceleration").sd == pytest.approx(0.980665)
+    assert parse_prior("normal(1, 0.5, 0.2, inf)").bounds == (0.2, float("inf"))
+    for text in (
+        "uniform(1)",
+        "normal",
+        "gamma(1, 2)",
+        "normal(1, a)",
+        "log-normal(1 mm, 0.3 mm)",
+        "normal(1, nan)",
+        3,
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            parse_prior(text)
+    with pytest.raises(ValueError, match="section is missing"):
+        parse_job("", Path("a.toml"), Path("."))

@@ -1,0 +1,88 @@
+"""The figure of a fit: data, errors, windows and limits."""
+
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, Measurements, plot_fit
+from fe_likelihoods.signals.fits import strongest_window
+from fe_likelihoods.units import G0
+
+CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "mm"))
+WORDS = ["before", "after"]
+
+
+@pytest.fixture(autouse=True)
+def close():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture
+def measured(rng):
+    """Twenty seconds, the top strong from 12 s on and the drift from 3 s on."""
+    time = 0.05 * np.arange(401)
+    shapes = [np.exp(-(((time - center) / 2.0) ** 2)) for center in (14.5, 5.5)]
+    return Measurements(CHANNELS, 0.05, np.array(shapes) * rng.normal(size=(2, 401)), "SYNTHETIC: bursts")
+
+
+def test_rows_are_channels_and_columns_responses(measured):
+    figure = plot_fit(measured, {"before": 0.0 * measured.values, "after": 1.07 * measured.values})
+    rows = np.reshape(figure.axes, (2, 3))
+    assert [axes.get_ylabel() for axes in rows[:, 0]] == ["top [g]", "drift [mm]"]
+    assert figure.get_suptitle() == "SYNTHETIC: bursts"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["measured", *WORDS]
+    for k, factor in enumerate((1 / G0, 1e3)):
+        before, after, zoom = rows[k]
+        assert [axes.get_title() for axes in (before, after)] == ["before, RRMSE 100 %", "after, RRMSE 7.0 %"]
+        np.testing.assert_allclose(before.lines[0].get_ydata(), factor * measured.values[k])
+        np.testing.assert_allclose(after.lines[1].get_ydata(), 1.07 * factor * measured.values[k])
+        assert [line.get_label() for line in zoom.lines] == ["measured", *WORDS]
+        assert before.get_xlim() == after.get_xlim() == (0.0, 20.0) and before.get_ylim() == after.get_ylim()
+        (span,) = before.patches
+        assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx(zoom.get_xlim())
+    assert [np.round(axes.get_xlim(), 1).tolist() for axes in rows[:, 2]] == [
+        pytest.approx([12.0, 17.0], abs=1.0),
+        pytest.approx([3.0, 8.0], abs=1.0),
+    ]
+
+
+def test_short_histories_and_single_responses_have_no_window(measured):
+    assert len(plot_fit(measured, measured, "drift", window=None).axes) == 1
+    (axes,) = plot_fit(measured.trim(0.0, 6.0), {"model": measured.trim(0.0, 6.0)}, ["drift"]).axes
+    assert axes.get_title() == "model, RRMSE 0.0 %" and axes.get_xlim() == (0.0, 6.0)
+    figure = plot_fit(measured, 0.5 * measured.values, title="")
+    assert figure.axes[0].get_title() == "model, RRMSE 50 %" and figure.get_suptitle() == ""
+
+
+def test_responses_with_other_times_and_missing_samples(measured):
+    with_gap = measured.values.copy()
+    with_gap[0, 100:200] = np.nan
+    gappy = replace(measured, values=with_gap)
+    figure = plot_fit(gappy, {"same": 1.1 * with_gap, "longer steps": measured.decimate(2)})
+    same, longer, _ = figure.axes[:3]
+    assert same.get_title() == "same, RRMSE 10 %" and longer.get_title() == "longer steps", "no error for other times"
+    assert len(longer.lines[1].get_xdata()) == 201
+    only = plot_fit(measured, {"drift only": measured.select(["drift"])})
+    assert only.axes[0].get_title() == "drift only: no such channel"
+
+
+def test_the_strongest_window(rng):
+    values = np.zeros(100)
+    values[60:70] = 1.0
+    values[:5] = np.nan
+    begin, end = strongest_window(0.1 * np.arange(100), values, 1.0)
+    assert begin == pytest.approx(6.0) and end == pytest.approx(7.0)
+
+
+def test_wrong_arguments_are_refused(measured):
+    with pytest.raises(ValueError, match=r"'before': an array must have the shape of the measured values, \(2, 401\)"):
+        plot_fit(measured, {"before": np.zeros((2, 4))})
+    with pytest.raises(ValueError, match="no response to draw"):
+        plot_fit(measured, {})
+    with pytest.raises(ValueError, match="channels must be some of top, drift"):
+        plot_fit(measured, measured, ["roof"])
+    with pytest.raises(ValueError, match="window must be a positive number"):
+        plot_fit(measured, measured, window=-1.0)
