@@ -1,7 +1,8 @@
 """Make the figures of README and documentation (`make figures`): small files in docs/figures, the same on every run.
 
-Tutorial 01 makes those of the oscillator, 02 those of the update, 10 those of damage; the last two take
-minutes. The models draw their section and their hysteresis loops.
+Tutorial 01 makes those of the oscillator, 02 and 03 those of the updates, 10 those of damage; they take minutes.
+`sampler_figures` compares the samplers and shows what goes wrong. The models draw their section and their hysteresis
+loops.
 """
 
 import os
@@ -16,6 +17,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import sampler_figures
 from PIL import Image
 
 from fe_likelihoods import (
@@ -31,8 +33,16 @@ ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
 FIGURES_OF_TUTORIALS = {  # script and options: name of its figure, name here
     "01_linear_oscillator.py": {name: f"oscillator_{name}" for name in ("record", "corner", "fit", "prediction")},
-    "02_bridge_column.py --preset reduced": {"fig5_response": "column_response"},
-    "02_bridge_column.py --events 2 --guide --walkers 100": {"fig4_pair": "column_pair"},
+    "02_bridge_column.py --events 2 --guide --walkers 100": {
+        "fig4_pair": "column_pair",
+        "corner": "column_corner",
+        "fig5_response": "column_fit",
+    },
+    "03_isolated_bridge.py --sampler guide --walkers 100 --step 1e-3": {
+        "fig5_parameters_and_fit": "bridge_parameters",
+        "fig6_marginals": "bridge_marginals",
+        "fig7_predictions": "bridge_prediction",
+    },
     "10_damage.py": {"damage_predicted": "column_damage", "prediction": "damage_prediction"},
 }
 WIDEST = 1100  # pixels
@@ -97,7 +107,8 @@ if __name__ == "__main__":
             subprocess.run(command, check=True, env={k: v for k, v in os.environ.items() if k != "FAST"})
             for name, new_name in figures.items():
                 shrink(Path(folder) / f"{name}.png", new_name)
-        for name, figure in model_figures().items():
+        samplers = {"samplers_column": sampler_figures.column(), "samplers_bridge": sampler_figures.bridge()}
+        for name, figure in (model_figures() | samplers | sampler_figures.correlated_errors()).items():
             figure.savefig(Path(folder) / f"{name}.png", dpi=85)
             shrink(Path(folder) / f"{name}.png", name)
     for path in sorted(TARGET.glob("*.png")):

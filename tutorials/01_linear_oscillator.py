@@ -19,14 +19,12 @@ import time
 from pathlib import Path
 
 import arviz
-import corner
 import emcee
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.lines import Line2D
 from scipy.special import logsumexp
 
 from fe_likelihoods import (
@@ -40,12 +38,12 @@ from fe_likelihoods import (
     from_si,
     peak,
     plot_bands,
+    plot_fit,
     problems,
     propagate,
-    rrmse,
     to_si,
 )
-from samplers import SMCSampler, TMCMCSampler, comparison_table, to_arviz
+from samplers import SMCSampler, TMCMCSampler, comparison_table, plot_corner, to_arviz
 
 FAST = bool(os.environ.get("FAST"))  # a shorter chain of emcee, fewer walkers of TMCMC, no progress bars
 parser = argparse.ArgumentParser(description="Ten-minute introduction; writes figures and summary.json to a folder.")
@@ -159,7 +157,7 @@ for Sampler in (emcee.EnsembleSampler, SMCSampler, TMCMCSampler):
     seconds[name], simulations[name] = time.perf_counter() - start, posterior.report()["simulations"] - before
     runs[name], samples[name] = sampler, sampler.get_chain(flat=True, discard=discard if is_emcee else 0)
 print(comparison_table(runs, {"emcee": seconds["emcee"]}, discard=discard))
-print(arviz.summary(to_arviz(runs["SMC"]), kind="stats"))  # arviz.from_emcee(sampler) works for all three as well
+print(arviz.summary(to_arviz(runs["SMC"]), kind="stats"))  # r_hat needs two runs: to_arviz([run_1, run_2])
 
 # %%
 # 6. Is the result correct?
@@ -214,38 +212,9 @@ for name in ("SMC", "TMCMC"):
     )
 
 # %%
-# The corner plot shows the three posteriors on top of one another.
+# The corner plot shows the three posteriors on top of one another, in the units of ``posterior.parameters``.
 
-LABELS = ["stiffness\n[x nominal]", "damping\n[x nominal]", r"$\sigma_a$ [g]", r"$\sigma_d$ [cm]"]
-COLOURS = {"emcee": GREEN, "SMC": BLUE, "TMCMC": ORANGE}
-
-limits = list(np.quantile(to_display(np.concatenate(list(samples.values()))), [0.001, 0.999], axis=0).T)
-figure = plt.figure(figsize=(7.6, 7.6))
-for name, x in samples.items():
-    corner.corner(
-        to_display(x),
-        fig=figure,
-        labels=LABELS,
-        range=limits,
-        color=COLOURS[name],
-        weights=np.full(len(x), 1.0 / len(x)),
-        plot_datapoints=False,
-        plot_density=False,
-        no_fill_contours=True,
-        levels=(0.5, 0.9),
-        truths=to_display(truth),
-        truth_color=GREY,
-        max_n_ticks=3,
-        labelpad=0.08,
-        smooth=1.0,
-    )
-for i in range(posterior.ndim):  # corner scales each diagonal panel to the last histogram only
-    diagonal = figure.axes[i * (posterior.ndim + 1)]
-    diagonal.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in diagonal.patches))
-handles = [Line2D([], [], color=COLOURS[name], label=name) for name in samples]
-handles.append(Line2D([], [], color=GREY, marker="s", label="truth (synthetic)"))
-figure.legend(handles=handles, loc="upper right", fontsize=13, frameon=False, bbox_to_anchor=(0.97, 0.95))
-figure.text(0.66, 0.72, "contours contain 50 and 90 %", fontsize=11, ha="left")
+figure = plot_corner(samples, posterior, truths=truth)
 save(figure, "corner")
 
 # %%
@@ -256,19 +225,7 @@ save(figure, "corner")
 # relative root-mean-square error of a channel. After the update, only the noise is left.
 
 theta = {"nominal values": np.ones(2), "posterior mean": samples["SMC"].mean(axis=0)[:2]}
-figure, rows = plt.subplots(2, 1, figsize=(9, 5), sharex=True, sharey=True, layout="constrained")
-for axes, (label, values) in zip(rows, theta.items(), strict=True):
-    response = model.simulate(values)
-    error = rrmse(response, measured.values)[1]
-    data, simulated = (from_si(x, "cm") for x in (measured.channel("displacement"), response[1]))
-    axes.plot(measured.time, data, ".", color=ORANGE, markersize=2.5, label="measured (synthetic)")
-    axes.plot(measured.time, simulated, color=BLUE, linewidth=1.0, label=f"{label}: RRMSE {100 * error:.0f} %")
-    axes.legend(frameon=False, fontsize="small", ncols=2, loc="upper left")
-    axes.set_ylabel("displacement [cm]")
-    axes.grid(alpha=0.25)
-largest = from_si(np.abs(measured.channel("displacement")).max(), "cm")
-rows[-1].set(xlabel="time [s]", xlim=(0.0, record.duration), ylim=(-1.1 * largest, 1.4 * largest))
-save(figure, "fit")
+save(plot_fit(measured, {title: model.simulate(values) for title, values in theta.items()}, title=""), "fit")
 
 # %%
 # 8. Prediction

@@ -18,13 +18,12 @@ synthetic motion or any record that you name::
     python tutorials/02_bridge_column.py --preset ramancha2022                 # the algorithm of the paper; hours
     python tutorials/02_bridge_column.py --record motion.AT2 --scale 0.85      # another base motion (AT2, V2, CSV)
     python tutorials/02_bridge_column.py --preset reduced --classes            # compare model classes by evidence
-    python tutorials/02_bridge_column.py --record base.csv --measurements top.csv --column own.toml    # your own test
 
 EQ1 alone says nothing about ``a1``, because the bars stay elastic: the prior decides. With ``--events 2`` a stronger
 EQ2 follows EQ1, and the data inform every parameter.
 
-The last line is for a test of your own: measured acceleration and displacement of the top of a column
-(:doc:`/own_column` describes the files).
+A test of your own, with measured acceleration and displacement of the top of a column, is updated with the command line
+(:doc:`/own_column`).
 
 With ``FAST=1`` the script keeps one sample in 16 and uses 24 walkers. It then shows how the tutorial works; its numbers
 are not results.
@@ -38,18 +37,17 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import corner
 import emcee
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import own_column
 
 from fe_likelihoods import (
     average_predictions,
     from_si,
+    plot_fit,
     problems,
     propagate,
     read_record,
@@ -60,9 +58,10 @@ from samplers import (
     RAMANCHA_2022_LITERAL,
     SMCSampler,
     compare_models,
-    ladder_plot,
     ladder_table,
-    pair_plot,
+    plot_corner,
+    plot_ladder,
+    plot_pairs,
     summary,
     to_arviz,
 )
@@ -79,10 +78,6 @@ PRESETS = {
 parser = argparse.ArgumentParser(description="Update the bridge column with SMC; write tables and figures to a folder.")
 parser.add_argument("--events", type=int, choices=(1, 2), default=1, help="bundled data: EQ1, or EQ1 and EQ2")
 parser.add_argument("--record", type=Path, help="base motion: AT2, V2, SMC, K-NET, ESM, CSV (default: synthetic)")
-parser.add_argument(
-    "--measurements", type=Path, help="measured response of the top: .csv or .xlsx (default: synthetic)"
-)
-parser.add_argument("--column", type=Path, help="geometry, materials, prior and columns of the measurements: .toml")
 parser.add_argument("--units", help="unit of the acceleration, if the file of the record does not state it")
 parser.add_argument("--scale", type=float, default=1.0, help="factor by which the record is multiplied")
 parser.add_argument("--preset", choices=PRESETS, default="fast" if os.environ.get("FAST") else "default")
@@ -94,12 +89,8 @@ parser.add_argument("--classes", action="store_true", help="also compare model c
 parser.add_argument("--resume", action="store_true", help="continue an interrupted run in OUT, with the same options")
 parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the results")
 args = parser.parse_args()
-if args.measurements and not args.record:
-    parser.error("--measurements need the base motion under which they were measured: give --record too")
 if args.events != 1 and (args.record or args.scale != 1.0):
     parser.error("--events chooses bundled data: leave out --record and --scale")
-if args.column and not args.measurements:
-    parser.error("--column describes a test of your own: give --measurements too")
 
 walkers, every, sweeps, guided, settings = PRESETS[args.preset]
 walkers, every = args.walkers or walkers, args.every or every
@@ -115,11 +106,7 @@ args.out.mkdir(parents=True, exist_ok=True)
 # on the multiples of five nominal values; half-normal priors on the noise levels; and the likelihood of its equation
 # (3).
 
-own = own_column.read_settings(args.column) if args.measurements else None
-if own is not None:
-    record = read_record(args.record, units=args.units).scale(args.scale)
-    measurements = own_column.read_measurements(args.measurements, own, record)
-elif args.record is None:
+if args.record is None:
     data = problems.bridge_column_data(args.events)
     record, measurements = data.record.scale(args.scale), data.measurements
     if args.scale != 1.0:
@@ -130,16 +117,14 @@ else:
 
 
 def make_posterior(**changes):
-    """The posterior of the data, of the tutorial's column or of one's own, for a model with changes."""
-    if own is not None:
-        return own_column.make_posterior(record, measurements, own, every, **changes)
+    """The posterior of the data for a model with changes."""
     return problems.bridge_column(record=record, measurements=measurements, every=every, **changes)
 
 
 posterior = make_posterior()
 model, measured = posterior.likelihood.model, posterior.likelihood.measurements
 levels = problems.BRIDGE_COLUMN_NOISE if args.events == 1 else problems.BRIDGE_COLUMN_SENSOR_NOISE
-truth = None if own else np.array([*problems.BRIDGE_COLUMN_MEANS.values(), *levels.values()])
+truth = np.array([*problems.BRIDGE_COLUMN_MEANS.values(), *levels.values()])
 
 print(f"base motion: {record.name} x {args.scale:g}; measurements: {measurements.description}")
 print(f"{measured.n_steps} samples at {measured.dt:g} s of {', '.join(c.name for c in measured.channels)}")
@@ -167,7 +152,7 @@ for axis, (instants, values, title, label) in zip(axes, rows, strict=True):
     axis.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
     axis.set(title=title, ylabel=label, ylim=np.array([-1.1, 1.1]) * np.nanmax(np.abs(values)))
 axes[-1].set(xlabel="time [s]", xlim=(0.0, record.duration))
-figure.suptitle("Figure 3: measurement data for model updating" + ("" if own else " (synthetic)"))
+figure.suptitle("Figure 3: measurement data for model updating (synthetic)")
 figure.savefig(args.out / "fig3_data.png", dpi=150)
 
 # %%
@@ -198,7 +183,7 @@ report = posterior.report()
 print(ladder_table(sampler))
 print(sampler.verdict)
 (args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
-ladder_plot(sampler).savefig(args.out / "ladder.png", dpi=150)
+plot_ladder(sampler).savefig(args.out / "ladder.png", dpi=150)
 
 # %%
 # Table 2: reported values and posterior
@@ -224,7 +209,7 @@ def table2() -> list[dict[str, str]]:
     moments = summary(samples, posterior.parameter_names)
     for i, name in enumerate(posterior.parameter_names):
         unit, mean, cv = DISPLAY.get(name, "-"), moments.mean[i], moments.cv[i]
-        true = np.nan if truth is None else truth[i]
+        true = truth[i]
         distance = (mean - true) / moments.sd[i]
         if name in model.parameter_names:
             nominal = model.nominal[name]
@@ -247,8 +232,6 @@ def table2() -> list[dict[str, str]]:
         rows.append(
             dict(zip(keys, (name, *row), strict=True)) | {"CV": f"{cv:.2e}", "(mean-truth)/sd": f"{distance:+.2f}"}
         )
-    if truth is None:
-        return [{key: value for key, value in row.items() if "ruth" not in key} for row in rows]
     return rows
 
 
@@ -267,50 +250,17 @@ print("\n".join(lines))
 # Figure 4: the posterior
 # -----------------------
 #
-# First in the form of the paper, then as a usual corner plot. The orange lines mark the true values of the synthetic
-# data. The grey marks are the reported values; an arrow points to a value outside of a panel and gives it.
+# First in the form of the paper, then as a corner plot with the prior. The red lines mark the true values of the
+# synthetic data. The grey marks are the reported values; an arrow points to a value outside of a panel and gives it.
 
-LABELS = ["$E_c$ [x nominal]", "$E_s$ [x nominal]", "$a_0$ [x nominal]", "$a_1$ [x nominal]", "$f_t$ [x nominal]"]
-UNITS = dict.fromkeys(posterior.parameter_names[5:], None)
-for name in UNITS:
-    kind, _, channel = name.partition("_")
-    UNITS[name] = {"sigma_acceleration": "g", "sigma_displacement": "in"}.get(name)
-    symbol = "\\" + kind + (f"_{channel[0]}" if channel else "")
-    LABELS.append(f"${symbol}$ [{UNITS[name] or '-'}]")
-
-
-def to_display(x: np.ndarray) -> np.ndarray:
-    """Convert the noise levels of parameters (..., ndim) to g and in."""
-    columns = [x[..., 5 + k] if unit is None else from_si(x[..., 5 + k], unit) for k, unit in enumerate(UNITS.values())]
-    return np.concatenate([x[..., :5], np.stack(columns, axis=-1)], axis=-1)
-
-
-shown, true_shown = to_display(samples), None if truth is None else to_display(truth)
-reported = np.append(np.ones(5), np.full(len(UNITS), np.nan))  # multiples of themselves; none of the noise
-pair_plot(shown, LABELS, truth=true_shown, nominal=reported).savefig(args.out / "fig4_pair.png", dpi=130)
-lowest, highest = shown.min(axis=0), shown.max(axis=0)
-if true_shown is not None:
-    lowest, highest = np.minimum(lowest, true_shown), np.maximum(highest, true_shown)
-margin = 0.05 * (highest - lowest)
-figure = corner.corner(
-    shown,
-    range=list(zip(lowest - margin, highest + margin, strict=True)),  # the true values are always inside
-    labels=LABELS,
-    titles=[label.split(" [")[0] for label in LABELS],
-    truths=true_shown,
-    show_titles=True,
-    title_fmt=".3g",
-    quantiles=[0.05, 0.5, 0.95],
-    smooth=1.0,
-    max_n_ticks=3,
-)
-figure.savefig(args.out / "corner.png", dpi=110)
+plot_pairs(samples, posterior, truths=truth).savefig(args.out / "fig4_pair.png", dpi=130)
+plot_corner(samples, posterior, truths=truth).savefig(args.out / "corner.png", dpi=110)
 
 # %%
 # Figure 5: the response before and after the update
 # --------------------------------------------------
 #
-# RRMSE is the relative root-mean-square error of a channel.
+# RRMSE is the relative root-mean-square error of a channel. At the right is the strongest part of the motion.
 
 
 def error_line(title: str, error: np.ndarray) -> str:
@@ -329,19 +279,7 @@ points = {
 predictions = {title: measured.values - posterior.likelihood.residuals(point) for title, point in points.items()}
 errors = {title: rrmse(response, measured.values) for title, response in predictions.items()}
 
-shape = {"nrows": measured.n_channels, "ncols": 2, "squeeze": False}
-figure, axes = plt.subplots(**shape, figsize=(12, 6), sharex=True, sharey="row", layout="constrained")
-for column, (title, response) in enumerate(predictions.items()):
-    for i, channel in enumerate(measured.channels):
-        axis = axes[i, column]
-        axis.plot(measured.time, from_si(measured.values[i], channel.unit), color="0.55", linewidth=0.8, label="data")
-        axis.plot(measured.time, from_si(response[i], channel.unit), color="#d9822b", linewidth=0.7, label="model")
-        axis.set_title(f"{title}\n{channel.quantity}, RRMSE {100 * errors[title][i]:.1f} %", fontsize=10)
-        if column == 0:
-            axis.set_ylabel(f"{channel.quantity} [{channel.unit}]")
-figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)  # hides no peak
-for axis in axes[-1]:
-    axis.set(xlabel="time [s]", xlim=(0.0, record.duration))
+figure = plot_fit(measured, predictions, title="synthetic data")
 figure.savefig(args.out / "fig5_response.png", dpi=150)
 for title, error in errors.items():
     print(error_line(title, error))
@@ -403,7 +341,7 @@ result = {
     "log_evidence_error": float(sampler.log_evidence_error),
     "posterior_mean": dict(zip(posterior.parameter_names, samples.mean(axis=0).tolist(), strict=True)),
     "posterior_sd": dict(zip(posterior.parameter_names, samples.std(axis=0, ddof=1).tolist(), strict=True)),
-    "truth": None if truth is None else dict(zip(posterior.parameter_names, truth.tolist(), strict=True)),
+    "truth": dict(zip(posterior.parameter_names, truth.tolist(), strict=True)),
     "rrmse": {k: dict(zip([c.name for c in measured.channels], v.tolist(), strict=True)) for k, v in errors.items()},
     "verdict": sampler.verdict.status,
     "reasons": sampler.verdict.reasons,

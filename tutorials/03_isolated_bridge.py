@@ -30,15 +30,12 @@ import time
 import warnings
 from pathlib import Path
 
-import corner
 import emcee
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.ticker import MaxNLocator
-from scipy.stats import gaussian_kde
 
 from fe_likelihoods import (
     Bearing,
@@ -58,8 +55,10 @@ from samplers import (
     SMCSampler,
     TMCMCSampler,
     compare_models,
-    ladder_plot,
     ladder_table,
+    plot_corner,
+    plot_ladder,
+    plot_marginals,
     summary,
     to_arviz,
 )
@@ -159,7 +158,7 @@ for i, name in enumerate(names):
 (args.out / "parameters.txt").write_text("\n".join(lines) + "\n")
 print("\n".join(lines))
 (args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
-ladder_plot(sampler).savefig(args.out / "ladder.png", dpi=150)
+plot_ladder(sampler).savefig(args.out / "ladder.png", dpi=150)
 
 
 # %%
@@ -169,11 +168,6 @@ ladder_plot(sampler).savefig(args.out / "ladder.png", dpi=150)
 # J is the sum of squared residuals of a channel divided by the sum of squares of the measured channel.
 
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
-LABELS = [
-    *(rf"${symbol}$" for symbol in (r"f_{\min,1}", r"\Delta f_1", "a_1", r"f_{\min,2}", r"\Delta f_2", "a_2")),
-    *(rf"${symbol}$" for symbol in ("K_{d1}", "C_{01}", "K_{d2}", "C_{02}")),
-    *(r"$\sigma$" if name == "sigma" else name for name in names[n_structural:]),
-]
 rng = np.random.default_rng(args.seed)
 fit = fit_measures(posterior, samples)
 nominal_fit = fit_measures(posterior, np.ones((1, n_structural)))[0]
@@ -194,7 +188,7 @@ left.errorbar(
 )
 left.plot(range(n_structural), truth, "x", color=ORANGE, markersize=8, label="truth (synthetic)")
 left.axhline(1.0, color=GREY, linewidth=0.8, linestyle="--", label="nominal (assumed)")
-left.set_xticks(range(n_structural), LABELS[:n_structural])
+left.set_xticks(range(n_structural), names[:n_structural], rotation=30)
 left.set(ylabel="multiple of the nominal value [-]", title="Calibrated model parameters")
 left.legend(frameon=False, fontsize="small")
 for j in range(fit.shape[1]):
@@ -222,43 +216,14 @@ figure.savefig(args.out / "fig5_parameters_and_fit.png", dpi=150)
 # Figure 6: marginal densities
 # ----------------------------
 #
-# The lines mark the parameters with which the synthetic data were made.
+# The dotted lines are the prior: where they are close to the posterior, the data say little about a parameter. The red
+# lines mark the parameters with which the synthetic data were made.
 
-columns = 4
-figure, axes = plt.subplots(
-    -(-len(names) // columns), columns, figsize=(11, 2.3 * -(-len(names) // columns)), layout="constrained"
-)
-for axis in axes.flat[len(names) :]:
-    axis.axis("off")
-for i, axis in enumerate(axes.flat[: len(names)]):
-    axis.hist(samples[:, i], bins=int(np.clip(len(samples) / 20, 10, 40)), density=True, color=BLUE, alpha=0.35)
-    if np.ptp(samples[:, i]) > 0.0:
-        x = np.linspace(samples[:, i].min(), samples[:, i].max(), 300)
-        axis.plot(x, gaussian_kde(samples[:, i])(x), color=BLUE)
-    if i < n_structural:
-        axis.axvline(truth[i], color=ORANGE, linewidth=1.0)
-    axis.set(xlabel=LABELS[i], yticks=[])
-    axis.xaxis.set_major_locator(MaxNLocator(4))
-figure.suptitle(
-    "Figure 6: marginal posterior densities; lines: truth (synthetic data, assumed nominal values)", fontsize="small"
-)
+truths = dict(zip(model.parameter_names, truth, strict=True))
+note = "synthetic data, assumed nominal values"
+figure = plot_marginals(samples, posterior, truths=truths, title=f"Figure 6: prior and posterior ({note})")
 figure.savefig(args.out / "fig6_marginals.png", dpi=150)
-truths = [*truth, *[None] * (len(names) - n_structural)]
-lowest, highest = samples.min(axis=0), samples.max(axis=0)
-lowest[:n_structural] = np.minimum(lowest[:n_structural], truth)
-highest[:n_structural] = np.maximum(highest[:n_structural], truth)
-margin = 0.05 * (highest - lowest)
-figure = corner.corner(
-    samples,
-    range=list(zip(lowest - margin, highest + margin, strict=True)),  # the true values are always inside
-    labels=LABELS,
-    label_kwargs={"fontsize": 18},
-    labelpad=0.1,
-    truths=truths,
-    smooth=1.0,
-    max_n_ticks=3,
-)
-figure.savefig(args.out / "corner.png", dpi=80)
+plot_corner(samples, posterior, truths=truths).savefig(args.out / "corner.png", dpi=80)
 
 
 # %%

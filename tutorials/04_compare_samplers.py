@@ -38,17 +38,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import corner
 import emcee
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.lines import Line2D
 
 from fe_likelihoods import Posterior, problems
-from samplers import CHING_CHEN_2007, SamplingWarning, SMCSampler, TMCMCSampler, comparison_table
+from samplers import CHING_CHEN_2007, SamplingWarning, SMCSampler, TMCMCSampler, comparison_table, plot_corner
 
 FAST = bool(os.environ.get("FAST"))
 parser = argparse.ArgumentParser(description="Compare SMC, TMCMC and emcee; write tables and figures to a folder.")
@@ -193,7 +191,7 @@ def other_mode(posterior: Posterior, truth: np.ndarray) -> np.ndarray:
     return np.append(posterior.likelihood.model.exchange_piers(truth[:10]), truth[10])
 
 
-def plot_corner(name: str, problem: Problem, posterior: Posterior, runs: dict[str, Run]) -> None:
+def draw_corner(name: str, problem: Problem, posterior: Posterior, runs: dict[str, Run]) -> None:
     """Corner plot of the samplers whose result is reliable, on common axes."""
     shown = ["SMC", "TMCMC", GUIDED]
     if runs[GUIDED].sampler.verdict.status == "not usable":
@@ -201,43 +199,8 @@ def plot_corner(name: str, problem: Problem, posterior: Posterior, runs: dict[st
     if name != "means":  # where emcee has one mode, or walkers at many places
         shown.append("emcee")
     points = {label: draws(label, runs[label].sampler) for label in shown}
-    quantiles = np.array([np.quantile(x, [0.001, 0.999], axis=0) for x in points.values()])
-    low = np.minimum(quantiles[:, 0].min(axis=0), problem.truth)
-    high = np.maximum(quantiles[:, 1].max(axis=0), problem.truth)
-    limits = list(zip(low - 0.02 * (high - low), high + 0.02 * (high - low), strict=True))
-    figure = None
-    for label, x in points.items():
-        figure = corner.corner(
-            x,
-            fig=figure,
-            labels=posterior.parameter_names,
-            range=limits,
-            color=COLOURS[label],
-            weights=np.full(len(x), 1.0 / len(x)),
-            plot_datapoints=label == GUIDED,  # its draws are too few for contours
-            plot_contours=label != GUIDED,
-            data_kwargs={"alpha": 0.7, "ms": 4},
-            plot_density=False,
-            no_fill_contours=True,  # a white interior would hide the samplers drawn before
-            levels=(0.5, 0.9),
-            smooth=1.0,
-            truths=problem.truth,
-            truth_color="0.6",
-            label_kwargs={"fontsize": 16 if max(map(len, posterior.parameter_names)) < 12 else 11},
-            max_n_ticks=3,
-        )
-    for axes in figure.axes[:: posterior.ndim + 1]:  # corner scales each diagonal panel to the last histogram only
-        axes.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches))
-    handles = [Line2D([], [], color=COLOURS[label], label=label) for label in shown]
-    title = f"{name} (synthetic data; grey: truth)\ncontours contain 50 and 90 %"
-    if GUIDED in shown:
-        handles[shown.index(GUIDED)].set(marker="o", linestyle="")
-        title += "\npoints: draws with a guide"
-    if FAST:
-        title += "\n" + TOO_SHORT.replace(": ", ":\n").replace("; ", ";\n")
-    size = 2 * posterior.ndim  # the panels have a fixed size
-    figure.legend(handles=handles, loc="upper right", title=title, fontsize=size, title_fontsize=size, frameon=False)
-    figure.savefig(args.out / f"corner_{name}.png", dpi=70)
+    title = f"{name} (synthetic data)" + (f"\n{TOO_SHORT}" if FAST else "")
+    plot_corner(points, posterior, truths=problem.truth, title=title).savefig(args.out / f"corner_{name}.png", dpi=80)
 
 
 def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict[str, Run]) -> None:
@@ -332,7 +295,7 @@ for name in args.problem or PROBLEMS:
         for label, run in runs.items()
     }
 
-    plot_corner(name, problem, posterior, runs)
+    draw_corner(name, problem, posterior, runs)
     plot_failures(name, problem, posterior, runs)
 
 (args.out / "comparison.json").write_text(json.dumps(results, indent=2) + "\n")

@@ -22,14 +22,12 @@ import sys
 import time
 from pathlib import Path
 
-import corner
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import own_models
-from matplotlib.lines import Line2D
 
 from fe_likelihoods import (
     ExecutableModel,
@@ -42,7 +40,7 @@ from fe_likelihoods import (
     Prior,
     TruncatedNormal,
 )
-from samplers import SMCSampler, summary
+from samplers import SMCSampler, plot_corner, summary
 
 TRUTH = np.array([1.15, 0.85])
 NOISE = np.array([0.3, 2e-3])  # standard deviations [m/s², m]
@@ -173,45 +171,6 @@ def with_few_simulations(posterior: Posterior, walkers: int, seed: int) -> SMCSa
     return sampler
 
 
-def plot_corner(draws: dict[str, np.ndarray], path: Path) -> None:
-    """Structural parameters of all posteriors on common axes."""
-    colours = dict(zip(draws, ("#1f5a8c", "#d9822b", "#5b8c5a"), strict=False))
-    together = np.concatenate([x[:, :2] for x in draws.values()] + [TRUTH[None]])
-    margin = 0.25 * np.ptp(together, axis=0)
-    figure = plt.figure(figsize=(6.5, 6.5))
-    widths = (4.5, 2.5, 0.8)  # equal curves stay visible
-    for width, (name, x) in zip(widths, draws.items(), strict=False):
-        corner.corner(
-            x[:, :2],
-            fig=figure,
-            bins=12,
-            range=list(zip(together.min(axis=0) - margin, together.max(axis=0) + margin, strict=True)),
-            labels=[f"{name} [x nominal]" for name in own_models.NAMES],
-            color=colours[name],
-            plot_datapoints=False,
-            plot_density=False,
-            no_fill_contours=True,
-            levels=(0.5, 0.9),
-            contour_kwargs={"linewidths": width},
-            hist_kwargs={"linewidth": width},
-            smooth=1.0,
-            truths=TRUTH,
-            truth_color="#8a8f98",
-            max_n_ticks=3,
-        )
-    for k in (0, 3):  # corner scales each diagonal panel to the last histogram only
-        diagonal = figure.axes[k]
-        diagonal.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in diagonal.patches))
-    handles = [
-        Line2D([], [], color=colour, linewidth=width, label=name)
-        for width, (name, colour) in zip(widths, colours.items(), strict=False)
-    ]
-    handles.append(Line2D([], [], color="#8a8f98", marker="s", label="truth (synthetic)"))
-    figure.legend(handles=handles, loc="upper right", frameon=False, bbox_to_anchor=(0.95, 0.93))
-    figure.text(0.6, 0.66, "contours contain 50 and 90 %", fontsize="small")
-    figure.savefig(path, dpi=130)
-
-
 def plot_loop(theta: np.ndarray, path: Path) -> None:
     """Hysteresis of the function at the given parameters (2,)."""
     acceleration, displacement = own_models.bilinear(theta)
@@ -266,7 +225,9 @@ def main() -> None:
     for thing in to_close:
         thing.close()
 
-    plot_corner(draws, args.out / "corner.png")
+    labels = [f"{name} [x nominal]" for name in own_models.NAMES]
+    structural = {name: x[:, :2] for name, x in draws.items()}
+    plot_corner(structural, labels=labels, truths=TRUTH).savefig(args.out / "corner.png", dpi=130)
     plot_loop(draws["function"].mean(axis=0)[:2], args.out / "loops.png")
     (args.out / "summary.json").write_text(json.dumps(results, indent=2) + "\n")
     print(f"figures and summary.json are in {args.out}/")

@@ -26,14 +26,13 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import corner
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import real_data
-from real_data import COLOURS, FAST, NOISES
+from real_data import FAST, NOISES
 
 from fe_likelihoods import (
     AutoregressiveNoise,
@@ -55,7 +54,7 @@ from fe_likelihoods import (
     residual_checks,
     rrmse,
 )
-from samplers import compare_models
+from samplers import compare_models, plot_corner
 
 SOURCE = "https://www.strongmotioncenter.org (CESMD): the processed data of the station in the name of the file"
 ONE_SUPPORT = {"ends only": 1.0, "column only": 0.0}
@@ -331,7 +330,9 @@ def study(name: str, args: argparse.Namespace) -> dict:
     figure = plot_residuals(left_over, channels, white.posterior.likelihood.model.dt)
     figure.suptitle(f"{bridge.title}: measured minus simulated at the posterior mean", fontsize="small")
     figure.savefig(out / f"{name}_residuals.png", dpi=130)
-    plot_corner(bridge, runs, out / f"{name}_corner.png")
+    labels = ["frequency [Hz]", "damping ratio [-]", "share of the ends [-]"]
+    draws = {f"noise: {noise}": run.draws[:, :3] for noise, run in runs.items()}
+    plot_corner(draws, labels=labels, title=bridge.title).savefig(out / f"{name}_corner.png", dpi=110)
 
     # evidence of the models under every noise
     evidence = {}
@@ -410,36 +411,6 @@ def compare_parts(bridge: Bridge, records: dict[int, Record], args, effective: f
 # %%
 # Figures
 # -------
-
-
-def plot_corner(bridge: Bridge, runs: dict[str, real_data.Run], path: Path) -> None:
-    """The posteriors under all noises on common axes."""
-    figure = None
-    draws = {noise: run.draws[:, :3] for noise, run in runs.items()}
-    together = np.concatenate(list(draws.values()))
-    margin = 0.05 * np.ptp(together, axis=0)
-    limits = list(zip(together.min(axis=0) - margin, together.max(axis=0) + margin, strict=True))
-    for noise, x in draws.items():
-        figure = corner.corner(
-            x,
-            fig=figure,
-            range=limits,
-            labels=["frequency [Hz]", "damping ratio [-]", "share of the ends [-]"],
-            color=COLOURS[noise],
-            plot_datapoints=False,
-            plot_density=False,
-            levels=(0.5, 0.9),
-            smooth=1.0,
-            bins=40,
-            hist_kwargs={"density": True},
-        )
-    for axes in np.reshape(figure.axes, (3, 3)).diagonal():
-        axes.relim()
-        axes.autoscale(axis="y")
-    for k, noise in enumerate(draws):
-        figure.text(0.5, 0.9 - 0.04 * k, f"noise: {noise}", color=COLOURS[noise])
-    figure.text(0.5, 0.94, bridge.title, fontsize="small")
-    figure.savefig(path, dpi=110)
 
 
 def plot_predictions(bridge: Bridge, predictions: dict[str, tuple], out: Path, name: str) -> None:

@@ -21,14 +21,13 @@ import argparse
 import json
 import time
 
-import corner
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import real_data
-from real_data import COLOURS, FAST, NOISES
+from real_data import FAST, NOISES
 
 from fe_likelihoods import (
     AutoregressiveNoise,
@@ -48,7 +47,7 @@ from fe_likelihoods import (
     read_columns,
     residual_checks,
 )
-from samplers import compare_models
+from samplers import compare_models, plot_corner
 
 SOURCE = "https://github.com/STAIRlab/mdof"
 FLOORS = {"floor1": 1, "floor2": 2, "floor3": 3}
@@ -182,29 +181,11 @@ figure.savefig(args.out / "residuals.png", dpi=130)
 
 names = white.posterior.likelihood.model.parameter_names
 drawn = [names.index(name) for name in ("stiffness_1", "stiffness_2", "stiffness_3", "damping_1", "mass_3")]
-together = np.concatenate([run.draws[:, : len(names)] for run in runs.values()])
 units = {"stiffness": "x nominal", "damping": "-", "mass": "x floor"}
-limits = np.quantile(together, [0.001, 0.999], axis=0) + np.multiply.outer([-0.1, 0.1], np.ptp(together, axis=0))
-figure = None
-for noise, run in runs.items():
-    figure = corner.corner(
-        run.draws[:, drawn],
-        fig=figure,
-        range=[tuple(limits[:, i]) for i in drawn],
-        labels=[f"{names[i]} [{units[names[i][:-2]]}]".replace("_", " ") for i in drawn],
-        color=COLOURS[noise],
-        plot_datapoints=False,
-        plot_density=False,
-        levels=(0.5, 0.9),
-        smooth=1.0,
-        bins=40,
-        hist_kwargs={"density": True},
-    )
-for axis in np.reshape(figure.axes, (len(drawn),) * 2).diagonal():
-    axis.relim()
-    axis.autoscale(axis="y")
-for k, noise in enumerate(runs):
-    figure.text(0.62, 0.9 - 0.03 * k, f"noise: {noise}", color=COLOURS[noise], fontsize="x-large")
+figure = plot_corner(
+    {f"noise: {noise}": run.draws[:, drawn] for noise, run in runs.items()},
+    labels=[f"{names[i]} [{units[names[i][:-2]]}]".replace("_", " ") for i in drawn],
+)
 figure.savefig(args.out / "corner.png", dpi=90)
 
 

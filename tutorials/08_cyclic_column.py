@@ -288,7 +288,7 @@ fits = fit_noises(
 )
 seconds_sampling = time.perf_counter() - start
 
-title = f"{first.name}, first half: multiples of nominal values, regions of 50 and 90 %"
+title = f"{first.name}, first half: multiples of nominal values"
 posterior_table = save_posterior(fits, prior, KIP, "kip", title, args.out)
 
 

@@ -108,7 +108,7 @@ fits = fit_noises(
 seconds_sampling = time.perf_counter() - start
 
 names = list(prior)
-title = "Steel coupon, first half: multiples of nominal values, regions of 50 and 90 %"
+title = "Steel coupon, first half: multiples of nominal values"
 posterior_table = save_posterior(fits, prior, MPA, "MPa", title, args.out)
 
 

@@ -17,8 +17,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import corner
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from real_data import find_file
@@ -41,9 +39,7 @@ from fe_likelihoods import (
     residual_checks,
     rrmse,
 )
-from samplers import SMCSampler, summary
-
-COLOURS = {"white": "#d9822b", "effective": "#5b8c5a", "AR(1)": "#1f5a8c"}
+from samplers import SMCSampler, plot_corner, summary
 
 
 def find_folder(given: Path | None, files: tuple[str, ...], source: str) -> Path:
@@ -152,33 +148,9 @@ def _posterior_rows(fits: Mapping[str, Fit], prior: Mapping[str, Any], scale: fl
 
 
 def _plot_corner(fits: Mapping[str, Fit], prior: Mapping[str, Any], title: str) -> Figure:
-    """Structural parameters under the three error models: regions of 50 and 90 %."""
-    n = len(prior)
-    ranges = []
-    for i in range(n):
-        seen = np.concatenate([np.quantile(fit.samples[:, i], (0.001, 0.999)) for fit in fits.values()])
-        margin = 0.1 * np.ptp(seen)
-        ranges.append((seen.min() - margin, seen.max() + margin))
-    figure = None
-    for name, fit in fits.items():
-        figure = corner.corner(
-            fit.samples[:, :n],
-            fig=figure,
-            labels=[f"{parameter} [x nominal]" for parameter in prior],
-            color=COLOURS[name],
-            plot_datapoints=False,
-            plot_density=False,
-            levels=(0.5, 0.9),
-            smooth=0.8,
-            hist_kwargs={"density": True},
-            range=ranges,
-        )
-    for axes in figure.axes[:: n + 1]:  # corner scales each diagonal panel to the last histogram only
-        axes.set_ylim(0.0, 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches))
-    handles = [plt.Line2D([], [], color=COLOURS[name]) for name in fits]
-    figure.legend(handles, list(fits), loc="upper right", bbox_to_anchor=(0.95, 0.9), frameon=False, fontsize=18)
-    figure.suptitle(title)
-    return figure
+    """Structural parameters under the three error models."""
+    labels = [f"{parameter} [x nominal]" for parameter in prior]
+    return plot_corner({name: fit.samples[:, : len(labels)] for name, fit in fits.items()}, labels=labels, title=title)
 
 
 def report(

@@ -23,7 +23,6 @@ from samplers import SMCSampler, summary
 
 FAST = bool(os.environ.get("FAST"))
 NOISES = ("white", "n_eff") if FAST else ("white", "AR(1)", "n_eff")
-COLOURS = {"white": "#8a8f98", "AR(1)": "#d9822b", "n_eff": "#1f5a8c"}
 
 
 class Run(NamedTuple):

@@ -12,7 +12,7 @@ import dask_jobqueue
 import problem
 from dask.distributed import Client
 
-from fe_likelihoods.simulation.executors import DaskExecutor
+from fe_likelihoods import DaskExecutor
 
 CLUSTERS = {"slurm": dask_jobqueue.SLURMCluster, "pbs": dask_jobqueue.PBSCluster}
 
