@@ -2,9 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+NEWER_PYTHON ?= python3.13
 READY := $(VENV)/.ready
 
-.PHONY: help update test test-slow clients tutorials bench docs figures lint format data clean
+.PHONY: help update test test-newer test-slow clients tutorials bench docs figures lint format data clean
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/'
@@ -14,11 +15,19 @@ $(READY): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@touch $(READY)
 
-update: $(READY) ## update the bridge column on the bundled data (reduced setting); writes tables and figures to results/
-	$(BIN)/python tutorials/02_bridge_column.py --preset reduced --out results
+update: $(READY) ## update the bridge column on the bundled data (reduced setting); writes report.html and tables to results/
+	$(BIN)/fe-likelihoods run data/templates/column.toml --out results
 
 test: $(READY)   ## run the quick tests on all cores
 	$(BIN)/python -m pytest -n auto --dist worksteal
+
+.venv-newer/.ready: pyproject.toml
+	$(NEWER_PYTHON) -m venv .venv-newer
+	.venv-newer/bin/python -m pip install --quiet --disable-pip-version-check --editable . pytest pytest-timeout pytest-xdist
+	@touch $@
+
+test-newer: .venv-newer/.ready ## tests of samplers and reports with arviz 1, by NEWER_PYTHON (from 3.12 on)
+	.venv-newer/bin/python -m pytest -n auto --dist worksteal tests/contract tests/reporting
 
 test-slow: $(READY) ## run the slow tests
 	$(BIN)/python -m pytest -m slow --timeout 7200
@@ -53,4 +62,4 @@ data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environments, the built documentation and the results
-	rm -rf $(VENV) .venv-clients .venv-uqpy .venv-tinyda docs/_build results results-*
+	rm -rf $(VENV) .venv-newer .venv-clients .venv-uqpy .venv-tinyda docs/_build results results-*

@@ -37,6 +37,9 @@ PACKAGES = ("fe_likelihoods", "samplers")
 # from the top down: an entry imports only from entries on lines below its own
 ORDER = {
     "fe_likelihoods": (
+        ("__main__",),
+        ("command",),
+        ("reporting",),
         ("problems",),
         ("adapters",),
         ("prediction",),
@@ -51,6 +54,7 @@ ORDER = {
     ),
     "samplers": (
         ("cost",),
+        ("timing",),
         ("smc", "tmcmc"),
         ("tempered",),
         ("reporting",),

@@ -8,7 +8,7 @@ import pytest
 from scipy import integrate, stats
 
 from samplers import SMCSampler
-from tests.benchmarks import job, peers, truth, truth_targets
+from tests.benchmarks import job, new_event, peers, transfer, truth, truth_targets
 from tests.benchmarks.comparison import compare
 from tests.benchmarks.growth import exponent
 from tests.benchmarks.rows import Row, as_table, machine, write_json
@@ -202,3 +202,21 @@ def test_run_of_the_truth_benchmark_is_compared_with_the_truth():
     lost = right | {"shares": [0.3, 0.7], "true_shares": [0.5, 0.5], "status": "usable"}
     line = truth.table([right, wrong, lost]).splitlines()[-1].split()
     assert line[:8] == ["sharp", "SMC", "300", "3", "2", "1", "1", "0"]  # runs, lost, silent, doubted, false
+
+
+def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, monkeypatch):
+    monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
+    (row,) = transfer.transfer()
+    assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+
+
+def test_hyper_samples_of_the_synthetic_twins_are_those_of_the_posterior():
+    """Many events of known spread determine median and spread; without events, they are those of the priors."""
+    rng = np.random.default_rng(1)
+    data = 0.3 + np.hypot(0.2, new_event._ERROR) * rng.standard_normal(2000)
+    median, spread = new_event._hyper_samples(data, rng, 2000).T
+    assert np.log(median).mean() == pytest.approx(data.mean(), abs=0.01)
+    assert spread.mean() == pytest.approx(np.sqrt(data.var() - new_event._ERROR**2), abs=0.01)
+    median, spread = new_event._hyper_samples(data[:0], rng, 2000).T
+    assert stats.kstest(np.log(median), stats.norm(0.0, 0.5).cdf).pvalue > 1e-3
+    assert stats.kstest(spread, stats.halfnorm(scale=0.3).cdf).pvalue > 1e-3

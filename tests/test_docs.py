@@ -5,6 +5,9 @@ import importlib.util
 import re
 from pathlib import Path
 
+import fe_likelihoods
+import samplers
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 SCRIPTS = sorted((ROOT / "tutorials").glob("[0-9]*.py"))
@@ -46,6 +49,13 @@ def test_every_page_is_in_a_toctree():
         listed = {entry for entry in listed if not entry.startswith("api/")} - generated
         assert {entry for entry in listed if "/" not in entry} == pages
     assert "theory/index" in toctree(DOCS / "index.rst")
+
+
+def test_the_page_of_names_has_every_public_name_and_no_other():
+    named = re.findall(r"``(\w+)``", (DOCS / "names.rst").read_text())
+    public = {*fe_likelihoods.__all__, *samplers.__all__}
+    assert not public - set(named), "say in docs/names.rst, and on the page of its task, what they are for"
+    assert not set(named) - public
 
 
 def test_tutorials_have_the_form_of_the_gallery():

@@ -21,7 +21,7 @@ from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fe_likelihoods import RCColumn, Record, from_si, problems, rrmse
+from fe_likelihoods import from_si, problems, rrmse
 
 ROOT = Path(__file__).parents[1]
 TUTORIALS = sorted((ROOT / "tutorials").glob("[0-9]*.py"))
@@ -75,19 +75,19 @@ def has_vertical_line(axes: Axes, x: float) -> bool:
 
 
 def check_corner(figure: Figure, labels: list[str], truth: list[float] = (), n_posteriors: int = 1) -> None:
-    """A corner plot has its labels, draws every posterior, and has every true value as a line within its limits."""
+    """A corner plot has its labels, draws every posterior, and marks every true value by a line or by an arrow."""
     n = len(labels)
     grid = np.reshape(np.array(figure.axes, dtype=object), (n, n))
-    assert [axes.get_xlabel() for axes in grid[-1]] == labels
-    assert [axes.get_ylabel() for axes in grid[1:, 0]] == labels[1:]
+    assert [axes.get_xlabel().replace("\n", " ") for axes in grid[-1]] == labels
+    assert [axes.get_ylabel().replace("\n", " ") for axes in grid[1:, 0]] == labels[1:]
     for i in range(n):
         histograms = [patch.get_xy() for patch in grid[i, i].patches]
         assert len(histograms) == n_posteriors
         assert max(xy[:, 1].max() for xy in histograms) < grid[i, i].get_ylim()[1], "every histogram fits"
     for i, value in enumerate(truth):
-        assert has_vertical_line(grid[i, i], value) and inside(grid[i, i], value), labels[i]
-        for j, other in enumerate(truth[:i]):
-            assert inside(grid[i, j], other, value), (labels[i], labels[j])
+        arrows = [text.get_text() for text in grid[i, i].texts]
+        outside = not inside(grid[i, i], value)
+        assert f"{value:.4g}" in arrows if outside else has_vertical_line(grid[i, i], value), labels[i]
 
 
 def check_bands(axes: Axes, label: str) -> None:
@@ -161,23 +161,25 @@ def test_introduction_draws_record_and_measurements(oscillator):
 
 def test_introduction_draws_three_posteriors_around_the_true_values(oscillator):
     stiffness, damping, sigma_a, sigma_d = json.loads((oscillator / "summary.json").read_text())["truth"]
-    labels = ["stiffness\n[x nominal]", "damping\n[x nominal]", r"$\sigma_a$ [g]", r"$\sigma_d$ [cm]"]
+    labels = ["stiffness [x nominal]", "damping [x nominal]", "sigma_acceleration [g]", "sigma_displacement [cm]"]
     truth = [stiffness, damping, float(from_si(sigma_a, "g")), float(from_si(sigma_d, "cm"))]
     figure = read_figure(oscillator, "corner")
     check_corner(figure, labels, truth, n_posteriors=3)
     entries = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert entries == ["emcee", "SMC", "TMCMC", "truth (synthetic)"]
+    assert entries[:3] == ["emcee", "SMC", "TMCMC"] and entries[3].startswith("prior")
+    assert entries[4:] == ["true value"]
 
 
 def test_introduction_draws_fit_and_prediction(oscillator):
-    before, after = read_figure(oscillator, "fit").axes
-    assert after.get_xlabel() == "time [s]" and after.get_ylabel() == "displacement [cm]"
-    errors = [int(re.search(r"RRMSE (\d+) %", texts(axes)[1])[1]) for axes in (before, after)]
+    before, after, zoom = read_figure(oscillator, "fit").axes[3:]
+    assert after.get_xlabel() == "time [s]" and before.get_ylabel() == "displacement [cm]"
+    errors = [int(re.search(r"RRMSE (\d+) %", axes.get_title())[1]) for axes in (before, after)]
     assert errors[0] > 90 and errors[1] < 40
     for axes, (start, error) in zip((before, after), zip(("nominal", "posterior"), errors, strict=True), strict=True):
         measured, response = line(axes, "measured")[1], line(axes, start)[1]
         assert 100 * rrmse(response, measured) == pytest.approx(error, abs=0.5)
         assert inside(axes, 12.0, measured.max()) and inside(axes, 12.0, measured.min())
+    assert np.ptp(zoom.get_xlim()) == pytest.approx(5.0)
     figure = read_figure(oscillator, "prediction")
     for axes, label in zip(figure.axes, ("acceleration [g]", "displacement [cm]"), strict=True):
         check_bands(axes, label)
@@ -236,26 +238,28 @@ def test_bridge_column_draws_the_figures_of_the_paper(column):
             axes, 25.0, axes.lines[0].get_ydata().min()
         )
 
-    labels = ["$E_c$", "$E_s$", "$a_0$", "$a_1$", "$f_t$"]
-    labels = [*(f"{label} [x nominal]" for label in labels), r"$\sigma_a$ [g]", r"$\sigma_d$ [in]"]
+    labels = [parameter.label for parameter in problems.bridge_column(every=16).parameters]
+    assert labels[0] == "Ec [x 22.89 GPa]" and labels[-1] == "sigma_displacement [in]"
     truth = list(summary["truth"].values())
     truth = [*truth[:5], float(from_si(truth[5], "g")), float(from_si(truth[6], "in"))]
     check_corner(read_figure(column, "corner"), labels, truth)
     pairs = np.reshape(np.array(read_figure(column, "fig4_pair").axes, dtype=object), (7, 7))
-    assert [axes.get_xlabel() for axes in pairs[-1]] == labels
+    assert [axes.get_xlabel().replace("\n", " ") for axes in pairs[-1]] == labels
     assert all(axes.get_title().startswith("CV = ") for axes in pairs.diagonal())
     for axes, value in zip(pairs.diagonal(), truth, strict=True):
         marks = [text.get_text() for text in axes.texts]
         assert has_vertical_line(axes, value) if inside(axes, value) else f"{value:.4g}" in marks
     assert "1" in [text.get_text() for text in pairs[0, 0].texts], "an arrow to the reported Ec"
 
-    response = read_figure(column, "fig5_response").axes
-    assert [axes.get_ylabel() for axes in response[::2]] == ["absolute acceleration [g]", "relative displacement [in]"]
+    response = np.reshape(np.array(read_figure(column, "fig5_response").axes, dtype=object), (2, 3))
+    assert [row[0].get_ylabel() for row in response] == ["acceleration [g]", "displacement [in]"]
     for k, title in enumerate(summary["rrmse"]):
-        for axes, error in zip(response[k::2], summary["rrmse"][title].values(), strict=True):
-            assert axes.get_title().startswith(title) and f"RRMSE {100 * error:.1f} %" in axes.get_title()
-            measured, simulated = line(axes, "data")[1], line(axes, "model")[1]
+        for axes, error in zip(response[:, k], summary["rrmse"][title].values(), strict=True):
+            shown = f"{100 * error:.1f}" if error < 0.1 else f"{100 * error:.0f}"
+            assert axes.get_title() == f"{title}, RRMSE {shown} %"
+            measured, simulated = line(axes, "measured")[1], line(axes, title)[1]
             assert rrmse(simulated, measured) == pytest.approx(error)
+        assert {line.get_label() for line in response[0, 2].lines} == {"measured", *summary["rrmse"]}
 
 
 def test_bridge_column_draws_the_tempering_stages(column):
@@ -276,129 +280,6 @@ def test_bridge_column_on_another_record(shared, tmp_path):
     output = run_tutorial("02_bridge_column.py", *options, "--out", str(tmp_path))
     assert "x 0.85" in output and "SYNTHETIC" in output
     assert json.loads((tmp_path / "summary.json").read_text())["rrmse"]["Before updating (reported values)"]
-
-
-def own_test(folder: Path) -> tuple[str, ...]:
-    """Options for a test of one's own: synthetic files of a slender column, the displacement with gaps and late."""
-    data = problems.bridge_column_data()
-    record = data.record.resample(1 / 64).trim(4.0, 6.5)
-    column = RCColumn.lhpost(record.scale(1.1), height=5.0, outputs=("displacement",))
-    rows = np.column_stack([record.time, from_si(record.acceleration, "g")])
-    lines = [f"{time:.6f};{value:.6e}".replace(".", ",") for time, value in rows]
-    (folder / "base.csv").write_text("\n".join(["Zeit [s];Boden [g]", *lines]), encoding="utf-8")
-    (drift,) = from_si(column.simulate([0.8, 1.0, 1.0, 1.0, 1.0]), "mm")
-    drift += 0.2 * np.random.default_rng(0).standard_normal(drift.size)
-    cells = ["" if k % 9 == 0 else f"{value:.4f}" for k, value in enumerate(drift)]
-    table = ["Logger 7", "Time,Top", "s,mm", *(f"{k / 64:.6f},{cells[k]}" for k in range(8, drift.size, 2))]
-    (folder / "top.csv").write_text("\n".join(table))
-    (folder / "own.toml").write_text(
-        '[column]\nheight = "5000 mm"\n[column.concrete]\nec = "3320 ksi"\n'
-        '[measurements]\ncolumns = {displacement = "Top"}\n[prior]\nEc = 0.2\nsigma_displacement = "5 mm"\n'
-    )
-    names = {"--record": "base.csv", "--measurements": "top.csv", "--column": "own.toml"}
-    return tuple(word for option, name in names.items() for word in (option, str(folder / name)))
-
-
-def test_own_column(tmp_path):
-    options = ("--scale", "1.1", "--walkers", "16", "--every", "1", "--out", str(tmp_path / "results"))
-    output = run_tutorial("02_bridge_column.py", *own_test(tmp_path), *options)
-    assert "base motion: base x 1.1; measurements: measurements of top.csv" in output and "SYNTHETIC" not in output
-    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
-    assert summary["truth"] is None
-    assert list(summary["posterior_mean"]) == ["Ec", "Es", "a0", "a1", "ft", "sigma_displacement"]
-    before, after = summary["rrmse"].values()
-    assert after["displacement"] < before["displacement"]
-    with (tmp_path / "results" / "table2.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert "Truth (synthetic)" not in rows[0] and rows[0]["Prior"] == "normal(1, 0.20), > 0"
-    assert rows[5]["Prior"] == "half-normal(0.1969 in)"
-    assert len(read_figure(tmp_path / "results", "fig3_data").axes) == 2
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[colum]\n", "unknown colum; known are column, measurements, prior, noise"),
-        ("[column]\nwidth = 1\n", r"\[column\]: unknown width; known are diameter"),
-        ('[column]\nheight = "5 kg"\n', "height: expected a number with its unit such as '48 in', got '5 kg'"),
-        ('[column]\nmass = "5 t"\n', "mass: expected .* got '5 t': this setting is a number in SI units"),
-        ("[column]\nheight = [1]\n", "expected a number, got"),
-        ("[column.concrete]\nfck = 1\n", r"\[column.concrete\]: unknown fck"),
-        ("[column]\nconcrete = 1\n", r"expected a table \[concrete\]"),
-        ('[noise]\nkind = "pink"\n', "expected a kind of 'per channel'"),
-        ("[column\n", "cannot read .*own.toml"),
-        ('[measurements]\nzero = "5 s"\n', r"\[measurements\] zero: expected the time .* got '5 s'"),
-        ("[measurements]\nzero = true\n", r"\[measurements\] zero: expected"),
-    ],
-)
-def test_settings_of_an_own_column_are_checked(tmp_path, monkeypatch, text, message):
-    monkeypatch.syspath_prepend(ROOT / "tutorials")
-    own_column = importlib.import_module("own_column")
-    (tmp_path / "own.toml").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        own_column.read_settings(tmp_path / "own.toml")
-
-
-def test_own_measurements_before_and_after_the_record_are_left_out(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "tutorials")
-    own_column = importlib.import_module("own_column")
-    record = Record("base", 0.01, np.sin(0.1 * np.arange(201)))
-    table = ["time_s,top [mm]", *(f"{0.01 * k:.2f},{k % 89}" for k in range(901))]
-    (tmp_path / "top.csv").write_text("\n".join(table))
-    for zero in (5.0, 3):
-        (tmp_path / "own.toml").write_text(f'[measurements]\ncolumns = {{displacement = "top [mm]"}}\nzero = {zero}\n')
-        settings = own_column.read_settings(tmp_path / "own.toml")
-        measured = own_column.read_measurements(tmp_path / "top.csv", settings, record)
-        assert measured.description == (
-            "measurements of top.csv, without 700 samples of displacement before or after the record"
-        )
-        expected = 1e-3 * (np.arange(100 * int(zero), 100 * int(zero) + 201) % 89)
-        assert measured.values[0] == pytest.approx(expected) and measured.start == 0.0
-        for every in (1, 4):
-            posterior = own_column.make_posterior(record, measured, settings, every)
-            assert posterior.likelihood.measurements.n_steps == 1 + 200 // every
-    late = settings._replace(measurements={**settings.measurements, "zero": 9.5})
-    with pytest.raises(ValueError, match="no sample within the record, 0 to 2 s; set zero"):
-        own_column.read_measurements(tmp_path / "top.csv", late, record)
-
-
-def test_own_measurements_shorter_than_the_record(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "tutorials")
-    own_column = importlib.import_module("own_column")
-    record = Record("base", 0.01, np.sin(0.1 * np.arange(201)))
-    table = ["time_s,top [mm]", *(f"{0.02 * k:.2f},{k % 89}" for k in range(40))]
-    (tmp_path / "top.csv").write_text("\n".join(table))
-    (tmp_path / "own.toml").write_text('[measurements]\ncolumns = {displacement = "top [mm]"}\n')
-    settings = own_column.read_settings(tmp_path / "own.toml")
-    measured = own_column.read_measurements(tmp_path / "top.csv", settings, record)
-    assert measured.description == "measurements of top.csv, displacement ends 1.22 s before the record"
-    np.testing.assert_array_equal(measured.values[0], [*(1e-3 * np.arange(40)), *[np.nan] * 61])
-    for every, n in ((1, 40), (2, 20)):
-        likelihood = own_column.make_posterior(record, measured, settings, every).likelihood
-        assert np.isfinite(likelihood.measurements.values).sum() == n
-        assert np.isfinite(likelihood.log_likelihood([1.0, 1.0, 1.0, 1.0, 1.0, 0.002]))
-
-
-def test_settings_in_the_documentation_are_those_of_the_tutorial(tmp_path, monkeypatch):
-    """The example of docs/own_column.rst describes the column of the tutorial."""
-    monkeypatch.syspath_prepend(ROOT / "tutorials")
-    own_column = importlib.import_module("own_column")
-    page = (ROOT / "docs" / "own_column.rst").read_text()
-    block = page.split(".. code-block:: toml\n\n")[1].split("\n\n``[meas")[0]
-    (tmp_path / "own.toml").write_text("\n".join(line[3:] for line in block.splitlines()))
-    settings = own_column.read_settings(tmp_path / "own.toml")
-    record = problems.bridge_column_data().record
-    own, usual = RCColumn.lhpost(record, **settings.column), RCColumn.lhpost(record)
-    for name in ("diameter", "height", "cover", "a0", "a1", "concrete", "steel"):
-        assert getattr(own, name) == getattr(usual, name), name
-    assert own.mass == pytest.approx(usual.mass, rel=1e-3) and own.bars.number == usual.bars.number
-    assert own.bars.area_each == pytest.approx(usual.bars.area_each, rel=1e-2)
-    posterior = own_column.make_posterior(
-        record, problems.bridge_column_data().measurements, settings, every=64, mesh=10
-    )
-    assert np.isfinite(posterior.log_prob([1.0] * 5 + [0.5, 0.01, 0.3, 0.3]))
-    assert posterior.prior.distributions["sigma_acceleration"].sd == pytest.approx(0.980665)
-    assert settings.noise == "autoregressive" and settings.prior["sigma_acceleration"] == pytest.approx(0.980665)
 
 
 @pytest.mark.slow
@@ -479,9 +360,11 @@ def test_isolated_bridge_draws_the_figures_of_the_paper(bridge):
 
     marginals = read_figure(bridge, "fig6_marginals").axes
     for axes, value in zip(marginals[:10], truth, strict=True):
-        assert has_vertical_line(axes, value) and inside(axes, value), axes.get_xlabel()
-    labels = [axes.get_xlabel() for axes in marginals[:11]]
-    assert labels[0] == r"$f_{\min,1}$" and labels[-1] == r"$\sigma$"
+        marks = [text.get_text() for text in axes.texts]
+        shown = has_vertical_line(axes, value) if inside(axes, value) else f"{value:.4g}" in marks
+        assert shown, axes.get_xlabel()
+    labels = [axes.get_xlabel() for axes in marginals]
+    assert len(labels) == 11 and labels[0] == "fmin_1 [x 0.055]" and labels[-1] == "sigma [-]"
     check_corner(read_figure(bridge, "corner"), labels, truth)
 
     histories = read_figure(bridge, "fig7_predictions").axes
@@ -526,7 +409,7 @@ def test_comparison_run_twice_simulates_once(times, tmp_path):
         x, y = line(axes, "truth (synthetic)")
         assert (x[0], y[0]) == (0.85, 1.1) and inside(axes, x[0], y[0]), "true df_1 and df_2"
         assert axes.get_title().endswith("warning (see the output)" if run["warnings"] else "no warning")
-    labels = "fmin_1 df_1 a_1 fmin_2 df_2 a_2 Kd_1 C0_1 Kd_2 C0_2 sigma".split()
+    labels = [parameter.label for parameter in problems.isolated_bridge().parameters]
     truth = [1.15, 0.85, 1.2, 0.9, 1.1, 0.8, 0.8, 1.25, 1.3, 0.9, 0.05]
     check_corner(read_figure(tmp_path, "corner_bridge"), labels, truth, n_posteriors=4)
 

@@ -24,6 +24,7 @@ from . import (
     hierarchy_cases,
     hierarchy_warnings,
     job,
+    new_event,
     opensees_memory,
     overhead,
     peers,
@@ -32,6 +33,7 @@ from . import (
     starts,
     startup,
     storage,
+    transfer,
     truth,
 )
 from .comparison import compare
@@ -52,6 +54,8 @@ BENCHMARKS = {
     "hierarchy_cases": hierarchy_cases.cases,
     "busy_workers": busy_workers.busy_workers,
     "hierarchy_warnings": hierarchy_warnings.alarms,
+    "transfer": transfer.transfer,
+    "new_event": new_event.new_event,
     "cache": cache.cache,
     "storage": storage.storage,
     "executors": executors.executors,
