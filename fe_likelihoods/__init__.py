@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .prediction.park_ang import ParkAng, park_ang_constants
     from .prediction.prediction import Prediction
     from .prediction.propagation import fit_measures, propagate
-    from .prediction.quantities import final_value, peak, rms
+    from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
     from .prediction.reliability import Exceedance, exceedance
     from .prediction.score_tables import HistoryScores, QuantityScores
     from .prediction.scores import crps_normal, crps_samples, interval_score, log_score_normal, share_within
@@ -184,12 +184,14 @@ __all__ = [
     "Uniform",
     "Varying",
     "align",
+    "arias_intensity",
     "average_predictions",
     "crps_normal",
     "crps_samples",
     "damage",
     "damage_measures",
     "damage_outputs",
+    "dissipated_energy",
     "effective_samples",
     "event_ratio",
     "exceedance",
@@ -340,7 +342,7 @@ _EXPORTS = {
     ),
     "prediction.prediction": ("Prediction",),
     "prediction.propagation": ("fit_measures", "propagate"),
-    "prediction.quantities": ("final_value", "peak", "rms"),
+    "prediction.quantities": ("arias_intensity", "dissipated_energy", "final_value", "peak", "rms"),
     "prediction.reliability": ("Exceedance", "exceedance"),
     "prediction.score_tables": ("HistoryScores", "QuantityScores"),
     "prediction.scores": ("crps_normal", "crps_samples", "interval_score", "log_score_normal", "share_within"),

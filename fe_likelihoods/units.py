@@ -73,6 +73,7 @@ _FACTORS = {
         "kip in": 1e3 * POUND_FORCE * INCH,
         "kip ft": 1e3 * POUND_FORCE * FOOT,
     },
+    "energy": {"J": 1.0, "kJ": 1e3, "MJ": 1e6},
     "curvature": {"1/m": 1.0, "1/mm": 1e3, "1/km": 1e-3, "1/in": 1.0 / INCH, "1/ft": 1.0 / FOOT},
     "strain": {"1": 1.0, "%": 1e-2, "microstrain": 1e-6},
     "rotation": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},

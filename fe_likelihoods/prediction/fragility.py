@@ -188,7 +188,7 @@ def fragility(
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, settings.get("noise", False))
     source = read_source(posterior_or_model)
     thetas, _ = split_samples(source, samples, settings.get("noise", False), True)
-    known = evaluator(quantity, source.model.channels)
+    known = evaluator(quantity, source.model.channels, source.model.dt)
     if known.rows is not None or len(known.channels) > 1:
         raise ValueError(f"fragility needs one number as quantity, such as peak(channel); got {quantity!r}")
     limit = threshold_in_si(threshold, unit, known.channels)

@@ -173,7 +173,7 @@ def propagate(
     state = chosen_state(source.model, record, from_state)
     excitation = excite(source.model, record, state, rest)
     model, n_steps = excitation.model, excitation.n_steps
-    evaluate = evaluator(quantity, model.channels)
+    evaluate = evaluator(quantity, model.channels, model.dt, n_steps)
 
     distinct, row_of_sample = distinct_rows(thetas)
     try:

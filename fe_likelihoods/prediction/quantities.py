@@ -1,34 +1,92 @@
-"""Quantities of a response: histories of channels, numbers from the history of one channel, or any function of it.
+r"""Quantities of a response: histories of channels, numbers from the histories of channels, or any function of it.
 
 A `ChannelQuantity` has a channel and therefore a dimension, so that a threshold in a unit of another dimension is
-refused.
+refused. Two of them are energies: of an acceleration, and of a force that moves through a displacement.
+
+.. math:: I_A = \frac{\pi}{2 g} \int a^2\, dt, \qquad W = \int F\, du.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..signals.channels import Channel, Measurements
+from ..units import G0
 
-__all__ = ["ChannelQuantity", "Evaluator", "Quantity", "evaluator", "final_value", "measured_quantity", "peak", "rms"]
+__all__ = [
+    "ChannelQuantity",
+    "Evaluator",
+    "Quantity",
+    "arias_intensity",
+    "dissipated_energy",
+    "evaluator",
+    "final_value",
+    "measured_quantity",
+    "peak",
+    "rms",
+]
+
+_WORK = {"force": ("energy", "kJ"), "moment": ("energy", "kJ"), "stress": ("stress", "MPa")}  # dimension and unit
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ChannelQuantity:
-    """A number computed from the history of one channel, with the dimension of the channel.
+    """A number computed from the history of one channel, or of several.
 
     Parameters
     ----------
     channel : str
         Name of the channel.
     function : callable
-        Function of the history (n_steps,) [SI] that returns a number [SI unit of the channel].
+        Function of the history (n_steps,) [SI] that returns a number [SI].
+    part : slice
+        Samples of the history that the function receives, such as the second half of a test. Default: all.
+    others : tuple of str or ndarray
+        Further arguments of the function: histories of other channels, by name, or arrays of the same number of
+        samples [SI], such as an imposed displacement. The part is taken of each.
+    timed : bool
+        Whether the last argument of the function is the time step [s].
+    describe : callable, optional
+        Function of the `Channel` that returns the `Channel` with name, dimension and display unit of the number, or
+        raises ValueError for a channel that has no such number. Default: those of the channel.
     """
 
     channel: str
-    function: Callable[[np.ndarray], float]
+    function: Callable[..., float]
+    part: slice = field(default_factory=lambda: slice(None))
+    others: tuple[str | np.ndarray, ...] = ()
+    timed: bool = False
+    describe: Callable[[Channel], Channel] | None = None
+
+    @property
+    def channel_names(self) -> list[str]:
+        """Names of all channels that are needed."""
+        return [self.channel, *(each for each in self.others if isinstance(each, str))]
+
+    def evaluate(self, histories: Sequence[np.ndarray], dt: float) -> float:
+        """Compute the number from the histories of `channel_names` [SI] and their time step [s]."""
+        first, *named = histories
+        further = iter(named)
+        arguments = [first, *(next(further) if isinstance(each, str) else each for each in self.others)]
+        return self.function(*(each[self.part] for each in arguments), *([dt] if self.timed else []))
+
+    def described(self, channel: Channel) -> Channel:
+        """Name, dimension and display unit of the number, as a channel."""
+        return channel if self.describe is None else self.describe(channel)
+
+    def check_length(self, n_steps: int) -> None:
+        """Raise ValueError if an array among the arguments has another number of samples, or the part has none."""
+        for each in self.others:
+            if not isinstance(each, str) and len(each) != n_steps:
+                raise ValueError(
+                    f"the history of channel {self.channel!r} has {n_steps} samples, the array that belongs to it "
+                    f"{len(each)}: give both for the same excitation"
+                )
+        if not len(range(n_steps)[self.part]):
+            raise ValueError(f"no sample of the {n_steps} of channel {self.channel!r} is in the part {self.part}")
 
 
 Quantity = None | str | ChannelQuantity | Sequence[str] | Sequence[ChannelQuantity] | Callable[[np.ndarray], Any]
@@ -45,7 +103,7 @@ class Evaluator(NamedTuple):
     function : callable or None
         Function of the response (n_channels, n_steps) [SI], None for histories.
     channels : tuple of Channel
-        Channels of the quantity, empty for a function of the whole response.
+        Channels of the quantity, with its dimension and display unit; empty for a function of the whole response.
     """
 
     rows: list[int] | None
@@ -53,14 +111,74 @@ class Evaluator(NamedTuple):
     channels: tuple[Channel, ...]
 
 
-def peak(channel: str) -> ChannelQuantity:
-    """Return the quantity "largest absolute value of the channel"."""
-    return ChannelQuantity(channel, _largest)
+def peak(channel: str, part: slice = slice(None)) -> ChannelQuantity:
+    """Return the quantity "largest absolute value of the channel", in a part of its samples (default: all)."""
+    return ChannelQuantity(channel, _largest, part)
 
 
-def rms(channel: str) -> ChannelQuantity:
-    """Return the quantity "root mean square of the channel", a measure of the energy of a motion."""
-    return ChannelQuantity(channel, _root_mean_square)
+def rms(channel: str, part: slice = slice(None)) -> ChannelQuantity:
+    """Return the quantity "root mean square of the channel", in a part of its samples (default: all)."""
+    return ChannelQuantity(channel, _root_mean_square, part)
+
+
+def arias_intensity(channel: str, part: slice = slice(None)) -> ChannelQuantity:
+    r"""Return the quantity "Arias intensity of an acceleration", a measure of the energy of the motion.
+
+    Parameters
+    ----------
+    channel : str
+        Name of a channel of acceleration.
+    part : slice
+        Samples of the history. Default: all.
+
+    Returns
+    -------
+    ChannelQuantity
+        :math:`\frac{\pi}{2 g} \int a^2\, dt` [m/s] by the trapezoidal rule (A. Arias, 1970, A measure of earthquake
+        intensity, in: Seismic Design for Nuclear Power Plants, MIT Press, 438-483). A channel of another dimension is
+        a ValueError when the quantity is used.
+    """
+    return ChannelQuantity(channel, _arias_intensity, part, timed=True, describe=_of_acceleration)
+
+
+def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = slice(None)) -> ChannelQuantity:
+    r"""Return the quantity "work of a force", which over closed cycles is the energy that they dissipate.
+
+    Parameters
+    ----------
+    force : str
+        Name of a channel of force, of moment (with a rotation), or of stress (with a strain; energy per volume).
+    displacement : str or (n_steps,) array_like
+        Name of the channel of the displacement that belongs to it, or the imposed displacement of a test [SI], with one
+        value per sample of the force.
+    part : slice
+        Samples of both histories. Default: all.
+
+    Returns
+    -------
+    ChannelQuantity
+        :math:`\int F\, du` [J, or J/m³ = Pa for a stress] by the trapezoidal rule. It contains the elastic energy
+        that is stored at the end of the part.
+
+    Raises
+    ------
+    ValueError
+        If the displacement is neither a name nor finite values (n_steps,). When the quantity is used: if the channel
+        has another dimension or another number of samples.
+
+    Examples
+    --------
+    >>> propagate(posterior, samples, quantity=dissipated_energy("force", test.history.displacement), noise=True)
+    """
+    if not isinstance(displacement, str):
+        displacement = np.array(displacement, dtype=float)
+        if displacement.ndim != 1 or not np.isfinite(displacement).all():
+            raise ValueError(
+                "dissipated_energy: expected the name of a channel, or finite displacements (n_steps,) [SI]; got an "
+                f"array of shape {displacement.shape}"
+            )
+        displacement.flags.writeable = False
+    return ChannelQuantity(force, _work, part, (displacement,), describe=_of_force)
 
 
 def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
@@ -108,16 +226,26 @@ def measured_quantity(quantity: Any, measurements: Measurements) -> np.ndarray:
         raise ValueError(
             "a function of the whole response is not known for measurements: give the measured values [SI] instead"
         )
-    values = []
-    for each in several:
-        (history,) = measurements.select([each.channel]).values
-        if np.isnan(history).any():
+    values = [_measured(each, measurements.select(each.channel_names)) for each in several]
+    return np.array(values[0] if isinstance(quantity, ChannelQuantity) else values)
+
+
+def _measured(quantity: ChannelQuantity, measurements: Measurements) -> float:
+    """The number of the measurements of its channels."""
+    quantity.check_length(measurements.n_steps)
+    quantity.described(measurements.channels[0])
+    if len(measurements.channels) > 1 and not measurements.simultaneous:
+        raise ValueError(
+            f"the channels {', '.join(quantity.channel_names)} are measured at different times, so that the number of "
+            "both is not known: give the measured value [SI]"
+        )
+    for channel, history in zip(measurements.channels, measurements.values, strict=True):
+        if np.isnan(history[quantity.part]).any():
             raise ValueError(
-                f"samples of channel {each.channel!r} are missing, so that its measured quantity is not known: give "
+                f"samples of channel {channel.name!r} are missing, so that its measured quantity is not known: give "
                 "the measured values [SI], or measurements that are trimmed to a part without gaps"
             )
-        values.append(float(each.function(history)))
-    return np.array(values[0] if isinstance(quantity, ChannelQuantity) else values)
+    return float(quantity.evaluate(measurements.values, measurements.steps[0]))
 
 
 class _MeanOfLast(NamedTuple):
@@ -137,7 +265,30 @@ def _largest(history: np.ndarray) -> float:
     return float(np.max(np.abs(history)))
 
 
-def evaluator(quantity: Quantity, channels: Sequence[Channel]) -> Evaluator:
+def _arias_intensity(acceleration: np.ndarray, dt: float) -> float:
+    squares = np.square(acceleration)
+    return float(0.5 * np.pi / G0 * dt * (squares.sum() - 0.5 * (squares[0] + squares[-1])))
+
+
+def _work(force: np.ndarray, displacement: np.ndarray) -> float:
+    return float(0.5 * (force[1:] + force[:-1]) @ np.diff(displacement))
+
+
+def _of_acceleration(channel: Channel) -> Channel:
+    if channel.dimension != "acceleration":
+        raise ValueError(f"arias_intensity needs an acceleration; channel {channel.name!r} is {channel.quantity!r}")
+    return Channel(f"Arias intensity of {channel.name}", "velocity", "m/s")
+
+
+def _of_force(channel: Channel) -> Channel:
+    if channel.dimension not in _WORK:
+        raise ValueError(
+            f"dissipated_energy needs a channel of {', '.join(_WORK)}; channel {channel.name!r} is {channel.quantity!r}"
+        )
+    return Channel(f"energy of {channel.name}", *_WORK[channel.dimension])
+
+
+def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_steps: int | None = None) -> Evaluator:
     """Return how a quantity is computed from responses.
 
     Parameters
@@ -146,6 +297,10 @@ def evaluator(quantity: Quantity, channels: Sequence[Channel]) -> Evaluator:
         The quantity, as in `fe_likelihoods.prediction.propagation.propagate`.
     channels : sequence of Channel
         Channels of the model.
+    dt : float
+        Time step of the model [s].
+    n_steps : int, optional
+        Number of steps of the histories, to check the arrays of a quantity before the simulations.
 
     Returns
     -------
@@ -155,7 +310,7 @@ def evaluator(quantity: Quantity, channels: Sequence[Channel]) -> Evaluator:
     Raises
     ------
     ValueError
-        If this is not a quantity, or it names an unknown channel.
+        If this is not a quantity, it names an unknown channel, or one that has no such number.
     """
     channels = tuple(channels)
     names = [channel.name for channel in channels]
@@ -169,9 +324,16 @@ def evaluator(quantity: Quantity, channels: Sequence[Channel]) -> Evaluator:
         return Evaluator(list(range(len(channels))), None, channels)
     if isinstance(quantity, str):
         return Evaluator([row(quantity)], None, (channels[row(quantity)],))
+
+    def number(each: ChannelQuantity) -> tuple[Callable[[np.ndarray], float], Channel]:
+        rows = [row(name) for name in each.channel_names]
+        if n_steps is not None:
+            each.check_length(n_steps)
+        return lambda response: each.evaluate([response[k] for k in rows], dt), each.described(channels[rows[0]])
+
     if isinstance(quantity, ChannelQuantity):
-        k, function = row(quantity.channel), quantity.function
-        return Evaluator(None, lambda response: function(response[k]), (channels[k],))
+        function, channel = number(quantity)
+        return Evaluator(None, function, (channel,))
     if callable(quantity):
         return Evaluator(None, quantity, ())
     if isinstance(quantity, Sequence) and quantity:
@@ -179,13 +341,8 @@ def evaluator(quantity: Quantity, channels: Sequence[Channel]) -> Evaluator:
             rows = [row(name) for name in quantity]
             return Evaluator(rows, None, tuple(channels[k] for k in rows))
         if all(isinstance(each, ChannelQuantity) for each in quantity):
-            rows = [row(each.channel) for each in quantity]
-            functions = [each.function for each in quantity]
-            return Evaluator(
-                None,
-                lambda response: np.array([f(response[k]) for f, k in zip(functions, rows, strict=True)]),
-                tuple(channels[k] for k in rows),
-            )
+            functions, numbers = zip(*(number(each) for each in quantity), strict=True)
+            return Evaluator(None, lambda response: np.array([f(response) for f in functions]), numbers)
     raise ValueError(
         "quantity must be None, a channel's name, different names, peak(name), several of these, or a function of the "
         f"response (n_channels, n_steps); got {quantity!r}"

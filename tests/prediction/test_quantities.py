@@ -1,0 +1,147 @@
+"""Energies of responses: closed forms, dimensions and units in every place, parts of histories, errors before a run."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.prediction.propagation import propagate
+from fe_likelihoods.prediction.quantities import (
+    arias_intensity,
+    dissipated_energy,
+    final_value,
+    measured_quantity,
+    peak,
+    rms,
+)
+from fe_likelihoods.prediction.reliability import exceedance
+from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.units import G0
+
+CHANNELS = (
+    Channel("deck", "absolute acceleration", "g"),
+    Channel("force", "lateral force", "kip"),
+    Channel("drift", "relative displacement", "mm"),
+)
+DT, STEPS, OMEGA = 0.01, 401, 2.0 * np.pi  # four periods of one second
+TIME = DT * np.arange(STEPS)
+STIFFNESS, DASHPOT, LENGTH = 3.0e6, 2.0e5, 0.02
+
+
+def respond(theta):
+    """A spring and a dashpot under an imposed motion, and an acceleration of amplitude theta g."""
+    drift, velocity = LENGTH * np.sin(OMEGA * TIME), LENGTH * OMEGA * np.cos(OMEGA * TIME)
+    force = theta[0] * (STIFFNESS * drift + DASHPOT * velocity)
+    return [theta[0] * G0 * np.sin(OMEGA * TIME), force, drift]
+
+
+MODEL = FunctionModel(respond, ["gain"], CHANNELS, DT, STEPS)
+SAMPLES = np.array([[0.8], [1.0], [1.3], [1.1]])
+DATA = Measurements(CHANNELS, DT, respond([1.0]))
+WORK = dissipated_energy("force", "drift")
+
+
+def test_arias_intensity_of_a_sine_and_the_work_of_a_dashpot_are_their_closed_forms():
+    both = propagate(MODEL, SAMPLES, quantity=[arias_intensity("deck"), WORK], progress=False)
+    periods, gain = 4, SAMPLES[:, 0]
+    np.testing.assert_allclose(both.values[:, 0], np.pi / (2 * G0) * (gain * G0) ** 2 * periods / 2, rtol=1e-12)
+    work = periods * np.pi * gain * DASHPOT * OMEGA * LENGTH**2  # the spring stores nothing over whole cycles
+    np.testing.assert_allclose(both.values[:, 1], work, rtol=(OMEGA * DT) ** 2)
+    measured = measured_quantity([arias_intensity("deck"), WORK], DATA)
+    np.testing.assert_allclose(measured, both.values[1], rtol=1e-12)
+
+
+def test_work_of_an_elastic_plastic_loop_is_the_area_of_its_parallelogram():
+    drift, force = np.array([0.0, 1, 5, 3, -5, -3, 1]), np.array([0.0, 2, 2, -2, -2, 2, 2])
+    (channel,) = CHANNELS[1:2]
+    loop = Measurements([channel], 1.0, force[None])
+    assert measured_quantity(dissipated_energy("force", drift), loop) == pytest.approx(1.0 + 8.0 + 16.0 + 8.0)
+    closed = dissipated_energy("force", drift, part=slice(1, None))  # from (1, 2) round to (1, 2)
+    assert measured_quantity(closed, loop) == pytest.approx(2 * 2 * 8.0)
+
+
+def test_an_energy_has_its_own_name_dimension_and_unit():
+    both = propagate(MODEL, SAMPLES, quantity=[arias_intensity("deck"), WORK, peak("deck")], progress=False)
+    assert [(c.name, c.dimension, c.unit) for c in both.channels] == [
+        ("Arias intensity of deck", "velocity", "m/s"),
+        ("energy of force", "energy", "kJ"),
+        ("deck", "acceleration", "g"),
+    ]
+    scores = both.score(DATA, level=0.5)
+    table = str(scores).splitlines()
+    assert table[2].split()[:5] == ["energy", "of", "force", "kJ", f"{measured_quantity(WORK, DATA) / 1e3:.3g}"]
+    work = propagate(MODEL, SAMPLES, quantity=WORK, progress=False)
+    assert exceedance(work, 7.5, unit="kJ").probability == 0.25
+    with pytest.raises(ValueError, match="a unit of energy, got 'kip'"):
+        exceedance(work, 2.0, unit="kip")
+
+
+def test_energy_per_volume_of_a_stress_has_the_dimension_of_a_stress():
+    strain = np.array([0.0, 0.01, -0.01])
+    stress = Channel("sigma", "stress", "MPa")
+    energy = dissipated_energy("sigma", strain)
+    assert energy.described(stress) == Channel("energy of sigma", "stress", "MPa")
+    assert measured_quantity(energy, Measurements([stress], 1.0, [[0.0, 2e6, 4e6]])) == pytest.approx(1e4 - 6e4)
+
+
+def test_white_noise_adds_its_mean_square_to_the_arias_intensity_and_nothing_to_the_work():
+    sigma = (2.0, 5e4, 1e-9)
+    prior = {"gain": TruncatedNormal(1.0, 0.1)} | {f"sigma_{c.name}": HalfNormal(1.0) for c in CHANNELS}
+    posterior = Posterior(FELikelihood(MODEL, DATA), prior)
+    samples = np.tile([1.0, *sigma], (400, 1))
+    quantity = [arias_intensity("deck"), WORK]
+    noisy = propagate(posterior, samples, quantity=quantity, noise=True, seed=1, progress=False)
+    exact = propagate(MODEL, [[1.0]], quantity=quantity, quantiles=(), progress=False).mean
+    exact = exact + [np.pi / (2 * G0) * sigma[0] ** 2 * TIME[-1], 0.0]
+    assert (np.abs(noisy.mean - exact) < 4.0 * noisy.standard_error).all()
+    assert noisy.mean[0] > exact[0] - 0.5 * np.pi / (2 * G0) * sigma[0] ** 2 * TIME[-1]  # control: not that of no noise
+
+
+@pytest.mark.parametrize("make", (peak, rms, arias_intensity, lambda name, part: dissipated_energy(name, TIME, part)))
+def test_a_part_of_the_samples_is_that_of_the_trimmed_history(make):
+    name = "force" if make not in (peak, rms, arias_intensity) else "deck"
+    half = slice(STEPS // 2, None)
+    trimmed = DATA.trim(TIME[half][0], TIME[-1])
+    expected = {peak: peak, rms: rms, arias_intensity: arias_intensity}.get(make, None)
+    whole = expected(name) if expected else dissipated_energy(name, TIME[half])
+    predicted = propagate(MODEL, [[1.0]] * 3, quantity=make(name, half), quantiles=(), progress=False).mean
+    assert predicted == pytest.approx(measured_quantity(whole, trimmed), rel=1e-12)
+    assert measured_quantity(make(name, half), DATA) == pytest.approx(predicted, rel=1e-12)
+
+
+def test_samples_may_be_missing_outside_of_the_part_only():
+    values = DATA.values.copy()
+    values[0, 3] = np.nan
+    gap = Measurements(CHANNELS, DT, values)
+    assert measured_quantity(peak("deck", slice(10, None)), gap) == pytest.approx(G0)
+    with pytest.raises(ValueError, match="samples of channel 'deck' are missing"):
+        measured_quantity(arias_intensity("deck"), gap)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "match"),
+    (
+        (arias_intensity("force"), "needs an acceleration; channel 'force' is 'lateral force'"),
+        (dissipated_energy("deck", "drift"), "needs a channel of force, moment, stress"),
+        (dissipated_energy("force", "roof"), "no channel 'roof'"),
+        (dissipated_energy("force", TIME[:-1]), "has 401 samples, the array that belongs to it 400"),
+        ([peak("deck"), peak("deck", slice(900, None))], "no sample of the 401"),
+    ),
+)
+def test_impossible_quantities_are_refused_before_a_simulation(quantity, match):
+    def never(theta):
+        raise AssertionError("simulated")
+
+    with pytest.raises(ValueError, match=match):
+        propagate(FunctionModel(never, ["gain"], CHANNELS, DT, STEPS), SAMPLES, quantity=quantity, progress=False)
+
+
+def test_displacements_are_finite_and_one_history_and_pairs_are_measured_at_the_same_times():
+    with pytest.raises(ValueError, match=r"finite displacements \(n_steps,\)"):
+        dissipated_energy("force", [[0.0, 1.0]])
+    late = Measurements(CHANNELS[1:], DT, DATA.values[1:], start=(0.0, 0.5))
+    with pytest.raises(ValueError, match="force, drift are measured at different times"):
+        measured_quantity(WORK, late)
+    assert final_value("drift").channel_names == ["drift"]
