@@ -46,7 +46,15 @@ def write_tables(folder: Path, sampler: Any, posterior: Posterior) -> tuple[str,
     evidence = f"log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}"
     fit = _fit_rows(posterior, samples)
     runs = _model_runs(posterior.likelihood, sampler.simulations)
-    lines = [str(moments), "", evidence, in_toml_terms(str(sampler.verdict)), *runs, "", "Relative RMS error of the response (RRMSE):"]
+    lines = [
+        str(moments),
+        "",
+        evidence,
+        in_toml_terms(str(sampler.verdict)),
+        *runs,
+        "",
+        "Relative RMS error of the response (RRMSE):",
+    ]
     lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     columns = ("parameter", "mean", "mean_error", "sd", "cv", "q05", "median", "q95", "nominal")
@@ -75,8 +83,10 @@ def _fit_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]
     """RRMSE of every channel at the posterior mean; one simulation."""
     likelihood = posterior.likelihood
     n = len(likelihood.model.parameter_names)
-    residuals = likelihood.residuals(samples[:, :n].mean(axis=0)) if likelihood.ndim == n else likelihood.residuals(
-        samples.mean(axis=0)
+    residuals = (
+        likelihood.residuals(samples[:, :n].mean(axis=0))
+        if likelihood.ndim == n
+        else likelihood.residuals(samples.mean(axis=0))
     )
     measured = likelihood.measurements
     errors = rrmse(measured.values - residuals, measured.values)
@@ -102,7 +112,14 @@ def write_samples(folder: Path, sampler: Any, posterior: Posterior, prediction: 
     return "posterior.nc"
 
 
-def write_report(path: Path, sampler: Any, posterior: Posterior, prediction: Prediction | None, again: str, truth: Mapping[str, float] | None) -> str:
+def write_report(
+    path: Path,
+    sampler: Any,
+    posterior: Posterior,
+    prediction: Prediction | None,
+    again: str,
+    truth: Mapping[str, float] | None,
+) -> str:
     """Write the report in HTML, with the command that makes it again; return the name of the file."""
     from ..reporting.report import report
 
