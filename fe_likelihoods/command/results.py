@@ -74,8 +74,8 @@ def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
     stored = likelihood.cache.info()
     return [
         f"{stored.simulations} runs of the model are stored, {stored.failures} of which failed, those for tables, "
-        f"report and predictions included. The sampling counts as {simulations:.0f} full simulations, since the guide starts "
-        "with short parts of the record."
+        f"report and predictions included. The sampling counts as {simulations:.0f} full simulations, since the guide "
+        "starts with short parts of the record."
     ]
 
 
