@@ -66,7 +66,7 @@ def propagate(
     samples: Any,
     *,
     part: str | None = None,
-    quantity: Quantity = None,
+    quantity: Quantity | Mapping[str, Quantity] = None,
     record: Record | None = None,
     from_state: str | None = None,
     rest: float = 10.0,
@@ -79,7 +79,7 @@ def propagate(
     pool: Any = None,
     seed: int | None = None,
     progress: bool = True,
-) -> Prediction:
+) -> Prediction | dict[str, Prediction]:
     """Predict a quantity from samples of the parameters.
 
     Parameters
@@ -96,7 +96,8 @@ def propagate(
         None for the histories of all channels, the name of a channel or several names for their histories,
         ``peak(name)`` or another `fe_likelihoods.prediction.quantities.ChannelQuantity` or several of them, or a
         function of the response (n_channels, n_steps) [SI] that returns a number or an array of fixed shape.
-        Exceptions of this function are not caught.
+        Exceptions of this function are not caught. Several of these by name, ``{"histories": None, "peaks":
+        [peak(name)]}``, are predicted from the same simulations and the same draws of the noise.
     record : Record, optional
         Another excitation, for models with a method ``with_record(record)``. Default: the excitation of the model.
     from_state : {"virgin", "end"}, optional
@@ -121,7 +122,7 @@ def propagate(
         Number of simulations per batch. Default: as many as make 32 MiB of responses, at most 256, or 16 if
         simulations run one by one.
     memory_bytes : int or None
-        Largest size [bytes] of the results retained for quantiles. A few batches are needed in addition. Histories are
+        Largest size [bytes] of the results retained for quantiles, of each quantity. A few batches are needed in addition. Histories are
         retained in single precision (seven digits) if they do not fit in double precision. If they do not fit in
         single precision either, a random subsample is retained, and `Prediction.n_quantile` is its size. None: no
         limit. Single numbers are always retained.
@@ -139,8 +140,8 @@ def propagate(
 
     Returns
     -------
-    Prediction
-        Mean, variance and quantiles of the quantity.
+    Prediction, or dict of str to Prediction
+        Mean, variance and quantiles of the quantity; of each one where several are given by name.
 
     Raises
     ------
@@ -173,40 +174,54 @@ def propagate(
     state = chosen_state(source.model, record, from_state)
     excitation = excite(source.model, record, state, rest)
     model, n_steps = excitation.model, excitation.n_steps
-    evaluate = evaluator(quantity, model.channels, model.dt, n_steps)
+    wanted = quantity if isinstance(quantity, Mapping) else {"": quantity}
+    if not wanted:
+        raise ValueError("quantity: expected at least one quantity by name; got none")
+    evaluators = {name: evaluator(each, model.channels, model.dt, n_steps) for name, each in wanted.items()}
 
     distinct, row_of_sample = distinct_rows(thetas)
     try:
-        seeds = np.random.SeedSequence(seed)
+        entropy = np.random.SeedSequence(seed).entropy
     except (TypeError, ValueError) as error:
         raise ValueError(f"seed must be a whole number, zero or more, or None; got {seed!r}") from error
     KEPT_STATES.limit(state_bytes)
-    accumulator = Accumulator(
-        members=samples_of_rows(row_of_sample, len(distinct)),
-        noise=sample_noise,
-        evaluate=evaluate.function,
-        rows=evaluate.rows,
-        result_of_sample=np.arange(n) if noise else row_of_sample,
-        probabilities=probabilities,
-        memory_bytes=memory_bytes,
-        seeds=seeds,
-    )
+    accumulators = {
+        name: Accumulator(
+            members=samples_of_rows(row_of_sample, len(distinct)),
+            noise=sample_noise,
+            evaluate=evaluate.function,
+            rows=evaluate.rows,
+            result_of_sample=np.arange(n) if noise else row_of_sample,
+            probabilities=probabilities,
+            memory_bytes=memory_bytes,
+            seeds=np.random.SeedSequence(entropy),
+        )
+        for name, evaluate in evaluators.items()
+    }
     response_size = len(model.channels) * model.n_steps
-    if evaluate.rows is not None:
-        accumulator.allocate((len(evaluate.rows), n_steps))
+    for name, evaluate in evaluators.items():
+        if evaluate.rows is not None:
+            accumulators[name].allocate((len(evaluate.rows), n_steps))
     if batch is None:
         together = source.executor is not None or simulates_in_batches(model)
         batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
             responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor)
-            accumulator.add(start, responses, reasons)
+            for accumulator in accumulators.values():
+                accumulator.add(start, responses, reasons)
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
-    prediction = _prediction(accumulator, n, effective, evaluate.channels, model.dt, state, shifted)
-    if record is not None and noise and prediction.dt is not None:
-        _warn_of_level(prediction, source)
-    return replace(prediction, quantity=quantity)
+    predictions = {
+        name: replace(
+            _prediction(each, n, effective, evaluators[name].channels, model.dt, state, shifted), quantity=wanted[name]
+        )
+        for name, each in accumulators.items()
+    }
+    histories = next((each for each in predictions.values() if each.dt is not None), None)
+    if record is not None and noise and histories is not None:
+        _warn_of_level(histories, source)
+    return predictions if isinstance(quantity, Mapping) else predictions[""]
 
 
 def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.ndarray:

@@ -411,3 +411,22 @@ def test_refused_otherwise(oscillator, rng):
     posterior.likelihood.noise = Mute()
     with pytest.raises(ValueError, match="Mute cannot be drawn from.*standard_deviations"):
         quiet(posterior, np.ones((5, 3)), noise=True)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_several_quantities_are_predicted_from_the_same_simulations(rng, noise):
+    model = Line(fails=True)
+    posterior = with_noise(model)
+    samples = np.column_stack([draws(rng, 60), np.tile(NOISE, (60, 1))])
+    wanted = {"histories": None, "peaks": [peak("a"), peak("b")], "first": "a", "size": lambda response: response.size}
+    together = quiet(posterior, samples, quantity=wanted, noise=noise, seed=3)
+    assert model.runs == 60  # each one once
+    assert list(together) == list(wanted)
+    for name, quantity in wanted.items():
+        alone = quiet(posterior, samples, quantity=quantity, noise=noise, seed=3)
+        for field in ("mean", "variance", "quantiles", "quantile_error", "failed"):
+            np.testing.assert_array_equal(getattr(together[name], field), getattr(alone, field))
+        assert together[name].quantity is quantity
+        assert together[name].channels == alone.channels and together[name].dt == alone.dt
+    with pytest.raises(ValueError, match="at least one quantity by name"):
+        quiet(posterior, samples, quantity={})
