@@ -122,7 +122,7 @@ def propagate(
         Number of simulations per batch. Default: as many as make 32 MiB of responses, at most 256, or 16 if
         simulations run one by one.
     memory_bytes : int or None
-        Largest size [bytes] of the results retained for quantiles, of each quantity. A few batches are needed in addition. Histories are
+        Largest size [bytes] of the results retained for quantiles, per quantity, besides a few batches. Histories are
         retained in single precision (seven digits) if they do not fit in double precision. If they do not fit in
         single precision either, a random subsample is retained, and `Prediction.n_quantile` is its size. None: no
         limit. Single numbers are always retained.
