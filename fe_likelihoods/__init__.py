@@ -45,6 +45,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .prediction.reliability import Exceedance, exceedance
     from .prediction.score_tables import HistoryScores, QuantityScores
     from .prediction.scores import crps_normal, crps_samples, interval_score, log_score_normal, share_within
+    from .probability.agreement import Agreement, compare_tests
     from .probability.autoregressive_noise import AutoregressiveNoise
     from .probability.block_likelihood import BlockLogLikelihood
     from .probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
@@ -96,6 +97,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .units import from_si, to_si
 
 __all__ = [
+    "Agreement",
     "Alignment",
     "AutoregressiveNoise",
     "AveragedPrediction",
@@ -186,6 +188,7 @@ __all__ = [
     "align",
     "arias_intensity",
     "average_predictions",
+    "compare_tests",
     "crps_normal",
     "crps_samples",
     "damage",
@@ -346,6 +349,7 @@ _EXPORTS = {
     "prediction.reliability": ("Exceedance", "exceedance"),
     "prediction.score_tables": ("HistoryScores", "QuantityScores"),
     "prediction.scores": ("crps_normal", "crps_samples", "interval_score", "log_score_normal", "share_within"),
+    "probability.agreement": ("Agreement", "compare_tests"),
     "probability.autoregressive_noise": ("AutoregressiveNoise",),
     "probability.block_likelihood": ("BlockLogLikelihood",),
     "probability.distributions": (

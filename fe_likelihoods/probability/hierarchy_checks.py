@@ -1,25 +1,17 @@
-"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails, bounds and errors.
-
-References
-----------
-A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry (2024), Pareto smoothed importance sampling, Journal of Machine
-Learning Research 25(72), 1-58: shapes above 0.7 mean that the weights have no usable mean.
-
-J. Zhang, M. A. Stephens (2009), A new and efficient estimation method for the generalized Pareto distribution,
-Technometrics 51, 316-325, doi:10.1198/tech.2009.08017.
-"""
+"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails, bounds and errors."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from .pareto_smoothing import LARGEST_SHAPE, pareto_shape
 from .population_marginal import draw_products, inverse_prior, population_marginal, sample_weights
 from .stored_posterior import resampled_description
 
 if TYPE_CHECKING:
     from .hierarchical_posterior import HierarchicalPosterior
 
-__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy", "pareto_shape"]
+__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy"]
 
 _HYPER_SAMPLES = 100
 _RESAMPLINGS = 12
@@ -27,7 +19,7 @@ _DRAWS = 500
 # Limits of the warnings, chosen with `python -m tests.benchmarks hierarchy_warnings`, where the exact result is known.
 _LARGEST_ERROR = 0.2  # of the mean of a hyper-parameter, in posterior standard deviations
 _FEWEST_EFFECTIVE = ((20.0, 0.15), (1.0, 0.0))  # if the error of a mean is above the second number
-_LARGEST_SHAPES = ((0.7, 0.1), (0.8, 0.0))  # Pareto shape, if the error of a mean is above the second number
+_LARGEST_SHAPES = ((LARGEST_SHAPE, 0.1), (0.8, 0.0))  # Pareto shape, if the error of a mean is above the second number
 _LARGEST_SHARE = 0.1  # of the hyper-samples at which weights may be unusable
 _LARGEST_OUTSIDE = 0.05  # of a population beyond bounds that the samples of a test reach
 _LARGEST_OUTSIDE_SUM = 0.06  # sum over the tests, without bounds at zero, which are those of positive parameters
@@ -156,31 +148,6 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
         float(np.sqrt(evidence**2 + evidences)),
         tuple(_messages(posterior, found, errors)),
     )
-
-
-def pareto_shape(weights: np.ndarray) -> float:
-    """Shape of a generalised Pareto distribution fitted to the largest of n weights; -inf where it has no tail.
-
-    The estimate of Zhang and Stephens (2009), with the prior of Vehtari et al. (2024), section 3.2 and appendix: the
-    largest of 0.2 n and 3 sqrt(n) weights, whichever is less.
-    """
-    ordered = np.sort(weights)
-    size = int(min(0.2 * len(ordered), 3.0 * np.sqrt(len(ordered))))
-    if size < 5:
-        return np.nan
-    excess = ordered[-size:] - ordered[-size - 1]
-    excess = excess[excess > 1e-12 * ordered[-1]]
-    if len(excess) < 5:
-        return -np.inf
-    n = len(excess)
-    index = np.arange(1, 31 + int(np.sqrt(n)))
-    theta = 1.0 / excess[-1] + (1.0 - np.sqrt(len(index) / (index - 0.5))) / (3.0 * excess[int(n / 4 + 0.5) - 1])
-    shapes = np.log1p(-theta[:, None] * excess).mean(axis=1)
-    profile = n * (np.log(-theta / shapes) - shapes - 1.0)
-    shares = np.exp(profile - profile.max())
-    mean = (theta * shares).sum() / shares.sum()
-    shape = np.log1p(-mean * excess).mean()
-    return float((n * shape + 5.0) / (n + 10.0))
 
 
 def _mean_errors(samples: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, float]:

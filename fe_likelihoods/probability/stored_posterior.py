@@ -16,7 +16,14 @@ from .inputs import as_points
 from .mixture_prior import MixtureDistribution, fit_mixture
 from .priors import Prior
 
-__all__ = ["DescribedPosterior", "StoredPosterior", "describe", "resampled_description"]
+__all__ = [
+    "DescribedPosterior",
+    "StoredPosterior",
+    "describe",
+    "log_density_on_scale",
+    "on_scale",
+    "resampled_description",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +148,32 @@ class DescribedPosterior(NamedTuple):
 
     def log_prior_at(self, points: np.ndarray) -> np.ndarray:
         """Logarithm of the prior density (...) of points (..., dim) on the scale of the population."""
-        rows = points.reshape(-1, points.shape[-1])
-        with np.errstate(over="ignore"):
-            values = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, rows, 0.0)), rows)
-        density = self.prior.logpdf(values) + (rows * self.logarithmic).sum(axis=1)
-        return density.reshape(points.shape[:-1])
+        return log_density_on_scale(self.prior, self.logarithmic, points)
+
+
+def on_scale(stored: StoredPosterior, names: Sequence[str], logarithmic: np.ndarray) -> tuple[Prior, np.ndarray]:
+    """Prior of some parameters, and their samples (n, dim), as logarithms where `logarithmic` (dim,) says so.
+
+    Raises ValueError as `describe`.
+    """
+    if missing := [name for name in names if name not in stored.prior.names]:
+        raise ValueError(
+            f"the stored samples have no parameters {', '.join(missing)}; they have {', '.join(stored.prior.names)}"
+        )
+    prior = stored.prior.subset(names)
+    values = stored.samples[:, [stored.prior.names.index(name) for name in names]]
+    if (values[:, logarithmic] <= 0.0).any():
+        positive = ", ".join(name for name, log in zip(names, logarithmic, strict=True) if log)
+        raise ValueError(f"a logarithmic scale needs positive samples of {positive}; use scale='linear'")
+    return prior, np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+
+
+def log_density_on_scale(prior: Prior, logarithmic: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Logarithm of the density (...) of a prior at points (..., dim) on the scale of `on_scale`."""
+    rows = points.reshape(-1, points.shape[-1])
+    with np.errstate(over="ignore"):
+        values = np.where(logarithmic, np.exp(np.where(logarithmic, rows, 0.0)), rows)
+    return (prior.logpdf(values) + (rows * logarithmic).sum(axis=1)).reshape(points.shape[:-1])
 
 
 def describe(
@@ -176,17 +204,8 @@ def describe(
         If a parameter is unknown, has a joint prior with parameters that are not described, or is not positive on a
         logarithmic scale; and as `fit_mixture`.
     """
-    if missing := [name for name in names if name not in stored.prior.names]:
-        raise ValueError(
-            f"the stored samples have no parameters {', '.join(missing)}; they have {', '.join(stored.prior.names)}"
-        )
     logarithmic = np.asarray(logarithmic, dtype=bool)
-    prior = stored.prior.subset(names)
-    values = stored.samples[:, [stored.prior.names.index(name) for name in names]]
-    if (values[:, logarithmic] <= 0.0).any():
-        positive = ", ".join(name for name, log in zip(names, logarithmic, strict=True) if log)
-        raise ValueError(f"a logarithmic scale needs positive samples of {positive}; use scale='linear'")
-    points = np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+    prior, points = on_scale(stored, names, logarithmic)
     rng, weights = np.random.default_rng(seed), np.exp(stored.log_weights)
     equal = np.ptp(stored.log_weights) == 0.0
     rows = _systematic(weights, min(len(points), max_samples), rng)  # evenly spaced rows for equal weights

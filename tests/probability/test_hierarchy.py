@@ -24,7 +24,7 @@ from fe_likelihoods import (
     propagate,
 )
 from fe_likelihoods.probability.hierarchical_posterior import _correlation_factor
-from fe_likelihoods.probability.hierarchy_checks import pareto_shape
+from fe_likelihoods.probability.pareto_smoothing import pareto_shape
 from fe_likelihoods.probability.stored_posterior import describe
 from tests.benchmarks.hierarchy_warnings import RIGHT, WRONG, problem, solve
 
