@@ -47,6 +47,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .prediction.scores import crps_normal, crps_samples, interval_score, log_score_normal, share_within
     from .probability.agreement import Agreement, compare_tests
     from .probability.autoregressive_noise import AutoregressiveNoise
+    from .probability.band_noise import BandNoise
     from .probability.block_likelihood import BlockLogLikelihood
     from .probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
     from .probability.event_noise import EventNoise
@@ -57,6 +58,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.likelihood import FELikelihood
     from .probability.marginal_noise import MarginalNoise
     from .probability.mixture_prior import MixtureDistribution, fit_mixture
+    from .probability.modulated_noise import ModulatedNoise
     from .probability.multivariate import MultivariateDistribution, MultivariateNormal, TruncatedMultivariateNormal
     from .probability.noise import GaussianNoise, Noise, SharedGaussianNoise
     from .probability.parameters import Parameter
@@ -101,6 +103,7 @@ __all__ = [
     "Alignment",
     "AutoregressiveNoise",
     "AveragedPrediction",
+    "BandNoise",
     "Bars",
     "Bearing",
     "BlockLogLikelihood",
@@ -147,6 +150,7 @@ __all__ = [
     "Mode",
     "ModeSearch",
     "Model",
+    "ModulatedNoise",
     "MomentCurvature",
     "MultivariateDistribution",
     "MultivariateNormal",
@@ -351,6 +355,7 @@ _EXPORTS = {
     "prediction.scores": ("crps_normal", "crps_samples", "interval_score", "log_score_normal", "share_within"),
     "probability.agreement": ("Agreement", "compare_tests"),
     "probability.autoregressive_noise": ("AutoregressiveNoise",),
+    "probability.band_noise": ("BandNoise",),
     "probability.block_likelihood": ("BlockLogLikelihood",),
     "probability.distributions": (
         "Distribution",
@@ -373,6 +378,7 @@ _EXPORTS = {
         "MixtureDistribution",
         "fit_mixture",
     ),
+    "probability.modulated_noise": ("ModulatedNoise",),
     "probability.multivariate": (
         "MultivariateDistribution",
         "MultivariateNormal",

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
+from ..simulation.residual_statistics import needs_response
 from .quadratic import check_quadratic, sums_of_squares
 
 __all__ = ["Archive", "NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
@@ -181,7 +182,8 @@ class ResponseTarget:
     Raises
     ------
     ValueError
-        If the statistics of the noise are not quadratic in the residuals, or the noise has time shifts.
+        If the statistics of the noise are not quadratic in the residuals, its level depends on the response, or it has
+        time shifts.
     """
 
     def __init__(self, posterior: _Posterior) -> None:
@@ -201,6 +203,12 @@ class ResponseTarget:
         self.n_steps = self.measured.shape[1]
         self.n_samples = self._likelihood.n_samples
         self.statistic: Callable[[np.ndarray], np.ndarray] = getattr(self.noise, "statistic", None) or sums_of_squares
+        if needs_response(self.statistic):
+            raise ValueError(
+                f"the level of {type(self.noise).__name__} depends on the response, so the posterior cannot be "
+                "emulated from residuals: sample without a guide, or use GaussianNoise, SharedGaussianNoise, "
+                "AutoregressiveNoise or BandNoise(relative=False)"
+            )
         if isinstance(self.comparison, Comparison) and self.statistic is not sums_of_squares:
             self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)
         check_quadratic(self.statistic, self.measured)

@@ -344,7 +344,7 @@ def _prediction(
 
 def _warn_of_level(prediction: Prediction, source: PredictionSource) -> None:
     """Warn if noise in SI units was calibrated with a much stronger or weaker response than the predicted one."""
-    if hasattr(source.noise, "response_deviations"):
+    if hasattr(source.noise, "response_deviations") and getattr(source.noise, "relative", True):
         return
     far = []
     for channel, mean in zip(prediction.channels, prediction.mean, strict=True):
@@ -356,7 +356,7 @@ def _warn_of_level(prediction: Prediction, source: PredictionSource) -> None:
         warnings.warn(
             "the predicted response has another level (root mean square) than the measurements of the calibration: "
             f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
-            "too narrow for a stronger motion; RelativeNoise scales with the response",
+            "too narrow for a stronger motion; ModulatedNoise, BandNoise and RelativeNoise scale with the response",
             stacklevel=3,
         )
 

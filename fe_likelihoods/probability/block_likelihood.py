@@ -23,6 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..signals.channels import Measurements
+from .band_noise import BandNoise
+from .modulated_noise import ModulatedNoise
 from .noise import GaussianNoise, Noise, SharedGaussianNoise, noise_of_part, noise_statistic
 from .relative_noise import RelativeNoise
 from .residuals import effective_samples
@@ -145,6 +147,8 @@ def block_log_likelihood(
     -------
     (n, n_blocks) float
     """
+    if hasattr(noise, "log_densities"):
+        return _blocks_of_samples(noise, measurements, values, residuals, parameters, stops)
     statistic = noise_statistic(noise)
     total = samples_per_channel(count_samples(values))
     sums = np.nancumsum(np.square(residuals), axis=2) if statistic is None and measurements.simultaneous else None
@@ -166,6 +170,25 @@ def block_log_likelihood(
             noise_of_block = replace(noise, effective_samples=share * samples_per_channel(counts))
         upto[:, block] = noise_of_block.log_likelihood(statistics, counts, parameters)
     return np.diff(upto, axis=1, prepend=0.0)
+
+
+def _blocks_of_samples(
+    noise: Noise,
+    measurements: Measurements,
+    values: np.ndarray,
+    residuals: np.ndarray,
+    parameters: np.ndarray,
+    stops: Sequence[float],
+) -> np.ndarray:
+    """Terms of blocks for a noise that has a term for each sample."""
+    times = np.stack([measurements.times(channel.name) for channel in measurements.channels])
+    block = np.searchsorted(np.asarray(stops) - _ROUND_OFF * max(measurements.steps), times, side="right")
+    # samples after the last block, if there are any, belong to none
+    terms = [
+        np.bincount(block.ravel(), noise.log_densities(each, each + values, one).ravel(), minlength=len(stops) + 1)
+        for each, one in zip(residuals, parameters, strict=True)
+    ]
+    return np.array(terms)[:, : len(stops)]
 
 
 def _until(measurements: Measurements, values: np.ndarray, stop: float) -> tuple[np.ndarray, int]:
@@ -193,6 +216,11 @@ def describe_blocks(seconds: float, chosen: bool, noise: Noise) -> str:
         f"One observation is one block of time with the samples of all channels. Blocks are at most {seconds:.4g} s "
         f"long, {how}. Shorter blocks would not be independent. Compare models with equal blocks only."
     )
-    if isinstance(noise, _WHITE):
+    if isinstance(noise, _WHITE | ModulatedNoise):
         return text
+    if isinstance(noise, BandNoise):
+        return text + (
+            " The term of a block is the density of its whitened residuals, with an equal part of the determinant for "
+            "each sample."
+        )
     return text + " The term of a block is conditional on the blocks before it."

@@ -24,12 +24,11 @@ from ..simulation.memory_cache import MemoryCache, ResponseMemory, distinct_keys
 from ..simulation.model import (
     Model,
     SimulationBatch,
-    Statistic,
     misfit_of_responses,
-    statistic_width,
 )
 from ..simulation.remarks import repeat_remark_of
 from ..simulation.repeated_points import RepeatedPoints
+from ..simulation.residual_statistics import Statistic, statistic_width
 from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .inputs import as_rows, check_statistic, name_of_statistic

@@ -10,7 +10,8 @@ import numpy as np
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.sampling import same_step
-from ..simulation.model import Model, Statistic
+from ..simulation.model import Model
+from ..simulation.residual_statistics import Statistic, apply_statistic
 from .noise import Noise, noise_channels, noise_time_shifts
 
 __all__ = [
@@ -117,7 +118,7 @@ def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparis
     """Raise ValueError if samples are missing and the statistic of a noise has no rule for them."""
     if statistic is None or not isinstance(measured, Comparison):
         return
-    if not np.isfinite(statistic(measured.values)).all():
+    if not np.isfinite(apply_statistic(statistic, measured.values, measured.values)).all():
         raise ValueError(
             f"samples are missing, and the statistic {statistic!r} of the noise is not finite with residuals of NaN at "
             "these samples; leave such residuals out in the statistic, or use GaussianNoise, SharedGaussianNoise or "

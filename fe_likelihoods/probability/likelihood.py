@@ -118,8 +118,9 @@ class FELikelihood(CachedSimulations):
     ) -> None:
         check_model(model)
         measurements = match_measurements(model, join_measurements(model, measurements))
-        self.noise = named_noise(model, measurements, noise)
-        check_noise_channels(model, self.noise)
+        noise = named_noise(model, measurements, noise)
+        check_noise_channels(model, noise)
+        self.noise = noise_of_part(noise, measurements)
         structural, others = tuple(model.parameter_names), tuple(self.noise.parameter_names)
         self.parameter_names = structural + others
         if len(set(self.parameter_names)) != len(self.parameter_names):

@@ -25,7 +25,6 @@ from ..simulation.memory_cache import MemoryCache, ResponseMemory
 from ..simulation.model import (
     Model,
     SimulationBatch,
-    Statistic,
     has_batch_method,
     misfit_batch,
     misfit_of_responses,
@@ -34,6 +33,7 @@ from ..simulation.model import (
 )
 from ..simulation.remarks import store_remark_of
 from ..simulation.repeated_points import RepeatedPoints
+from ..simulation.residual_statistics import Statistic
 from ..simulation.verification import VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .requested_simulations import Requested, Simulated

@@ -14,8 +14,11 @@ Which noise to take:
 ``GaussianNoise(channels, effective_samples=n_eff)``      Correlated errors without more parameters; `n_eff` is
                                                           estimated from residuals.
 ``SharedGaussianNoise.of(measurements)``                  One unknown standard deviation for all channels.
-``RelativeNoise.of(measurements)``                        Standard deviations that are shares of the response levels,
-                                                          for predictions of weaker or stronger motions.
+``ModulatedNoise(channels, window=1.0, sensor=...)``      Standard deviations that follow the envelope of the simulated
+                                                          response, for predictions of weaker or stronger motions.
+``BandNoise(channels, (1.0, 5.0), sensor=...)``           Errors that are correlated in time: shares of the response in
+                                                          bands of frequency, for predictions of other motions.
+``RelativeNoise.of(measurements)``                        Standard deviations that are shares of the response levels.
 ``...Noise(channels, sensor={"top": 0.02})``              Known sensor noise in addition to the unknown model error.
 ========================================================  ==============================================================
 
@@ -27,13 +30,14 @@ samples. `AutoregressiveNoise` is in `fe_likelihoods.probability.autoregressive_
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
+from ..simulation.residual_statistics import Statistic
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = [
@@ -50,7 +54,6 @@ __all__ = [
     "total_deviations",
 ]
 
-Statistic = Callable[[np.ndarray], np.ndarray]
 PerChannel = Mapping[str, float] | Sequence[float] | None
 HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -63,7 +66,9 @@ class Noise(Protocol):
     * ``channels``, the measured channels in the order of the statistics; checked against those of the model.
     * ``statistic``, a function of a module that takes the residuals (n_channels, n_steps) and returns the numbers
       (n_numbers,) which `log_likelihood` needs, the sums of squares (n_channels,) first. Without it these are all.
-      Residuals of missing samples are NaN; a statistic without a rule for them is refused with such measurements.
+      Residuals of missing samples are NaN; a statistic without a rule for them is refused with such measurements. A
+      statistic with an attribute ``of_response`` that is true also takes the response at the samples, as a second
+      argument.
     * ``time_shifts``, the largest unknown time shifts of channels [s] by name, with the statistics of
       `fe_likelihoods.probability.time_shift_noise.TimeShiftNoise`.
     * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
@@ -71,8 +76,12 @@ class Noise(Protocol):
     * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
       standard deviations (n_channels, n_steps) of the errors of a simulated response; used in predictions in place of
       ``standard_deviations`` where the noise depends on the response.
+    * ``response_errors(parameters, response, normal, dt)``, which returns the errors (n_channels, n_steps) made of
+      standard normal numbers of that shape; for errors that are correlated in time and depend on the response.
+    * ``whitened(residuals, response, parameters)`` and ``log_densities(residuals, response, parameters)`` at the
+      measured samples, for checks of residuals and for the log-likelihood in blocks of time.
     * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed where it
-      depends on their number.
+      depends on their number or times. A likelihood calls it with its own measurements.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
       predictions with autoregressive noise.
     """

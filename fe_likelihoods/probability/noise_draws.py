@@ -23,12 +23,16 @@ class SampleNoise(NamedTuple):
     of_response : callable or None
         For a noise that depends on the response: function of the parameters (n_noise,) of one sample and its response
         (n_channels, n_steps) that returns the standard deviations (n_channels, n_steps) [SI].
+    errors_of_response : callable or None
+        For such a noise whose errors are correlated in time: function of parameters, response and standard normal
+        numbers (n_channels, n_steps) that returns the errors (n_channels, n_steps) [SI].
     """
 
     deviations: np.ndarray
     lag_one: np.ndarray | None
     events: tuple[slice, ...] = ()
     of_response: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    errors_of_response: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
 
     def over_time(self, levels: np.ndarray, n_steps: int) -> np.ndarray:
         """Values at all steps, shape (n_channels, n_steps) or (n_channels, 1), from those of one sample."""
@@ -46,7 +50,10 @@ class SampleNoise(NamedTuple):
 
         The response (n_channels, n_steps) of the sample is needed if the noise depends on it.
         """
-        errors = rng.standard_normal((self.deviations.shape[-1], n_steps))
+        n_channels = self.deviations.shape[-1] if response is None else len(response)
+        errors = rng.standard_normal((n_channels, n_steps))
+        if self.errors_of_response is not None:
+            return self.errors_of_response(self.deviations[sample], response, errors)
         if self.lag_one is not None:
             from scipy.signal import lfilter  # imported here because it is slow to import and rarely needed
 
@@ -59,7 +66,9 @@ class SampleNoise(NamedTuple):
         return self.over_time(self.deviations[sample], n_steps) * errors
 
 
-def sample_noise(noise: Any, parameters: np.ndarray, n_channels: int, dt: float | None = None) -> SampleNoise:
+def sample_noise(
+    noise: Any, parameters: np.ndarray, n_channels: int, dt: float | None = None, at_samples: bool = False
+) -> SampleNoise:
     """Noise of samples whose levels hold for the whole measurements, or depend on the response.
 
     Parameters
@@ -73,6 +82,8 @@ def sample_noise(noise: Any, parameters: np.ndarray, n_channels: int, dt: float 
     dt : float, optional
         Time step of the responses [s], for a noise whose level depends on the response. Without it, such a noise has
         the level of the measurements.
+    at_samples : bool
+        Whether the responses are those at the measured samples, for a noise that knows the times of these.
 
     Returns
     -------
@@ -95,7 +106,10 @@ def sample_noise(noise: Any, parameters: np.ndarray, n_channels: int, dt: float 
             f"channels; got shape {deviations.shape}, smallest {deviations.min(initial=np.inf)}"
         )
     if dt is not None and hasattr(noise, "response_deviations"):
-        return SampleNoise(parameters, None, of_response=partial(noise.response_deviations, dt=dt))
+        step = None if at_samples else dt
+        errors = partial(noise.response_errors, dt=step) if hasattr(noise, "response_errors") else None
+        deviations_of = partial(noise.response_deviations, dt=step)
+        return SampleNoise(parameters, None, of_response=deviations_of, errors_of_response=errors)
     if not hasattr(noise, "lag_one_correlations"):
         return SampleNoise(deviations, None)
     lag_one = np.asarray(noise.lag_one_correlations(parameters), dtype=float)

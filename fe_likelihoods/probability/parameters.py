@@ -12,10 +12,10 @@ import numpy as np
 from ..signals.channels import Channel
 from ..simulation.model import Model
 from ..units import UNITS, find_unit
+from .band_noise import BandNoise
 from .event_noise import EventNoise
 from .marginal_noise import sampled_noise
 from .noise import Noise, SharedGaussianNoise, noise_channels
-from .relative_noise import RelativeNoise
 
 __all__ = ["Parameter", "channels_of_deviations", "describe_parameters"]
 
@@ -94,6 +94,9 @@ def channels_of_deviations(noise: Noise, default: Sequence[Channel]) -> dict[str
     if isinstance(sampled, EventNoise):
         rows = [sampled.channels[row] for _, row in sampled.levels]
         return dict(zip(sampled.parameter_names, rows, strict=True))
+    if isinstance(sampled, BandNoise):
+        rows = [] if sampled.relative else [each for each in sampled.channels for _ in range(sampled.n_bands)]
+        return dict(zip(sampled.parameter_names, rows, strict=False))
     return {f"sigma_{channel.name}": channel for channel in noise_channels(sampled, default)}
 
 
@@ -106,6 +109,6 @@ def _of_noise(noise: Noise, default: Sequence[Channel]) -> list[Parameter]:
         elif name.startswith("time_shift_"):
             described.append(Parameter(name, "s"))
         else:
-            dimensionless = name.startswith("rho_") or isinstance(sampled, SharedGaussianNoise | RelativeNoise)
+            dimensionless = name.startswith(("rho_", "share_")) or isinstance(sampled, SharedGaussianNoise)
             described.append(Parameter(name, "-" if dimensionless else ""))
     return described

@@ -19,6 +19,7 @@ from .joint import JointLikelihood
 from .likelihood import FELikelihood
 from .marginal_noise import MarginalNoise
 from .noise_draws import SampleNoise, sample_noise
+from .relative_noise import RelativeNoise
 from .time_shift_noise import TimeShiftNoise
 
 if TYPE_CHECKING:
@@ -205,17 +206,27 @@ def _errors(
 ) -> np.ndarray | None:
     """One draw of the errors per row, (n, n_channels, n_samples) [SI]; None for a noise that cannot be drawn from."""
     n_channels, n_samples = _compared(likelihood).shape
-    if isinstance(noise, EventNoise):
+    if hasattr(noise, "log_densities"):
+        drawn = sample_noise(noise, parameters, n_channels, likelihood.model.dt, at_samples=True)
+        responses = np.stack([_at_samples(likelihood, response) for response in responses])
+    elif isinstance(noise, EventNoise):
         deviations = np.nan_to_num(noise.deviations_per_event(parameters))
         drawn = SampleNoise(deviations, None, tuple(slice(*window) for window in noise.windows))
     elif hasattr(noise, "standard_deviations"):
         drawn = sample_noise(noise, parameters, n_channels, likelihood.model.dt)
     else:
         return None
-    if drawn.of_response is not None and isinstance(likelihood.measured, Comparison):
+    if isinstance(noise, RelativeNoise) and isinstance(likelihood.measured, Comparison):
         # deviations at the steps of the model, then at the times of the samples, where interpolation may overshoot
         drawn = drawn._replace(of_response=partial(_deviations_at_samples, likelihood.measured, drawn.of_response))
     return np.stack([drawn.draw(row, n_samples, rng, response) for row, response in enumerate(responses)])
+
+
+def _at_samples(likelihood: FELikelihood, response: np.ndarray) -> np.ndarray:
+    """A response at the measured samples (n_channels, n_samples) [SI], NaN where one is missing."""
+    if not isinstance(likelihood.measured, Comparison):
+        return response
+    return np.where(likelihood.measured.missing, np.nan, likelihood.measured.at_samples(response))
 
 
 def _deviations_at_samples(

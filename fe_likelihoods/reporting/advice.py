@@ -194,16 +194,21 @@ def _of_the_noise(fits: Fits) -> list[Advice]:
             "from sample to sample, so the data count as more than they are, and the intervals are too narrow."
         )
         action = (
-            "Use AutoregressiveNoise or GaussianNoise(effective_samples=...), and look at the residuals for an effect "
-            "that the model lacks."
+            "Use AutoregressiveNoise, BandNoise or GaussianNoise(effective_samples=...), and look at the residuals for "
+            "an effect that the model lacks."
         )
         found.append(Advice(CAUTION, "The errors are not white noise", text, action))
-    left = [_place(fit, each) for fit, each in doubtful if _is_correlated(each) and fit.noise == "autoregressive"]
+    coloured = ("autoregressive", "bands")
+    left = [_place(fit, each) for fit, each in doubtful if _is_correlated(each) and fit.noise in coloured]
     if left:
         text = (
-            f"The innovations are still correlated in {_listed(left)}: the errors have more than one correlation time."
+            "What the noise model does not predict (the innovations, or the whitened residuals) is still correlated "
+            f"in {_listed(left)}: the errors have another correlation than that of the noise model."
         )
-        action = "Compare with GaussianNoise(effective_samples=...), and look for an effect that the model lacks."
+        action = (
+            "Compare with BandNoise or GaussianNoise(effective_samples=...), and look for an effect that the model "
+            "lacks."
+        )
         found.append(Advice(CAUTION, "The noise model does not fit the errors", text, action))
     strange = [_place(fit, each) for fit, each in doubtful if each.checks.normal[0] < SMALL_PROBABILITY]
     if strange:
@@ -304,8 +309,8 @@ def residual_sentence(fit: Fit, each: ChannelFit) -> str:
         return f"{where}: the correlation from sample to sample is {lag:.2f}; {text}. Their distribution is {shape}."
     colour = "still correlated" if _is_correlated(each) else "white or nearly so"
     return (
-        f"{where}: what the noise model does not predict (the innovations) is {colour} (correlation {lag:.2f}); its "
-        f"distribution is {shape}."
+        f"{where}: what the noise model does not predict (the innovations, or the whitened residuals) is {colour} "
+        f"(correlation {lag:.2f}); its distribution is {shape}."
     )
 
 

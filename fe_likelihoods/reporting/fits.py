@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..probability.autoregressive_noise import AutoregressiveNoise
+from ..probability.band_noise import BandNoise
 from ..probability.event_noise import find_events
 from ..probability.likelihood import FELikelihood
 from ..probability.marginal_noise import sampled_noise
@@ -55,9 +56,10 @@ class Fit(NamedTuple):
     residuals : (n_channels, n_samples) float, or None
         Measured minus simulated after the update [SI].
     channels : tuple of ChannelFit
-    noise : {"white", "autoregressive", "effective"}
-        How the likelihood treats successive errors: as independent, with a correlation (the innovations are checked
-        then), or as fewer independent ones.
+    noise : {"white", "autoregressive", "bands", "effective"}
+        How the likelihood treats successive errors: as independent, with a correlation or with a spectrum (the
+        innovations or the whitened residuals are checked then), or as fewer independent ones. Where the level of the
+        noise depends on the response, the residuals are divided by it before they are checked.
     """
 
     title: str
@@ -155,7 +157,12 @@ def _split(
         windows = [(f"{key}, {window.name}" if key else window.name, window) for window in events.windows]
     sampled = sampled_noise(likelihood.noise)
     noise = "autoregressive" if isinstance(sampled, AutoregressiveNoise) else "white"
+    noise = "bands" if isinstance(sampled, BandNoise) else noise
     noise = "effective" if getattr(sampled, "effective_samples", None) is not None else noise
+    checked = residuals.get(after)
+    if checked is not None and hasattr(sampled, "whitened"):
+        parameters = np.array([values[name] for name in sampled.parameter_names])
+        checked = sampled.whitened(checked, measured.values - checked, parameters)
     fits = []
     for title, window in windows:
         inside = np.ones(measured.values.shape, dtype=bool)
@@ -176,13 +183,17 @@ def _split(
             tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
         )
         own = {name: np.where(inside, each, np.nan)[np.ix_(rows, columns)] for name, each in residuals.items()}
+        left = None if checked is None else np.where(inside, checked, np.nan)[np.ix_(rows, columns)]
         fits.append(
             Fit(
                 title,
                 part,
                 {name: part.values - each for name, each in own.items()},
                 own.get(after),
-                tuple(_channel_fit(part, row, own, before, after, values, noise) for row in range(len(rows))),
+                tuple(
+                    _channel_fit(part, row, own, before, after, None if left is None else left[[row]], values, noise)
+                    for row in range(len(rows))
+                ),
                 noise,
             )
         )
@@ -195,14 +206,14 @@ def _channel_fit(
     residuals: dict[str, np.ndarray],
     before: str,
     after: str,
+    left: np.ndarray | None,
     values: dict[str, float],
     noise: str,
 ) -> ChannelFit:
     channel, measured = part.channels[row], part.values[row]
     errors = {name: _relative_error(each[row], measured) for name, each in residuals.items()}
     checks = None
-    if after in residuals:
-        left = residuals[after][[row]]
+    if left is not None:
         try:
             if noise == "autoregressive":
                 left = innovations(left, np.array([values[f"rho_{channel.name}"]]))

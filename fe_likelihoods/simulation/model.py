@@ -20,9 +20,9 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
-from ..signals.interpolation import POINTS
 from .changed_model import SentModel
 from .faults import ChangedModel, FailedRun, MisfitReason, is_transient, reason_of
+from .residual_statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 
 __all__ = [
     "ContinuedResponse",
@@ -30,7 +30,6 @@ __all__ = [
     "Model",
     "SimulationBatch",
     "SimulationFailed",
-    "Statistic",
     "first_part",
     "has_batch_method",
     "misfit_batch",
@@ -40,17 +39,9 @@ __all__ = [
     "sent_simulation",
     "simulate_batch",
     "split_seconds",
-    "statistic_width",
 ]
 
 logger = logging.getLogger(__name__)
-
-Statistic = Callable[[np.ndarray], np.ndarray]
-"""Function of residuals (n_channels, n_steps) that returns (n_numbers,), the sums of squares (n_channels,) first.
-
-Residuals of missing samples are NaN. Which samples are missing is the same for all residuals of a likelihood.
-It must be defined at the top level of a module, so that it can be sent to workers.
-"""
 
 _RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is needed: 64 MiB
 
@@ -262,7 +253,7 @@ def misfit_batch(
     -------
     MisfitBatch
     """
-    reduce = _sums_of_squares if statistic is None else statistic
+    reduce = sums_of_squares if statistic is None else statistic
     shape = (statistic_width(measured, statistic),)
     own = pool is None and statistic is None and not isinstance(measured, Comparison)
     whole = getattr(model, "misfit_batch", None) if own else None
@@ -296,7 +287,7 @@ def sent_simulation(
         Takes parameters (n_parameters,); returns the result with an empty reason, or None and the reason of a failure,
         as in `misfit_batch` or `simulate_batch`.
     """
-    reduce = _sums_of_squares if statistic is None else statistic
+    reduce = sums_of_squares if statistic is None else statistic
     return partial(
         _attempt_sent, _response if measured is None else partial(_misfit, measured, reduce), SentModel(model)
     )
@@ -320,42 +311,12 @@ def misfit_of_responses(
     -------
     MisfitBatch
     """
-    reduce = _sums_of_squares if statistic is None else statistic
-    rows = [_reduced(response, measured, reduce) for response in batch.response]
+    reduce = sums_of_squares if statistic is None else statistic
+    rows = [reduce_response(response, measured, reduce) for response in batch.response]
     misfit = np.reshape(rows, (len(rows), statistic_width(measured, statistic)))
     reasons = [reason or not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
     misfit[[bool(reason) for reason in reasons]] = np.nan
     return MisfitBatch(misfit, reasons)
-
-
-def statistic_width(measured: np.ndarray | Comparison, statistic: Statistic | None = None) -> int:
-    """Number of numbers that a statistic of the residuals has, by default the sums of squares."""
-    if isinstance(measured, Comparison) and measured.lags is not None:
-        return len(measured.values) * (1 + POINTS * (2 * measured.lags.count + 1))
-    values = measured.values if isinstance(measured, Comparison) else measured
-    return len((_sums_of_squares if statistic is None else statistic)(values))
-
-
-def _sums_of_squares(residuals: np.ndarray) -> np.ndarray:
-    return np.square(residuals).sum(axis=-1)
-
-
-def _reduced(response: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic) -> np.ndarray:
-    with np.errstate(over="ignore", invalid="ignore"):
-        if isinstance(measured, Comparison):
-            if not np.isfinite(response).all():  # also where no sample is affected
-                return np.full(statistic_width(measured, reduce), np.nan)
-            if measured.lags is not None:
-                sums = _sums_of_squares(measured.known_residuals(response))
-                return np.concatenate([sums, measured.lags.sums(response, measured.values).ravel()])
-            known = reduce is _sums_of_squares
-            return reduce(measured.known_residuals(response) if known else measured.residuals(response))
-        # contiguous rows, because the order of summation, and so the last bit, must not depend on the array's layout
-        residuals = np.ascontiguousarray(response - measured)
-        if reduce is not _sums_of_squares and np.isnan(residuals).any():
-            # a failed simulation: for a statistic, NaN marks a missing sample
-            return np.full(len(reduce(measured)), np.nan)
-        return reduce(residuals)
 
 
 def _misfit_from_responses(
@@ -366,7 +327,7 @@ def _misfit_from_responses(
     rows = max(1, _RESPONSE_VALUES // (len(model.channels) * model.n_steps))
     for start in range(0, len(thetas), rows):
         batch = simulate_batch(model, thetas[start : start + rows])
-        misfits += [_reduced(response, measured, reduce) for response in batch.response]
+        misfits += [reduce_response(response, measured, reduce) for response in batch.response]
         reasons += batch.reasons
     return MisfitBatch(np.reshape(misfits, (len(thetas), statistic_width(measured, reduce))), reasons)
 
@@ -420,7 +381,7 @@ def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, 
     if reason := not_finite(model, response):
         raise SimulationFailed(reason)
     try:
-        return _reduced(response, measured, reduce)
+        return reduce_response(response, measured, reduce)
     except Exception as error:
         raise SimulationFailed(reason_of(error) if is_transient(error) else MisfitReason(reason_of(error))) from error
 

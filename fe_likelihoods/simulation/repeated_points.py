@@ -12,6 +12,7 @@ from .cache_rows import StoredSimulation
 from .disk_cache import SimulationCache
 from .faults import TransientReason
 from .model import misfit_batch
+from .residual_statistics import needs_response
 from .tolerance import largest_difference, response_tolerance
 from .verification import VerifyingRun
 
@@ -91,4 +92,5 @@ def _is_same(one: StoredSimulation, other: StoredSimulation, run: VerifyingRun, 
         return True
     if one.reason or other.reason:
         return bool(one.reason and other.reason)
-    return largest_difference(one.misfit, other.misfit, run.measured, tolerance) is None
+    of_response = needs_response(run.statistic)
+    return largest_difference(one.misfit, other.misfit, run.measured, tolerance, of_response) is None

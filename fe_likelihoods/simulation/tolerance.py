@@ -24,7 +24,11 @@ def response_tolerance(model: Model) -> float:
 
 
 def largest_difference(
-    stored: np.ndarray, new: np.ndarray, measured: np.ndarray | Comparison, tolerance: float
+    stored: np.ndarray,
+    new: np.ndarray,
+    measured: np.ndarray | Comparison,
+    tolerance: float,
+    of_response: bool = False,
 ) -> tuple[int, float] | None:
     """The statistic that differs most between two simulations with the same parameters, if one differs too much.
 
@@ -37,6 +41,8 @@ def largest_difference(
         Measured response [SI].
     tolerance : float
         Accepted change of the response in a channel, relative to the norm of the response.
+    of_response : bool
+        Whether sums of squares of the response are among the further numbers.
 
     Returns
     -------
@@ -48,7 +54,7 @@ def largest_difference(
     -----
     The norm of a response is at most r, the sum of the norms of its residual and of the measured response. If the
     response changes by t r, the sum of squares s^2 changes by at most 2 s t r + (t r)^2, and so does a sum of products
-    of two residuals of the channel.
+    of two residuals of the channel. A sum of squares of the response changes by at most 2 r t r + (t r)^2.
     """
     if np.array_equal(stored, new):
         return None
@@ -57,6 +63,8 @@ def largest_difference(
     sums = np.sort([stored[: len(measured)], new[: len(measured)]], axis=0)
     s = np.sqrt(sums[0])[channels]
     r = (np.sqrt(sums[1]) + np.linalg.norm(measured, axis=1))[channels]
+    if of_response:
+        s[len(measured) :] = r[len(measured) :]
     difference = np.abs(stored - new)
     with np.errstate(divide="ignore", invalid="ignore"):
         # the positive root of (t r)^2 + 2 s (t r) = difference, in the form that does not cancel

@@ -27,7 +27,8 @@ from .cache_rows import CachedRows, StoredSimulation, simulation_keys
 from .disk_cache import SimulationCache
 from .faults import TransientReason
 from .fingerprint import simulation_fingerprint
-from .model import Model, SimulationBatch, Statistic, misfit_batch, misfit_of_responses
+from .model import Model, SimulationBatch, misfit_batch, misfit_of_responses
+from .residual_statistics import Statistic, needs_response
 from .tolerance import largest_difference, response_tolerance
 from .verification_schedule import Schedule, shared_schedule
 
@@ -347,7 +348,7 @@ class VerifiedCache:
                 advice = ". If failures depend on anything but the parameters, set retry_failures=True"
         else:
             tolerance = self._tolerance(run)
-            found = largest_difference(row.misfit, new, run.measured, tolerance)
+            found = largest_difference(row.misfit, new, run.measured, tolerance, needs_response(run.statistic))
             if found is None:
                 return
             index, change = found
@@ -387,7 +388,7 @@ class VerifiedCache:
         if reason or new_reason:
             outcome = f"failed ({new_reason})" if new_reason else "succeeded"
             return f"{text}{outcome}. Make it depend on its parameters alone, for example with a fixed seed"
-        found = largest_difference(earlier, new, run.measured, self._tolerance(run))
+        found = largest_difference(earlier, new, run.measured, self._tolerance(run), needs_response(run.statistic))
         if found is None:
             return ""
         index, change = found

@@ -1,0 +1,293 @@
+r"""White noise whose standard deviation follows the simulated response in time, in the likelihood and in predictions.
+
+The error of a model grows with the response: it is large in the strong part of a motion and small before and after it.
+`ModulatedNoise` is Gaussian and independent from sample to sample, with the standard deviation
+
+.. math:: \sigma_{ck}^2 = s_c^2 + (a_c\, e_{ck}(\theta))^2
+
+of sample k of channel c: the known noise :math:`s_c` of the sensor, and the unknown share :math:`a_c` of the envelope
+:math:`e_{ck}` of the simulated response. The envelope is a moving root mean square. Because it is that of the
+simulation, the likelihood is a normalised density of the measurements, and a prediction has the same noise.
+
+See ``docs/theory/noise.rst``.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from ..signals.channels import Channel, Measurements
+from .grouped_errors import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
+from .noise import HALF_LOG_TWO_PI, PerChannel, options_repr, set_channels
+from .sample_counts import SampleCounts
+
+__all__ = ["ModulatedNoise", "PartSums"]
+
+_PARTS = 3  # parts of a window, in steps of which it moves
+_ROUND_OFF = 1e-6  # of a part
+
+
+@dataclass(frozen=True)
+class PartSums:
+    """Statistic of the residuals and of the response: sums of squares in short parts of the time.
+
+    Parameters
+    ----------
+    part : float
+        Length of a part [s].
+    steps, starts : tuple of float
+        Time step and time of the first sample of each channel [s].
+    """
+
+    part: float
+    steps: tuple[float, ...]
+    starts: tuple[float, ...]
+
+    of_response: ClassVar[bool] = True
+
+    def __call__(self, residuals: np.ndarray, response: np.ndarray) -> np.ndarray:
+        """Return the sums (n_numbers,) [SI unit of the channel, squared].
+
+        Those of the residuals of all samples, then those of the residuals in each part, then those of the response in
+        each part; (n_channels,) each. Samples with residuals of NaN are left out.
+        """
+        places, there = self.places(residuals.shape[1]), ~np.isnan(residuals)
+        squares = [np.square(residuals), np.square(response)]
+        sums = [sums_of_parts(each, places, there) for each in squares]
+        return np.concatenate([np.nansum(squares[0], axis=1), *(each.ravel() for each in sums)])
+
+    def places(self, n_steps: int) -> np.ndarray:
+        """Part of each sample (n_channels, n_steps)."""
+        times = np.array(self.starts)[:, None] + np.array(self.steps)[:, None] * np.arange(n_steps)
+        return np.maximum(np.floor(times / self.part + _ROUND_OFF).astype(int), 0)
+
+
+def sums_of_parts(values: np.ndarray, places: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Sums (n_parts, n_channels) of the values (n_channels, n_steps) that are there in each part."""
+    n_parts = int(places.max()) + 1
+    return np.stack(
+        [
+            np.bincount(place[known], row[known], minlength=n_parts)
+            for row, place, known in zip(values, places, there, strict=True)
+        ],
+        axis=1,
+    )
+
+
+@dataclass(frozen=True)
+class ModulatedNoise:
+    """Independent Gaussian noise with an unknown share of the envelope of the simulated response per channel.
+
+    Parameters
+    ----------
+    channels : sequence of Channel
+        The measured channels, in the order of the model.
+    window : float
+        Length of the window [s] in which the root mean square of the response is taken: longer than a period of the
+        response, and shorter than the strong part of the motion.
+    sensor : mapping of channel names to float, or sequence of float
+        Known standard deviation of the noise of each sensor [SI unit of the channel], positive: the standard deviation
+        of the error where the response is zero.
+    layout : MeasuredLayout, optional
+        Times of the samples; set by the likelihood (`with_measurements`).
+
+    Raises
+    ------
+    ValueError
+        If the window is not positive, or a channel has no sensor noise.
+
+    Notes
+    -----
+    The window moves in steps of a third of its length, so that the envelope is constant within these parts of the time:
+    e^2 is the mean square of the response in a part and its two neighbours. Parts start at the time zero. Two sums of
+    squares per part and channel, of the residuals and of the response, are then sufficient, and a change of the share
+    needs no simulation. A simulation is cached with 1 + 6 T / window numbers per channel, for a duration of T: 2.9 kB
+    for 60 s and a window of 1 s.
+
+    The envelope depends on the structural parameters, not on the measurements. The likelihood is therefore a normalised
+    density, and evidences can be compared with those of `GaussianNoise` and others, unlike those of `RelativeNoise`.
+    The share is the ratio of the error to the response, and may exceed one.
+
+    The statistics are not quadratic in the residuals, so samplers cannot use a guide (`fe_likelihoods.ResponseGuide`).
+    Sums over the samples that are there take the place of all where samples are missing.
+
+    Examples
+    --------
+    >>> noise = ModulatedNoise(model.channels, window=1.0, sensor={"top": 0.005})
+    >>> posterior = Posterior(FELikelihood(model, measurements, noise), prior | {"share_top": HalfNormal(0.5)})
+    >>> propagate(posterior, samples, record=weaker, noise=True)  # noise of the weaker response
+    """
+
+    channels: tuple[Channel, ...]
+    window: float
+    sensor: tuple[float, ...]
+    layout: MeasuredLayout | None
+
+    def __init__(
+        self,
+        channels: Sequence[Channel],
+        *,
+        window: float,
+        sensor: PerChannel,
+        layout: MeasuredLayout | None = None,
+    ) -> None:
+        if not 0.0 < window < math.inf:
+            raise ValueError(f"ModulatedNoise: window must be a positive length [s]; got {window!r}")
+        object.__setattr__(self, "window", float(window))
+        set_channels(self, channels, sensor)
+        if self.sensor is None or not all(value > 0.0 for value in self.sensor):
+            raise ValueError(
+                "ModulatedNoise needs the noise of the sensor of each channel, a positive standard deviation in SI "
+                f"units, for the parts where the response is zero; got {sensor!r}. Take it from the quiet part before "
+                "the motion, or from the resolution of the sensor"
+            )
+        object.__setattr__(self, "layout", layout)
+
+    def __repr__(self) -> str:
+        # display units and the layout, which the measurements determine, change no value of the likelihood
+        named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
+        return f"ModulatedNoise({', '.join([*named, f'window={self.window!r}', *options_repr(self.sensor)])})"
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """``share_<channel>``: standard deviations as shares of the envelope of the response [-]."""
+        return tuple(f"share_{channel.name}" for channel in self.channels)
+
+    @property
+    def statistic(self) -> PartSums:
+        """Statistic of the residuals and of the response."""
+        if self.layout is None:
+            raise without_layout(self)
+        return PartSums(self.window / _PARTS, self.layout.steps, self.layout.starts)
+
+    def with_measurements(self, measurements: Measurements) -> "ModulatedNoise":
+        """The same noise for the times of these measurements.
+
+        Raises
+        ------
+        ValueError
+            If the window is shorter than three time steps.
+        """
+        if self.window < (_PARTS - _ROUND_OFF) * max(measurements.steps):
+            raise ValueError(
+                f"ModulatedNoise: the window of {self.window:g} s must be at least three steps of "
+                f"{max(measurements.steps):g} s; give a longer one"
+            )
+        sums = PartSums(self.window / _PARTS, tuple(measurements.steps), tuple(measurements.starts))
+        there = ~np.isnan(measurements.values)
+        counts = sums_of_parts(there.astype(float), sums.places(there.shape[1]), there).astype(int)
+        return replace(self, layout=MeasuredLayout(sums.steps, sums.starts, tuple(map(tuple, counts.tolist()))))
+
+    def log_likelihood(self, statistics: np.ndarray, n_samples: int | SampleCounts, shares: np.ndarray) -> np.ndarray:
+        """Log-likelihood of the measurements.
+
+        Parameters
+        ----------
+        statistics : (n, n_numbers) float
+            Those of `PartSums` [SI unit of the channel, squared]; NaN where the simulation failed.
+        n_samples : int or SampleCounts
+            Number of samples of every channel, or those of each channel where samples are missing.
+        shares : (n, n_channels) float
+            Parameters of the noise.
+
+        Returns
+        -------
+        (n,) float
+            -inf for negative shares, and where the statistics are not finite; never NaN.
+        """
+        if self.layout is None:
+            raise without_layout(self)
+        counts = np.array(self.layout.counts)
+        squares, powers = split_sums(statistics, counts)
+        with np.errstate(invalid="ignore"):
+            envelope = np.sqrt(_mean_squares(powers, counts))
+        shares = np.asarray(shares, dtype=float)[:, None]
+        return grouped_log_likelihood(squares, counts, self._deviations(shares, envelope), n_samples)
+
+    def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
+        """Standard deviations (n, n_channels) of the errors where the response is zero [SI]; NaN for negative shares.
+
+        Elsewhere they depend on the response, see `response_deviations`.
+        """
+        parameters = np.asarray(parameters, dtype=float)
+        return self._deviations(parameters, np.zeros_like(parameters))
+
+    def response_deviations(
+        self, shares: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None
+    ) -> np.ndarray:
+        """Standard deviations of the errors of a simulated response.
+
+        Parameters
+        ----------
+        shares : (n_channels,) float
+            Parameters of the noise.
+        response : (n_channels, n_steps) float
+            Response [SI unit of each channel]; NaN where a sample is missing.
+        dt : float or sequence of float, optional
+            Its time step [s], of a response from the time zero. Default: the response is at the measured samples.
+
+        Returns
+        -------
+        (n_channels, n_steps) float
+            [SI unit of each channel]; NaN where the response is.
+        """
+        response = np.asarray(response, dtype=float)
+        if dt is None:
+            sums = self.statistic
+        else:
+            steps = per_channel(dt, len(response))
+            sums = PartSums(self.window / _PARTS, steps, (0.0,) * len(steps))
+        places, there = sums.places(response.shape[1]), ~np.isnan(response)
+        power = sums_of_parts(np.square(response), places, there)
+        counts = sums_of_parts(np.ones_like(response), places, there)
+        levels = np.sqrt(_mean_squares(power[None], counts)[0])
+        envelope = np.take_along_axis(levels.T, places, axis=1)
+        deviations = self._deviations(np.asarray(shares, dtype=float)[:, None], envelope, axis=0)
+        return np.where(there, deviations, np.nan)
+
+    def whitened(self, residuals: np.ndarray, response: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        """Residuals divided by their standard deviations: white, with a standard deviation of one, if the noise fits.
+
+        Parameters
+        ----------
+        residuals, response : (n_channels, n_samples) float
+            At the measured samples [SI unit of each channel]; NaN where a sample is missing.
+        shares : (n_channels,) float
+            Parameters of the noise.
+
+        Returns
+        -------
+        (n_channels, n_samples) float
+            [-], for `fe_likelihoods.residual_checks`.
+        """
+        response = np.where(np.isnan(residuals), np.nan, response)
+        return residuals / self.response_deviations(shares, response)
+
+    def log_densities(self, residuals: np.ndarray, response: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        """Log-density (n_channels, n_samples) of each sample, arguments as for `whitened`; zero where it is missing."""
+        response = np.where(np.isnan(residuals), np.nan, response)
+        deviations = self.response_deviations(shares, response)
+        terms = -HALF_LOG_TWO_PI - np.log(deviations) - 0.5 * np.square(residuals / deviations)
+        return np.nan_to_num(terms, nan=0.0)
+
+    def _deviations(self, shares: np.ndarray, envelope: np.ndarray, axis: int = -1) -> np.ndarray:
+        """Sensor noise and share of the envelope together; `axis` is that of the channels."""
+        floor = np.array(self.sensor)
+        floor = floor[:, None] if axis == 0 else floor
+        with np.errstate(invalid="ignore"):
+            return np.where(shares >= 0.0, np.hypot(floor, shares * envelope), np.nan)
+
+
+def _mean_squares(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Mean squares (n, n_parts, n_channels) over each part and its two neighbours, from the sums of the parts."""
+
+    def with_neighbours(values: np.ndarray) -> np.ndarray:
+        total = values.copy()
+        total[..., 1:, :] += values[..., :-1, :]
+        total[..., :-1, :] += values[..., 1:, :]
+        return total
+
+    return with_neighbours(sums) / np.maximum(with_neighbours(counts), 1)

@@ -1,0 +1,64 @@
+"""Statistics of the residuals of a simulation: the few numbers that a likelihood needs of a response."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..signals.comparison import Comparison
+from ..signals.interpolation import POINTS
+
+__all__ = ["Statistic", "apply_statistic", "needs_response", "reduce_response", "statistic_width", "sums_of_squares"]
+
+Statistic = Callable[..., np.ndarray]
+"""Function of residuals (n_channels, n_samples) that returns (n_numbers,), the sums of squares (n_channels,) first.
+
+Residuals of missing samples are NaN. Which samples are missing is the same for all residuals of a likelihood. With an
+attribute ``of_response`` that is true, it has a second argument, the response at the samples (n_channels, n_samples),
+NaN where one is missing. It must be defined at the top level of a module, so that it can be sent to workers.
+"""
+
+
+def needs_response(statistic: Statistic | None) -> bool:
+    """Whether a statistic is one of the residuals and of the response."""
+    return bool(getattr(statistic, "of_response", False))
+
+
+def apply_statistic(statistic: Statistic, residuals: np.ndarray, response: np.ndarray) -> np.ndarray:
+    """Numbers (n_numbers,) of a statistic; residuals and response (n_channels, n_samples) are NaN where missing."""
+    return statistic(residuals, response) if needs_response(statistic) else statistic(residuals)
+
+
+def statistic_width(measured: np.ndarray | Comparison, statistic: Statistic | None = None) -> int:
+    """Number of numbers that a statistic of the residuals has, by default the sums of squares."""
+    if isinstance(measured, Comparison) and measured.lags is not None:
+        return len(measured.values) * (1 + POINTS * (2 * measured.lags.count + 1))
+    values = measured.values if isinstance(measured, Comparison) else measured
+    return len(apply_statistic(sums_of_squares if statistic is None else statistic, values, values))
+
+
+def sums_of_squares(residuals: np.ndarray) -> np.ndarray:
+    """Sums of squares (n_channels,) of residuals (n_channels, n_samples)."""
+    return np.square(residuals).sum(axis=-1)
+
+
+def reduce_response(response: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic) -> np.ndarray:
+    """Statistic `reduce` (n_numbers,) of a response (n_channels, n_steps) [SI]; NaN for a failed simulation."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        if isinstance(measured, Comparison):
+            if not np.isfinite(response).all():  # also where no sample is affected
+                return np.full(statistic_width(measured, reduce), np.nan)
+            if measured.lags is not None:
+                sums = sums_of_squares(measured.known_residuals(response))
+                return np.concatenate([sums, measured.lags.sums(response, measured.values).ravel()])
+            if reduce is sums_of_squares:
+                return reduce(measured.known_residuals(response))
+            residuals = measured.residuals(response)
+            if not needs_response(reduce):
+                return reduce(residuals)
+            return reduce(residuals, np.where(measured.missing, np.nan, measured.at_samples(response)))
+        # contiguous rows, because the order of summation, and so the last bit, must not depend on the array's layout
+        residuals = np.ascontiguousarray(response - measured)
+        if reduce is not sums_of_squares and np.isnan(residuals).any():
+            # a failed simulation: for a statistic, NaN marks a missing sample
+            return np.full(statistic_width(measured, reduce), np.nan)
+        return apply_statistic(reduce, residuals, np.ascontiguousarray(response))

@@ -1,0 +1,384 @@
+"""`ModulatedNoise` and `BandNoise`: densities against scipy, calibration, predictive draws, gaps, caches, reports."""
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.fft import dct
+
+from fe_likelihoods import (
+    BandNoise,
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    HalfNormal,
+    JointLikelihood,
+    Measurements,
+    ModulatedNoise,
+    Posterior,
+    RelativeNoise,
+    SimulationCache,
+    TruncatedNormal,
+    find_modes,
+    propagate,
+    residual_checks,
+)
+from fe_likelihoods.emulation.target import ResponseTarget
+from fe_likelihoods.simulation.tolerance import largest_difference
+
+N, DT = 240, 0.02
+CHANNELS = (Channel("top", "acceleration", "m/s2"), Channel("base", "displacement", "mm"))
+SENSOR, EDGES, WINDOW = (0.02, 1e-4), (2.0, 8.0), 0.6
+NOISES = {
+    "modulated": ModulatedNoise(CHANNELS, window=WINDOW, sensor=SENSOR),
+    "shares in bands": BandNoise(CHANNELS, EDGES, sensor=SENSOR),
+    "levels in bands": BandNoise(CHANNELS, EDGES, relative=False, sensor=SENSOR),
+}
+PARAMETERS = {
+    "modulated": np.array([0.3, 0.1]),
+    "shares in bands": np.array([0.5, 0.1, 2.0, 0.2, 0.4, 0.9]),
+    "levels in bands": np.array([0.2, 0.1, 0.05, 1e-3, 3e-3, 5e-4]),
+}
+EVERY = pytest.mark.parametrize("kind", list(NOISES))
+
+
+def response(theta, n=N, dt=DT):
+    """A burst in two channels."""
+    time = dt * np.arange(n)
+    burst = np.exp(-(((time - 1.5) / 0.5) ** 2))
+    return np.stack([theta[0] * burst * np.sin(30.0 * time), 0.01 * theta[0] * burst * np.cos(11.0 * time)])
+
+
+MODEL = FunctionModel(response, ["factor"], CHANNELS, DT, N)
+
+
+def measured(values, **options):
+    return Measurements(CHANNELS, options.pop("dt", DT), values, **options)
+
+
+def likelihood_of(kind, values, **options):
+    return FELikelihood(MODEL, measured(values), NOISES[kind], **options)
+
+
+def covariance(kind, history, parameters, channel, dt=DT):
+    """Covariance of the errors of one channel without gaps, from the definitions, with loops and a full matrix."""
+    n, sensor = len(history), SENSOR[channel]
+    if kind == "modulated":
+        parts = np.floor(dt * np.arange(n) / (WINDOW / 3.0) + 1e-9)
+        envelope = [np.sqrt(np.mean(history[np.abs(parts - part) <= 1] ** 2)) for part in parts]
+        return np.diag(sensor**2 + (parameters[channel] * np.array(envelope)) ** 2)
+    time = np.arange(n)
+    basis = np.sqrt(2.0 / n) * np.cos(np.pi * np.outer(time, time + 0.5) / n)
+    basis[0] /= np.sqrt(2.0)
+    band = np.digitize(time / (2.0 * n * dt), EDGES)
+    variances, coefficients = np.empty(n), basis @ history
+    for b, level in enumerate(parameters[3 * channel : 3 * channel + 3]):
+        inside = band == b
+        size = np.mean(coefficients[inside] ** 2) if kind == "shares in bands" else n / inside.sum()
+        variances[inside] = sensor**2 + level**2 * size
+    return basis.T @ np.diag(variances) @ basis
+
+
+def exact(kind, values, theta, parameters):
+    simulated = response(theta)
+    return sum(
+        stats.multivariate_normal(simulated[c], covariance(kind, simulated[c], parameters, c)).logpdf(values[c])
+        for c in range(2)
+    )
+
+
+@EVERY
+def test_the_likelihood_is_the_multivariate_normal_density(kind, rng):
+    values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
+    likelihood, parameters = likelihood_of(kind, values), PARAMETERS[kind]
+    for theta in (0.7, 1.0, 1.4):
+        expected = exact(kind, values, [theta], parameters)
+        assert likelihood([theta, *parameters]) == pytest.approx(expected, rel=1e-11)
+    noise, simulated = likelihood.noise, response([1.4])
+    assert noise.log_densities(simulated - values, simulated, parameters).sum() == pytest.approx(expected, rel=1e-11)
+    # a change of the noise needs no simulation, and impossible noise none at all
+    assert likelihood.simulations == 3
+    likelihood(np.hstack([np.full((50, 1), 1.0), parameters * rng.uniform(0.5, 2.0, (50, 1))]))
+    assert likelihood([1.1, *(-parameters)]) == -np.inf and likelihood.simulations == 3
+
+
+@pytest.mark.parametrize("kind", ["modulated", "shares in bands"])
+def test_the_density_integrates_to_one_over_the_measurements(kind):
+    """`RelativeNoise`, the control, does not: its level is computed from the measurements."""
+    channel = (CHANNELS[0],)
+    model = FunctionModel(lambda theta: theta[0] * np.array([[1.0, -0.4]]), ["factor"], channel, DT, 2)
+    noise = {
+        "modulated": ModulatedNoise(channel, window=3.0 * DT, sensor=(0.1,)),
+        "shares in bands": BandNoise(channel, (10.0,), sensor=(0.1,)),
+    }[kind]
+    n = len(noise.parameter_names)
+
+    simulated = model.simulate([1.0])
+    axes = np.linspace(-3.0, 5.0, 61), np.linspace(-4.0, 3.2, 61)
+    step = (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0])
+    fitted = FELikelihood(model, Measurements(channel, DT, simulated), noise).noise
+    density = [
+        np.exp(fitted.log_densities(simulated - [[one, two]], simulated, np.full(n, 0.8)).sum())
+        for one in axes[0]
+        for two in axes[1]
+    ]
+    # equal weights are exact up to exp(-2 (pi sd / step)^2) for normal densities that are zero at the ends
+    assert step * np.sum(density) == pytest.approx(1.0, abs=1e-4)
+    values = [np.array([[one, two]]) for one in axes[0] for two in axes[1]]
+    relative = [
+        RelativeNoise(channel, [np.sqrt(np.mean(each**2))]).log_likelihood(
+            np.sum((each - simulated) ** 2, axis=1)[None], 2, [[0.3]]
+        )[0]
+        for each in values
+    ]
+    assert step * np.sum(np.exp(relative)) > 1.05
+
+
+@EVERY
+def test_draws_have_the_covariance_of_the_density(kind, rng):
+    """Predictions and replicated measurements: per step, and correlation from step to step, against the matrix."""
+    likelihood, parameters, n = likelihood_of(kind, response([1.0])), PARAMETERS[kind], 600
+    names = likelihood.noise.parameter_names
+    posterior = Posterior(likelihood, {"factor": TruncatedNormal(1.0, 0.1)} | {name: HalfNormal(1.0) for name in names})
+    samples = np.tile([1.0, *parameters], (n, 1))
+    prediction = propagate(posterior, samples, noise=True, seed=1, progress=False)
+    draws = posterior.predictive_draws(samples)
+    simulated = response([1.0])
+    for c, channel in enumerate(CHANNELS):
+        matrix = covariance(kind, simulated[c], parameters, c)
+        sd = np.sqrt(np.diag(matrix))
+        np.testing.assert_allclose(prediction.sd[c], sd, rtol=1e-9)
+        errors = (draws.replicates[channel.name] - draws.responses[channel.name]) / sd
+        # variances of n draws have a relative standard error of sqrt(2 / n)
+        assert np.abs(errors.var(axis=0) - 1.0).max() < 5.0 * np.sqrt(2.0 / n)
+        lag_one = np.diag(matrix, 1) / (sd[1:] * sd[:-1])
+        assert np.abs((errors[:, 1:] * errors[:, :-1]).mean(axis=0) - lag_one).max() < 5.0 * np.sqrt(2.0 / n)
+        quantiles = prediction.quantile(0.95)[c] - prediction.quantile(0.05)[c]
+        assert np.mean(quantiles / (2.0 * 1.6449 * sd)) == pytest.approx(1.0, abs=0.04)
+        if kind == "modulated":
+            assert sd.max() > 5.0 * sd.min() and np.abs(lag_one).max() == 0.0
+        elif channel.name == "top":
+            assert np.abs(lag_one).mean() > 0.2
+
+
+@pytest.mark.parametrize("kind", ["modulated", "shares in bands"])
+def test_shares_scale_with_the_motion_and_levels_in_si_units_do_not(kind):
+    noise = likelihood_of(kind, response([1.0])).noise
+    parameters = PARAMETERS[kind]
+    strong, weak = (np.square(noise.response_deviations(parameters, response([f]), DT)) for f in (1.0, 0.1))
+    floor = np.square(np.array(SENSOR))[:, None]
+    np.testing.assert_allclose(weak - floor, 0.01 * (strong - floor), rtol=1e-6, atol=1e-14)
+    fixed = likelihood_of("levels in bands", response([1.0])).noise
+    levels = [fixed.response_deviations(PARAMETERS["levels in bands"], response([f]), DT) for f in (1.0, 0.1)]
+    np.testing.assert_array_equal(*levels)
+
+
+def test_levels_in_bands_are_those_of_the_errors_whatever_the_time_step():
+    """The variance of the samples is the sum of the squared levels, apart from the ends, and of the sensor."""
+    noise, parameters = NOISES["levels in bands"], PARAMETERS["levels in bands"]
+    total = np.hypot(np.sqrt(np.square(parameters[:3]).sum()), SENSOR[0])
+    assert noise.standard_deviations(parameters[None])[0, 0] == pytest.approx(total)
+    for n, dt in ((2000, 0.02), (4000, 0.01), (500, 0.02)):
+        found = noise.response_deviations(parameters, np.zeros((2, n)), dt)
+        assert np.sqrt(np.mean(found[0] ** 2)) == pytest.approx(total, rel=1e-12)
+        np.testing.assert_allclose(found[0, n // 4 : 3 * n // 4], total, rtol=0.03)
+    one = BandNoise(CHANNELS, EDGES, relative=False, sensor=SENSOR)
+    errors = one.response_errors(
+        parameters * [1, 0, 0, 1, 0, 0], np.zeros((2, 4000)), np.random.default_rng(1).standard_normal((2, 4000)), DT
+    )
+    spectrum = np.square(dct(errors[0], norm="ortho"))
+    assert spectrum[:320].sum() > 30.0 * spectrum[320:].sum()  # below 2 Hz
+
+
+def test_calibrated_parameters_have_uniform_ranks(rng):
+    """Simulation-based calibration on a grid: exact posteriors, so that the ranks test the density alone."""
+    n, repeats, channel = 120, 120, (CHANNELS[0],)
+    model = FunctionModel(lambda theta: response(theta, n)[:1], ["factor"], channel, DT, n)
+    noises = [
+        ModulatedNoise(channel, window=WINDOW, sensor=(0.02,)),
+        BandNoise(channel, (5.0,), sensor=(0.02,)),
+        BandNoise(channel, (5.0,), relative=False, sensor=(0.02,)),
+    ]
+    axes = [np.linspace(0.4, 1.6, 21), np.linspace(0.05, 1.0, 14), np.linspace(0.05, 1.0, 14)]
+    for noise in noises:
+        d = 1 + len(noise.parameter_names)
+        grid = np.stack([each.ravel() for each in np.meshgrid(*axes[1:d], indexing="ij")], axis=1)
+        ranks = np.empty((repeats, d))
+        for k in range(repeats):
+            truth = [rng.integers(len(axis)) for axis in axes[:d]]
+            theta = np.array([axis[place] for axis, place in zip(axes, truth, strict=False)])
+            simulated = model.simulate(theta[:1])
+            fitted = noise.with_measurements(Measurements(channel, DT, simulated))
+            errors = draw(fitted, theta[1:], simulated, rng)
+            likelihood = FELikelihood(model, Measurements(channel, DT, simulated + errors), noise)
+            statistics = likelihood.statistics(axes[0][:, None])
+            repeated = np.repeat(statistics, len(grid), axis=0), n, np.tile(grid, (len(statistics), 1))
+            values = fitted.log_likelihood(*repeated)
+            weights = np.exp(np.array(values) - np.max(values)).reshape([len(axis) for axis in axes[:d]])
+            for j, place in enumerate(truth):
+                marginal = weights.sum(axis=tuple(i for i in range(d) if i != j)) / weights.sum()
+                ranks[k, j] = marginal[:place].sum() + rng.uniform() * marginal[place]
+        for j in range(d):
+            assert stats.kstest(ranks[:, j], "uniform").pvalue > 1e-3, (noise, j)
+
+
+def draw(noise, parameters, simulated, rng):
+    normal = rng.standard_normal(simulated.shape)
+    if isinstance(noise, BandNoise):
+        return noise.response_errors(parameters, simulated, normal)
+    return noise.response_deviations(parameters, simulated) * normal
+
+
+@EVERY
+def test_gaps_and_times_of_channels(kind, rng):
+    """A gap divides a channel; samples that are there are those of the density. One channel has its own step."""
+    values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
+    gap, parameters = values.copy(), PARAMETERS[kind]
+    gap[0, 100:130] = np.nan
+    likelihood, simulated = likelihood_of(kind, gap), response([1.2])
+    if kind == "modulated":  # the envelope is that of the samples that are there
+        there = np.where(np.isnan(gap), np.nan, simulated)
+        sd = likelihood.noise.response_deviations(parameters, there)
+        expected = np.nansum(stats.norm.logpdf(gap, simulated, sd))
+    else:  # two stretches, and the channel without a gap
+        expected = stats.multivariate_normal(simulated[1], covariance(kind, simulated[1], parameters, 1)).logpdf(gap[1])
+        for part in (slice(0, 100), slice(130, N)):
+            matrix = covariance(kind, simulated[0, part], parameters, 0)
+            expected += stats.multivariate_normal(simulated[0, part], matrix).logpdf(gap[0, part])
+    assert likelihood([1.2, *parameters]) == pytest.approx(expected, rel=1e-10)
+    terms = likelihood.noise.log_densities(simulated - gap, simulated, parameters)
+    assert terms.sum() == pytest.approx(expected, rel=1e-10) and (terms[0, 100:130] == 0.0).all()
+    # every second sample of the second channel, padded with NaN
+    own = values.copy()
+    own[1, N // 2 :] = np.nan
+    own[1, : N // 2] = values[1, ::2]
+    other = FELikelihood(MODEL, Measurements(CHANNELS, (DT, 2.0 * DT), own), NOISES[kind])
+    matrices = [
+        covariance(kind, simulated[0], parameters, 0),
+        covariance(kind, simulated[1, ::2], parameters, 1, 2 * DT),
+    ]
+    expected = sum(
+        stats.multivariate_normal(each, matrix).logpdf(data)
+        for each, matrix, data in zip(
+            (simulated[0], simulated[1, ::2]), matrices, (own[0], values[1, ::2]), strict=True
+        )
+    )
+    assert other([1.2, *parameters]) == pytest.approx(expected, rel=1e-10)
+    names = other.noise.parameter_names
+    posterior = Posterior(other, {"factor": TruncatedNormal(1.0, 0.1)} | {name: HalfNormal(1.0) for name in names})
+    draws = posterior.predictive_draws(np.tile([1.2, *parameters], (500, 1)))
+    errors = draws.replicates["base"] - draws.responses["base"]
+    assert errors.shape == (500, N // 2)
+    ratio = errors.std(axis=0) / np.sqrt(np.diag(matrices[1]))
+    assert np.abs(ratio - 1.0).max() < 5.0 / np.sqrt(1000)
+
+
+@EVERY
+def test_blocks_of_time_add_up_and_are_those_of_the_whole_response(kind, rng):
+    values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
+    likelihood, parameters = likelihood_of(kind, values), PARAMETERS[kind]
+    names = likelihood.noise.parameter_names
+    posterior = Posterior(likelihood, {"factor": TruncatedNormal(1.0, 0.1)} | {name: HalfNormal(1.0) for name in names})
+    rows = np.array([[1.0, *parameters], [1.3, *(0.7 * parameters)]])
+    blocks = posterior.predictive_draws(rows, block=0.8).blocks
+    np.testing.assert_allclose(blocks.values.sum(axis=1), likelihood(rows), rtol=1e-10)
+    assert blocks.values.shape == (2, 6) and ("whitened" in blocks.note) == (kind != "modulated")
+    if kind == "modulated":
+        sd = likelihood.noise.response_deviations(parameters, response([1.0]))
+        expected = stats.norm.logpdf(values, response([1.0]), sd)[:, 40:80].sum()
+        assert blocks.values[0, 1] == pytest.approx(expected, rel=1e-10)
+
+
+@EVERY
+def test_whitened_residuals_pass_the_checks_that_residuals_fail(kind):
+    rng, n = np.random.default_rng(5), 3000
+    simulated = np.tile(response([1.0], 300), 10)
+    noise = NOISES[kind].with_measurements(measured(simulated))
+    errors = draw(noise, PARAMETERS[kind], simulated, rng)
+    found = residual_checks(errors, CHANNELS)
+    white = noise.whitened(errors, simulated, PARAMETERS[kind])
+    checks = residual_checks(white, CHANNELS)
+    assert (checks.white > 0.01).all() and (checks.normal > 0.01).all()
+    np.testing.assert_allclose(checks.standard_deviation, 1.0, atol=5.0 / np.sqrt(2.0 * n))
+    assert (found.normal < 1e-6).all() if kind == "modulated" else (found.white < 1e-6).all()
+
+
+@EVERY
+def test_caches_pools_pickles_and_joint_likelihoods(kind, rng, tmp_path):
+    values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
+    parameters, points = PARAMETERS[kind], rng.uniform(0.8, 1.2, 6)
+    rows = np.column_stack([points, np.tile(parameters, (6, 1))])
+    likelihood = likelihood_of(kind, values, cache=tmp_path / "cache")
+    expected = likelihood(rows)
+    again = likelihood_of(kind, values, cache=SimulationCache(tmp_path / "cache"))
+    np.testing.assert_array_equal(again(rows), expected)
+    assert again.simulations == 0 and again.disk_hits == 6
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(likelihood))(rows), expected)
+    white = again.with_noise(GaussianNoise(CHANNELS))
+    assert white.fingerprint != likelihood.fingerprint and white.density_parts() != likelihood.density_parts()
+    joint = JointLikelihood({"one": likelihood, "two": again}, separate=likelihood.noise.parameter_names)
+    point = np.concatenate([[1.1], parameters, parameters])
+    assert joint(point) == pytest.approx(2.0 * likelihood([1.1, *parameters]), rel=1e-12)
+
+
+def test_a_response_that_changes_by_round_off_is_the_same_simulation(rng):
+    """Sums of squares of the response are larger than those of the residuals, and may change more."""
+    simulated = 100.0 * response([1.0])
+    values = simulated + 1e-6 * rng.standard_normal((2, N))
+    statistic = likelihood_of("modulated", values).noise.statistic
+    changed = simulated * (1.0 + 1e-10)
+    stored, new = (statistic(each - values, each) for each in (simulated, changed))
+    assert largest_difference(stored, new, values, 1e-9, True) is None
+    assert largest_difference(stored, new, values, 1e-9) is not None  # control: the bound of residuals
+    far = simulated * (1.0 + 1e-7)
+    assert largest_difference(stored, statistic(far - values, far), values, 1e-9, True) is not None
+
+
+def test_guides_take_levels_in_si_units_and_refuse_shares(rng):
+    values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
+    priors = {"factor": TruncatedNormal(1.0, 0.3)}
+
+    def posterior_of(kind):
+        likelihood = likelihood_of(kind, values)
+        return Posterior(likelihood, priors | {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names})
+
+    mode = find_modes(posterior_of("levels in bands"), 4, seed=1).modes[0]
+    assert mode.parameters[0] == pytest.approx(1.0, abs=0.1)
+    for kind in ("modulated", "shares in bands"):
+        with pytest.raises(ValueError, match="depends on the response.*without a guide"):
+            ResponseTarget(posterior_of(kind))
+
+
+def test_units_and_names_of_the_parameters():
+    labels = [each.label for each in likelihood_of("levels in bands", response([1.0])).parameters]
+    assert labels[1:5] == [f"sigma_top_band{k} [m/s2]" for k in (1, 2, 3)] + ["sigma_base_band1 [mm]"]
+    for kind in ("modulated", "shares in bands"):
+        assert {each.unit for each in likelihood_of(kind, response([1.0])).parameters[1:]} == {"-"}
+
+
+def test_what_is_wrong_is_refused():
+    with pytest.raises(ValueError, match="needs the noise of the sensor.*quiet part"):
+        ModulatedNoise(CHANNELS, window=1.0, sensor={"top": 0.1})
+    with pytest.raises(ValueError, match="window must be a positive length"):
+        ModulatedNoise(CHANNELS, window=0.0, sensor=SENSOR)
+    with pytest.raises(ValueError, match="at least three steps"):
+        FELikelihood(MODEL, measured(response([1.0])), ModulatedNoise(CHANNELS, window=0.05, sensor=SENSOR))
+    for edges in ((), (2.0, 1.0), (0.0, 1.0), (np.inf,)):
+        with pytest.raises(ValueError, match="ascending positive frequencies"):
+            BandNoise(CHANNELS, edges, sensor=SENSOR)
+    with pytest.raises(ValueError, match=r"shares needs the noise of the sensor.*relative=False"):
+        BandNoise(CHANNELS, EDGES)
+    with pytest.raises(ValueError, match="below 25 Hz"):
+        FELikelihood(MODEL, measured(response([1.0])), BandNoise(CHANNELS, (2.0, 25.0), sensor=SENSOR))
+    gaps = response([1.0])
+    gaps[0, ::7] = np.nan
+    with pytest.raises(ValueError, match=r"divide channel 'top' into 35 stretches.*AutoregressiveNoise"):
+        likelihood_of("levels in bands", gaps)
+    for noise in NOISES.values():
+        with pytest.raises(ValueError, match="needs the times of the samples"):
+            noise.log_likelihood(np.zeros((1, 30)), N, np.ones((1, len(noise.parameter_names))))
+    fitted = likelihood_of("modulated", response([1.0])).noise
+    with pytest.raises(ValueError, match=r"is for \[240, 240\] samples"):
+        fitted.log_likelihood(np.zeros((1, len(fitted.statistic(gaps, gaps)))), 100, np.ones((1, 2)))
