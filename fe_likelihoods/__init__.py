@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .emulation.emulator import ResponseEmulator
     from .emulation.guide import ResponseGuide
     from .emulation.modes import Mode, ModeSearch, find_modes
+    from .models.equivalent_linear import EquivalentLinear
     from .models.executable import ExecutableModel
     from .models.function import FunctionModel
     from .models.isolated_bridge import IsolatedBridge
@@ -27,6 +28,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .models.rc_column_curves import MaterialCurve, MomentCurvature, material_curves, moment_curvature
     from .models.rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
     from .models.steel_coupon import SteelCoupon
+    from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
     from .models.umbridge import UMBridgeModel
     from .plots.damage import plot_damage
     from .plots.histories import plot_histories, plot_loop
@@ -118,6 +120,7 @@ __all__ = [
     "Dataset",
     "DisplacementHistory",
     "Distribution",
+    "EquivalentLinear",
     "EventNoise",
     "EventRatios",
     "EventWindow",
@@ -128,6 +131,7 @@ __all__ = [
     "Fragility",
     "FunctionModel",
     "GaussianNoise",
+    "GroupedFrame",
     "HalfNormal",
     "HierarchicalPosterior",
     "Hierarchy",
@@ -147,6 +151,7 @@ __all__ = [
     "MeasuredHistory",
     "Measurements",
     "MixtureDistribution",
+    "ModalModel",
     "Mode",
     "ModeSearch",
     "Model",
@@ -174,6 +179,7 @@ __all__ = [
     "ResponseSpectrum",
     "Rubber",
     "SharedGaussianNoise",
+    "ShearFlexuralBeam",
     "ShearFrame",
     "SimulationCache",
     "SimulationFailed",
@@ -275,6 +281,7 @@ _EXPORTS = {
         "ModeSearch",
         "find_modes",
     ),
+    "models.equivalent_linear": ("EquivalentLinear",),
     "models.executable": ("ExecutableModel",),
     "models.function": ("FunctionModel",),
     "models.isolated_bridge": ("IsolatedBridge",),
@@ -306,6 +313,11 @@ _EXPORTS = {
         "Steel",
     ),
     "models.steel_coupon": ("SteelCoupon",),
+    "models.tall_buildings": (
+        "GroupedFrame",
+        "ModalModel",
+        "ShearFlexuralBeam",
+    ),
     "models.umbridge": ("UMBridgeModel",),
     "plots.damage": ("plot_damage",),
     "plots.histories": (

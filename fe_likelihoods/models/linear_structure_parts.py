@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..simulation.model import SimulationFailed
-from .linear_structure import LinearSystem, modal_damping
+from .linear_system import LinearSystem, modal_damping
 from .validation import check_positive
 
 __all__ = ["BridgeDeck", "ShearFrame"]

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from fe_likelihoods import BridgeDeck, LinearStructure, Record, ShearFrame, SimulationFailed
 from fe_likelihoods.kernels.complex_modes import superpose_modes
-from fe_likelihoods.models.linear_structure import LinearSystem, modal_damping, respond_structure
+from fe_likelihoods.models.linear_system import LinearSystem, modal_damping, respond_structure
 from fe_likelihoods.signals.sdof import respond
 from fe_likelihoods.simulation.model import simulate_batch
 

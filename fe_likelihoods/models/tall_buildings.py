@@ -1,0 +1,366 @@
+"""Parts of a `LinearStructure` with few parameters for tall buildings on one support.
+
+* `ModalModel`: frequencies, damping ratios and effective shapes of a few modes, without an assumption on the structure.
+* `GroupedFrame`: a shear frame with one stiffness factor per group of storeys.
+* `ShearFlexuralBeam`: a uniform cantilever between a shear and a flexural beam (Miranda & Taghavi 2005), with one
+  parameter for the ratio of the two, whatever the number of storeys.
+
+The equations are in ``docs/theory/tall_buildings.rst``.
+
+References
+----------
+E. Miranda, S. Taghavi, Approximate floor acceleration demands in multistory buildings. I: Formulation, Journal of
+Structural Engineering 131(2), 2005, 203-211, doi:10.1061/(ASCE)0733-9445(2005)131:2(203).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ..simulation.model import SimulationFailed
+from .linear_structure_parts import ShearFrame
+from .linear_system import LinearSystem
+from .validation import check_integer
+
+__all__ = ["BeamModes", "GroupedFrame", "ModalModel", "ShearFlexuralBeam", "beam_modes"]
+
+_MOST_MODES = 50
+_GAUSS_POINTS = 256  # of the square of a mode shape, whose shortest half wave has the length 1 / 50
+
+
+@dataclass(frozen=True)
+class ModalModel:
+    """A building on one support as a sum of modes, whose properties at the sensors are the parameters.
+
+    With the relative displacement u_k of an oscillator with the frequency and the damping of mode k, channel c has the
+    absolute acceleration a + sum_k s_ck u_k''. The effective shape s_ck is the participation factor times the mode
+    shape at the sensor; its sum over all modes of a structure is 1. Modes that are left out are stiff: they move with
+    the support, with the remaining share 1 - sum_k s_ck.
+
+    The parameters are ``frequency_1``, ... [Hz], in ascending order; ``damping_1``, ...; and ``shape_<channel>_1``, ...
+    for each channel.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        Names of the channels.
+    n_modes : int
+        Number of modes.
+
+    Raises
+    ------
+    ValueError
+        If there is no channel, or the number of modes is not from 1 to 50.
+
+    Examples
+    --------
+    >>> model = LinearStructure(ModalModel(["roof", "floor 20"], 3), base)
+    """
+
+    channels: tuple[str, ...]
+    n_modes: int
+
+    n_supports = 1
+
+    def __init__(self, channels: Sequence[str], n_modes: int) -> None:
+        channels = _names("ModalModel", channels)
+        check_integer("n_modes of a ModalModel", n_modes, 1, _MOST_MODES)
+        object.__setattr__(self, "channels", channels)
+        object.__setattr__(self, "n_modes", int(n_modes))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """``frequency_1``, ..., ``damping_1``, ..., and ``shape_<channel>_1``, ..., channel by channel."""
+        what = ("frequency", "damping", *(f"shape_{channel}" for channel in self.channels))
+        return tuple(f"{each}_{k}" for each in what for k in range(1, self.n_modes + 1))
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return self.channels
+
+    def assemble(self, theta: np.ndarray) -> LinearSystem:
+        """Compute the matrices at the parameters (n_parameters,), with the modes as degrees of freedom.
+
+        Raises
+        ------
+        SimulationFailed
+            If the frequencies are not positive and ascending, or a damping ratio is not positive.
+        """
+        n = self.n_modes
+        frequencies, ratios, shapes = theta[:n], theta[n : 2 * n], theta[2 * n :].reshape(-1, n)
+        if not (frequencies[0] > 0.0 and (np.diff(frequencies) > 0.0).all()):
+            raise SimulationFailed(f"frequencies must be positive and ascending; they are {_listed(frequencies)} Hz")
+        if not (ratios > 0.0).all():
+            raise SimulationFailed(f"damping ratios must be positive; they are {_listed(ratios)}")
+        return _modal_system(2.0 * np.pi * frequencies, ratios, shapes)
+
+
+@dataclass(frozen=True)
+class GroupedFrame:
+    """Shear frame whose storeys share one stiffness factor per group, with one damping ratio or Rayleigh damping.
+
+    The parameters are ``stiffness_1``, ..., the multiples of the nominal stiffnesses of the storeys in each group, and
+    ``damping``, the ratio of critical damping of all modes. With ``rayleigh=(i, j)`` the damping matrix is
+    C = a M + b K, and the parameters are ``damping_i`` and ``damping_j``, the ratios of these two modes.
+
+    Parameters
+    ----------
+    floors, masses, stiffnesses
+        As for `ShearFrame`.
+    groups : sequence of int
+        Group of each storey, from the lowest one: 1 to the number of groups, each of which has a storey. Groups usually
+        end where the section of the columns changes.
+    rayleigh : pair of int, optional
+        Two different modes, counted from 1.
+
+    Raises
+    ------
+    ValueError
+        As `ShearFrame`, and if `groups` or `rayleigh` do not fit.
+
+    Examples
+    --------
+    >>> frame = GroupedFrame({"roof": 6}, [1.0] * 6, [900.0] * 6, groups=[1, 1, 1, 2, 2, 2])
+    >>> LinearStructure(frame, base).simulate([1.1, 0.9, 0.02])
+    """
+
+    floors: tuple[tuple[str, int], ...]
+    masses: tuple[float, ...]
+    stiffnesses: tuple[float, ...]
+    groups: tuple[int, ...]
+    rayleigh: tuple[int, int] | None = None
+
+    n_supports = 1
+
+    def __init__(
+        self, floors, masses: Sequence[float], stiffnesses: Sequence[float], groups: Sequence[int], rayleigh=None
+    ) -> None:
+        frame, groups = ShearFrame(floors, masses, stiffnesses), tuple(groups)
+        n = len(frame.masses)
+        if len(groups) != n or set(groups) != set(range(1, max(groups, default=0) + 1)):
+            raise ValueError(
+                f"GroupedFrame: expected the group of each of {n} storeys, numbers from 1 without gaps; got {groups!r}"
+            )
+        if rayleigh is not None:
+            rayleigh = tuple(rayleigh)
+            if len(rayleigh) != 2 or len(set(rayleigh)) != 2 or not set(rayleigh) <= set(range(1, n + 1)):
+                raise ValueError(
+                    f"GroupedFrame: rayleigh must be two different modes from 1 to {n}, or None; got {rayleigh!r}"
+                )
+        for name in ("floors", "masses", "stiffnesses"):
+            object.__setattr__(self, name, getattr(frame, name))
+        object.__setattr__(self, "groups", tuple(int(group) for group in groups))
+        object.__setattr__(self, "rayleigh", rayleigh)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """``stiffness_1``, ..., one per group, and ``damping``, or ``damping_i`` and ``damping_j``."""
+        damping = ("damping",) if self.rayleigh is None else tuple(f"damping_{mode}" for mode in self.rayleigh)
+        return (*(f"stiffness_{group}" for group in range(1, max(self.groups) + 1)), *damping)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return tuple(name for name, _ in self.floors)
+
+    def assemble(self, theta: np.ndarray) -> LinearSystem:
+        """Compute the matrices at the parameters (n_parameters,).
+
+        Raises
+        ------
+        SimulationFailed
+            If a stiffness or damping is not positive, or a mode has a negative ratio with this Rayleigh damping.
+        """
+        factors = theta[np.array(self.groups) - 1]
+        ratios = theta[max(self.groups) :]
+        if not (theta > 0.0).all():
+            bad = [name for name, value in zip(self.parameter_names, theta, strict=True) if not value > 0.0]
+            raise SimulationFailed(f"stiffnesses and dampings must be positive; not positive: {', '.join(bad)}")
+        frame = ShearFrame(self.floors, self.masses, self.stiffnesses)
+        n = len(self.masses)
+        system = frame.assemble(np.concatenate([factors, np.full(n, ratios[0])]))
+        if self.rayleigh is None:
+            return system
+        frequencies = np.sqrt(eigh(system.stiffness, system.mass, eigvals_only=True))
+        own = frequencies[np.array(self.rayleigh) - 1]
+        mass, stiffness = np.linalg.solve(0.5 * np.stack([1.0 / own, own], axis=1), ratios)
+        if not (mass / frequencies + stiffness * frequencies > 0.0).all():
+            raise SimulationFailed(
+                f"Rayleigh damping with the ratios {_listed(ratios)} of modes {self.rayleigh} makes the damping of "
+                "another mode negative"
+            )
+        return system._replace(damping=mass * system.mass + stiffness * system.stiffness)
+
+
+@dataclass(frozen=True)
+class ShearFlexuralBeam:
+    """Building as a uniform cantilever, a shear beam and a flexural beam side by side (Miranda & Taghavi 2005).
+
+    The parameters are ``frequency``, that of the first mode [Hz]; ``alpha``, the ratio of shear to flexural stiffness
+    H sqrt(GA / EI); and ``damping``, the ratio of critical damping of all modes. alpha = 0 is a flexural beam (shear
+    walls), alpha above about 20 a shear beam (moment frames), in between are buildings with both. Modes above the
+    last one move with the base.
+
+    Parameters
+    ----------
+    heights : dict of str to float, or sequence of pairs
+        Names of the channels, and their heights above the base as shares of the height of the building, above 0 to 1.
+    n_modes : int
+        Number of modes.
+
+    Raises
+    ------
+    ValueError
+        If there is no channel, a height is not above 0 and at most 1, or the number of modes is not from 1 to 50.
+
+    Examples
+    --------
+    >>> beam = ShearFlexuralBeam({"roof": 1.0, "floor 20": 0.5}, n_modes=5)
+    >>> LinearStructure(beam, base).simulate([0.2, 6.0, 0.015])
+    """
+
+    heights: tuple[tuple[str, float], ...]
+    n_modes: int = 5
+
+    n_supports = 1
+
+    def __init__(self, heights: Mapping[str, float] | Sequence[tuple[str, float]], n_modes: int = 5) -> None:
+        pairs = tuple(heights.items() if isinstance(heights, Mapping) else heights)
+        names = _names("ShearFlexuralBeam", [name for name, _ in pairs])
+        shares = tuple(float(height) for _, height in pairs)
+        if not all(0.0 < share <= 1.0 for share in shares):
+            raise ValueError(
+                f"ShearFlexuralBeam: expected heights as shares of that of the building, above 0 to 1; got {shares}"
+            )
+        check_integer("n_modes of a ShearFlexuralBeam", n_modes, 1, _MOST_MODES)
+        object.__setattr__(self, "heights", tuple(zip(names, shares, strict=True)))
+        object.__setattr__(self, "n_modes", int(n_modes))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """``frequency``, ``alpha`` and ``damping``."""
+        return ("frequency", "alpha", "damping")
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return tuple(name for name, _ in self.heights)
+
+    def assemble(self, theta: np.ndarray) -> LinearSystem:
+        """Compute the matrices at the parameters (n_parameters,), with the modes as degrees of freedom.
+
+        Raises
+        ------
+        SimulationFailed
+            If the frequency or the damping is not positive, or alpha is negative or above 1000.
+        """
+        frequency, alpha, damping = theta.tolist()
+        if not (frequency > 0.0 and damping > 0.0 and 0.0 <= alpha <= 1000.0):
+            raise SimulationFailed(
+                "frequency and damping must be positive, and alpha from 0 to 1000; they are "
+                f"{frequency} Hz, {damping} and {alpha}"
+            )
+        modes = beam_modes(alpha, self.n_modes, np.array([height for _, height in self.heights]))
+        frequencies = 2.0 * np.pi * frequency * modes.frequency_ratios
+        return _modal_system(frequencies, np.full(self.n_modes, damping), modes.shapes)
+
+
+class BeamModes(NamedTuple):
+    """Modes of the shear-flexural beam.
+
+    Attributes
+    ----------
+    frequency_ratios : ndarray[n_modes]
+        Frequencies as multiples of the first one.
+    shapes : ndarray[n_heights, n_modes]
+        Mode shapes times participation factors [-], which add to 1 over all modes.
+    """
+
+    frequency_ratios: np.ndarray
+    shapes: np.ndarray
+
+
+def beam_modes(alpha: float, n_modes: int, heights: np.ndarray) -> BeamModes:
+    """Compute the modes of a uniform cantilever of shear and flexural stiffness (Miranda & Taghavi 2005, eqs. 7-13).
+
+    Parameters
+    ----------
+    alpha : float
+        H sqrt(GA / EI), not negative.
+    n_modes : int
+        Number of modes.
+    heights : ndarray[n_heights]
+        Heights as shares of that of the building.
+
+    Returns
+    -------
+    BeamModes
+    """
+    from scipy.optimize import brentq  # slow to import, and not needed for other structures
+
+    def characteristic(gamma: float) -> float:
+        # divided by cosh(beta), which overflows for large beta
+        beta = math.hypot(gamma, alpha)
+        inverse = 2.0 * math.exp(-beta) / (1.0 + math.exp(-2.0 * beta))
+        return (
+            2.0 * inverse
+            + (2.0 + alpha**4 / (gamma * beta) ** 2) * math.cos(gamma)
+            + alpha**2 / (gamma * beta) * math.sin(gamma) * math.tanh(beta)
+        )
+
+    ratios, shapes = np.empty(n_modes), np.empty((len(heights), n_modes))
+    for k in range(n_modes):
+        # one root in each interval of pi: between that of the shear beam, (k + 1/2) pi, and that of the flexural one
+        gamma = brentq(characteristic, max(k * math.pi, 1e-3), (k + 1) * math.pi, xtol=1e-14)
+        beta = math.hypot(gamma, alpha)
+        ratios[k] = gamma * beta
+        shapes[:, k] = _beam_shape(gamma, beta, heights)
+    return BeamModes(ratios / ratios[0], shapes)
+
+
+def _beam_shape(gamma: float, beta: float, heights: np.ndarray) -> np.ndarray:
+    """Mode shape times participation factor at the heights (n_heights,).
+
+    phi = sin(gamma x) - eta cos(gamma x) + eta cosh(beta x) - gamma / beta sinh(beta x), written with decaying
+    exponentials only. The integral of phi follows from its differential equation, that of its square by Gauss points.
+    """
+    small = math.exp(-beta)
+    sine, cosine = math.sin(gamma), math.cos(gamma)
+    denominator = 2.0 * gamma**2 * cosine * small + beta**2 * (1.0 + small**2)
+    eta = (2.0 * gamma**2 * sine * small + gamma * beta * (1.0 - small**2)) / denominator
+    rising = (gamma**2 * sine - gamma**3 / beta * cosine - gamma * beta * small) / denominator
+    falling = 0.5 * (eta + gamma / beta)
+    nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_POINTS)
+    x = np.append(0.5 * (nodes + 1.0), heights)
+    phi = np.sin(gamma * x) - eta * np.cos(gamma * x)
+    phi += rising * np.exp(beta * (x - 1.0)) + falling * np.exp(-beta * x)
+    integral = (gamma**2 + beta**2) / (gamma * beta**2)
+    return integral / (0.5 * weights @ np.square(phi[:_GAUSS_POINTS])) * phi[_GAUSS_POINTS:]
+
+
+def _modal_system(frequencies: np.ndarray, ratios: np.ndarray, shapes: np.ndarray) -> LinearSystem:
+    """Matrices with the modes as degrees of freedom: angular frequencies [rad/s], ratios, effective shapes."""
+    n = len(frequencies)
+    return LinearSystem(
+        mass=np.eye(n),
+        damping=np.diag(2.0 * ratios * frequencies),
+        stiffness=np.diag(np.square(frequencies)),
+        influence=np.ones((n, 1)),
+        shape=shapes,
+        direct=1.0 - shapes.sum(axis=1, keepdims=True),
+    )
+
+
+def _names(kind: str, names: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(names, str) or not names or not all(isinstance(name, str) and name for name in names):
+        raise ValueError(f"{kind}: expected the names of one or more channels; got {names!r}")
+    return tuple(names)
+
+
+def _listed(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
