@@ -1,12 +1,13 @@
 """An update as its TOML file describes it, read and checked before anything is computed."""
 
+import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from .priors import parse_prior
-from .schema import FREE_SECTIONS, MODELS, PARTS, SECTIONS, Key, did_you_mean, read_keys
+from .schema import EVENT, FREE_SECTIONS, MODELS, PARTS, SECTIONS, Key, did_you_mean, read_keys
 
 __all__ = ["Job", "parse_job", "read_job"]
 
@@ -31,6 +32,10 @@ class Job:
         Distributions as text, by parameter.
     noise : str
         Kind of the noise.
+    events : dict of str to dict
+        Keys of the events to predict, by name.
+    event : str
+        The event whose record and measurements these are; empty for those of the calibration.
     """
 
     file: Path
@@ -45,10 +50,26 @@ class Job:
     sampler: dict[str, Any]
     budget: dict[str, Any]
     prediction: dict[str, Any]
+    events: dict[str, dict[str, Any]] = field(default_factory=dict)
+    event: str = ""
 
     def where(self, section: str) -> str:
         """File and section, for messages."""
-        return f"{self.file.name}: [{section}]"
+        own = self.event and section in ("record", "measurements")
+        return f"{self.file.name}: [{f'events.{self.event}' if own else section}]"
+
+    def of_event(self, name: str) -> "Job":
+        """The same update with record and measurements of one of its events; `measurements` is empty without them."""
+        given = dict(self.events[name])
+        measured = {"file": given.pop("measured")} if "measured" in given else {}
+        if measured and "zero" in given:
+            measured["zero"] = given.pop("zero")
+        if measured and not measured["file"].lower().endswith((".h5", ".hdf5")):
+            kept = {key: value for key, value in self.measurements.items() if key not in ("file", "bundled")}
+            measured = kept | measured
+        if "every" in self.record:
+            given["every"] = self.record["every"]
+        return replace(self, record=given, measurements=measured, event=name)
 
     def path(self, section: str, key: str, name: str) -> Path:
         """An existing file that a key names; ValueError if there is none."""
@@ -116,11 +137,28 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
             parse_prior(prior)
         except ValueError as error:
             raise ValueError(f"{file.name}: [priors] {name}: {error}") from None
+    events = _read_events(content.get("events", {}), file.name)
     noise = values.pop("noise").get("kind", "per channel")
     kinds = ("per channel", "autoregressive", "shared", "per event", "marginal")
     if noise not in kinds:
         raise ValueError(f"{file.name}: [noise] kind: unknown noise {noise!r}; {did_you_mean(noise, kinds)}")
-    return Job(file, text, folder, kind, model, priors=priors, noise=noise, **values)
+    return Job(file, text, folder, kind, model, priors=priors, noise=noise, events=events, **values)
+
+
+def _read_events(given: dict[str, Any], file: str) -> dict[str, dict[str, Any]]:
+    events = {}
+    for name, keys in given.items():
+        if not isinstance(keys, dict):
+            raise ValueError(f"{file}: [events] {name}: expected a section [events.{name}]; got {keys!r}")
+        if not re.fullmatch(r"[\w-]+", name):
+            raise ValueError(
+                f"{file}: [events.{name}]: expected a name of letters, digits, - and _, for names of files"
+            )
+        events[name] = read_keys(keys, EVENT, f"{file}: [events.{name}]")
+        for key, needed in (("zero", "measured"), ("rest", "from_state")):
+            if key in keys and needed not in keys:
+                raise ValueError(f"{file}: [events.{name}] {key}: this key has no effect without {needed}")
+    return events
 
 
 def _read_model(given: dict[str, Any], file: str) -> tuple[str, dict[str, Any]]:

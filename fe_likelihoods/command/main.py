@@ -72,8 +72,8 @@ def main(ctx: click.Context, debug: bool) -> None:
 def run(ctx: click.Context, file: Path, out: Path | None, resume: bool, overwrite: bool, quiet: bool) -> None:
     """Sample the posterior that FILE (TOML) describes; write report, tables and samples to a folder.
 
-    The same command continues a run that was killed. A folder with a run of other settings is refused; [budget] and
-    [prediction] may change.
+    The same command continues a run that was killed. A folder with a run of other settings is refused; [budget],
+    [prediction] and [events] may change.
     """
     from .runs import default_folder, run_job
 

@@ -25,7 +25,7 @@ from .job import Job
 from .priors import parse_prior
 from .schema import PARTS, did_you_mean
 
-__all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of"]
+__all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
 
 USER_MODELS = ("function", "opensees", "executable")
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
@@ -72,7 +72,7 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     record = read_base_motion(job)
     sensors = _all_channels(job, record)
     measured = read_measured(job, sensors, record)
-    record, measured = _reduced(job, record, measured)
+    record, measured = reduce_data(job, record, measured)
     model = _located(job, "model", lambda: _make_model(job, record, measured))
     workers = job.budget.get("workers")
     if workers is not None and job.kind not in USER_MODELS:
@@ -118,16 +118,18 @@ def _all_channels(job: Job, record: Record | None) -> tuple[Channel, ...]:
     return _located(job, "model", lambda: _built_in(job, record, names).channels)
 
 
-def _reduced(job: Job, record: Record | None, measured: Measurements) -> tuple[Record | None, Measurements]:
+def reduce_data(
+    job: Job, record: Record | None, measured: Measurements | None
+) -> tuple[Record | None, Measurements | None]:
     """The first part of the data, and one sample in so many."""
     duration, every = job.record.get("duration"), job.record.get("every", 1)
 
-    def reduce() -> tuple[Record | None, Measurements]:
+    def reduce() -> tuple[Record | None, Measurements | None]:
         shorter, fewer = record, measured
         if duration is not None:
-            shorter, fewer = shorter.trim(0.0, duration), fewer.trim(0.0, duration)
+            shorter, fewer = shorter.trim(0.0, duration), fewer and fewer.trim(0.0, duration)
         if every != 1:
-            shorter, fewer = shorter.resample(shorter.dt * every), fewer.decimate(every)
+            shorter, fewer = shorter.resample(shorter.dt * every), fewer and fewer.decimate(every)
         return shorter, fewer
 
     return (record, measured) if record is None else _located(job, "record", reduce)

@@ -15,7 +15,7 @@ from ..probability.posterior import Posterior
 from ..signals.error_measures import rrmse
 from .hints import in_toml_terms
 
-__all__ = ["read_prediction", "write_prediction", "write_report", "write_samples", "write_tables"]
+__all__ = ["read_prediction", "write_csv", "write_prediction", "write_report", "write_samples", "write_tables"]
 
 _ARRAYS = ("mean", "variance", "standard_error", "quantiles", "quantile_error", "failed")
 
@@ -61,8 +61,8 @@ def write_tables(folder: Path, sampler: Any, posterior: Posterior) -> tuple[str,
     nominal = [parameter.shown(parameter.nominal) for parameter in posterior.parameters]
     values = (labels, moments.mean, errors, moments.sd, moments.cv, low, median, high, nominal)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
-    _write_csv(folder / "summary.csv", rows)
-    _write_csv(folder / "fit.csv", fit)
+    write_csv(folder / "summary.csv", rows)
+    write_csv(folder / "fit.csv", fit)
     (folder / "stages.txt").write_text(ladder_table(sampler) + "\n", encoding="utf-8")
     return ("summary.txt", "summary.csv", "fit.csv", "stages.txt")
 
@@ -96,7 +96,8 @@ def _fit_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]
     ]
 
 
-def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows with the same keys as a CSV file with a header."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..prediction.prediction import Prediction
 from ..simulation.disk_cache import SimulationCache
+from .events import predict_events, prediction_options, read_events
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem
 from .results import read_prediction, write_prediction, write_report, write_samples, write_tables
@@ -25,7 +26,7 @@ from .results import read_prediction, write_prediction, write_report, write_samp
 __all__ = ["Outcome", "default_folder", "make_sampler", "report_run", "run_job"]
 
 SETTINGS, ORIGIN, CHAIN, CACHE = "settings.toml", "origin.json", "run.h5", "simulations.sqlite"
-CHANGEABLE = ("budget", "prediction")  # sections that do not change what a run has computed so far
+CHANGEABLE = ("budget", "events", "prediction")  # sections that do not change what a run has computed so far
 DRAWS, STEPS = 100, 4  # of predictions, of the chain
 PRESETS = {
     "ramancha2022": "RAMANCHA_2022_LITERAL",
@@ -130,6 +131,7 @@ def run_job(
     folder = folder or default_folder(file)
     tried = make_problem(job)
     make_sampler(job, tried)  # before the folder is touched
+    events = read_events(job, tried)
     _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
     sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
@@ -139,7 +141,9 @@ def run_job(
         write_prediction(folder / "prediction.npz", prediction)
     draws = job.prediction.get("draws", DRAWS)
     samples = write_samples(folder, sampler, problem.posterior, prediction, draws)
-    return Outcome(folder, sampler, problem, (*_write(folder, job.file, sampler, problem, prediction), samples))
+    written = (*_write(folder, job.file, sampler, problem, prediction), samples)
+    predicted = predict_events(job, events, problem.posterior, _drawn(job, problem, sampler), folder, progress)
+    return Outcome(folder, sampler, problem, (*written, *predicted))
 
 
 def report_run(path: Path) -> Outcome:
@@ -246,25 +250,20 @@ def _changes(old: str, new: str) -> list[str]:
     return found
 
 
+def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
+    """Draws of the posterior to predict with, evenly from the chain."""
+    samples, n = sampler.get_chain(flat=True), job.prediction.get("draws", DRAWS)
+    rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
+    drawn = samples[rows]
+    return problem.posterior.draw_noise(drawn, job.sampler.get("seed", 1)) if job.noise == "marginal" else drawn
+
+
 def _predict(job: Job, problem: Problem, sampler: Any, progress: bool) -> Prediction | None:
     from ..prediction.propagation import propagate
 
-    n = job.prediction.get("draws", DRAWS)
-    if n < 1:
+    if job.prediction.get("draws", DRAWS) < 1:
         return None
-    samples = sampler.get_chain(flat=True)
-    rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
-    posterior, drawn = problem.posterior, samples[rows]
-    if job.noise == "marginal":
-        drawn = posterior.draw_noise(drawn, job.sampler.get("seed", 1))
     try:
-        return propagate(
-            posterior,
-            drawn,
-            noise=job.prediction.get("noise", False),
-            quantiles=tuple(job.prediction.get("quantiles", (0.05, 0.5, 0.95))),
-            seed=job.sampler.get("seed", 1),
-            progress=progress,
-        )
+        return propagate(problem.posterior, _drawn(job, problem, sampler), **prediction_options(job), progress=progress)
     except ValueError as error:
         raise ValueError(f"{job.where('prediction')} {error}") from error

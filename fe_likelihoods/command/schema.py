@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from ..units import DIMENSIONS, to_si
 
 __all__ = [
+    "EVENT",
     "FREE_SECTIONS",
     "MODELS",
     "PARTS",
@@ -246,7 +247,20 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
 }
 """Keys of the sections besides ``[model]`` and ``[priors]``."""
 
-FREE_SECTIONS = {"model": "the structure; its keys depend on `kind`", "priors": "parameter = distribution"}
+EVENT: tuple[Key, ...] = (
+    *(key for key in SECTIONS["record"] if key.name != "every"),
+    Key("measured", "text", "measured response in this event, to be compared: a file as in [measurements]"),
+    Key("zero", "time", "time in this file at which the base motion begins; by default that of [measurements]"),
+    Key("from_state", "text", '"virgin" (the default), or "end" to begin with the state after the record'),
+    Key("rest", "time", 'pause before the motion, for "end" (10 s)'),
+)
+"""Keys of ``[events.NAME]``, which are predicted after the run."""
+
+FREE_SECTIONS = {
+    "model": "the structure; its keys depend on `kind`",
+    "priors": "parameter = distribution",
+    "events": "other base motions, one table [events.NAME] for each",
+}
 
 
 def _is_number(value: Any) -> bool:

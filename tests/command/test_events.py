@@ -1,0 +1,96 @@
+"""Other events in the TOML file: their predictions, their scores, their errors."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import LinearOscillator, SimulationCache, from_si, propagate, read_csv
+from fe_likelihoods.command.job import read_job
+from fe_likelihoods.command.models import make_problem
+from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
+
+SETTINGS = OSCILLATOR.replace("draws = 10", "draws = 20")
+EVENTS = """
+[events.weaker]
+file = "base.csv"
+scale = 0.5
+measured = "weaker.csv"
+[events.after]
+file = "base.csv"
+from_state = "end"
+rest = "1 s"
+"""
+
+
+@pytest.fixture
+def events(folder):  # noqa: F811
+    record = read_csv("base.csv")
+    response = LinearOscillator(record.scale(0.5), 0.8).simulate([1.1, 0.9]) / [[9.80665], [1e-3]]
+    rows = [f"{t!r},{a!r},{d!r}" for t, a, d in zip(record.time.tolist(), *response.tolist(), strict=True)]
+    (folder / "weaker.csv").write_text("\n".join(["time_s,top [g],top [mm]", *rows]))
+    (folder / "oscillator.toml").write_text(SETTINGS + EVENTS)
+    return folder
+
+
+def test_events_are_predicted_and_scored(events):
+    said = call("run", "oscillator.toml", "--out", "r", "--quiet")
+    assert "event-weaker.txt, event-weaker.csv, event-weaker.png, event-after.txt" in said
+    with open("r/event-weaker.csv", newline="") as file:
+        rows = {row["channel"]: row for row in csv.DictReader(file)}
+    record = read_csv("base.csv").scale(0.5)
+    peaks = np.abs(LinearOscillator(record, 0.8).simulate([1.1, 0.9])).max(axis=1)
+    for largest, row in zip(peaks, rows.values(), strict=True):
+        peak = from_si(largest, row["unit"])
+        assert float(row["measured"]) == pytest.approx(peak)
+        assert float(row["median"]) == pytest.approx(peak, rel=0.05)
+        assert float(row["q05"]) <= float(row["median"]) <= float(row["q95"])
+    text = (events / "r" / "event-weaker.txt").read_text()
+    assert "interval score" in text and "CRPS" in text and "without the noise" in text
+    assert "measurements" not in (events / "r" / "event-after.txt").read_text().splitlines()[-1]
+    assert (events / "r" / "event-after.png").stat().st_size > 10_000
+
+
+def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
+    (events / "oscillator.toml").write_text(SETTINGS)
+    call("run", "oscillator.toml", "--out", "r", "--quiet")
+    stored = SimulationCache("r/simulations.sqlite").info().simulations
+    (events / "oscillator.toml").write_text(SETTINGS + EVENTS)
+    call("run", "oscillator.toml", "--out", "r", "--quiet")
+    assert SimulationCache("r/simulations.sqlite").info().simulations == stored
+    assert (events / "r" / "event-weaker.csv").is_file()
+
+
+def test_the_prediction_is_that_of_propagate(events):
+    from fe_likelihoods.command.events import predict_events, read_events
+    from fe_likelihoods.prediction.quantities import peak
+
+    job = read_job("oscillator.toml")
+    problem = make_problem(job)
+    samples = problem.posterior.sample_prior(12, 1)
+    found = read_events(job, problem)
+    assert [event.name for event in found] == ["weaker", "after"]
+    predict_events(job, found, problem.posterior, samples, events, False)
+    for event in found:
+        options = {"record": event.record, "seed": 1, "progress": False} | event.options
+        expected = propagate(problem.posterior, samples, quantity=peak("displacement"), **options)
+        with open(f"event-{event.name}.csv", newline="") as file:
+            row = list(csv.DictReader(file))[1]
+        assert float(row["median"]) == pytest.approx(from_si(expected.quantile(0.5), row["unit"]), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('from_state = "end"', 'from_state = "rest"', "[events.after] from_state: expected one of virgin, end"),
+        ('measured = "weaker.csv"', 'measured = "waker.csv"', "[events.weaker] file: there is no file waker.csv"),
+        ('measured = "weaker.csv"', 'zero = "1 s"', "[events.weaker] zero: this key has no effect without measured"),
+        ("scale = 0.5", "factor = 0.5", "[events.weaker] factor: unknown key"),
+        ("[events.weaker]\nfile", "[events.weaker]\nformat", "[events.weaker] file: this key is missing"),
+        ("[events.weaker]", '[events."a/b"]', "[events.a/b]: expected a name of letters"),
+    ],
+)
+def test_errors_name_section_and_key_before_the_run(events, old, new, message):
+    (events / "oscillator.toml").write_text((SETTINGS + EVENTS).replace(old, new))
+    assert message in call("run", "oscillator.toml", "--out", "r", code=1)
+    assert not (events / "r").exists()
