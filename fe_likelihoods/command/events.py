@@ -110,11 +110,6 @@ def predict_events(
 def _predict_event(
     job: Job, event: Event, posterior: Posterior, samples: np.ndarray, folder: Path, progress: bool
 ) -> tuple[str, ...]:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     from ..plots.predictions import plot_bands
     from ..prediction.propagation import propagate
     from ..prediction.quantities import peak
@@ -149,9 +144,7 @@ def _predict_event(
     names = tuple(f"event-{event.name}.{ending}" for ending in ("txt", "csv", "png"))
     (folder / names[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
     write_csv(folder / names[1], rows)
-    figure = plot_bands(histories, event.measured)
-    figure.savefig(folder / names[2], dpi=150)
-    plt.close(figure)
+    plot_bands(histories, event.measured).savefig(folder / names[2], dpi=150)
     return names
 
 
