@@ -34,6 +34,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .plots.histories import plot_histories, plot_loop
     from .plots.materials import plot_material, plot_moment_curvature
     from .plots.predictions import plot_bands, plot_fragility
+    from .plots.scores import plot_scores
     from .plots.structures import plot_sensors
     from .prediction.averaging import AveragedPrediction, average_predictions
     from .prediction.damage import Damage, LimitState, damage, limit_states
@@ -235,6 +236,7 @@ __all__ = [
     "plot_material",
     "plot_moment_curvature",
     "plot_residuals",
+    "plot_scores",
     "plot_sensors",
     "predict_new_event",
     "problems",
@@ -309,6 +311,7 @@ _EXPORTS = {
         "plot_bands",
         "plot_fragility",
     ),
+    "plots.scores": ("plot_scores",),
     "plots.structures": ("plot_sensors",),
     "prediction.averaging": (
         "AveragedPrediction",

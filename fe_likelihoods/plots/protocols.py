@@ -21,12 +21,14 @@ __all__ = [
     "ExceedanceLike",
     "FragilityLike",
     "HistoryLike",
+    "HistoryScoresLike",
     "HoopsLike",
     "MaterialCurveLike",
     "MomentCurvatureLike",
     "NamedLike",
     "PatchesLike",
     "PredictionLike",
+    "QuantityScoresLike",
     "RecordLike",
     "ResidualChecksLike",
     "SpectrumLike",
@@ -102,6 +104,37 @@ class PredictionLike(Protocol):
 
     def quantile(self, probability: float) -> np.ndarray:
         """Quantile of all channels, shape (n_channels, n_steps) [SI]."""
+
+
+class HistoryScoresLike(Protocol):
+    """Scores of predicted histories, such as `fe_likelihoods.HistoryScores`."""
+
+    channels: Sequence[ChannelLike]
+    level: float
+    rms: np.ndarray
+    interval_score: np.ndarray
+    width: np.ndarray
+    coverage: np.ndarray
+    coverage_by_level: np.ndarray
+    coverage_error: np.ndarray
+    pit: np.ndarray
+    effective_samples: np.ndarray
+
+
+class QuantityScoresLike(Protocol):
+    """Scores of predicted numbers, such as `fe_likelihoods.QuantityScores`."""
+
+    names: Sequence[str]
+    units: Sequence[str]
+    level: float
+    measured: np.ndarray
+    median: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    lower_quartile: np.ndarray
+    upper_quartile: np.ndarray
+    interval_score: np.ndarray
+    pit: np.ndarray
 
 
 class CurveLike(Protocol):

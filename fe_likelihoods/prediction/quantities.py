@@ -52,6 +52,8 @@ class ChannelQuantity:
     describe : callable, optional
         Function of the `Channel` that returns the `Channel` with name, dimension and display unit of the number, or
         raises ValueError for a channel that has no such number. Default: those of the channel.
+    name : str
+        What the number is, such as "peak"; ``str(quantity)`` is "peak of deck".
     """
 
     channel: str
@@ -60,6 +62,10 @@ class ChannelQuantity:
     others: tuple[str | np.ndarray, ...] = ()
     timed: bool = False
     describe: Callable[[Channel], Channel] | None = None
+    name: str = "quantity"
+
+    def __str__(self) -> str:
+        return f"{self.name} of {self.channel}"
 
     @property
     def channel_names(self) -> list[str]:
@@ -113,12 +119,12 @@ class Evaluator(NamedTuple):
 
 def peak(channel: str, part: slice = slice(None)) -> ChannelQuantity:
     """Return the quantity "largest absolute value of the channel", in a part of its samples (default: all)."""
-    return ChannelQuantity(channel, _largest, part)
+    return ChannelQuantity(channel, _largest, part, name="peak")
 
 
 def rms(channel: str, part: slice = slice(None)) -> ChannelQuantity:
     """Return the quantity "root mean square of the channel", in a part of its samples (default: all)."""
-    return ChannelQuantity(channel, _root_mean_square, part)
+    return ChannelQuantity(channel, _root_mean_square, part, name="RMS")
 
 
 def arias_intensity(channel: str, part: slice = slice(None)) -> ChannelQuantity:
@@ -138,7 +144,9 @@ def arias_intensity(channel: str, part: slice = slice(None)) -> ChannelQuantity:
         intensity, in: Seismic Design for Nuclear Power Plants, MIT Press, 438-483). A channel of another dimension is
         a ValueError when the quantity is used.
     """
-    return ChannelQuantity(channel, _arias_intensity, part, timed=True, describe=_of_acceleration)
+    return ChannelQuantity(
+        channel, _arias_intensity, part, timed=True, describe=_of_acceleration, name="Arias intensity"
+    )
 
 
 def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = slice(None)) -> ChannelQuantity:
@@ -178,7 +186,7 @@ def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = s
                 f"array of shape {displacement.shape}"
             )
         displacement.flags.writeable = False
-    return ChannelQuantity(force, _work, part, (displacement,), describe=_of_force)
+    return ChannelQuantity(force, _work, part, (displacement,), describe=_of_force, name="energy")
 
 
 def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
@@ -198,7 +206,7 @@ def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
     """
     if not isinstance(samples, int | np.integer) or samples < 1:
         raise ValueError(f"final_value: samples must be a whole number, 1 or more; got {samples!r}")
-    return ChannelQuantity(channel, _MeanOfLast(int(samples)))
+    return ChannelQuantity(channel, _MeanOfLast(int(samples)), name="final value")
 
 
 def measured_quantity(quantity: Any, measurements: Measurements) -> np.ndarray:

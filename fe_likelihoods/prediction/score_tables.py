@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..probability.residuals import effective_samples
 from ..signals.channels import Channel
 from ..signals.error_measures import rrmse
 from ..units import from_si
@@ -59,6 +60,12 @@ class HistoryScores(NamedTuple):
     without_spread : ndarray of int, shape (n_channels,)
         Number of measured samples with a predicted standard deviation of zero. They are left out of `log_score` and
         `pit`, which are NaN if no other samples are left.
+    effective_samples : ndarray, shape (n_channels,)
+        Number of independent samples that the measured ones are worth, from the autocorrelation of the normalised
+        errors (`fe_likelihoods.effective_samples`): for the standard error of a coverage.
+    coverage_error : ndarray, shape (n_channels, 3)
+        Standard errors of `coverage_by_level`, if the band has its level: those of a binomial share of as many
+        independent samples as the part is worth. NaN without such samples.
     """
 
     channels: tuple[Channel, ...]
@@ -75,6 +82,8 @@ class HistoryScores(NamedTuple):
     coverage_by_level: np.ndarray
     pit: np.ndarray
     without_spread: np.ndarray
+    effective_samples: np.ndarray
+    coverage_error: np.ndarray
 
     def __str__(self) -> str:
         head = ["channel", "unit", "RMS", "RRMSE", "CRPS", "interval score", "width", "log score"]
@@ -124,6 +133,8 @@ class QuantityScores(NamedTuple):
         Interval score.
     pit : ndarray, shape (n_quantities,)
         Predicted probability of a smaller value than the measured one.
+    lower_quartile, upper_quartile : ndarray, shape (n_quantities,)
+        Ends of the intervals with probability 0.5, as `lower` and `upper`.
     """
 
     names: tuple[str, ...]
@@ -137,6 +148,8 @@ class QuantityScores(NamedTuple):
     log_score: np.ndarray
     interval_score: np.ndarray
     pit: np.ndarray
+    lower_quartile: np.ndarray
+    upper_quartile: np.ndarray
 
     @property
     def within(self) -> np.ndarray:
@@ -209,6 +222,9 @@ def score_histories(
         _warn_of_certainty(channels, certain, there.sum(axis=1))
     transforms = pit_normal(*moments, measured)
     shares = [_histogram(row[known]) for row, known in zip(transforms, spread, strict=True)]
+    counts = np.stack([(there & (classes == k)).sum(axis=1) for k in range(len(LEVELS) + 1)], axis=1)
+    worth = _effective(np.where(spread, measured - moments[0], np.nan) / np.where(spread, moments[1], 1.0))
+    parts = counts * (worth / there.sum(axis=1))[:, None]
     return HistoryScores(
         channels=tuple(channels),
         level=level,
@@ -224,6 +240,8 @@ def score_histories(
         coverage_by_level=np.stack([_mean(inside, there & (classes == k)) for k in range(len(LEVELS) + 1)], axis=1),
         pit=np.array(shares),
         without_spread=certain,
+        effective_samples=worth,
+        coverage_error=np.sqrt(level * (1.0 - level) / np.where(counts > 0, np.maximum(parts, 1.0), np.nan)),
     )
 
 
@@ -254,9 +272,8 @@ def score_values(
     -------
     QuantityScores
     """
-    measured, ascending, n = np.asarray(measured, dtype=float), np.sort(values, axis=0), len(values)
-    rank = max(1, math.ceil(0.5 * (1.0 - level) * (n + 1) - 0.5))  # as `share_within` of the PIT (rank + 0.5) / (n + 1)
-    lower, upper = ascending[rank - 1], ascending[n - rank]
+    measured, ascending = np.asarray(measured, dtype=float), np.sort(values, axis=0)
+    (lower, upper), quartiles = _interval(ascending, level), _interval(ascending, 0.5)
     return QuantityScores(
         names=tuple(names),
         units=tuple(units),
@@ -269,7 +286,16 @@ def score_values(
         log_score=log_score_normal(values.mean(axis=0), values.std(axis=0, ddof=1), measured),
         interval_score=interval_score(lower, upper, measured, level),
         pit=pit_samples(values, measured),
+        lower_quartile=quartiles[0],
+        upper_quartile=quartiles[1],
     )
+
+
+def _interval(ascending: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the central interval of sorted samples (n, n_quantities)."""
+    n = len(ascending)
+    rank = max(1, math.ceil(0.5 * (1.0 - level) * (n + 1) - 0.5))  # as `share_within` of the PIT (rank + 0.5) / (n + 1)
+    return ascending[rank - 1], ascending[n - rank]
 
 
 def envelope(histories: np.ndarray) -> np.ndarray:
@@ -320,6 +346,15 @@ def _warn_of_certainty(channels: Sequence[Channel], certain: np.ndarray, samples
         "the noise of the sensors too, such as RelativeNoise.of(measurements, sensor=...)",
         stacklevel=4,
     )
+
+
+def _effective(errors: np.ndarray) -> np.ndarray:
+    """Independent samples (n_channels,) that normalised errors are worth; 1 where they are fewer than two, or zero."""
+    worth = np.ones(len(errors))
+    for k, row in enumerate(errors):
+        if np.isfinite(row).sum() > 1 and np.nan_to_num(row).any():
+            worth[k] = effective_samples(row[None])[0]
+    return worth
 
 
 def _histogram(transforms: np.ndarray) -> np.ndarray:

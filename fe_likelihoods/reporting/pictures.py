@@ -10,6 +10,7 @@ import numpy as np
 from samplers import plot_corner, plot_ladder, plot_marginals, plot_run
 
 from ..prediction.prediction import Prediction
+from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.fits import plot_fit
 from .fits import Fit
 from .run import FinishedRun
@@ -17,7 +18,7 @@ from .run import FinishedRun
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Picture", "draw_fit", "draw_posterior", "draw_prediction", "draw_residuals", "draw_run"]
+__all__ = ["Picture", "draw_fit", "draw_posterior", "draw_prediction", "draw_residuals", "draw_run", "draw_scores"]
 
 LEGIBLE = 80  # pixels per inch at which the smallest labels can be read
 WIDEST = 1100  # pixels: fits on a page of 1200
@@ -154,5 +155,23 @@ def draw_prediction(prediction: Prediction, measurements: Any) -> list[Picture]:
             "parameters, and the noise only if the legend says so.",
             f"Predicted histories of {', '.join(channel.name for channel in prediction.channels)} with their band.",
             lambda: prediction.plot(measurements),
+        )
+    ]
+
+
+def draw_scores(scores: HistoryScores | QuantityScores) -> list[Picture]:
+    """Calibration of a prediction, its coverage and its sharpness; none where a measured number is zero."""
+    if isinstance(scores, QuantityScores) and not scores.measured.all():
+        return []
+    from ..plots.scores import plot_scores
+
+    return [
+        _picture(
+            "Scores of the prediction",
+            "Left: bars outside of the grey band show a prediction that is too narrow (high at both ends), too wide "
+            "(high in the middle) or biased (high at one end). Coverage is right near the grey line; of two "
+            "predictions, the one with the smaller interval score is better.",
+            "Histogram of the probability integral transform, coverage, and width and interval score of the bands.",
+            lambda: plot_scores(scores),
         )
     ]

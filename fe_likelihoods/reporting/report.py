@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..prediction.prediction import Prediction
+from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
 from .advice import Advice, advise
 from .contents import (
@@ -26,7 +27,7 @@ from .contents import (
 from .failures import Failures, failures
 from .fits import Fits, fit_data_sets
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
-from .pictures import Picture, draw_fit, draw_posterior, draw_prediction, draw_residuals, draw_run
+from .pictures import Picture, draw_fit, draw_posterior, draw_prediction, draw_residuals, draw_run, draw_scores
 from .run import FinishedRun, read_run
 from .table import ParameterRow, parameter_rows
 
@@ -223,18 +224,18 @@ def _predictions(prediction: Any, measured: Any) -> dict[str, tuple[Prediction, 
 
 
 def _predicted(name: str, prediction: Prediction, measurements: Measurements | None) -> Predicted:
+    scores = _scores(prediction, measurements)
     pictures = draw_prediction(prediction, measurements) if prediction.dt is not None else []
+    pictures += draw_scores(scores) if not isinstance(scores, str) else []
     values, counts = tuple(predicted_values(prediction)), (prediction.n_samples, prediction.n_failed)
-    return Predicted(
-        name, tuple(pictures), values, prediction.probabilities, *counts, _scores(prediction, measurements)
-    )
+    return Predicted(name, tuple(pictures), values, prediction.probabilities, *counts, str(scores))
 
 
-def _scores(prediction: Prediction, measurements: Measurements | None) -> str:
-    """Table of the scores of a prediction with noise; empty without measurements or noise, or why there is none."""
+def _scores(prediction: Prediction, measurements: Measurements | None) -> HistoryScores | QuantityScores | str:
+    """Scores of a prediction with noise; empty without measurements or noise, or why there are none."""
     if measurements is None or not prediction.noise:
         return ""
     try:
-        return str(prediction.score(measurements))
+        return prediction.score(measurements)
     except ValueError as error:
         return f"no scores: {error}"

@@ -101,6 +101,7 @@ def test_the_page_needs_nothing_from_elsewhere(page):
     for png, alt in page.images:
         assert png.startswith(b"\x89PNG") and alt
     assert len(page.images) >= 5
+    assert sum(alt.startswith("Histogram of the probability integral") for _, alt in page.images) == 1  # not of peaks
 
 
 def test_texts_of_users_are_escaped_and_shown(page):

@@ -1,0 +1,224 @@
+"""Figure of the scores of predictions: calibration, coverage with its error, and sharpness beside it.
+
+A single share of samples in a band says little. The figure shows where the measured values are in the predicted
+distributions (histogram of the probability integral transform, PIT), whether weak and strong response are covered
+alike, and what the coverage costs: the width of the band, and the interval score, which adds a penalty for every value
+outside of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..units import from_si
+from .protocols import HistoryScoresLike, QuantityScoresLike
+from .style import BLUE, GREY, ORANGE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_scores"]
+
+_LEVELS = ("weak", "moderate", "strong")
+_BAND = 0.9  # probability of the bands of chance
+_BINS = 10
+_MOST_NAMES = 12  # points with names in the last axes
+_FEWEST = 3  # events whose scatter is drawn as standard errors
+
+
+def plot_scores(
+    scores: HistoryScoresLike | QuantityScoresLike | Mapping[str, HistoryScoresLike] | Mapping[str, QuantityScoresLike],
+) -> Figure:
+    """Plot scores of predicted histories, or of predicted numbers such as peaks, of one event or of several.
+
+    Parameters
+    ----------
+    scores : HistoryScoresLike, QuantityScoresLike, or mapping from names of events to them
+        Results of `fe_likelihoods.Prediction.score`, all of histories or all of numbers, with one level.
+
+    Returns
+    -------
+    matplotlib Figure
+        Three axes. Left: shares of the PIT in equal parts of 0 to 1 (ten for histories), with the band that contains
+        90 % of the shares of calibrated predictions (binomial, for the number of independent samples), and standard
+        errors of their mean between histories for three events or more. Histories:
+        coverage of weak, moderate and strong response with its standard error (between events for three events or
+        more, else that of a binomial share of independent samples), and the coverage against the width of the band and
+        the interval score, both as multiples of the root mean square of the measured channel. Numbers: median,
+        50 % and outer interval divided by the measured value, in the order of the events, and the shares of
+        measured values in the intervals, with the mean width and score of the outer ones.
+
+    Raises
+    ------
+    ValueError
+        If there are no scores, scores of histories and of numbers are mixed, levels differ, or a measured number is
+        zero.
+    """
+    import matplotlib.pyplot as plt
+
+    events = dict(scores) if isinstance(scores, Mapping) else {"": scores}
+    histories = {hasattr(each, "coverage_by_level") for each in events.values()}
+    if len(histories) != 1 or len({each.level for each in events.values()}) != 1:
+        raise ValueError(
+            "plot_scores: expected scores of one event or more, all of histories or all of numbers, with one level; "
+            f"got {[(name, type(each).__name__, getattr(each, 'level', None)) for name, each in events.items()]}"
+        )
+    if histories == {True}:
+        figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.6), layout="constrained")
+        _history_axes(axes, events)
+        return figure
+    rows = sum(len(each.names) for each in events.values())
+    size = (11.0, max(3.4, 1.2 + 0.24 * rows))
+    figure, axes = plt.subplots(1, 3, figsize=size, layout="constrained", width_ratios=(1.0, 1.6, 0.8))
+    _number_axes(axes, events)
+    return figure
+
+
+def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScoresLike]) -> None:
+    level = next(iter(events.values())).level
+    shares = np.concatenate([each.pit for each in events.values()])
+    worth = sum(float(each.effective_samples.sum()) for each in events.values())
+    _draw_histogram(axes[0], np.nanmean(shares, axis=0), worth)
+    if len(events) >= _FEWEST:
+        known = shares[np.isfinite(shares).all(axis=1)]
+        error = known.std(axis=0, ddof=1) / np.sqrt(len(known))
+        at = (np.arange(shares.shape[1]) + 0.5) / shares.shape[1]
+        axes[0].errorbar(at, known.mean(axis=0), error, fmt="none", color=ORANGE, linewidth=1.2, label="between events")
+        axes[0].legend(frameon=False, fontsize="small")
+
+    names = list(dict.fromkeys(channel.name for each in events.values() for channel in each.channels))
+    for k, name in enumerate(names):
+        coverage, errors = _coverage_of(name, list(events.values()))
+        at = np.arange(len(_LEVELS)) + 0.12 * (k - 0.5 * (len(names) - 1))
+        axes[1].errorbar(at, coverage, errors, fmt="o", markersize=4, linewidth=1, color=_colour(k), label=name)
+    axes[1].axhline(level, color=GREY, linewidth=0.8)
+    axes[1].set_xticks(range(len(_LEVELS)), _LEVELS)
+    axes[1].set_xlabel("response")
+    axes[1].set_ylabel(f"share in the {level:.0%} band [-]")
+    axes[1].set_title("coverage by level of the response", fontsize="medium")
+    axes[1].set_ylim(top=1.03)
+
+    points = [(event, each, k) for event, each in events.items() for k in range(len(each.channels))]
+    for event, each, k in points:
+        name = each.channels[k].name
+        ends = each.width[k] / each.rms[k], each.interval_score[k] / each.rms[k]
+        colour = _colour(names.index(name))
+        axes[2].plot(ends, [each.coverage[k]] * 2, color=colour, linewidth=0.8)
+        axes[2].plot(ends[0], each.coverage[k], "o", color=colour, fillstyle="none", markersize=5)
+        axes[2].plot(ends[1], each.coverage[k], "o", color=colour, markersize=5)
+        if len(points) <= _MOST_NAMES:
+            text = f"{event}: {name}" if event and len(names) > 1 else event or name
+            axes[2].annotate(text, (ends[1], each.coverage[k]), (4, 3), textcoords="offset points", fontsize="x-small")
+    axes[2].axhline(level, color=GREY, linewidth=0.8)
+    axes[2].set_xlabel("width (open), interval score (full) / RMS [-]")
+    axes[2].set_ylabel(f"share in the {level:.0%} band [-]")
+    axes[2].set_title("sharpness beside coverage", fontsize="medium")
+    axes[2].margins(x=0.3, y=0.1)
+    axes[2].set_xlim(left=0.0)
+    if len(names) > 1:
+        axes[1].legend(frameon=False, fontsize="small")
+    for each in axes:
+        each.grid(alpha=0.25)
+
+
+def _coverage_of(name: str, events: Sequence[HistoryScoresLike]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean coverage (3,) of a channel by level, and its standard errors."""
+    found, errors = [], []
+    for each in events:
+        for k, channel in enumerate(each.channels):
+            if channel.name == name:
+                found.append(each.coverage_by_level[k])
+                errors.append(each.coverage_error[k])
+    shares, there = np.array(found), np.isfinite(found)
+    count = np.maximum(there.sum(axis=0), 1)
+    mean = np.where(there.any(axis=0), np.where(there, shares, 0.0).sum(axis=0) / count, np.nan)
+    within = np.sqrt(np.where(there, np.square(errors), 0.0).sum(axis=0)) / count
+    between = np.sqrt(np.where(there, np.square(shares - mean), 0.0).sum(axis=0) / np.maximum(count - 1, 1) / count)
+    return mean, np.where(count >= _FEWEST, between, within)
+
+
+def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScoresLike]) -> None:
+    level = next(iter(events.values())).level
+    joined = {
+        what: np.concatenate([np.asarray(getattr(each, what)) for each in events.values()])
+        for what in (
+            "measured",
+            "median",
+            "lower",
+            "upper",
+            "lower_quartile",
+            "upper_quartile",
+            "interval_score",
+            "pit",
+        )
+    }
+    labels = [_label(event, each, k) for event, each in events.items() for k in range(len(each.names))]
+    measured, pit = joined["measured"], joined["pit"]
+    if not measured.all():
+        raise ValueError(f"plot_scores: intervals are divided by the measured values; that of {labels} is zero for one")
+    n = len(measured)
+    bins = min(_BINS, max(2, n // 3))
+    _draw_histogram(axes[0], np.histogram(pit, bins, (0.0, 1.0))[0] / n, n)
+
+    places = np.arange(n)[::-1]
+    for ends, width, text in ("", 1.2, f"{level:.0%}"), ("_quartile", 3.5, "50%"):
+        left, right = joined[f"lower{ends}"] / measured, joined[f"upper{ends}"] / measured
+        axes[1].hlines(places, left, right, color=BLUE, linewidth=width, label=text)
+    axes[1].plot(joined["median"] / measured, places, "o", color="white", markeredgecolor=BLUE, markersize=4)
+    axes[1].axvline(1.0, color=ORANGE, linewidth=1.0, label="measured")
+    axes[1].set_yticks(places, labels, fontsize="x-small")
+    axes[1].set_ylim(-0.7, n - 0.3)
+    axes[1].set_xlabel("predicted / measured [-]")
+    axes[1].legend(frameon=False, fontsize="small", ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+
+    for k, probability in enumerate((0.5, level)):
+        low, high = _chance(n, probability)
+        axes[2].fill_between([k - 0.4, k + 0.4], low, high, color=GREY, alpha=0.3, linewidth=0.0)
+        axes[2].hlines(probability, k - 0.4, k + 0.4, color=GREY, linewidth=1.0)
+        axes[2].plot(k, np.mean(np.abs(pit - 0.5) <= 0.5 * probability), "o", color=BLUE)
+    size = np.abs(measured)
+    width, score = np.mean((joined["upper"] - joined["lower"]) / size), np.mean(joined["interval_score"] / size)
+    axes[2].set_title(f"width {width:.2f}, interval score {score:.2f}\nof the measured value", fontsize="small")
+    axes[2].set_xticks([0, 1], ["50%", f"{level:.0%}"])
+    axes[2].set_xlim(-0.6, 1.6)
+    axes[2].set_ylim(-0.03, 1.03)
+    axes[2].set(xlabel="interval", ylabel="share of measured values within [-]")
+    for each in axes:
+        each.grid(alpha=0.25)
+
+
+def _label(event: str, scores: QuantityScoresLike, k: int) -> str:
+    """Event, quantity and measured value."""
+    name = ", ".join(each for each in (event, scores.names[k]) if each)
+    unit = scores.units[k]
+    value = scores.measured[k] if unit == "SI" else from_si(scores.measured[k], unit)
+    return f"{name}: {value:.3g} {unit}"
+
+
+def _draw_histogram(axes: Axes, shares: np.ndarray, independent: float) -> None:
+    """Shares of the PIT in equal parts of 0 to 1, and the band of chance for a number of independent values."""
+    n, probability = max(1, round(independent)), 1.0 / len(shares)
+    low, high = _chance(n, probability)
+    at = (np.arange(len(shares)) + 0.5) * probability
+    axes.bar(at, shares, 0.94 * probability, color=BLUE, alpha=0.75)
+    axes.fill_between([0.0, 1.0], low, high, color=GREY, alpha=0.35, linewidth=0.0, label=f"{_BAND:.0%} by chance")
+    axes.axhline(probability, color=GREY, linewidth=0.8)
+    axes.set(xlim=(0.0, 1.0), xlabel="predicted probability below measured (PIT)", ylabel="share [-]")
+    axes.set_title(f"calibration: worth {n} values", fontsize="medium")
+    axes.legend(frameon=False, fontsize="small")
+
+
+def _chance(n: int, probability: float) -> tuple[float, float]:
+    """Ends of the band that contains 90 % of binomial shares of n trials, or more."""
+    from scipy.stats import binom  # imported here because it is slow to import
+
+    low, high = binom.ppf([0.5 - 0.5 * _BAND, 0.5 + 0.5 * _BAND], n, probability)
+    return low / n, high / n
+
+
+def _colour(k: int) -> str:
+    return (BLUE, ORANGE, GREY, "#3f8f5b", "#a23b72", "#6b4ba1")[k % 6]

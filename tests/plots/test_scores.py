@@ -1,0 +1,126 @@
+"""The figure of scores shows what the scores say: histogram, band of chance, coverage with errors, intervals."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from scipy import stats
+
+from fe_likelihoods.plots.scores import plot_scores
+from fe_likelihoods.prediction.score_tables import score_histories, score_values
+from fe_likelihoods.signals.channels import Channel
+
+CHANNELS = (Channel("deck", "absolute acceleration", "g"), Channel("drift", "relative displacement", "mm"))
+STEPS = 4000
+
+
+def histories(rng, factor=1.0, correlated=1):
+    """Scores of two sines with normal errors; the stated standard deviation is `factor` times the true one."""
+    mean = np.sin(0.1 * np.arange(STEPS)) * np.array([[3.0], [0.02]])
+    sd = 0.2 * np.array([[3.0], [0.02]])
+    kernel = np.ones(correlated) / np.sqrt(correlated)
+    errors = np.array([np.convolve(row, kernel, "valid") for row in rng.normal(size=(2, STEPS + correlated - 1))])
+    stated = np.broadcast_to(factor * sd, mean.shape)
+    band = tuple(mean + z * stated for z in stats.norm.ppf([0.05, 0.95]))
+    envelope = np.linspace(0.0, 1.0, STEPS) * np.ones((2, 1))
+    return score_histories(CHANNELS, mean + sd * errors, (mean, stated), band, envelope, 0.9)
+
+
+def numbers(measured, rng):
+    values = measured * np.exp(0.2 * rng.normal(size=(500, len(measured))))
+    return score_values([c.name for c in CHANNELS], [c.unit for c in CHANNELS], values, measured, 0.9)
+
+
+def bars(axes):
+    return np.array([patch.get_height() for patch in axes.patches])
+
+
+def chance(axes):
+    """Ends of the shaded band."""
+    heights = axes.collections[0].get_paths()[0].vertices[:, 1]
+    return heights.min(), heights.max()
+
+
+def test_histogram_of_calibrated_histories_is_within_the_band_of_chance_and_that_of_narrow_ones_is_not(rng):
+    low, high = chance(plot_scores(histories(rng)).axes[0])
+    assert low < 0.1 < high
+    assert np.mean((bars(plt.gcf().axes[0]) >= low) & (bars(plt.gcf().axes[0]) <= high)) >= 0.7
+    narrow = plot_scores(histories(rng, factor=0.5)).axes[0]
+    assert bars(narrow)[[0, -1]].min() > chance(narrow)[1] > bars(narrow)[4]
+    plt.close("all")
+
+
+def test_correlated_errors_widen_the_band_of_chance_and_the_errors_of_the_coverage(rng):
+    white, slow = histories(rng), histories(rng, correlated=20)
+    assert (slow.effective_samples < 0.2 * white.effective_samples).all()
+    ends = [np.diff(chance(plot_scores(each).axes[0]))[0] for each in (white, slow)]
+    assert ends[1] > 2.0 * ends[0]
+    assert (slow.coverage_error > 2.0 * white.coverage_error).all()
+    expected = np.sqrt(0.9 * 0.1 / (white.effective_samples[0] * 0.5))  # half of the samples are strong
+    assert white.coverage_error[0, 2] == pytest.approx(expected, rel=1e-3)
+    plt.close("all")
+
+
+@pytest.mark.slow
+def test_stated_errors_of_the_coverage_are_those_of_repeated_histories(rng):
+    """The number of independent samples is that of a mean square; for a band it is right within a third."""
+    scores = [histories(rng, correlated=20) for _ in range(200)]
+    actual = np.std([each.coverage_by_level for each in scores], axis=0)
+    stated = np.mean([each.coverage_error for each in scores], axis=0)
+    assert (np.abs(np.log(stated / actual)) < np.log(4 / 3)).all()
+
+
+def test_points_show_coverage_width_and_interval_score_in_multiples_of_the_rms(rng):
+    scores = histories(rng)
+    figure = plot_scores(scores)
+    drawn = [line.get_xydata() for line in figure.axes[2].lines if line.get_marker() == "o"]
+    for k in range(2):
+        width, full = drawn[2 * k], drawn[2 * k + 1]
+        np.testing.assert_allclose(width, [[scores.width[k] / scores.rms[k], scores.coverage[k]]])
+        np.testing.assert_allclose(full, [[scores.interval_score[k] / scores.rms[k], scores.coverage[k]]])
+    assert figure.axes[1].get_xlabel() == "response"
+    plt.close("all")
+
+
+def test_coverage_of_several_events_has_the_error_between_events(rng):
+    events = {f"EQ{k}": histories(rng, factor) for k, factor in enumerate((0.5, 1.0, 2.0))}
+    axes = plot_scores(events).axes[1]
+    each = np.array([scores.coverage_by_level[0] for scores in events.values()])
+    center, lengths = axes.containers[0][0].get_ydata(), axes.containers[0][2][0].get_segments()
+    np.testing.assert_allclose(center, each.mean(axis=0))
+    half = [0.5 * (segment[1, 1] - segment[0, 1]) for segment in lengths]
+    np.testing.assert_allclose(half, each.std(axis=0, ddof=1) / np.sqrt(3))
+    plt.close("all")
+
+
+def test_intervals_of_numbers_are_drawn_relative_to_the_measured_values_in_the_order_of_events(rng):
+    events = {name: numbers(np.array(values), rng) for name, values in {"B": (2.0, 0.01), "A": (0.5, 0.03)}.items()}
+    figure = plot_scores(events)
+    labels = [text.get_text() for text in figure.axes[1].get_yticklabels()]
+    assert [each.split(":")[0] for each in labels] == ["B, deck", "B, drift", "A, deck", "A, drift"]
+    assert labels[1] == "B, drift: 10 mm"
+    outer, inner = (each.get_segments() for each in figure.axes[1].collections[:2])
+    np.testing.assert_allclose(
+        [segment[:, 0] for segment in outer[2:]],
+        np.stack([events["A"].lower, events["A"].upper], axis=1) / events["A"].measured[:, None],
+    )
+    assert all(o[0, 0] < i[0, 0] < i[1, 0] < o[1, 0] for o, i in zip(outer, inner, strict=True))
+    shares = [line.get_ydata()[0] for line in figure.axes[2].lines]
+    pit = np.concatenate([each.pit for each in events.values()])
+    assert shares == [np.mean(np.abs(pit - 0.5) <= 0.25), np.mean(np.abs(pit - 0.5) <= 0.45)]
+    plt.close("all")
+
+
+def test_half_of_calibrated_numbers_are_between_the_quartiles(rng):
+    y = rng.normal(size=4000)
+    scores = score_values(["a"] * 4000, ["SI"] * 4000, rng.normal(size=(99, 4000)), y, 0.9)
+    inside = np.mean((scores.lower_quartile <= y) & (y <= scores.upper_quartile))
+    assert abs(inside - 0.5) < 4.0 * 0.5 / np.sqrt(4000)
+
+
+def test_scores_that_do_not_belong_together_are_refused(rng):
+    with pytest.raises(ValueError, match="all of histories or all of numbers"):
+        plot_scores({"a": histories(rng), "b": numbers(np.array([1.0, 2.0]), rng)})
+    with pytest.raises(ValueError, match="expected scores of one event or more"):
+        plot_scores({})
+    with pytest.raises(ValueError, match=r"divided by the measured values.*drift"):
+        plot_scores(numbers(np.array([1.0, 0.0]), rng))
