@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .prediction.damage import Damage, LimitState, damage, limit_states
     from .prediction.damage_measures import DamageMeasures, damage_measures, damage_outputs
     from .prediction.fragility import Fragility, fit_fragility, fragility, peak_ground_acceleration
+    from .prediction.held_out import score_left_out
     from .prediction.new_event import EventRatios, event_ratio, predict_new_event
     from .prediction.park_ang import ParkAng, park_ang_constants
     from .prediction.prediction import Prediction
@@ -58,6 +59,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .probability.hierarchical_posterior import HierarchicalPosterior, Varying
     from .probability.hierarchy import Hierarchy
     from .probability.joint import JointLikelihood
+    from .probability.leave_one_out import leave_one_out
     from .probability.likelihood import FELikelihood
     from .probability.marginal_noise import MarginalNoise
     from .probability.mixture_prior import MixtureDistribution, fit_mixture
@@ -219,6 +221,7 @@ __all__ = [
     "growing_durations",
     "innovations",
     "interval_score",
+    "leave_one_out",
     "limit_states",
     "log_score_normal",
     "material_curves",
@@ -257,6 +260,7 @@ __all__ = [
     "response_spectrum",
     "rms",
     "rrmse",
+    "score_left_out",
     "serve",
     "share_within",
     "table_motion",
@@ -334,6 +338,7 @@ _EXPORTS = {
         "fragility",
         "peak_ground_acceleration",
     ),
+    "prediction.held_out": ("score_left_out",),
     "prediction.new_event": ("EventRatios", "event_ratio", "predict_new_event"),
     "prediction.park_ang": (
         "ParkAng",
@@ -364,6 +369,7 @@ _EXPORTS = {
     ),
     "probability.hierarchy": ("Hierarchy",),
     "probability.joint": ("JointLikelihood",),
+    "probability.leave_one_out": ("leave_one_out",),
     "probability.likelihood": ("FELikelihood",),
     "probability.marginal_noise": ("MarginalNoise",),
     "probability.mixture_prior": (

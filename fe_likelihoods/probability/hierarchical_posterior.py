@@ -21,6 +21,7 @@ D. Lewandowski, D. Kurowicka, H. Joe (2009), Generating random correlation matri
 method, Journal of Multivariate Analysis 100, 1989-2001, doi:10.1016/j.jmva.2009.04.008, section 2.
 """
 
+import copy
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -171,11 +172,24 @@ class HierarchicalPosterior:
                 self.described[name] = describe(test, [*varying, *common], self._logarithmic, max_samples)
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
+        self._set_smallest_sd()
+
+    def _set_smallest_sd(self) -> None:
         deviations = [
             np.sqrt(np.cov(each.points.T, ddof=0).reshape(len(self._logarithmic), -1).diagonal())
             for each in self.described.values()
         ]
-        self._smallest_sd = _SMALLEST_SD * np.min(deviations, axis=0)[: len(varying)]
+        self._smallest_sd = _SMALLEST_SD * np.min(deviations, axis=0)[: len(self.varying)]
+
+    def without(self, test: str) -> "HierarchicalPosterior":
+        """The same posterior density without the data of one test; ValueError for the only test, or an unknown one."""
+        if test not in self.tests or len(self.tests) < 2:
+            raise ValueError(f"expected one of two tests or more, {', '.join(map(repr, self.tests))}; got {test!r}")
+        other = copy.copy(self)
+        other.tests = {name: each for name, each in self.tests.items() if name != test}
+        other.described = {name: each for name, each in self.described.items() if name != test}
+        other._set_smallest_sd()
+        return other
 
     @property
     def ndim(self) -> int:

@@ -1,0 +1,97 @@
+"""Scores of predicted events: each calibrated event predicted from the others, and compared with its measurements."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..probability.leave_one_out import LeftOut
+from ..probability.posterior import Posterior
+from .new_event import EventRatios, predict_new_event
+from .prediction import Prediction
+from .quantities import Quantity
+from .score_tables import HistoryScores, QuantityScores
+
+__all__ = ["HeldOutScore", "score_left_out"]
+
+
+class HeldOutScore(NamedTuple):
+    """How well an event is predicted from the other ones.
+
+    Attributes
+    ----------
+    scores : HistoryScores or QuantityScores
+        Of the prediction against the measurements of the event.
+    log_density : float
+        Logarithm of the predictive density of all data of the event, see `LeftOut`; NaN without its evidence.
+    prediction : Prediction
+        The prediction; its number of samples is that of the simulations.
+    """
+
+    scores: HistoryScores | QuantityScores
+    log_density: float
+    prediction: Prediction
+
+
+def score_left_out(
+    left_out: Mapping[str, LeftOut],
+    posteriors: Mapping[str, Posterior],
+    *,
+    quantity: Quantity = None,
+    ratios: Mapping[str, ArrayLike] | None = None,
+    noise: bool = False,
+    n: int = 500,
+    seed: int = 0,
+    **options: Any,
+) -> dict[str, HeldOutScore]:
+    """Predict each event from the others, under its own excitation, and score it with its measurements.
+
+    Parameters
+    ----------
+    left_out : mapping of str to LeftOut
+        Result of `leave_one_out`, or some of it.
+    posteriors : mapping of str to Posterior
+        The posterior of each of these events, with its model and its measurements.
+    quantity : optional
+        As for `propagate`: numbers such as ``peak(channel)``, or histories (default).
+    ratios : mapping of str to array_like, optional
+        The `event_ratio` of each event, by name; each prediction is corrected with those of the other events, two or
+        more.
+    noise, n, options
+        As for `predict_new_event`; `n` simulations for each event.
+    seed : int
+        Seed of the draws; each event has draws of its own.
+
+    Returns
+    -------
+    dict of str to HeldOutScore
+
+    Raises
+    ------
+    ValueError
+        If a posterior or a ratio is missing, and as `predict_new_event` and `Prediction.score`.
+    """
+    for what, given in (("posteriors", posteriors), ("ratios", left_out if ratios is None else ratios)):
+        if missing := [name for name in left_out if name not in given]:
+            raise ValueError(f"score_left_out: {what} of {', '.join(map(repr, missing))} are missing")
+    seeds = np.random.SeedSequence(seed).spawn(len(left_out))
+    found = {}
+    for (name, each), own_seed in zip(left_out.items(), seeds, strict=True):
+        others = None
+        if ratios is not None:
+            others = EventRatios([ratios[other] for other in each.hierarchy.posterior.tests if other in ratios])
+        prediction = predict_new_event(
+            each.hierarchy,
+            posteriors[name],
+            None,
+            quantity=quantity,
+            ratios=others,
+            noise=noise,
+            n=n,
+            seed=int(own_seed.generate_state(1)[0]),
+            **options,
+        )
+        scores = prediction.score(posteriors[name].likelihood.measurements)
+        found[name] = HeldOutScore(scores, each.log_density, prediction)
+    return found

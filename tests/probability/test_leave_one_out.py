@@ -1,0 +1,131 @@
+"""Populations without one test, by weights and by a new run, against the exact density of the other tests on a grid."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fe_likelihoods import (
+    HalfNormal,
+    HierarchicalPosterior,
+    Hierarchy,
+    Prior,
+    StoredPosterior,
+    TruncatedNormal,
+    Varying,
+    leave_one_out,
+)
+from fe_likelihoods.probability.pareto_smoothing import smoothed_weights
+
+ERROR, WIDE = 0.2, 2.0  # standard deviations of a measurement and of the prior of a test
+LINEAR = Varying(TruncatedNormal(0.0, 2.0, -np.inf, np.inf), HalfNormal(1.0), "linear")
+GRID = np.stack([each.ravel() for each in np.meshgrid(np.linspace(-1, 3, 120), np.linspace(0.01, 2.4, 120))], axis=1)
+ALIKE = (0.7, 1.4, 1.0, 1.5)
+ONE_BESIDE = (1.0, 1.2, 0.9, 1.1, 1.0, 3.0)
+
+
+def population(measured, with_evidence=True) -> HierarchicalPosterior:
+    """Tests with one normal measurement each, from exact samples of their posteriors."""
+    sd, tests = 1.0 / np.sqrt(1.0 / ERROR**2 + 1.0 / WIDE**2), {}
+    for k, each in enumerate(measured):
+        draws = np.random.default_rng(k).normal(sd**2 / ERROR**2 * each, sd, (400, 1))
+        evidence = stats.norm(0.0, np.hypot(ERROR, WIDE)).logpdf(each) if with_evidence else None
+        prior = Prior({"a": TruncatedNormal(0.0, WIDE, -np.inf, np.inf)})
+        tests[f"T{k}"] = StoredPosterior(draws, prior, log_evidence=evidence)
+    return HierarchicalPosterior(tests, {"a": LINEAR})
+
+
+def on_grid(posterior: HierarchicalPosterior) -> np.ndarray:
+    log_density = posterior.log_prob(GRID)
+    density = np.exp(log_density - log_density.max())
+    return density / density.sum()
+
+
+def hierarchy_of(measured, n=2000, **options) -> Hierarchy:
+    posterior = population(measured, **options)
+    rows = np.random.default_rng(0).choice(len(GRID), n, p=on_grid(posterior))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Hierarchy(posterior, GRID[rows])
+
+
+@pytest.fixture(scope="module")
+def alike() -> Hierarchy:
+    return hierarchy_of(ALIKE)
+
+
+@pytest.fixture(scope="module")
+def beside() -> Hierarchy:
+    return hierarchy_of(ONE_BESIDE)
+
+
+def check(left_out, posterior, name, measured) -> None:
+    """Means, standard deviations and predictive density are those of the other tests, on the grid."""
+    weights = on_grid(posterior.without(name))
+    mean = weights @ GRID
+    sd = np.sqrt(weights @ np.square(GRID - mean))
+    samples, n = left_out.hierarchy.samples, min(left_out.effective_samples, 500.0)
+    assert (np.abs(samples.mean(axis=0) - mean) < 4.0 * sd / np.sqrt(n)).all()
+    np.testing.assert_allclose(samples.std(axis=0), sd, rtol=0.15)
+    density = stats.norm.pdf(measured, GRID[:, 0], np.hypot(ERROR, GRID[:, 1]))
+    assert abs(left_out.log_density - np.log(weights @ density)) < 4.0 * left_out.log_density_error + 0.05
+    assert name not in left_out.hierarchy.posterior.tests
+
+
+def test_weights_leave_tests_out_as_exactly_as_a_new_run(alike):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = leave_one_out(alike)
+    for (name, each), measured in zip(found.items(), ALIKE, strict=True):
+        assert not each.sampled and each.pareto_shape < 0.7 and each.effective_samples > 300
+        check(each, alike.posterior, name, measured)
+    # control: the population of all tests is not that without T0
+    weights = on_grid(alike.posterior.without("T0"))
+    error = alike.samples[:, 0].mean() - weights @ GRID[:, 0]
+    assert abs(error) > 4.0 * np.sqrt(weights @ np.square(GRID[:, 0] - weights @ GRID[:, 0])) / np.sqrt(500.0)
+
+
+def test_a_test_that_moved_the_population_is_left_out_by_a_new_run(beside):
+    with pytest.warns(UserWarning, match=r"cannot leave them out: 'T5' \(Pareto shape 1\.\d+.*sampled anew") as caught:
+        found = leave_one_out(beside)
+    assert len(caught) == 1 and [name for name, each in found.items() if each.sampled] == ["T5"]
+    check(found["T5"], beside.posterior, "T5", ONE_BESIDE[5])
+    check(found["T0"], beside.posterior, "T0", ONE_BESIDE[0])
+    assert found["T5"].log_density < found["T0"].log_density - 4.0  # the others did not predict it
+    # control: its weights would have given another spread
+    own = beside.posterior.log_marginals(beside.samples)[:, 5]
+    weights, _ = smoothed_weights(-own)
+    exact = on_grid(beside.posterior.without("T5")) @ GRID[:, 1]
+    assert abs(weights @ beside.samples[:, 1] - exact) > 4.0 * abs(found["T5"].hierarchy.samples[:, 1].mean() - exact)
+
+
+def test_another_sampler_can_be_given(beside):
+    def sample(posterior):
+        return GRID[np.random.default_rng(1).choice(len(GRID), 1000, p=on_grid(posterior))]
+
+    with pytest.warns(UserWarning, match="sampled anew"):
+        found = leave_one_out(beside, sample=sample)["T5"]
+    check(found, beside.posterior, "T5", ONE_BESIDE[5])
+    assert len(found.hierarchy.samples) == 1000
+
+
+def test_without_an_evidence_there_is_no_density_of_the_data():
+    found = leave_one_out(hierarchy_of(ALIKE, n=500, with_evidence=False))
+    assert all(np.isnan(each.log_density) for each in found.values())
+
+
+def test_a_single_test_cannot_be_left_out(alike):
+    single = hierarchy_of(ALIKE[:1], n=100)
+    with pytest.raises(ValueError, match="leave_one_out needs two tests"):
+        leave_one_out(single)
+    with pytest.raises(ValueError, match="expected one of two tests or more, 'T0'; got 'T0'"):
+        single.posterior.without("T0")
+    with pytest.raises(ValueError, match="got 'T9'"):
+        alike.posterior.without("T9")
+    rest = alike.posterior.without("T1")
+    points = GRID[::700]
+    assert list(rest.tests) == ["T0", "T2", "T3"] and rest.fingerprint != alike.posterior.fingerprint
+    np.testing.assert_allclose(
+        rest.log_likelihood(points), alike.posterior.log_marginals(points)[:, [0, 2, 3]].sum(axis=1)
+    )
