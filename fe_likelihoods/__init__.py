@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .models.opensees import OpenSeesModel
     from .models.rc_column import RCColumn
     from .models.rc_column_curves import MaterialCurve, MomentCurvature, material_curves, moment_curvature
-    from .models.rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
+    from .models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Patches, Steel
     from .models.steel_coupon import SteelCoupon
     from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
     from .models.umbridge import UMBridgeModel
@@ -109,6 +109,7 @@ __all__ = [
     "AutoregressiveNoise",
     "AveragedPrediction",
     "BandNoise",
+    "BarBuckling",
     "Bars",
     "Bearing",
     "BlockLogLikelihood",
@@ -148,6 +149,7 @@ __all__ = [
     "LinearStructure",
     "LocalPool",
     "LogNormal",
+    "LowCycleFatigue",
     "MarginalNoise",
     "MaterialCurve",
     "MeasuredData",
@@ -298,7 +300,7 @@ _EXPORTS = {
     "models.opensees": ("OpenSeesModel",),
     "models.rc_column": ("RCColumn",),
     "models.rc_column_curves": ("MaterialCurve", "MomentCurvature", "material_curves", "moment_curvature"),
-    "models.rc_column_parts": ("Bars", "Concrete", "Hoops", "Patches", "Steel"),
+    "models.rc_column_parts": ("BarBuckling", "Bars", "Concrete", "Hoops", "LowCycleFatigue", "Patches", "Steel"),
     "models.steel_coupon": ("SteelCoupon",),
     "models.tall_buildings": ("GroupedFrame", "ModalModel", "ShearFlexuralBeam"),
     "models.umbridge": ("UMBridgeModel",),

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import concrete04
+from . import bar_failure, concrete04
 from .concrete04 import envelope, unloading
 from .jit import SUM_REORDERING, kernel
 from .reinforcing_steel import E0 as STEEL_E0
@@ -66,13 +66,15 @@ class Sections(NamedTuple):
         Constants of core and cover.
     steel : ndarray (reinforcing_steel.N_CONSTANTS,)
         Constants of the bars.
+    failure : ndarray (bar_failure.N_FAILURE,) or (0,)
+        Constants of the fatigue and buckling of the bars; empty for bars that do not fail.
     concrete_memory : ndarray (n_sections, 5, n_concrete)
         eps_min, eps_max, eps_end, slope and tension slope of each fiber.
-    steel_memory : ndarray (n_sections, n_bars, reinforcing_steel.N_STATE)
+    steel_memory : ndarray (n_sections, n_bars, reinforcing_steel.N_STATE or bar_failure.N_STATE)
     virgin : ndarray (n_sections,)
         1 while no bar of the section has been committed beyond yield, else 0. The memory of the bars of a virgin
         section is not kept up to date.
-    trial : ndarray (reinforcing_steel.N_STATE,)
+    trial : ndarray (reinforcing_steel.N_STATE or bar_failure.N_STATE,)
         Scratch.
     """
 
@@ -83,6 +85,7 @@ class Sections(NamedTuple):
     bar_area: np.ndarray
     concrete: np.ndarray
     steel: np.ndarray
+    failure: np.ndarray
     concrete_memory: np.ndarray
     steel_memory: np.ndarray
     virgin: np.ndarray
@@ -126,12 +129,14 @@ def _sum_envelope(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
 
 
 @kernel
-def _sum_bars(e0, kappa, j, bar_y, bar_area, steel, steel_memory, virgin, trial):
+def _sum_bars(e0, kappa, j, bar_y, bar_area, steel, failure, steel_memory, virgin, trial):
     """Sum over the bars, one after the other, where some are near or beyond yield."""
     n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(steel_memory.shape[1]):
         yi = bar_y[i]
-        if virgin[j] == 1.0:
+        if failure.shape[0] > 0:
+            stress, tangent = bar_failure.stress_tangent(e0 - yi * kappa, steel_memory[j, i], steel, failure, trial)
+        elif virgin[j] == 1.0:
             stress, tangent = monotonic_stress_tangent(e0 - yi * kappa, steel)
         else:
             stress, tangent = stress_tangent(e0 - yi * kappa, steel_memory[j, i], steel, trial)
@@ -234,7 +239,16 @@ def forces(e0, kappa, j, sections):
                 k_bending + bars_bending,
             )
     a, b, c, d, e = _sum_bars(
-        e0, kappa, j, bar_y, bar_area, steel, sections.steel_memory, sections.virgin, sections.trial
+        e0,
+        kappa,
+        j,
+        bar_y,
+        bar_area,
+        steel,
+        sections.failure,
+        sections.steel_memory,
+        sections.virgin,
+        sections.trial,
     )
     return n_force + a, moment + b, k_axial + c, k_coupling + d, k_bending + e
 
@@ -255,13 +269,16 @@ def _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory):
 
 
 @kernel
-def _commit_bars(e0, kappa, j, bar_y, steel, steel_memory, virgin):
+def _commit_bars(e0, kappa, j, bar_y, steel, failure, steel_memory, virgin):
     """Advance the memory of the bars of a section that is, or has been, committed beyond yield."""
     if virgin[j] == 1.0:
         virgin[j] = 0.0
         steel_memory[j] = 0.0
     for i in range(steel_memory.shape[1]):
-        update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel)
+        if failure.shape[0] > 0:
+            bar_failure.update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel, failure)
+        else:
+            update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel)
 
 
 @kernel(inline=True, fastmath=SUM_REORDERING)
@@ -285,7 +302,7 @@ def commit(e0, kappa, j, sections):
         for i in range(bar_y.shape[0]):
             beyond += 1.0 if abs(e0 - bar_y[i] * kappa) >= limit else 0.0
     if beyond > 0.0:
-        _commit_bars(e0, kappa, j, bar_y, steel, sections.steel_memory, virgin)
+        _commit_bars(e0, kappa, j, bar_y, steel, sections.failure, sections.steel_memory, virgin)
 
 
 @kernel

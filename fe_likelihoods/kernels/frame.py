@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import concrete04, fiber_section, reinforcing_steel
+from . import bar_failure, concrete04, fiber_section, reinforcing_steel
 from .beam_column import HEAD, PER_SECTION, Elements, advance, initialise
 from .corotational import BasicForces, add_to_stiffness, deformations
 from .fiber_section import Sections
@@ -67,6 +67,7 @@ def allocate(
     cover: np.ndarray,
     bars: np.ndarray,
     penetration: float = 0.0,
+    bars_fail: bool = False,
 ) -> Column:
     """Return a `Column` with its memory allocated and the constants of its materials still to be set.
 
@@ -86,7 +87,10 @@ def allocate(
     penetration : float
         Length below the base over which the deformations of the base section continue (strain of the bars in the
         foundation) [m].
+    bars_fail : bool
+        Whether the bars have fatigue or buckling (`bar_failure`), whose constants are also still to be set.
     """
+    n_bar_state = bar_failure.N_STATE if bars_fail else reinforcing_steel.N_STATE
     concrete = _append_empty_fibers(np.concatenate([core, cover]), 16)
     padded_bars = _append_empty_fibers(bars, 8)
     n_sections = n_elements * len(points)
@@ -105,10 +109,11 @@ def allocate(
             bar_area=np.ascontiguousarray(padded_bars[:, 1], dtype=float),
             concrete=np.zeros((2, concrete04.N_CONSTANTS)),
             steel=np.zeros(reinforcing_steel.N_CONSTANTS),
+            failure=np.zeros(bar_failure.N_FAILURE if bars_fail else 0),
             concrete_memory=np.zeros((n_sections, 5, len(concrete))),
-            steel_memory=np.zeros((n_sections, len(bars), reinforcing_steel.N_STATE)),
+            steel_memory=np.zeros((n_sections, len(bars), n_bar_state)),
             virgin=np.zeros(n_sections),
-            trial=np.zeros(reinforcing_steel.N_STATE),
+            trial=np.zeros(n_bar_state),
         ),
         elements=Elements(
             points=np.ascontiguousarray(points, dtype=float),

@@ -19,7 +19,7 @@ its curve in the slot of level (b+1)//2. Only the rules of the odd branches are 
 by the same rules with the signs of all strains and stresses changed.
 
 The law is that of the material ReinforcingSteel of OpenSees with its default options: no buckling, no fatigue, no
-isotropic hardening. ``docs/theory/reinforcing_steel.rst`` lists all rules.
+isotropic hardening. `bar_failure` adds buckling and fatigue. ``docs/theory/reinforcing_steel.rst`` lists all rules.
 
 References
 ----------
@@ -44,12 +44,14 @@ __all__ = [
     "N_CONSTANTS",
     "N_STATE",
     "constants",
+    "curve_slot",
     "backbone",
     "virgin_stress_tangent",
     "monotonic_stress_tangent",
     "stress_tangent",
     "switch_backbone",
     "stress_history",
+    "transition",
     "update",
 ]
 
@@ -63,6 +65,7 @@ N_STATE = 10 + 9 * N_CURVE
 
 TRANSITION = 0.0002  # strain over which the plateau turns into hardening
 TIE = 1e-14  # strains closer than this count as equal
+MAX_TRANSITIONS = 40  # from one branch to the next, within one step
 NEAR_ZERO = 1e-6  # a bar this close to the origin of its backbone counts as being at the origin [strain]
 VIRGIN_Q = 0.6  # largest q for which the series of virgin_stress_tangent are exact to round-off
 
@@ -188,7 +191,7 @@ def _mirror(state):
 
 
 @kernel
-def _slot(branch):
+def curve_slot(branch):
     """Return the position in the memory of the curve of a branch > 2."""
     return CURVES + N_CURVE * ((branch + 1) // 2 - 2)
 
@@ -196,7 +199,7 @@ def _slot(branch):
 @kernel
 def _returning_curve(xc, state, c, curve):
     """Write to `curve` the auxiliary curve on which a path that reversed at `xc` on branch 5 returns to branch 3."""
-    two, three = state[_slot(3) :], state[_slot(5) :]
+    two, three = state[curve_slot(3) :], state[curve_slot(5) :]
     xa2, xb2, ea2 = two[XA], two[XB], two[EA]
     xa3, xb3 = three[XA], three[XB]
     start = xb3 * (xc - xa3) / (xb3 - xa3) + xa2 * (xb3 - xc) / (xb3 - xa3)
@@ -239,7 +242,7 @@ def _step(x, tension, state, c):
         state[XMAX] = xc - state[OP]
         state[XXMAX] = max(state[XXMAX], xc)
         er = c[E0] * (0.82 + 1.0 / (5.55 + 1000.0 * max(state[XXMAX], -state[XXMIN])))
-        curve = state[_slot(3) :]
+        curve = state[curve_slot(3) :]
         if e >= c[SHP]:
             m = min(state[XMIN], -c[SHP] - TIE)
             ea = state[OP] + c[SHP] - c[FSH] / c[E0]
@@ -265,7 +268,7 @@ def _step(x, tension, state, c):
         state[BRANCH] = 3
         return False, 0.0, 0.0
 
-    curve = state[_slot(b) :]
+    curve = state[curve_slot(b) :]
     up = b % 4 == 1
     reached = x >= curve[XB] - TIE if up else x <= curve[XB] + TIE
     reversal = x < xc - TIE if up else x > xc + TIE
@@ -278,7 +281,7 @@ def _step(x, tension, state, c):
         elif b == 5:
             state[BRANCH] = 1
         elif b == 7:
-            _returning_curve(curve[XA], state, c, state[_slot(3) :])
+            _returning_curve(curve[XA], state, c, state[curve_slot(3) :])
             state[BRANCH] = 3
         else:
             state[BRANCH] = b - 4
@@ -292,33 +295,44 @@ def _step(x, tension, state, c):
         x_target = state[OP] + state[XMAX] + d
         new = 5
     elif b == 5:
-        aside = state[_slot(7) :]
+        aside = state[curve_slot(7) :]
         _returning_curve(xc, state, c, aside)
         x_target = curve[XA]
         s_target, e_target = evaluate_curve(x_target, aside)
         new = 7
     elif b == 7:
         x_target = curve[XA]
-        s_target, e_target = evaluate_curve(x_target, state[_slot(5) :])
+        s_target, e_target = evaluate_curve(x_target, state[curve_slot(5) :])
         state[RE] = xc
         new = 9
     elif up:
         if b + 4 <= 20:
             state[RE] = curve[XA]
         x_target = state[RE]
-        s_target, e_target = evaluate_curve(x_target, state[_slot(b - 2) :])
+        s_target, e_target = evaluate_curve(x_target, state[curve_slot(b - 2) :])
         new = b + 2
     elif b + 2 <= 20:
         x_target = curve[XA]
-        s_target, e_target = evaluate_curve(x_target, state[_slot(b - 2) :])
+        s_target, e_target = evaluate_curve(x_target, state[curve_slot(b - 2) :])
         new = b + 2
     else:
-        x_target = state[_slot(b - 4) :][XA]
-        s_target, e_target = evaluate_curve(x_target, state[_slot(b - 6) :])
+        x_target = state[curve_slot(b - 4) :][XA]
+        s_target, e_target = evaluate_curve(x_target, state[curve_slot(b - 6) :])
         new = b - 2
-    fit_curve(End(xc, sc, er), End(x_target, s_target, e_target), True, c[FYP] / c[E0], state[_slot(new) :])
+    fit_curve(End(xc, sc, er), End(x_target, s_target, e_target), True, c[FYP] / c[E0], state[curve_slot(new) :])
     state[BRANCH] = new
     return False, 0.0, 0.0
+
+
+@kernel(inline=True)
+def transition(x, state, c):
+    """Make one transition of any branch at the natural strain `x`; arguments and results are those of `_step`."""
+    if int(state[BRANCH]) % 2 == 1:
+        return _step(x, True, state, c)
+    _mirror(state)
+    done, s, modulus = _step(-x, False, state, c)
+    _mirror(state)
+    return done, -s, modulus
 
 
 @kernel
@@ -333,15 +347,8 @@ def update(eps, state, c):
             return 0.0, c[E0]
         state[BRANCH] = 1.0 if x > 0.0 else 2.0
     s, modulus = math.nan, math.nan
-    for _ in range(40):
-        tension = int(state[BRANCH]) % 2 == 1
-        if tension:
-            done, s, modulus = _step(x, True, state, c)
-        else:
-            _mirror(state)
-            done, s, modulus = _step(-x, False, state, c)
-            _mirror(state)
-            s = -s
+    for _ in range(MAX_TRANSITIONS):
+        done, s, modulus = transition(x, state, c)
         if done:
             break
     state[XC] = x
@@ -365,7 +372,7 @@ def stress_tangent(eps, state, c, trial):
     x = math.log(1.0 + eps) if eps > -0.95 else math.nan
     b = int(state[BRANCH])
     if b > 2:
-        curve = state[_slot(b) :]
+        curve = state[curve_slot(b) :]
         up = b % 4 <= 1
         if (state[XC] <= x < curve[XB] - TIE) if up else (curve[XB] + TIE < x <= state[XC]):
             s, modulus = evaluate_curve(x, curve)

@@ -40,7 +40,7 @@ from ..simulation.model import ContinuedResponse
 from .circular_section import Confinement, gauss_lobatto
 from .rc_column_analysis import ColumnHistory
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
-from .rc_column_parts import Bars, Concrete, Hoops, Patches, Steel
+from .rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Patches, Steel
 from .rc_column_presets import lhpost_arguments
 from .rc_column_run import PreparedColumn, prepare_column, run_column
 from .rc_column_section import ReinforcedSection
@@ -72,9 +72,13 @@ PARAMETERS = {
     "Esh": "hardening modulus of steel [Pa]",
     "mass": "mass at the top [kg]",
     "penetration": "length of strain penetration into the foundation [m]",
+    "Cf": "coefficient of the fatigue of bars [-]",
+    "Cd": "coefficient of the loss of strength of bars [-]",
+    "slenderness": "unsupported length of bars by their diameter [-]",
 }
+_OF_FATIGUE, _OF_BUCKLING = ("Cf", "Cd"), ("slenderness",)
 _NOMINAL_UNITS = dict(
-    zip(PARAMETERS, ("GPa", "GPa", "1/s", "s", "MPa", "MPa", "MPa", "MPa", "GPa", "kg", "m"), strict=True)
+    zip(PARAMETERS, ("GPa", "GPa", "1/s", "s", "MPa", "MPa", "MPa", "MPa", "GPa", "kg", "m"), strict=False)
 )
 
 
@@ -114,6 +118,10 @@ class RCColumn(ThreadedModel):
         column. Zero is a rigid anchorage. A common estimate is 0.022 fy d [MPa, m] (Priestley, Seible & Calvi, Seismic
         Design and Retrofit of Bridges, 1996). With 2 elements of 3 points it completes their plastic hinge,
         0.08 height + 0.022 fy d, because the end section of such an element represents height/12.
+    fatigue : LowCycleFatigue or None
+        Low-cycle fatigue of the bars. None: bars neither lose strength nor fracture.
+    buckling : BarBuckling or None
+        Buckling of the bars. None: bars in compression stay straight.
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (see the notes).
     n_elements, n_points : int
@@ -176,6 +184,9 @@ class RCColumn(ThreadedModel):
     ``Esh``           hardening modulus of steel [Pa]
     ``mass``          mass at the top [kg]
     ``penetration``   length of strain penetration into the foundation [m]
+    ``Cf``            coefficient of Coffin and Manson, with `fatigue`
+    ``Cd``            coefficient of the loss of strength, with `fatigue`
+    ``slenderness``   unsupported length of the bars by their diameter, with `buckling`
     ================  ============================================================
     """
 
@@ -194,6 +205,8 @@ class RCColumn(ThreadedModel):
     a0: float = 0.0
     a1: float = 0.0
     penetration: float = 0.0
+    fatigue: LowCycleFatigue | None = None
+    buckling: BarBuckling | None = None
     parameters: tuple[str, ...] = ("Ec", "Es", "a0", "a1", "ft")
     n_elements: int = 2
     n_points: int = 3
@@ -243,7 +256,13 @@ class RCColumn(ThreadedModel):
         """Nominal values of all parameters [SI]."""
         c, s = self.concrete, self.steel
         values = (c.ec, s.es, self.a0, self.a1, c.ft, c.fc, s.fy, s.fu, s.esh, self.mass, self.penetration)
-        return dict(zip(PARAMETERS, values, strict=True))
+        found = dict(zip(PARAMETERS, values, strict=False))
+        if self.fatigue is not None:
+            found |= dict(zip(_OF_FATIGUE, (self.fatigue.cf, self.fatigue.cd), strict=True))
+        if self.buckling is not None:
+            slenderness = self.buckling.slenderness or self.hoops.spacing / self.bars.diameter
+            found |= dict(zip(_OF_BUCKLING, (slenderness,), strict=True))
+        return found
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
@@ -426,9 +445,10 @@ class RCColumn(ThreadedModel):
                 "read a Record with fe_likelihoods.read_csv, read_at2 or read_v2",
             )
         parts = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops}
-        for name, part in zip(parts, (self.concrete, self.steel, self.bars, self.hoops), strict=True):
-            kind = parts[name]
-            if not isinstance(part, kind):
+        failure = {"fatigue": LowCycleFatigue, "buckling": BarBuckling}
+        for name, kind in (parts | failure).items():
+            part = getattr(self, name)
+            if not isinstance(part, kind) and (part is not None or name in parts):
                 raise invalid(f"{kind.__name__}(...) as {name}", part, "import it from fe_likelihoods")
         check_fields(
             self,
@@ -452,6 +472,11 @@ class RCColumn(ThreadedModel):
         idle = [name for name in self.parameters if name in ("a0", "a1")]
         if idle and not isinstance(self.loading, Record):
             raise invalid("parameters that act under imposed displacement", idle, "leave damping out of parameters")
+        for option, names in (("fatigue", _OF_FATIGUE), ("buckling", _OF_BUCKLING)):
+            idle = [name for name in self.parameters if name in names]
+            if idle and getattr(self, option) is None:
+                kind = {"fatigue": "LowCycleFatigue()", "buckling": "BarBuckling()"}[option]
+                raise invalid(f"parameters that act without {option}", idle, f"add {option}={kind} to the column")
         check_nominal(self.parameters, self.nominal)
         _ = self._parsed_outputs  # checks the names
         check_units(dict(self.units))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels import concrete04, reinforcing_steel
+from ..kernels import bar_failure, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
 from ..kernels.frame import Column
 from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
@@ -20,7 +20,7 @@ from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from .base import BuiltInModel, History, remark_on_range
 from .circular_section import Confinement
-from .rc_column_parts import Concrete, Steel, hardening_fault
+from .rc_column_parts import BarBuckling, Concrete, LowCycleFatigue, Steel, hardening_fault
 from .validation import check_values
 
 __all__ = [
@@ -66,10 +66,14 @@ class ColumnHistory(History):
         Largest strain of a bar in the base section, divided by the ultimate strain of the steel. Above 1, real bars
         fracture, whereas the law of the steel was continued along its tangent. A warning about this is logged once per
         model, also where simulations come from a cache on disk.
+    bar_damage : ndarray[n_bars] or None
+        Miner's sum of each bar at the last sample, in the section where it is largest; a bar has fractured above 1. In
+        the order of ``model.section.fibers()[2]``. None without fatigue.
     """
 
     retries: int
     beyond_range: float
+    bar_damage: np.ndarray | None = None
 
 
 class Analysis(NamedTuple):
@@ -224,6 +228,10 @@ def check_physical_values(values: dict[str, float], steel: Steel) -> None:
         raise SimulationFailed(
             f"the steel has no hardening: fu = {values['fu']:.4g} Pa is not above fy = {values['fy']:.4g} Pa"
         )
+    if values.get("Cd", np.inf) < values.get("Cf", 0.0):
+        raise SimulationFailed(
+            f"bars without strength before they fracture: Cd = {values['Cd']:.4g} is below Cf = {values['Cf']:.4g}"
+        )
     strains = steel.hardening_strain, steel.ultimate_strain
     fault = hardening_fault(values["fy"], values["fu"], values["Es"], values["Esh"], *strains)
     if fault:
@@ -231,21 +239,32 @@ def check_physical_values(values: dict[str, float], steel: Steel) -> None:
 
 
 def checked_history(
-    model: BuiltInModel, steel: Steel, bar_radius: float, analysis: Analysis, theta: np.ndarray
+    model: BuiltInModel,
+    steel: Steel,
+    bar_radius: float,
+    analysis: Analysis,
+    theta: np.ndarray,
+    bar_damage: np.ndarray | None = None,
 ) -> ColumnHistory:
-    """History of a simulation; warns once per model where bars exceed the strain at which they fracture."""
+    """History of a simulation; warns once per model where bars exceed the strain at which they fracture.
+
+    There is no warning where a bar has fractured, which the model then describes.
+    """
     strain, curvature = (analysis.values[analysis.names.index(f"base {row}")] for row in ("axial strain", "curvature"))
     limit = steel.ultimate_strain
     beyond = float((np.abs(strain) + bar_radius * np.abs(curvature)).max()) / limit
-    if beyond > 1.0:
+    if beyond > 1.0 and (bar_damage is None or bar_damage.max() < 1.0):
+        advice = "Use RCColumn(..., fatigue=LowCycleFatigue()) for bars that lose strength and fracture"
+        if bar_damage is not None:
+            advice = "Use a smaller cf of LowCycleFatigue, with which they fracture at this strain"
         at = dict(zip(model.parameters, theta.tolist(), strict=True))
         remark_on_range(
             model,
             f"a bar strain of {beyond * limit:.3g} at the base exceeds the ultimate strain of the steel, {limit:.3g}, "
-            f"at which bars fracture; the law was continued along its tangent, at {at}. This model gives no further "
-            "warnings: check history(theta).beyond_range, or use a weaker loading",
+            f"at which bars fracture; the law was continued along its tangent, at {at}. {advice}, "
+            "or a weaker loading. This model gives no further warnings: check history(theta).beyond_range",
         )
-    return ColumnHistory(analysis.names, analysis.values, analysis.retries, beyond)
+    return ColumnHistory(analysis.names, analysis.values, analysis.retries, beyond, bar_damage)
 
 
 def expect_fracture(model: BuiltInModel) -> None:
@@ -254,7 +273,13 @@ def expect_fracture(model: BuiltInModel) -> None:
 
 
 def set_materials(
-    sections: Sections, values: dict[str, float], concrete: Concrete, steel: Steel, confinement: Confinement
+    sections: Sections,
+    values: dict[str, float],
+    concrete: Concrete,
+    steel: Steel,
+    confinement: Confinement,
+    fatigue: LowCycleFatigue | None = None,
+    buckling: BarBuckling | None = None,
 ) -> None:
     """Write the constants of core, cover and bars at the physical parameter `values` [SI] into `sections`."""
     fc, ec, ft = values["fc"], values["Ec"], values["ft"]
@@ -275,6 +300,10 @@ def set_materials(
         steel.ultimate_strain,
         sections.steel,
     )
+    if fatigue is not None or buckling is not None:
+        coefficients = (values["Cf"], fatigue.alpha, values["Cd"]) if fatigue is not None else (0.0, 1.0, 1.0)
+        support = (values["slenderness"], buckling.alpha) if buckling is not None else (0.0, 1.0)
+        bar_failure.constants(sections.steel, values["fy"], *coefficients, *support, sections.failure)
 
 
 def _by_section(sections: np.ndarray) -> np.ndarray:

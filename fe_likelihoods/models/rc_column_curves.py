@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from ..kernels import concrete04, reinforcing_steel
+from ..kernels import bar_failure, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
 from ..kernels.frame import allocate
 from ..simulation.model import SimulationFailed
@@ -115,7 +115,7 @@ def material_curves(
         curves.append(MaterialCurve(name, path, stress))
     path = _path("steel", steel)
     stress = np.empty_like(path)
-    reinforcing_steel.stress_history(path, np.zeros(reinforcing_steel.N_STATE), sections.steel, stress)
+    _bar_stress(path, np.zeros(len(sections.trial)), sections, stress)
     return (*curves, MaterialCurve("steel", path, stress))
 
 
@@ -174,7 +174,7 @@ class _Section:
             for part, constants in zip((slice(None, core), slice(core, None)), sections.concrete, strict=True)
         ]
         self.bar_x, self.bar_area = -sections.bar_y[:n_bars], sections.bar_area[:n_bars]
-        self.steel, self.bars = sections.steel, np.zeros((n_bars, reinforcing_steel.N_STATE))
+        self.sections, self.bars = sections, np.zeros((n_bars, len(sections.trial)))
         self.axial_strain = 0.0
 
     def forces(self, axial_strain: float, curvature: float, bars: np.ndarray) -> tuple[float, float]:
@@ -187,7 +187,7 @@ class _Section:
             moment -= float((stress * area * x).sum())
         stress = np.empty(1)
         for x, area, memory in zip(self.bar_x, self.bar_area, bars, strict=True):
-            reinforcing_steel.stress_history(np.array([axial_strain - x * curvature]), memory, self.steel, stress)
+            _bar_stress(np.array([axial_strain - x * curvature]), memory, self.sections, stress)
             force += float(stress[0] * area)
             moment -= float(stress[0] * area * x)
         return force, moment
@@ -255,9 +255,19 @@ def _sections(column: RCColumn, theta: np.ndarray) -> tuple[Sections, dict[str, 
         core=core,
         cover=cover,
         bars=bars,
+        bars_fail=column.fatigue is not None or column.buckling is not None,
     ).sections
-    set_materials(sections, values, column.concrete, column.steel, column.section.confinement(values["fc"]))
+    confinement = column.section.confinement(values["fc"])
+    set_materials(sections, values, column.concrete, column.steel, confinement, column.fatigue, column.buckling)
     return sections, values
+
+
+def _bar_stress(strain: np.ndarray, memory: np.ndarray, sections: Sections, stress: np.ndarray) -> None:
+    """Take one bar through `strain`, write its `stress`, and advance its `memory`."""
+    if sections.failure.size:
+        bar_failure.stress_history(strain, memory, sections.steel, sections.failure, stress)
+    else:
+        reinforcing_steel.stress_history(strain, memory, sections.steel, stress)
 
 
 def _path(name: str, reversals: Sequence[float]) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from ..kernels import reinforcing_steel
 from .validation import check_fields, check_integer, invalid
 
-__all__ = ["Bars", "Concrete", "Hoops", "Patches", "Steel", "hardening_fault"]
+__all__ = ["BarBuckling", "Bars", "Concrete", "Hoops", "LowCycleFatigue", "Patches", "Steel", "hardening_fault"]
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,58 @@ def hardening_fault(fy: float, fu: float, es: float, esh: float, eps_sh: float, 
             "a larger Esh or a larger difference between fy and fu is needed"
         )
     return ""
+
+
+@dataclass(frozen=True)
+class LowCycleFatigue:
+    """Low-cycle fatigue of bars: loss of strength from cycle to cycle, and fracture.
+
+    A half cycle of the plastic strain ep adds (ep/cf)^(1/alpha) to Miner's sum; a bar fractures where the sum reaches
+    one. The strength decreases by (cf/cd)^(1/alpha) times the sum. ``docs/theory/reinforcing_steel.rst`` has the
+    equations.
+
+    Attributes
+    ----------
+    cf, alpha : float
+        Coefficient and exponent of Coffin and Manson, for the plastic strain of a half cycle from one reversal to the
+        next. The defaults are those that OpenSees documents for its material ReinforcingSteel, from the tests of Brown
+        & Kunnath (2004).
+    cd : float
+        Coefficient of the loss of strength, at least `cf`; a large one means no loss before fracture.
+    """
+
+    cf: float = 0.26
+    alpha: float = 0.506
+    cd: float = 0.389
+
+    def __post_init__(self) -> None:
+        check_fields(self, positive=("cf", "alpha", "cd"), of="of fatigue")
+        if self.alpha > 1.0:
+            raise invalid("an exponent alpha of at most 1", self.alpha, "tests of bars give 0.4 to 0.6")
+        if self.cd < self.cf:
+            raise invalid(
+                f"a coefficient cd of at least cf = {self.cf:g}", self.cd, "a smaller one has no strength at fracture"
+            )
+
+
+@dataclass(frozen=True)
+class BarBuckling:
+    """Buckling of bars in compression (Dhakal & Maekawa 2002).
+
+    Attributes
+    ----------
+    slenderness : float or None
+        Unsupported length of the bars divided by their diameter. None: the spacing of the hoops divided by the diameter
+        of the bars. Where hoops yield or are weak, bars buckle over several spacings, and the ratio is larger.
+    alpha : float
+        1 for steel that hardens linearly, 0.75 for steel that does not.
+    """
+
+    slenderness: float | None = None
+    alpha: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, positive=("slenderness", "alpha"), optional=("slenderness",), of="of buckling")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..kernels import bar_failure
 from ..kernels.frame import Column, allocate
 from ..kernels.newmark import Dynamics, committed_state
 from ..kernels.static import Iteration
@@ -108,8 +109,10 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
         weights=prepared.weights,
         **prepared.fibers,
         penetration=values["penetration"],
+        bars_fail=model.fatigue is not None or model.buckling is not None,
     )
-    set_materials(column.sections, values, model.concrete, model.steel, prepared.section.confinement(values["fc"]))
+    confinement = prepared.section.confinement(values["fc"])
+    set_materials(column.sections, values, model.concrete, model.steel, confinement, model.fatigue, model.buckling)
     iteration = Iteration(float(model.tolerance), int(model.max_iterations), int(model.halvings))
     record = any(output.row is None for output in prepared.outputs)
     gravity = np.zeros(3 * model.n_elements)
@@ -127,7 +130,11 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
         end = np.concatenate([[model.n_steps - 1], energies, *parts])
     rows = dict(zip(analysis.names, analysis.values, strict=True))
     outputs = {o.name: o.evaluate(rows, analysis.sections, values["penetration"]) for o in prepared.outputs}
-    return ColumnRun(checked_history(model, model.steel, model.bar_circle_radius, analysis, theta), outputs, end)
+    damage = None
+    if model.fatigue is not None:
+        damage = column.sections.steel_memory[:, :, bar_failure.DAMAGE].max(axis=0)
+    history = checked_history(model, model.steel, model.bar_circle_radius, analysis, theta, damage)
+    return ColumnRun(history, outputs, end)
 
 
 def _restore(column: Column, energies: np.ndarray, state: np.ndarray, n_steps: int) -> int:

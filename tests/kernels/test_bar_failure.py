@@ -1,0 +1,314 @@
+"""Fatigue and buckling of bars: closed forms, rainflow counting, OpenSees, tangents, and bars that do not fail."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.kernels import bar_failure, reinforcing_steel
+from fe_likelihoods.kernels.bar_failure import DAMAGE, FRACTURED, HALF_CYCLES, N_FAILURE, N_STATE
+from tests.opensees_bar import bar_stresses
+from tests.opensees_column import require_opensees
+
+from . import golden
+
+STEEL = (415e6, 620e6, 2e11, 8e9, 0.008, 0.1)  # fy, fu, Es, Esh [Pa], eps_sh, eps_u
+FY, ES = STEEL[0], STEEL[2]
+ALPHA, CD = 0.506, 0.389
+NATURAL_FY = FY * (1.0 + FY / ES)
+MODULUS = NATURAL_FY / np.log1p(FY / ES)  # natural
+YIELD = np.log1p(FY / ES)
+
+
+def path(*turns, n=200):
+    """Strains from zero through `turns`, `n` steps from one to the next."""
+    return np.interp(np.arange(len(turns) * n + 1) / n, np.arange(len(turns) + 1), [0.0, *turns])
+
+
+def failure(cf=0.0, slenderness=0.0, alpha_b=1.0, cd=CD):
+    """Constants of the law and of its failure."""
+    c, f = golden.steel_constants(STEEL), np.zeros(N_FAILURE)
+    bar_failure.constants(c, FY, cf, ALPHA, cd, slenderness, alpha_b, f)
+    return c, f
+
+
+def follow(strain, **options):
+    """Stress, tangent and Miner's sum (3, n) of a new bar."""
+    c, f = failure(**options)
+    state, out = np.zeros(N_STATE), np.empty((3, len(strain)))
+    for i, eps in enumerate(strain):
+        out[0, i], out[1, i] = bar_failure.update(eps, state, c, f)
+        out[2, i] = state[DAMAGE]
+    return out
+
+
+def lawful(strain):
+    """Stress of a bar that does not fail."""
+    stress = np.empty(len(strain))
+    reinforcing_steel.stress_history(strain, np.zeros(reinforcing_steel.N_STATE), golden.steel_constants(STEEL), stress)
+    return stress
+
+
+def natural(strain, stress):
+    """Natural strain and stress."""
+    return np.log1p(strain), stress * (1.0 + strain)
+
+
+def random_turns(rng, n, low=-0.03, high=0.03):
+    return path(*rng.uniform(low, high, n), n=40)
+
+
+def coffin_manson(x, s, cf):
+    """Damage of a half cycle with the natural strain `x` and stress `s` from its start."""
+    return (max(abs(x) - abs(s) / MODULUS, 0.0) / cf) ** (1.0 / ALPHA)
+
+
+def rainflow(x, s, cf):
+    """Miner's sum by rainflow counting (ASTM E1049, 5.4.4) of a history of natural strain and stress."""
+    turns = [0, *(np.flatnonzero(np.diff(x)[1:] * np.diff(x)[:-1] < 0.0) + 1), len(x) - 1]
+    stack, total = [], 0.0
+
+    def add(i, j, weight):
+        nonlocal total
+        total += weight * coffin_manson(x[i] - x[j], s[i] - s[j], cf)
+
+    for turn in turns:
+        stack.append(turn)
+        while len(stack) > 2 and abs(x[stack[-1]] - x[stack[-2]]) >= abs(x[stack[-2]] - x[stack[-3]]):
+            if len(stack) == 3:
+                add(stack[0], stack[1], 1)
+                del stack[0]
+            else:
+                add(stack[-3], stack[-2], 2)
+                del stack[-3:-1]
+    for i, j in zip(stack[:-1], stack[1:], strict=True):
+        add(i, j, 1)
+    return total
+
+
+# --- fatigue ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_bar_without_failure_is_that_of_the_law(rng):
+    for strain in (random_turns(rng, 20), random_turns(rng, 20, -0.01, 0.06)):
+        np.testing.assert_array_equal(follow(strain)[0], lawful(strain))
+
+
+def test_half_cycles_of_constant_amplitude_follow_coffin_and_manson():
+    """The number of half cycles to fracture is that of the closed form, over a factor of ten in life."""
+    found, expected = [], []
+    for amplitude in (0.02, 0.03, 0.045, 0.06):
+        strain = path(*[amplitude, -amplitude] * 40)
+        stress, _, damage = follow(strain, cf=0.26, cd=10.0)
+        ends = slice(2 * 200, None, 200)
+        x, s = natural(strain, lawful(strain))
+        # stable loops: each half cycle from the fourth on adds the same
+        one = coffin_manson(x[4 * 200] - x[5 * 200], s[4 * 200] - s[5 * 200], 0.26)
+        steps = np.diff(damage[ends])
+        steps = steps[: np.argmax(damage[ends] > 1.0) - 1]
+        np.testing.assert_allclose(steps[3:], one, rtol=2e-3)
+        found.append(np.argmax(damage > 1.0) / 200.0)
+        expected.append(1.0 / one)
+    assert expected[0] / expected[-1] > 8.0
+    np.testing.assert_allclose(
+        found, expected, atol=1.5
+    )  # the first half cycle begins at zero, the last is not complete
+
+
+def test_strength_decreases_with_the_damage_and_ends_with_fracture():
+    strain = path(*[0.03, -0.03] * 40)
+    stress, tangent, damage = follow(strain, cf=0.2)
+    loss = (0.2 / CD) ** (1.0 / ALPHA)
+    factor = 1.0 - loss * damage - np.maximum(damage - 1.0, 0.0) / 0.04
+    broken = int(np.argmax(factor <= 0.0))
+    assert 1.0 < damage[broken] < 1.04
+    np.testing.assert_allclose(stress[:broken], factor[:broken] * lawful(strain)[:broken], rtol=1e-12)
+    assert not stress[broken:].any()
+    assert not tangent[broken:].any()
+
+
+def test_damage_is_that_of_rainflow_counting(rng):
+    """An independent count; loops of the law overshoot their start a little before they close, so it is not exact."""
+    ratios = []
+    for _ in range(30):
+        strain = random_turns(rng, 30)
+        damage = follow(strain, cf=0.26)[2, -1]
+        ratios.append(damage / rainflow(*natural(strain, lawful(strain)), 0.26))
+    assert np.abs(np.array(ratios) - 1.0).max() < 0.01
+
+
+def test_counting_reversals_without_closing_loops_is_detected(rng):
+    """Negative control of the test above: half cycles from each reversal to the next are another sum."""
+    strain = random_turns(rng, 30)
+    x, s = natural(strain, lawful(strain))
+    naive = sum(coffin_manson(x[i + 40] - x[i], s[i + 40] - s[i], 0.26) for i in range(0, len(x) - 1, 40))
+    assert abs(naive / rainflow(x, s, 0.26) - 1.0) > 0.05
+
+
+def test_a_nested_loop_leaves_the_outer_half_cycle_as_it_was():
+    """Miner's sum with a small loop inside a large half cycle is the sum of both."""
+    cf = 0.26
+    plain = follow(path(0.03, -0.03, 0.03), cf=cf)[2, -1]
+    strain = path(0.03, -0.03, 0.0, -0.01, 0.03)
+    x, s = natural(strain, lawful(strain))
+    loop = 2.0 * coffin_manson(x[600] - x[800], s[600] - s[800], cf)
+    assert follow(strain, cf=cf)[2, -1] == pytest.approx(plain + loop, rel=0.01)
+    assert loop > 0.005 * plain
+
+
+def test_steps_do_not_matter():
+    turns = (0.03, -0.02, 0.01, -0.01, 0.02, -0.03, 0.04)
+    coarse, fine = (follow(path(*turns, n=n), cf=0.2)[2, -1] for n in (4, 400))
+    assert coarse == pytest.approx(fine, rel=1e-9)
+
+
+def test_deepest_nesting(rng):
+    """More nested reversals than levels, and their way out: the half cycles that are forgotten are small."""
+    strain = path(*(0.03 * 0.9 ** np.arange(30) * (-1.0) ** np.arange(30)), 0.04, n=40)
+    damage = follow(strain, cf=0.2)[2]
+    assert (np.diff(damage) > -1e-3 * damage[-1]).all()
+    assert damage[-1] == pytest.approx(rainflow(*natural(strain, lawful(strain)), 0.2), rel=0.02)
+
+
+def test_fatigue_is_that_of_opensees(rng):
+    """Equal to round-off in simple histories; in others OpenSees departs from rainflow counting (see the theory)."""
+    require_opensees()
+    cf = 0.15
+    simple = [path(0.2), path(-0.15), path(*[0.02, -0.02] * 30, n=50), path(*[0.05, -0.01] * 20, n=50)]
+    nested = [random_turns(rng, 20) for _ in range(20)]
+    stresses = bar_stresses(STEEL, ("-CMFatigue", cf, ALPHA, CD), [*simple, *nested])
+    for strain, theirs in zip(simple, stresses[: len(simple)], strict=True):
+        ours = follow(strain, cf=cf)[0]
+        np.testing.assert_allclose(ours / FY, theirs / FY, atol=1e-9)
+    assert any((stress[1:] == 0.0).any() for stress in stresses[: len(simple)])  # some of these bars fracture
+    off, agree = [], 0
+    for strain, theirs in zip(nested, stresses[len(simple) :], strict=True):
+        ours, _, damage = follow(strain, cf=cf)
+        sound = damage < 0.98
+        difference = np.abs(ours - theirs)[sound] / FY
+        agree += difference.max() < 1e-3
+        off.append(np.median(difference))
+    assert agree >= 5
+    assert max(off) < 0.01
+
+
+# --- buckling --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slenderness", [3.0, 8.0, 12.0, 16.0])
+def test_compression_follows_dhakal_and_maekawa(slenderness):
+    """The three parts of their average stress, written out for natural strains."""
+    strain = -np.linspace(0.0, 0.15, 400)[1:]
+    stress, _, _ = follow(strain, slenderness=slenderness)
+    x, s = natural(strain, stress)
+    _, local = natural(strain, lawful(strain))
+    z, s, local = -x, -s, -local
+    lp = slenderness * np.sqrt(FY / 100e6)
+    end = max(55.0 - 2.3 * lp, 7.0) * YIELD
+    part = min(1.1 - 0.016 * lp, 1.0)
+    at_end = part * np.interp(end, z, local)
+    expected = np.select(
+        [z <= YIELD, z <= end],
+        [local, local * (1.0 - (1.0 - part) * (z - YIELD) / (end - YIELD))],
+        np.maximum(at_end - 0.02 * MODULUS * (z - end), 0.2 * NATURAL_FY),
+    )
+    np.testing.assert_allclose(s, expected, rtol=2e-4)
+    if slenderness == 16.0:
+        assert s[-1] == pytest.approx(0.2 * NATURAL_FY, rel=1e-6)
+
+
+def test_tension_before_buckling_is_that_of_the_law(rng):
+    strain = path(0.05, 0.045, 0.06)
+    np.testing.assert_array_equal(follow(strain, slenderness=12.0)[0], lawful(strain))
+
+
+def test_compression_after_tension_begins_at_the_unloaded_point():
+    """The strain of buckling counts from there: at zero strain, a bar stretched to 0.04 has long buckled."""
+    strain = path(0.04, 0.0)
+    ratio = follow(strain, slenderness=12.0)[0][-1] / lawful(strain)[-1]
+    c, f = failure(slenderness=12.0)
+    x, s = natural(strain[200], lawful(strain)[200])
+    expected, _ = bar_failure.buckling_factor(x - s / MODULUS, c, f)
+    assert ratio == pytest.approx(expected, rel=1e-12)
+    assert expected < 0.7
+
+
+def test_a_buckled_bar_becomes_straight_at_its_largest_strain():
+    strain = path(0.03, -0.02, 0.03, 0.04)
+    stress, law = follow(strain, slenderness=12.0)[0], lawful(strain)
+    returning = slice(2 * 200 + 20, 3 * 200)
+    up = law[returning] > 0.1 * FY
+    assert (stress[returning][up] < law[returning][up]).all()
+    np.testing.assert_allclose(stress[3 * 200 :], law[3 * 200 :], rtol=1e-12)
+
+
+def test_stress_has_no_jumps(rng):
+    """Fine steps change the stress little, at every change of rule."""
+    for _ in range(10):
+        turns = np.clip(rng.uniform(-0.03, 0.04, 12), -0.03, 0.04)
+        strain = path(*turns, n=3000)
+        stress = follow(strain, slenderness=12.0, cf=0.12)[0]
+        allowed = 1.3 * MODULUS * np.abs(np.diff(strain)) + 2e-3 * FY  # the law itself has small jumps
+        assert (np.abs(np.diff(stress)) < allowed).all()
+
+
+def test_differences_from_opensees_in_compression():
+    """OpenSees starts the same reduction at about 2.5 instead of one yield strain: its stress is higher."""
+    require_opensees()
+    strain = path(-0.08, n=800)
+    steel = tuple(value / 1e6 for value in STEEL[:4]) + STEEL[4:]  # in MPa, the unit of the formulas
+    for slenderness, limit in ((5.0, 0.08), (8.0, 0.16), (12.0, 0.21), (16.0, 0.17)):
+        (theirs,) = bar_stresses(steel, ("-DMBuck", slenderness, 1.0), [strain])
+        difference = follow(strain, slenderness=slenderness)[0] / FY - theirs / steel[0]
+        assert difference.min() > -1e-3
+        assert 0.5 * limit < difference.max() < limit
+
+
+# --- both ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [dict(cf=0.1), dict(slenderness=10.0), dict(cf=0.1, slenderness=10.0)])
+def test_tangent_is_the_derivative(rng, options):
+    c, f = failure(**options)
+    trial, tested = np.zeros(N_STATE), 0
+    for _ in range(25):
+        state = np.zeros(N_STATE)
+        strain = random_turns(rng, 8)
+        for eps in strain:
+            bar_failure.update(eps, state, c, f)
+        direction = np.sign(strain[-1] - strain[-2])
+        for ahead in (1e-3, 4e-3, 1e-2):
+            eps, step = strain[-1] + direction * ahead, 1e-7
+            values = [bar_failure.stress_tangent(eps + k * step, state, c, f, trial) for k in (-1, 0, 1)]
+            branches = []
+            for k in (-1, 1):
+                copy = state.copy()
+                bar_failure.update(eps + k * step, copy, c, f)
+                branches.append((copy[reinforcing_steel.BRANCH], copy[FRACTURED]))
+            if branches[0] != branches[1] or branches[0][1] or state[FRACTURED]:
+                continue
+            difference = (values[2][0] - values[0][0]) / (2.0 * step)
+            assert values[1][1] == pytest.approx(difference, rel=2e-4, abs=2e-5 * MODULUS)
+            tested += 1
+    assert tested > 30
+
+
+def test_a_trial_leaves_the_memory_as_it_was(rng):
+    c, f = failure(cf=0.1, slenderness=10.0)
+    state, trial = np.zeros(N_STATE), np.zeros(N_STATE)
+    for eps in random_turns(rng, 15):
+        before, copy = state.copy(), state.copy()
+        tried = bar_failure.stress_tangent(eps + 1e-3, state, c, f, trial)
+        np.testing.assert_array_equal(state, before)
+        assert tried == bar_failure.update(eps + 1e-3, copy, c, f)
+        bar_failure.update(eps, state, c, f)
+
+
+def test_kernels_equal_pure_python(rng):
+    c, f = failure(cf=0.1, slenderness=10.0)
+    state, pure = np.zeros(N_STATE), np.zeros(N_STATE)
+    for eps in random_turns(rng, 12)[::4]:
+        compiled = bar_failure.update(eps, state, c, f)
+        assert bar_failure.update.py_func(eps, pure, c, f) == pytest.approx(compiled, rel=1e-11, abs=1.0)
+    np.testing.assert_allclose(pure[HALF_CYCLES:], state[HALF_CYCLES:], rtol=1e-9, atol=1e-9)
+    out = np.zeros(N_FAILURE)
+    bar_failure.constants.py_func(c, FY, 0.1, ALPHA, CD, 10.0, 1.0, out)
+    np.testing.assert_allclose(out, f, rtol=1e-14)

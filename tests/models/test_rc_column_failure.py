@@ -1,0 +1,198 @@
+"""Columns whose bars buckle, lose strength and fracture: options, parameters, failures, warnings and continued runs."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    BarBuckling,
+    DisplacementHistory,
+    FELikelihood,
+    HalfNormal,
+    LowCycleFatigue,
+    Measurements,
+    Posterior,
+    Prior,
+    RCColumn,
+    SimulationFailed,
+    TruncatedNormal,
+    material_curves,
+    moment_curvature,
+)
+from fe_likelihoods.kernels import bar_failure
+from fe_likelihoods.problems import bridge_column_data
+from tests.kernels import golden
+
+WEAK = LowCycleFatigue(cf=0.09, cd=0.389)
+SLENDER = BarBuckling(slenderness=10.0)
+
+
+def cycles(*drifts, height=7.3152, points=30):
+    """Two reversed cycles of each drift."""
+    corners = [0.0, *(sign * drift * height for drift in drifts for _ in range(2) for sign in (1.0, -1.0)), 0.0]
+    legs = [np.linspace(a, b, points, endpoint=False) for a, b in zip(corners[:-1], corners[1:], strict=True)]
+    return DisplacementHistory("cycles", np.concatenate([*legs, [0.0]]))
+
+
+@pytest.fixture(scope="module")
+def column():
+    """Cycles to a drift of 7 %."""
+    return RCColumn.lhpost(cycles(0.01, 0.03, 0.05, 0.07), parameters=("Ec",), penetration=0.3, max_increment=0.01)
+
+
+def peaks(model):
+    """Largest force in the second cycle of each level of drift [N]."""
+    return np.abs(model.simulate(np.ones(len(model.parameters)))[0][: 4 * 120]).reshape(4, 120)[:, 60:].max(axis=1)
+
+
+def test_bars_that_hardly_fail_give_the_default_response(column):
+    """A large Cf and stocky bars; the response of the default column comes from other kernels."""
+    stocky = replace(column, fatigue=LowCycleFatigue(cf=1e3, cd=1e9), buckling=BarBuckling(slenderness=0.1))
+    np.testing.assert_allclose(stocky.simulate([1.0]), column.simulate([1.0]), rtol=1e-6, atol=1.0)
+
+
+def test_fatigue_and_buckling_reduce_the_strength_of_late_cycles(column):
+    plain, tired, both = (
+        peaks(model)
+        for model in (column, replace(column, fatigue=WEAK), replace(column, fatigue=WEAK, buckling=SLENDER))
+    )
+    np.testing.assert_allclose(tired[0], plain[0], rtol=1e-3)
+    assert tired[-1] < 0.95 * plain[-1]
+    assert both[-1] < tired[-1]
+
+
+def test_outer_bars_fracture_first(column):
+    damage = replace(column, fatigue=WEAK).history([1.0]).bar_damage
+    y = column.section.fibers()[2][:, 0]
+    assert damage.shape == y.shape
+    order = np.argsort(np.abs(y))
+    assert damage[order[-1]] > 1.0
+    assert damage[order[0]] < 0.5
+    assert column.history([1.0]).bar_damage is None
+
+
+def test_base_force_is_that_of_the_bars_that_remain(column):
+    """After fracture of all bars, a column without axial load has almost no strength."""
+    brittle = replace(column, axial_load=0.0, fatigue=LowCycleFatigue(cf=0.03, cd=10.0))
+    try:
+        late = peaks(brittle)
+    except SimulationFailed as failure:
+        assert "did not converge" in str(failure)
+    else:
+        assert late[-1] < 0.3 * late[0]
+
+
+def test_default_slenderness_is_that_between_hoops(column):
+    model = replace(column, buckling=BarBuckling())
+    assert model.nominal["slenderness"] == pytest.approx(column.hoops.spacing / column.bars.diameter)
+    given = replace(column, buckling=BarBuckling(model.nominal["slenderness"]))
+    np.testing.assert_array_equal(model.simulate([1.0]), given.simulate([1.0]))
+
+
+def test_parameters_are_multiples_of_the_arguments(column):
+    free = replace(column, fatigue=WEAK, buckling=SLENDER, parameters=("Cf", "Cd", "slenderness"))
+    fixed = replace(column, fatigue=LowCycleFatigue(1.2 * 0.09, 0.506, 0.9 * 0.389), buckling=BarBuckling(1.1 * 10.0))
+    np.testing.assert_allclose(free.simulate([1.2, 0.9, 1.1]), fixed.simulate([1.0]), rtol=1e-9)
+    assert not np.array_equal(free.simulate([1.2, 0.9, 1.1]), free.simulate([1.0, 1.0, 1.0]))
+
+
+def test_a_loss_of_strength_beyond_all_strength_fails(column):
+    model = replace(column, fatigue=WEAK, parameters=("Cd",))
+    with pytest.raises(SimulationFailed, match=r"Cd = 0\.0389 is below Cf = 0\.09"):
+        model.simulate([0.1])
+
+
+def test_the_fatigue_coefficient_is_found_from_a_test_to_fracture(column):
+    """Synthetic test to fracture: the log-likelihood is largest at the true Cf."""
+    model = replace(column, fatigue=WEAK, parameters=("Cf",))
+    force = model.simulate([1.0]) + 2e3 * np.random.default_rng(3).standard_normal((1, model.n_steps))
+    likelihood = FELikelihood(model, Measurements(model.channels, model.dt, force))
+    posterior = Posterior(likelihood, Prior({"Cf": TruncatedNormal(1.0, 0.3), "sigma_force": HalfNormal(1e4)}))
+    values = np.array([posterior([cf, 2e3]) for cf in (0.8, 0.9, 1.0, 1.1, 1.2)])
+    assert np.argmax(values) == 2
+    assert values[2] - np.sort(values)[-2] > 100.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(parameters=("Cf",)), "add fatigue=LowCycleFatigue"),
+        (dict(parameters=("slenderness",)), "add buckling=BarBuckling"),
+        (dict(fatigue=0.26), r"expected LowCycleFatigue\(...\) as fatigue"),
+        (dict(buckling="yes"), r"expected BarBuckling\(...\) as buckling"),
+    ],
+)
+def test_wrong_options(column, changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(column, **changes)
+
+
+def test_wrong_values():
+    with pytest.raises(ValueError, match="positive cf"):
+        LowCycleFatigue(cf=0.0)
+    with pytest.raises(ValueError, match="alpha of at most 1"):
+        LowCycleFatigue(alpha=2.0)
+    with pytest.raises(ValueError, match="cd of at least cf"):
+        LowCycleFatigue(cf=0.26, cd=0.2)
+    with pytest.raises(ValueError, match="positive slenderness"):
+        BarBuckling(slenderness=-1.0)
+
+
+def test_fingerprint_covers_the_options(column):
+    prints = {
+        column.fingerprint,
+        replace(column, fatigue=WEAK).fingerprint,
+        replace(column, fatigue=LowCycleFatigue()).fingerprint,
+        replace(column, buckling=SLENDER).fingerprint,
+    }
+    assert len(prints) == 4
+
+
+def test_the_warning_about_fracture_names_the_option(column, caplog):
+    """Without fatigue, and with a fatigue under which no bar fractures; there is none where a bar fractures."""
+    brittle = replace(column.steel, ultimate_strain=0.03)
+    for fatigue, advice in ((None, r"fatigue=LowCycleFatigue()"), (LowCycleFatigue(cf=5.0, cd=10.0), "a smaller cf")):
+        model = replace(column, steel=brittle, fatigue=fatigue)
+        with caplog.at_level(logging.WARNING):
+            caplog.clear()
+            assert model.history([1.0]).beyond_range > 1.0
+        assert advice in caplog.text
+        assert advice in model.range_remark
+    model = replace(column, steel=brittle, fatigue=WEAK)
+    assert model.history([1.0]).bar_damage.max() > 1.0
+    assert not model.range_remark
+
+
+def test_material_and_section_curves_include_the_failure(column):
+    model = replace(column, fatigue=WEAK, buckling=SLENDER)
+    strains = [0.03, -0.03] * 6
+    curves = [material_curves(m, [1.0], steel=strains)[2].stress for m in (column, model)]
+    stress, state = np.empty_like(curves[1]), np.zeros(bar_failure.N_STATE)
+    values = model.physical_values(np.ones(1))
+    s = column.steel
+    moduli = (values[name] for name in ("fy", "fu", "Es", "Esh"))
+    c = golden.steel_constants((*moduli, s.hardening_strain, s.ultimate_strain))
+    f = np.zeros(bar_failure.N_FAILURE)
+    bar_failure.constants(c, values["fy"], 0.09, 0.506, 0.389, 10.0, 1.0, f)
+    bar_failure.stress_history(material_curves(model, [1.0], steel=strains)[2].strain, state, c, f, stress)
+    np.testing.assert_array_equal(curves[1], stress)
+    assert np.abs(curves[0] - curves[1]).max() > 50e6
+
+    there = np.concatenate([np.linspace(0.0, 0.04, 30), np.linspace(0.04, -0.04, 60)])
+    moments = [moment_curvature(m, [1.0], there).moment for m in (column, model)]
+    assert abs(moments[1][-1]) < 0.97 * abs(moments[0][-1])
+
+
+def test_an_earthquake_continues_from_a_damaged_state():
+    """A run in two parts has the bits of one run, memory of fatigue and buckling included."""
+    record = bridge_column_data().record.scale(4.0).trim(5.0, 11.0)
+    model = RCColumn.lhpost(record, fatigue=WEAK, buckling=SLENDER)
+    theta = np.ones(5)
+    whole = model.simulate(theta)
+    first = model.first(3.0)
+    start = first.simulate_from(theta)
+    rest = model.simulate_from(theta, start.state)
+    np.testing.assert_array_equal(np.concatenate([start.response, rest.response], axis=1), whole)
+    assert 0.0 < model.history(theta).bar_damage.max() < 1.0
