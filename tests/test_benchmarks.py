@@ -8,7 +8,7 @@ import pytest
 from scipy import integrate, stats
 
 from samplers import SMCSampler
-from tests.benchmarks import job, new_event, peers, transfer, truth, truth_targets
+from tests.benchmarks import job, new_event, noises, peers, transfer, truth, truth_targets
 from tests.benchmarks.comparison import compare
 from tests.benchmarks.growth import exponent
 from tests.benchmarks.rows import Row, as_table, machine, write_json
@@ -208,6 +208,10 @@ def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, mon
     monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
     (row,) = transfer.transfer()
     assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+    monkeypatch.setattr(noises, "_FOLDER", tmp_path)
+    for part in (noises._painter_street, noises._meloland):
+        (row,) = part(1)
+        assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
 
 
 def test_hyper_samples_of_the_synthetic_twins_are_those_of_the_posterior():

@@ -12,6 +12,7 @@ of the error in each band in SI units. See ``docs/theory/noise.rst``.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -78,12 +79,22 @@ class BandSums:
 
     def bands(self, n: int, dt: float) -> np.ndarray:
         """Band of each coefficient (n,) of n samples: coefficient k has the frequency k / (2 n dt)."""
-        frequencies = np.arange(n) / (2.0 * n * dt)
-        return np.searchsorted(self.edges, frequencies * (1.0 + _ROUND_OFF), side="right")
+        return _bands(self.edges, n, dt)
+
+
+@lru_cache(maxsize=64)  # the same for every simulation
+def _bands(edges: tuple[float, ...], n: int, dt: float) -> np.ndarray:
+    frequencies = np.arange(n) / (2.0 * n * dt)
+    bands = np.searchsorted(edges, frequencies * (1.0 + _ROUND_OFF), side="right")
+    bands.flags.writeable = False
+    return bands
 
 
 def stretches(there: np.ndarray) -> Iterator[slice]:
     """Samples of each stretch without a gap, from whether each sample is there (n_steps,)."""
+    if there.all():
+        yield slice(0, len(there))
+        return
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
         yield slice(int(first), int(stop))

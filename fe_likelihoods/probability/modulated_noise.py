@@ -15,6 +15,7 @@ See ``docs/theory/noise.rst``.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -61,8 +62,15 @@ class PartSums:
 
     def places(self, n_steps: int) -> np.ndarray:
         """Part of each sample (n_channels, n_steps)."""
-        times = np.array(self.starts)[:, None] + np.array(self.steps)[:, None] * np.arange(n_steps)
-        return np.maximum(np.floor(times / self.part + _ROUND_OFF).astype(int), 0)
+        return _places(self, n_steps)
+
+
+@lru_cache(maxsize=64)  # the same for every simulation
+def _places(sums: PartSums, n_steps: int) -> np.ndarray:
+    times = np.array(sums.starts)[:, None] + np.array(sums.steps)[:, None] * np.arange(n_steps)
+    places = np.maximum(np.floor(times / sums.part + _ROUND_OFF).astype(int), 0)
+    places.flags.writeable = False
+    return places
 
 
 def sums_of_parts(values: np.ndarray, places: np.ndarray, there: np.ndarray) -> np.ndarray:

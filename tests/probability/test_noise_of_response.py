@@ -10,14 +10,17 @@ from scipy.fft import dct
 from fe_likelihoods import (
     BandNoise,
     Channel,
+    Events,
     FELikelihood,
     FunctionModel,
     GaussianNoise,
     HalfNormal,
     JointLikelihood,
+    LinearOscillator,
     Measurements,
     ModulatedNoise,
     Posterior,
+    Record,
     RelativeNoise,
     SimulationCache,
     TruncatedNormal,
@@ -291,6 +294,23 @@ def test_blocks_of_time_add_up_and_are_those_of_the_whole_response(kind, rng):
         assert blocks.values[0, 1] == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.parametrize("kind", ["shares in bands", "levels in bands"])
+def test_a_block_of_band_noise_is_nearly_conditional_on_the_others(kind, rng):
+    """Against the exact density of a block given all other samples of the channel; white noise is the control."""
+    simulated, parameters, inside = response([1.0]), PARAMETERS[kind], np.arange(N) // 60 == 1
+    noise = NOISES[kind].with_measurements(measured(simulated))
+    matrix = covariance(kind, simulated[0], parameters, 0)
+    gain = matrix[np.ix_(inside, ~inside)] @ np.linalg.inv(matrix[np.ix_(~inside, ~inside)])
+    left = matrix[np.ix_(inside, inside)] - gain @ matrix[np.ix_(~inside, inside)]
+    found, exact_ones, white = np.empty((3, 200))
+    for k in range(200):
+        errors = draw(noise, parameters, simulated, rng)
+        found[k] = noise.log_densities(errors, simulated, parameters)[0, inside].sum()
+        exact_ones[k] = stats.multivariate_normal(gain @ errors[0, ~inside], left).logpdf(errors[0, inside])
+        white[k] = stats.norm.logpdf(errors[0, inside], 0.0, np.sqrt(np.diag(matrix)[inside])).sum()
+    assert abs(np.mean(found - exact_ones)) < 0.2 * abs(np.mean(white - exact_ones))
+
+
 @EVERY
 def test_whitened_residuals_pass_the_checks_that_residuals_fail(kind):
     rng, n = np.random.default_rng(5), 3000
@@ -382,3 +402,37 @@ def test_what_is_wrong_is_refused():
     fitted = likelihood_of("modulated", response([1.0])).noise
     with pytest.raises(ValueError, match=r"is for \[240, 240\] samples"):
         fitted.log_likelihood(np.zeros((1, len(fitted.statistic(gaps, gaps)))), 100, np.ones((1, 2)))
+
+
+@pytest.mark.parametrize("kind", ["modulated", "shares in bands"])
+def test_events_have_levels_of_their_own_response(kind, rng):
+    """Two events with a pause, of which the second is ten times weaker: the shares are those of both."""
+    time = DT * np.arange(400)
+    strong = Record("EQ1", DT, np.exp(-(((time - 4.0) / 1.5) ** 2)) * rng.standard_normal(400))
+    events = Events([strong, strong.scale(0.1)], rest=4.0, names=["EQ1", "EQ2"])
+    model = LinearOscillator(events)
+    simulated, sensor = model.simulate([1.0, 1.0]), {"acceleration": 1e-3, "displacement": 1e-6}
+    noise = {
+        "modulated": ModulatedNoise(model.channels, window=WINDOW, sensor=sensor),
+        "shares in bands": BandNoise(model.channels, (5.0,), sensor=sensor),
+    }[kind]
+    parameters = np.array([0.2, 0.3] if kind == "modulated" else [0.2, 0.3, 0.4, 0.2])
+    single = {}
+    for window in events.windows:
+        part = simulated[:, window.samples]
+        own = noise.with_measurements(Measurements(model.channels, DT, part))
+        single[window.name] = Measurements(model.channels, DT, part + draw(own, parameters, part, rng))
+    likelihood = FELikelihood(model, single, noise)
+    if kind == "shares in bands":  # each event is a stretch, and its density that of its own
+        expected = 0.0
+        for window in events.windows:
+            part = simulated[:, window.samples]
+            own = noise.with_measurements(single[window.name])
+            expected += own.log_densities(part - single[window.name].values, part, parameters).sum()
+        assert likelihood([1.0, 1.0, *parameters]) == pytest.approx(expected, rel=1e-10)
+    best = max(
+        (likelihood([1.0, 1.0, *(factor * parameters)]), factor) for factor in (0.25, 0.5, 0.8, 1.0, 1.25, 2.0, 4.0)
+    )
+    assert best[1] in (0.8, 1.0, 1.25)
+    white = residual_checks(likelihood.noise.whitened(likelihood.residuals([1.0, 1.0]), simulated, parameters))
+    np.testing.assert_allclose(white.standard_deviation, 1.0, atol=0.15)
