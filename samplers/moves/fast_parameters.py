@@ -21,6 +21,7 @@ from emcee import State
 from emcee.model import Model
 from emcee.moves import Move
 
+from ..proposals.mixture import Mixture
 from .kernels import Inside, MixtureMove, RandomWalkMove, calibrate_move
 
 __all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
@@ -84,6 +85,8 @@ class WithFastSweeps(Move):
         If `indices` is empty or contains an invalid index, or if `sweeps` is less than 1.
     """
 
+    takes_mixture = True
+
     def __init__(self, move: Move, indices: Sequence[int], sweeps: int = 2):
         if sweeps < 1:
             raise ValueError(f"sweeps must be at least 1, got {sweeps}; to make no fast sweeps, use the move itself")
@@ -107,9 +110,14 @@ class WithFastSweeps(Move):
         """Mean acceptance of the fast sweeps after the latest move; NaN before the first one."""
         return float(np.mean(self._accepted)) if len(self._accepted) else float("nan")
 
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit the walk, and the wrapped move if it can be fitted, to points (n, ndim) with weights (n,)."""
-        calibrate_move(self.move, coords, weights, inside)
+    def calibrate(
+        self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
+    ) -> None:
+        """Fit the walk, and the wrapped move if it can be fitted, to points (n, ndim) with weights (n,).
+
+        `mixture` is that of `MixtureMove.calibrate`; other moves do not use it.
+        """
+        calibrate_move(self.move, coords, weights, inside, mixture)
         self._walk.calibrate(coords, weights, inside)
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:

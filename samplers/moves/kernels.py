@@ -73,9 +73,16 @@ def describe(move: Move) -> dict:
     return {"class": type(move).__name__, **settings}
 
 
-def calibrate_move(move: Move, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-    """Fit a move to points (n, ndim) with normalised weights (n,), if it can be fitted; emcee's own moves cannot."""
-    if hasattr(move, "calibrate"):
+def calibrate_move(
+    move: Move, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
+) -> None:
+    """Fit a move to points (n, ndim) with normalised weights (n,), if it can be fitted; emcee's own moves cannot.
+
+    A `MixtureMove`, with fast sweeps or without, takes a given `mixture` instead.
+    """
+    if mixture is not None and getattr(move, "takes_mixture", False):
+        move.calibrate(coords, weights, inside, mixture)
+    elif hasattr(move, "calibrate"):
         move.calibrate(coords, weights, inside)
 
 
@@ -225,7 +232,7 @@ class MixtureMove(MHMove):
     Parameters
     ----------
     max_components : int
-        Largest number of components of the mixture.
+        Largest number of components of the mixture, where it is fitted. After recycling, it is the last proposal.
     independence_threshold : float
         Acceptance of the independence kernel above which the other two are used less often.
     target : float
@@ -236,6 +243,8 @@ class MixtureMove(MHMove):
     ter Braak, C. J. F. (2006), A Markov chain Monte Carlo version of the genetic algorithm differential evolution,
     Statistics and Computing 16, doi:10.1007/s11222-006-8769-1
     """
+
+    takes_mixture = True
 
     def __init__(self, max_components: int = 6, independence_threshold: float = 0.5, target: float = 0.25):
         if max_components < 1:
@@ -256,14 +265,19 @@ class MixtureMove(MHMove):
         """The fitted mixture; None before the first fit."""
         return self._mixture
 
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit the mixture to points (n, ndim) with normalised weights (n,).
+    def calibrate(
+        self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
+    ) -> None:
+        """Fit the mixture to points (n, ndim) with normalised weights (n,), or take a given `mixture`.
 
         The next sweep uses the independence kernel. The bounds of the support are determined at the first call only.
+
+        A mixture that was fitted to the very points that it moves makes their tails too light for many sweeps: where
+        points in the tails have widened it, they are soon replaced, and where there are none, it hardly proposes any.
         """
         if inside is not None and self._bounds is None:
             self._bounds = find_support_bounds(inside, coords)
-        self._mixture = fit_mixture(coords, weights, self.max_components, self._bounds)
+        self._mixture = fit_mixture(coords, weights, self.max_components, self._bounds) if mixture is None else mixture
         self._inside = inside
         self._archive = to_component_space(self._mixture, coords)
         self._cumulated = np.cumsum(weights)

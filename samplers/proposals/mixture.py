@@ -42,6 +42,8 @@ __all__ = [
 
 # Degrees of freedom: heavier tails than a Gaussian, and finite fourth moments.
 DOF = 6.0
+# Fewer degrees of freedom that are tried in this order, for points with heavier tails. They must be above 2.
+HEAVIER = (4.0, 3.0, 2.5)
 # Limits of expectation-maximisation: iterations of a fit, iterations of a trial, and the gain in mean log-likelihood
 # below which a fit stops.
 ITERATIONS = 30
@@ -171,8 +173,9 @@ def fit_mixture(
     """Fit a mixture; the number of components minimises the Bayesian information criterion.
 
     Components are added one at a time, each by splitting an existing one, as long as the criterion improves. Each
-    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. If shears
-    (`samplers.proposals.shears`) improve the criterion, the components are fitted to the transformed points.
+    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. Then fewer
+    degrees of freedom are tried, for points with heavier tails. If shears (`samplers.proposals.shears`) improve the
+    criterion, the components are fitted to the transformed points.
 
     Parameters
     ----------
@@ -185,7 +188,7 @@ def fit_mixture(
     bounds : SupportBounds, optional
         Bounds of the support. Those near the population are removed by a transformation if this improves the criterion.
     dof : float
-        Degrees of freedom, above 2.
+        Largest degrees of freedom, above 2. Of these and 4, 3 and 2.5, the ones with the best criterion are used.
 
     Returns
     -------
@@ -248,11 +251,32 @@ def _fit_components(
         if criterion >= best_criterion:
             break
         best, best_criterion = found, criterion
+    best, best_criterion = _with_heavier_tails(best, best_criterion, white, weights, effective)
 
     roots = root @ best.roots
-    mixture = Mixture(best.weights, mean + best.means @ root.T, roots, invert_roots(roots), dof, shears)
+    mixture = Mixture(best.weights, mean + best.means @ root.T, roots, invert_roots(roots), best.dof, shears)
     volume = 2.0 * effective * float(np.sum(np.log(root.diagonal())))
     return mixture, best_criterion + volume + len(shears) * PARAMETERS_PER_SHEAR * math.log(max(effective, 2.0))
+
+
+def _with_heavier_tails(
+    best: Mixture, best_criterion: float, white: np.ndarray, weights: np.ndarray, effective: float
+) -> tuple[Mixture, float]:
+    """Lower the degrees of freedom of a fit as long as the criterion, with one more parameter, improves.
+
+    Several components may have stood for the tails of one, so one component is tried too.
+    """
+    penalty = math.log(max(effective, 2.0))
+    for dof in HEAVIER:
+        starts = [np.ones((len(white), 1))]
+        if len(best.weights) > 1:
+            starts.append(np.exp(log_responsibilities(best, white)))
+        tried = [_maximise(white, weights, effective, responsibilities, dof) for responsibilities in starts]
+        criteria = [_criterion(len(m.weights), white.shape[1], effective, value) + penalty for m, value in tried]
+        if min(criteria) >= best_criterion:
+            break
+        best, best_criterion = tried[int(np.argmin(criteria))][0], min(criteria)
+    return best, best_criterion
 
 
 def _criterion(count: int, ndim: int, effective: float, log_likelihood: float) -> float:

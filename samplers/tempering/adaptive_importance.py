@@ -35,7 +35,7 @@ from .archive import Archive, StartingDensity
 from .evidence_check import EvidenceCheck, draw_inside, evidence_from_weights
 from .flights import Flight
 from .population import Density, Population, Report, Stage, Sweep
-from .rounds import tail_variance
+from .rounds import round_shares, tail_variance
 from .settings import RecyclingSettings
 from .stopping import StoppedEarly, stop_at
 from .weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
@@ -61,7 +61,9 @@ class Recycled(NamedTuple):
         Their records (log_prob, log_prior and, where there are any, blobs).
     log_weights : (n,) float
         Log-weights of the draws, round by round against the mixture of the round, which was not fitted to them. The
-        sum of the weights of a round is its effective sample size.
+        share of a round depends on its number of draws and on the effective share of the round before it, not on its
+        own weights (`samplers.tempering.rounds.round_shares`): a round with few points of large weight in a tail would
+        have a small effective sample size, and the tail would be cut short.
     log_evidence, log_evidence_error : float
         Log-evidence from all points but those of the check, and its standard error.
     check : EvidenceCheck, optional
@@ -243,10 +245,9 @@ def recycle(
                 archive.update()
                 log_evidence, error = _evidence(archive.log_weights(beta), inherited)
             archive.add(mixture, made, flight)
-            parts = [_part_of_result(draws, start, beta) for draws in (drawn if beta == 1.0 else [draws])]
             return Recycled(
                 doubt,
-                *(np.concatenate(column) for column in zip(*parts, strict=True)),
+                *_result(drawn if beta == 1.0 else [draws], start, beta),
                 log_evidence,
                 error,
                 check,
@@ -280,10 +281,14 @@ class _Drawn(NamedTuple):
         return _weights_against(self.mixture, records, coords, start, beta)
 
 
-def _part_of_result(draws: _Drawn, start: StartingDensity, beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, records and log-weights of draws that have all arrived, as in `Recycled`."""
-    log_weights = draws.log_weights(start, beta)
-    return *draws.flight.landed_part(), _of_round(log_weights) if beta == 1.0 else log_weights
+def _result(drawn: Sequence[_Drawn], start: StartingDensity, beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, records and log-weights of rounds of draws that have all arrived, as in `Recycled`."""
+    parts = [draws.flight.landed_part() for draws in drawn]
+    log_weights = [draws.log_weights(start, beta) for draws in drawn]
+    sizes = [draws.made for draws in drawn]
+    shares = round_shares(sizes, [effective_sample_size(w) / n for w, n in zip(log_weights, sizes, strict=True)])
+    scaled = [w + np.log(share / n) for w, share, n in zip(log_weights, shares, sizes, strict=True)]
+    return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
 
 
 def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
@@ -383,14 +388,6 @@ def _with_even_share(mixture: Mixture, share: float) -> Mixture:
     """The mixture with a share of its weight spread evenly over its components."""
     weights = (1.0 - share) * mixture.weights + share / len(mixture.weights)
     return mixture._replace(weights=weights)
-
-
-def _of_round(log_weights: np.ndarray) -> np.ndarray:
-    """Log-weights scaled so that the sum of the weights is their effective sample size."""
-    effective = effective_sample_size(log_weights)
-    if effective == 0.0:
-        return log_weights
-    return log_weights - log_mean_weight(log_weights) - np.log(len(log_weights)) + np.log(effective)
 
 
 def _doubt(

@@ -354,18 +354,20 @@ def _by_recycling(
         yield population, Restart(found.doubt)
         return found
     weights = normalised_weights(found.log_weights)
-    schedule.calibrate(found.coords, coarse_weights(found.log_weights), density.inside)
+    # the last proposal, since it was not fitted to the draws of the check, most of the points that are moved
+    proposal = found.proposals[-1][1]
+    schedule.calibrate(found.coords, coarse_weights(found.log_weights), density.inside, proposal)
     ancestors = systematic(weights, random, size)
     effective = effective_sample_size(found.log_weights)
     population = Population(1.0, found.coords[ancestors], found.records[ancestors], effective, (ancestors,))
     if settings.check_draws != 0:
         yield population, found.check
-    for doubt in check_fit(found.check, found.proposals[-1][1], size, found.coords, found.log_weights):
+    for doubt in check_fit(found.check, proposal, size, found.coords, found.log_weights):
         yield population, doubt
     if earlier is not None:
         yield from _disagreement(population, earlier, found.log_evidence, found.log_evidence_error)
     distinct = len(np.unique(ancestors))
-    poor = distinct < ENOUGH_DISTINCT * size or fits_poorly(found.check, found.proposals[-1][1], size)
+    poor = distinct < ENOUGH_DISTINCT * size or fits_poorly(found.check, proposal, size)
     if settings.recycling.closing_sweeps or poor:
         mutated = yield from _mutate(population, ancestors, density, random, schedule, settings)
     else:

@@ -15,6 +15,7 @@ from emcee.moves import Move, RedBlueMove
 
 from ..moves.fast_parameters import WithFastSweeps
 from ..moves.kernels import MixtureMove, calibrate_move
+from ..proposals.mixture import Mixture
 from .budget import BudgetExhausted
 from .population import Density, Population, Sweep
 from .settings import Settings
@@ -61,11 +62,15 @@ class MoveSchedule(NamedTuple):
         return random.choice(self.moves, p=self.probabilities)
 
     def calibrate(
-        self, coords: np.ndarray, weights: np.ndarray, inside: Callable[[np.ndarray], np.ndarray] | None
+        self,
+        coords: np.ndarray,
+        weights: np.ndarray,
+        inside: Callable[[np.ndarray], np.ndarray] | None,
+        mixture: Mixture | None = None,
     ) -> None:
-        """Fit the moves that can be fitted to points (n, ndim) with normalised weights (n,)."""
+        """Fit the moves that can be fitted to points (n, ndim) with normalised weights (n,); or use a `mixture`."""
         for move in self.moves:
-            calibrate_move(move, coords, weights, inside)
+            calibrate_move(move, coords, weights, inside, mixture)
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
         """Let the moves that can use it propose points in parts of the target that their fits do not cover.

@@ -50,6 +50,21 @@ def test_a_gaussian_is_one_component(rng):
     assert len(mixture.weights) == 1 and mixture.shears == ()
 
 
+@pytest.mark.parametrize("ndim", [2, 5])
+def test_degrees_of_freedom_follow_the_tails(ndim, rng):
+    """Fits to a Gaussian keep six; fits to a Student t get fewer where the density is better for it."""
+    normal = rng.standard_normal((400, ndim))
+    assert fit_mixture(normal, uniform(400)).dof == 6.0
+    student = stats.multivariate_t(np.zeros(ndim), np.eye(ndim), df=2.5, seed=1)
+    x = student.rvs(2000).reshape(-1, ndim)
+    mixture = fit_mixture(x[:1000], uniform(1000))
+    assert mixture.dof <= 3.0
+    fresh = x[1000:]
+    found = np.mean(log_density(mixture, fresh) - student.logpdf(fresh))
+    six = mixture._replace(dof=6.0)
+    assert found > -0.05 and found > np.mean(log_density(six, fresh) - student.logpdf(fresh))
+
+
 def test_weights_count_as_points(rng):
     """Weighted points give the mixture of the population that they represent."""
     x = 2.0 * rng.standard_normal((40000, 2))

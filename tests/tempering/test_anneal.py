@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from samplers.moves.fast_parameters import WithFastSweeps
 from samplers.moves.kernels import MixtureMove
+from samplers.tempering.adaptive_importance import recycle
 from samplers.tempering.anneal import anneal
 from samplers.tempering.evidence_check import EvidenceCheck
 from samplers.tempering.flights import Flight
@@ -85,6 +87,44 @@ def test_points_of_recycling_carry_weights():
     population, stage = next(step for step in steps if isinstance(step[1], Stage))
     assert stage.moves == 0 and 0.0 < stage.beta < 1.0
     assert len(population.log_weights) == len(population.coords) == len(population.records) >= N
+
+
+def test_sweeps_after_recycling_use_its_last_proposal(monkeypatch):
+    """A mixture fitted to the points that it moves would make their tails too light."""
+    found = []
+
+    def watched(*arguments):
+        found.append((yield from recycle(*arguments)))
+        return found[-1]
+
+    monkeypatch.setattr("samplers.tempering.anneal.recycle", watched)
+    posterior, random, move = Gaussian(3, sd=0.02), np.random.RandomState(1), MixtureMove()
+    start = Population(0.0, posterior.sample_prior(250, random), None, 250.0)
+    moves = WithFastSweeps(move, [2])
+    list(anneal(start, CountedDensity(posterior), random, MoveSchedule([moves], np.ones(1)), Settings(recycle=True)))
+    assert found[0].trusted and move.mixture is found[0].proposals[-1][1]
+
+
+def test_the_weights_of_recycling_estimate_the_evidence():
+    """The share of a round of draws does not depend on its own weights, so their sum has the mean of the evidence."""
+    posterior, deviations = Gaussian(3, sd=0.02), []
+    for seed in range(20):
+        random = np.random.RandomState(seed)
+        density = CountedDensity(posterior)
+        flight = density.submit(posterior.sample_prior(250, random))
+        found = finished(recycle(flight, density, random, RecyclingSettings()))
+        deviations.append(np.logaddexp.reduce(found.log_weights) - posterior.log_evidence)
+    error = np.std(deviations, ddof=1) / np.sqrt(len(deviations))
+    assert error < 0.02 and abs(np.mean(deviations)) < 4.0 * error
+
+
+def finished(generator):
+    """What a generator returns."""
+    while True:
+        try:
+            next(generator)
+        except StopIteration as stop:
+            return stop.value
 
 
 def test_nothing_runs_ahead_of_its_consumer():
