@@ -39,9 +39,11 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .prediction.averaging import AveragedPrediction, average_predictions
     from .prediction.damage import Damage, LimitState, damage, limit_states
     from .prediction.damage_measures import DamageMeasures, damage_measures, damage_outputs
-    from .prediction.fragility import Fragility, fit_fragility, fragility, peak_ground_acceleration
+    from .prediction.event_ratios import EventRatios, LevelRatios
+    from .prediction.fragility import Fragility, fragility, peak_ground_acceleration
+    from .prediction.fragility_curve import fit_fragility
     from .prediction.held_out import score_left_out
-    from .prediction.new_event import EventRatios, event_ratio, predict_new_event
+    from .prediction.new_event import event_level, event_ratio, predict_new_event
     from .prediction.park_ang import ParkAng, park_ang_constants
     from .prediction.prediction import Prediction
     from .prediction.propagation import fit_measures, propagate
@@ -144,6 +146,7 @@ __all__ = [
     "ImposedTest",
     "IsolatedBridge",
     "JointLikelihood",
+    "LevelRatios",
     "LimitState",
     "LinearOscillator",
     "LinearStructure",
@@ -211,6 +214,7 @@ __all__ = [
     "damage_outputs",
     "dissipated_energy",
     "effective_samples",
+    "event_level",
     "event_ratio",
     "exceedance",
     "final_value",
@@ -334,14 +338,11 @@ _EXPORTS = {
         "damage_measures",
         "damage_outputs",
     ),
-    "prediction.fragility": (
-        "Fragility",
-        "fit_fragility",
-        "fragility",
-        "peak_ground_acceleration",
-    ),
+    "prediction.fragility": ("Fragility", "fragility", "peak_ground_acceleration"),
+    "prediction.fragility_curve": ("fit_fragility",),
+    "prediction.event_ratios": ("EventRatios", "LevelRatios"),
     "prediction.held_out": ("score_left_out",),
-    "prediction.new_event": ("EventRatios", "event_ratio", "predict_new_event"),
+    "prediction.new_event": ("event_level", "event_ratio", "predict_new_event"),
     "prediction.park_ang": (
         "ParkAng",
         "park_ang_constants",

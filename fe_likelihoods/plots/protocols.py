@@ -138,7 +138,7 @@ class QuantityScoresLike(Protocol):
 
 
 class CurveLike(Protocol):
-    """A lognormal fragility curve, such as `fe_likelihoods.prediction.fragility.FragilityCurve`."""
+    """A lognormal fragility curve, such as `fe_likelihoods.prediction.fragility_curve.FragilityCurve`."""
 
     median: float
     dispersion: float

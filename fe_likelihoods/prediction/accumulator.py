@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..probability.noise_draws import SampleNoise
+from .model_error import ModelError
 from .streaming import RetainedResults, RunningMoments
 
 __all__ = ["Accumulator"]
@@ -23,7 +24,7 @@ class Accumulator:
     ----------
     members : list of ndarray
         Indices of the samples of each distinct theta.
-    noise : SampleNoise or None
+    noise : SampleNoise, ModelError or None
         Noise of every sample, None for a prediction without noise.
     evaluate : callable or None
         The quantity as a function of a response (n_channels, n_steps) [SI], None for histories.
@@ -55,7 +56,7 @@ class Accumulator:
     """
 
     members: list[np.ndarray]
-    noise: SampleNoise | None
+    noise: SampleNoise | ModelError | None
     evaluate: Callable[[np.ndarray], np.ndarray] | None
     rows: list[int] | None
     result_of_sample: np.ndarray

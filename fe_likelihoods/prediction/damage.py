@@ -4,8 +4,9 @@ The presence of a limit state is the probability that its measure exceeds its li
 samples (`fe_likelihoods.prediction.reliability`). Where a limit is one of strain, its location is the same probability
 at each section and side of a column. The extent is given by quantiles of the measures.
 
-The samples are those of the parameters. The probabilities therefore contain the uncertainty of the parameters and not
-the error of the model, which is often larger: a probability of 0 or 1 means that all samples of the parameters agree.
+The samples are those of the parameters. The error of the model, which is often larger, is in ratios of measured to
+fitted values of the measures (``ratios=``). Without them a probability of 0 or 1 means that all samples of the
+parameters agree, and a warning says so.
 
 References
 ----------
@@ -20,15 +21,18 @@ Structural Engineering 111(4), 740-757, doi:10.1061/(ASCE)0733-9445(1985)111:4(7
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .damage_measures import SIDES, STRAIN_MEASURES, DamageMeasures
+from .event_ratios import EventRatios, LevelRatios
+from .event_spread import EventSpread
 from .prediction import Prediction
-from .reliability import Exceedance, exceedance
+from .propagation import check_effective_sample_size
+from .reliability import Exceedance, exceedance, exceedance_probability, warn_of_missing_error
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -202,8 +206,11 @@ def damage(
     prediction: Prediction,
     limits: Sequence[LimitState] | None = None,
     *,
+    ratios: EventRatios | LevelRatios | Mapping[str, EventRatios | LevelRatios] | None = None,
+    noise: bool | None = None,
     effective_sample_size: float | None = None,
     level: float = 0.95,
+    seed: int = 0,
 ) -> Damage:
     """Find presence, location and extent of damage from a prediction.
 
@@ -213,10 +220,18 @@ def damage(
         The result of ``propagate(model, samples, quantity=damage_measures(model))``.
     limits : sequence of LimitState, optional
         The limit states. Default: `limit_states`.
+    ratios : EventRatios, LevelRatios, or mapping of str to these, optional
+        The error of the model: ratios of measured to fitted values in several events, for each measure by its name, or
+        the same for all. Measures without ratios have no error of the model. Strains are rarely measured; a stated
+        guess is ``EventRatios([1.0], prior_sd=0.3, prior_events=10)``.
+    noise : bool, optional
+        False states that the error of the model is left out on purpose. Default: a warning if there are no ratios.
     effective_sample_size : float, optional
         Effective number of independent samples. Default: that of the prediction.
     level : float
         Probability of the intervals of the probabilities, between 0 and 1.
+    seed : int
+        Seed of the draws of the ratios.
 
     Returns
     -------
@@ -226,7 +241,13 @@ def damage(
     ------
     ValueError
         If the prediction is of another quantity, contains noise or has no values of the samples, or a limit is of an
-        unknown measure, is no `LimitState`, is not positive, or does not have one value or one for each sample.
+        unknown measure, is no `LimitState`, is not positive, or does not have one value or one for each sample; if
+        ratios are of an unknown measure or of several quantities; and for ``noise=True``.
+
+    Warns
+    -----
+    UserWarning
+        If limit states have no ratios, so that the error of the model is left out.
 
     Notes
     -----
@@ -239,8 +260,11 @@ def damage(
             "damage needs a prediction of damage measures: propagate(model, samples, "
             f"quantity=damage_measures(model)); this one has quantity={measures!r}"
         )
-    if prediction.noise:
-        raise ValueError("the noise of sensors does no damage: propagate the measures with noise=False")
+    if prediction.noise or noise:
+        raise ValueError(
+            "the noise of sensors does no damage, and errors that are drawn do work and leave residual values: "
+            "propagate the measures with noise=False, and give ratios= for the error of the model"
+        )
     if prediction.values is None:
         raise ValueError("damage needs the values of the samples: propagate with memory_bytes=None")
     states = limit_states(measures) if limits is None else _checked_states(limits)
@@ -248,7 +272,9 @@ def damage(
     if len(set(names)) != len(names):
         raise ValueError(f"limit states need different names; got {', '.join(names)}")
     values = measures.split(prediction.values)
-    effective = prediction.effective_sample_size if effective_sample_size is None else effective_sample_size
+    errors = _ratios_of_measures(ratios, tuple(values))
+    effective = float(check_effective_sample_size(effective_sample_size, prediction.effective_sample_size))
+    weights = None if prediction.spread is None else prediction.spread.weights
     presence, location = {}, {}
     for state in states:
         if state.measure not in values:
@@ -257,14 +283,18 @@ def damage(
                 "damage_measures(measures=...) chooses them"
             )
         found, limit = values[state.measure], _limit_per_sample(state, prediction)
-        limit_of_row = limit.reshape(-1, *(1,) * (found.ndim - 1))
-        ratio = limit_of_row / found if state.measure in _DECREASING else found / limit_of_row
-        reported = state.limit if np.ndim(state.limit) == 0 else limit.mean()
-        largest = ratio.max(axis=(2, 3)) if ratio.ndim == 4 else ratio
-        presence[state.name] = _exceeded(largest, reported, effective, level)
-        if ratio.ndim == 4:
-            location[state.name] = _exceeded(ratio, reported, effective, level)
-    quantiles = measures.split(prediction.quantiles) if prediction.probabilities else {}
+        reported = np.asarray(state.limit if np.ndim(state.limit) == 0 else limit.mean(), dtype=float)
+        spread = EventSpread(found, weights, errors.get(state.measure))
+        options = (limit, spread, effective, level, seed, state.measure in _DECREASING)
+        largest = found.max(axis=(2, 3)) if found.ndim == 4 else found
+        presence[state.name] = _exceeded(largest, *options)._replace(threshold=reported)
+        if found.ndim == 4:
+            location[state.name] = _exceeded(found, *options)._replace(threshold=reported)
+    without = [state.name for state in states if state.measure not in errors]
+    if without and noise is None:
+        guess = "state a guess, such as EventRatios([1.0], prior_sd=0.3, prior_events=10)"
+        warn_of_missing_error(f"damage ({', '.join(without)})", guess)
+    quantiles = _extent(prediction, values, errors, np.random.default_rng(seed)) if prediction.probabilities else {}
     return Damage(
         events=measures.events,
         limits=states,
@@ -277,11 +307,11 @@ def damage(
         height=measures.height,
         diameter=measures.diameter,
         measures=measures,
-        effective_sample_size=float(effective),
+        effective_sample_size=effective,
         n_samples=int(prediction.n_samples),
         n_failed=int(prediction.n_failed),
         from_state=prediction.from_state,
-        uncertainty="the uncertainty of the parameters, not the error of the model or of the limits",
+        uncertainty=_contents(states, errors, weights is not None),
     )
 
 
@@ -327,7 +357,64 @@ def _limit_per_sample(state: LimitState, prediction: Prediction) -> np.ndarray:
     return limit.reshape(1) if limit.ndim == 0 else np.delete(limit, prediction.failed)
 
 
-def _exceeded(ratio: np.ndarray, limit: ArrayLike, effective: float, level: float) -> Exceedance:
-    """Probability that the ratio of measure and limit exceeds one, with the limit as its threshold."""
-    found = exceedance(ratio, 1.0, effective_sample_size=effective, level=level)
-    return found._replace(threshold=np.asarray(limit, dtype=float))
+def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, EventRatios | LevelRatios]:
+    """Ratios by the names of the measures; ValueError if they cannot be used."""
+    if ratios is None:
+        return {}
+    found = dict(ratios) if isinstance(ratios, Mapping) else dict.fromkeys(measures, ratios)
+    if unknown := sorted(set(found) - set(measures)):
+        raise ValueError(f"ratios of {', '.join(unknown)}; the measures are {', '.join(measures)}")
+    for name, each in found.items():
+        if not isinstance(each, EventRatios | LevelRatios) or each.shape:
+            raise ValueError(f"the ratios of {name!r} must be EventRatios or LevelRatios of one quantity; got {each!r}")
+    return found
+
+
+def _extent(
+    prediction: Prediction,
+    values: dict[str, np.ndarray],
+    errors: Mapping[str, EventRatios | LevelRatios],
+    rng: np.random.Generator,
+) -> dict[str, np.ndarray]:
+    """Quantiles of the measures, multiplied by draws of their ratios."""
+    quantiles = prediction.quantity.split(prediction.quantiles)
+    for name, ratios in errors.items():
+        found = values[name].copy()
+        for event in range(found.shape[1]):
+            drawn = found[:, event].reshape(len(found), -1)
+            largest = drawn.max(axis=1)  # all places of an event share its error
+            factor = np.ones(len(found))
+            factor[largest > 0.0] = ratios.draw_at(largest[largest > 0.0], rng)
+            found[:, event] *= factor.reshape(-1, *(1,) * (found.ndim - 2))
+        quantiles[name] = np.quantile(found, prediction.probabilities, axis=0)
+    return quantiles
+
+
+def _contents(
+    states: Sequence[LimitState], errors: Mapping[str, EventRatios | LevelRatios], of_population: bool
+) -> str:
+    """What the probabilities contain, in words."""
+    said = "the uncertainty of the parameters" + (", their spread between events" if of_population else "")
+    measures = list(dict.fromkeys(state.measure for state in states))
+    with_error = [name for name in measures if name in errors]
+    if not with_error:
+        return f"{said}, not the error of the model or of the limits"
+    whose = "" if len(with_error) == len(measures) else f" in {', '.join(with_error)}"
+    return f"{said} and the error of the model{whose}, not that of the limits"
+
+
+def _exceeded(
+    values: np.ndarray,
+    limit: np.ndarray,
+    spread: EventSpread,
+    effective: float,
+    level: float,
+    seed: int,
+    below: bool,
+) -> Exceedance:
+    """Probability that a measure (n, ...) exceeds its limit (n,) or (1,), or is below it."""
+    limits = np.broadcast_to(limit.reshape(-1, *(1,) * (values.ndim - 1)), values.shape)
+    if spread.ratios is None and spread.weights is None:
+        ratio = limits / values if below else values / limits
+        return exceedance(ratio, 1.0, effective_sample_size=effective, level=level)
+    return exceedance_probability(values, limits, spread, effective, level, seed, below)

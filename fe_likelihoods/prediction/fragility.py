@@ -1,66 +1,37 @@
-r"""Fragility: probability that a response exceeds a limit, against the intensity of the shaking.
+"""Fragility: probability that a response exceeds a limit, against the intensity of the shaking.
 
-Under each record the probability of an exceedance is the fraction of the samples of the posterior that exceed. A
-lognormal curve
-
-.. math:: P(\text{exceed} \mid x) = \Phi\!\left(\frac{\ln (x / m)}{s}\right)
-
-with median :math:`m` and dispersion :math:`s` is fitted to these points by maximum likelihood (Baker 2015). See
-``docs/theory/prediction.rst``.
-
-References
-----------
-J. W. Baker (2015), Efficient analytical fragility function fitting using dynamic structural analysis, Earthquake
-Spectra 31(1), 579-599, doi:10.1193/021113EQS025M.
+Under each record the probability of an exceedance is the mean over the samples of the posterior, or over draws of a new
+event (`Hierarchy`), of the probability that each exceeds. It contains the error of the model, from ratios of measured
+to fitted values or from a noise that follows the response. A lognormal curve is fitted to these points
+(`fe_likelihoods.prediction.fragility_curve`). See ``docs/theory/prediction.rst``.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy import optimize, special
+from scipy import stats
 
+from ..probability.hierarchy import Hierarchy
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
+from .event_ratios import EventRatios, LevelRatios
+from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .excitation import chosen_state, excite, under_record
-from .inputs import part_of, read_source, split_samples
+from .fragility_curve import FragilityCurve, curve_with_errors
+from .inputs import PredictionSource, part_of, read_source, split_samples
+from .model_error import follows_response
+from .new_event import draw_new_event
 from .propagation import check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
-from .reliability import binomial_interval, check_level, threshold_in_si
+from .reliability import binomial_interval, check_level, contents, threshold_in_si, warn_of_missing_error
 
-__all__ = ["Fragility", "FragilityCurve", "fit_fragility", "fragility", "peak_ground_acceleration"]
+__all__ = ["Fragility", "fragility", "peak_ground_acceleration"]
 
 logger = logging.getLogger(__name__)
-
-_REPLICATES = 100  # resamplings for the errors of the curve
-
-
-class FragilityCurve(NamedTuple):
-    """Lognormal fragility curve, P(exceed | intensity) = Phi(ln(intensity / median) / dispersion).
-
-    Attributes
-    ----------
-    median : float
-        Intensity at which the probability is one half.
-    dispersion : float
-        Standard deviation of the logarithm of the capacity in terms of intensity [-].
-    median_error, dispersion_error : float
-        Monte Carlo errors, by resampling the samples (which all records share) for fixed records. They do not include
-        the effect of other records. They are inf if more than a tenth of the resamplings do not determine a curve.
-    """
-
-    median: float
-    dispersion: float
-    median_error: float = np.inf
-    dispersion_error: float = np.inf
-
-    def probability(self, intensity: ArrayLike) -> np.ndarray:
-        """Return the probability of an exceedance at positive intensities."""
-        return special.ndtr(np.log(np.asarray(intensity, dtype=float) / self.median) / self.dispersion)
 
 
 class Fragility(NamedTuple):
@@ -73,11 +44,11 @@ class Fragility(NamedTuple):
     intensity : ndarray, shape (n_records,)
         Intensities of the records.
     probability : ndarray, shape (n_records,)
-        Fraction of the samples that exceed.
+        Mean over the samples of the probability to exceed.
     standard_error : ndarray, shape (n_records,)
         Monte Carlo error, as in `fe_likelihoods.Exceedance`.
     lower, upper : ndarray, shape (n_records,)
-        Clopper-Pearson interval, as in `fe_likelihoods.Exceedance`.
+        Interval of each probability, as in `fe_likelihoods.Exceedance`.
     n_failed : ndarray of int, shape (n_records,)
         Number of samples whose simulation failed.
     curve : FragilityCurve or None
@@ -87,6 +58,11 @@ class Fragility(NamedTuple):
     from_state : str
         State of the structure at the beginning of each record, "virgin" or "end", as in
         `fe_likelihoods.prediction.propagation.propagate`.
+    draws : ndarray, shape (n_draws, n_records), or None
+        Probabilities for draws of what is unknown of the ratios and of the population of events, from which intervals
+        and bands are made. None if there are neither ratios nor a population.
+    uncertainty : str
+        What the probabilities contain.
     """
 
     names: tuple[str, ...]
@@ -99,6 +75,43 @@ class Fragility(NamedTuple):
     curve: FragilityCurve | None
     threshold: float
     from_state: str = "virgin"
+    draws: np.ndarray | None = None
+    uncertainty: str = ""
+
+    def band(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+        """Band that contains the probabilities under all records together.
+
+        Parameters
+        ----------
+        level : float
+            Probability that the whole curve is in the band; each of its points is in it with a larger probability.
+
+        Returns
+        -------
+        lower, upper : ndarray, shape (n_records,)
+            The narrowest band between quantiles of equal probabilities at all records (Besag et al. 1995, section 6.3).
+
+        Raises
+        ------
+        ValueError
+            If there are no draws, or the level is not between 0 and 1.
+
+        References
+        ----------
+        J. Besag, P. Green, D. Higdon, K. Mengersen (1995), Bayesian computation and stochastic systems, Statistical
+        Science 10(1), 3-41, doi:10.1214/ss/1177010123.
+        """
+        if self.draws is None:
+            raise ValueError("a band needs what is unknown of the events: give fragility ratios=, or a Hierarchy")
+        check_level(level)
+        whole = self.draws[np.isfinite(self.draws).all(axis=1)]
+        if len(whole) < 20:
+            raise ValueError(f"a band needs 20 draws whose simulations did not fail; got {len(whole)}")
+        ordered = np.sort(whole, axis=0)
+        ranks = np.stack([stats.rankdata(column) for column in whole.T], axis=1)
+        outermost = np.maximum(ranks, len(whole) + 1.0 - ranks).max(axis=1)
+        last = int(np.ceil(np.quantile(outermost, level, method="higher"))) - 1
+        return ordered[len(whole) - 1 - last], ordered[last]
 
 
 def peak_ground_acceleration(record: Record | Sequence[Record]) -> float:
@@ -125,6 +138,9 @@ def fragility(
     *,
     part: str | None = None,
     unit: str | None = None,
+    ratios: EventRatios | LevelRatios | None = None,
+    noise: bool | str | None = None,
+    n: int = 500,
     intensity: Callable[[Record], float] = peak_ground_acceleration,
     failures_exceed: bool = False,
     from_state: str | None = None,
@@ -139,7 +155,9 @@ def fragility(
     Parameters
     ----------
     posterior_or_model, samples
-        As in `fe_likelihoods.prediction.propagation.propagate`.
+        As in `fe_likelihoods.prediction.propagation.propagate`. The samples may be a `Hierarchy`: `n` draws of the
+        parameters of a new event are then simulated under each record, and the intervals contain what is unknown of the
+        population.
     records : sequence of Record, or of tuples of Record
         Excitations, such as one motion scaled, ``[record.scale(k) for k in factors]``, or different motions. Each is a
         tuple if the model has several components: the horizontal and the vertical record of an `IsolatedBridge`, or the
@@ -147,11 +165,19 @@ def fragility(
     quantity : ChannelQuantity or callable
         A quantity that is one number, such as ``peak("displacement")``.
     threshold : float
-        The threshold.
+        The threshold; positive if there are ratios.
     part : str, optional
         For a `JointLikelihood` or its posterior: the name of the likelihood whose model predicts.
     unit : str, optional
         Unit of the threshold. It must have the dimension of the channel of the quantity. Default: SI.
+    ratios : EventRatios or LevelRatios, optional
+        Ratios of measured to fitted values of the quantity in several events: the error of the model.
+    noise : bool or str, optional
+        The error of the model from the noise of the calibration, as for `propagate`. Default: "model" if there are no
+        ratios, the noise follows the response (`RelativeNoise`) and the samples have its parameters. Otherwise the
+        error of the model is left out, with a warning; False states that this is on purpose.
+    n : int
+        Number of draws from a `Hierarchy`.
     intensity : callable
         Function of an element of `records` that returns a positive number. Default: peak acceleration [m/s²], of the
         first record of a tuple (the horizontal component, or the first support).
@@ -166,9 +192,10 @@ def fragility(
     level : float
         Probability of the intervals, between 0 and 1.
     seed : int, optional
-        Seed of the noise and of the resampling for the errors of the curve.
+        Seed of the noise, of the draws of a new event and of the ratios' population, and of the resampling for the
+        errors of the curve.
     **settings
-        Further arguments of `propagate`: noise, batch, pool, progress.
+        Further arguments of `propagate`: batch, pool, progress.
 
     Returns
     -------
@@ -182,18 +209,25 @@ def fragility(
         intensity is not positive, or the quantity is not one number.
     SimulationFailed
         If every simulation under a record fails and failures do not count as exceedances.
+
+    Warns
+    -----
+    UserWarning
+        If the error of the model is left out without ``noise=False``.
     """
     if taken := {"record", "quantiles", "memory_bytes"} & set(settings):
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")
-    posterior_or_model, samples = part_of(posterior_or_model, samples, part, settings.get("noise", False))
-    source = read_source(posterior_or_model)
-    thetas, _ = split_samples(source, samples, settings.get("noise", False), True)
+    predictor, rows, noise, weights = _chosen(posterior_or_model, samples, part, ratios, noise, n, seed)
+    source = read_source(predictor)
+    thetas, _ = split_samples(source, rows, noise, True)
     known = evaluator(quantity, source.model.channels, source.model.dt)
     if known.rows is not None or len(known.channels) > 1:
         raise ValueError(f"fragility needs one number as quantity, such as peak(channel); got {quantity!r}")
     limit = threshold_in_si(threshold, unit, known.channels)
     if limit.shape != ():
         raise ValueError(f"fragility needs one threshold; got an array of shape {limit.shape}")
+    if ratios is not None and (ratios.shape or not limit > 0.0):
+        raise ValueError("with ratios, fragility needs those of one quantity, (n_events,), and a positive threshold")
     records = list(records)
     if not records:
         raise ValueError("fragility needs one record or more, such as [record.scale(k) for k in factors]; got none")
@@ -204,22 +238,21 @@ def fragility(
     intensities = np.array([float(intensity(record)) for record in records])
     if not np.all((intensities > 0.0) & (intensities < np.inf)):
         raise ValueError(f"intensities must be positive and finite; got {intensities}")
-
     n = len(thetas)
     effective = check_effective_sample_size(effective_sample_size, n)
     check_level(level)
 
-    exceeds, counted = np.zeros((2, len(records), n))
-    failed = np.zeros(len(records), dtype=int)
+    values = np.full((n, len(records)), np.nan)
     for k, record in enumerate(records):
         try:
             prediction = propagate(
-                posterior_or_model,
-                samples,
+                predictor,
+                rows,
                 quantity=quantity,
                 record=record,
                 from_state=state,
                 rest=rest,
+                noise=noise,
                 quantiles=(),
                 seed=seed,
                 **settings,
@@ -227,108 +260,107 @@ def fragility(
         except SimulationFailed as error:
             if not failures_exceed:
                 raise SimulationFailed(f"record {_name(record)!r}: {error.reason}") from error
-            exceeds[k] = counted[k] = 1.0
-            failed[k] = n
             continue
         if prediction.values is None or prediction.values.ndim != 1:
             raise ValueError(f"fragility needs one number as quantity; got arrays of shape {prediction.mean.shape}")
-        used = np.setdiff1d(np.arange(n), prediction.failed, assume_unique=True)
-        counted[k, used], exceeds[k, used] = 1.0, prediction.values > limit
-        failed[k] = prediction.n_failed
-        if failures_exceed:
-            counted[k] = 1.0
-            exceeds[k, prediction.failed] = 1.0
-    trials = effective * counted.mean(axis=1)
-    share = exceeds.sum(axis=1) / counted.sum(axis=1)
-    lower, upper = binomial_interval(share, trials, level)
-    error = np.sqrt(share * (1.0 - share) / trials)
+        values[np.setdiff1d(np.arange(n), prediction.failed, assume_unique=True), k] = prediction.values
+    spread = EventSpread(values, weights, ratios)
+    found = _probabilities(spread, float(limit), failures_exceed, effective, level, seed)
     try:
-        curve = _curve_with_errors(intensities, exceeds, counted, effective, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        curve = curve_with_errors(intensities, found.single, found.counted, effective, found.draws, rng)
     except ValueError as reason:
         logger.warning("no fragility curve: %s", reason)
         curve = None
-    names = tuple(_name(record) for record in records)
-    return Fragility(names, intensities, share, error, lower, upper, failed, curve, float(limit), state)
-
-
-def fit_fragility(intensity: ArrayLike, exceedances: ArrayLike, trials: ArrayLike) -> FragilityCurve:
-    """Fit a lognormal fragility curve by maximum likelihood (Baker 2015: binomial at each intensity).
-
-    Parameters
-    ----------
-    intensity : (n,) array_like
-        Positive intensities.
-    exceedances : (n,) array_like
-        Number of exceedances at each intensity, not necessarily a whole number.
-    trials : (n,) array_like
-        Number of trials at each intensity, not necessarily a whole number.
-
-    Returns
-    -------
-    FragilityCurve
-        The curve, without errors (inf).
-
-    Raises
-    ------
-    ValueError
-        If the points do not determine a rising curve: fewer than two intensities, none or all of the trials exceed,
-        every intensity with an exceedance is above every one without, or the probability decreases with intensity.
-    """
-    intensity, exceedances, trials = (np.asarray(each, dtype=float) for each in (intensity, exceedances, trials))
-    if not intensity.shape == exceedances.shape == trials.shape or intensity.ndim != 1:
-        raise ValueError(
-            f"expected one number of exceedances and of trials for each intensity; got shapes {intensity.shape}, "
-            f"{exceedances.shape}, {trials.shape}"
-        )
-    if not (np.all(intensity > 0.0) and np.all((exceedances >= 0.0) & (exceedances <= trials + 1e-9))):
-        raise ValueError(
-            f"expected positive intensities and 0 <= exceedances <= trials; got {intensity}, {exceedances}, {trials}"
-        )
-    some, not_all = intensity[exceedances > 0.0], intensity[exceedances < trials]
-    if not some.size or not not_all.size:
-        raise ValueError(f"{'all' if some.size else 'none'} of the trials exceed: use records of other intensities")
-    if np.ptp(intensity[trials > 0.0]) == 0.0 or some.min() >= not_all.max():
-        raise ValueError(
-            "the points do not determine the slope: use more intensities between those where none and all exceed"
-        )
-
-    logs = np.log(intensity)
-    centre, width = logs.mean(), logs.std()
-    x = (logs - centre) / width
-    total = trials.sum()
-
-    def loss(ab: np.ndarray) -> tuple[float, np.ndarray]:
-        z = ab[0] + ab[1] * x
-        above, below = special.log_ndtr(z), special.log_ndtr(-z)
-        density = -0.5 * z**2 - 0.5 * np.log(2.0 * np.pi)
-        slope = exceedances * np.exp(density - above) - (trials - exceedances) * np.exp(density - below)
-        value = exceedances @ above + (trials - exceedances) @ below
-        return -value / total, -np.array([slope.sum(), slope @ x]) / total
-
-    found = optimize.minimize(loss, np.array([0.0, 1.0]), jac=True, method="BFGS", options={"gtol": 1e-8})
-    offset, slope = found.x
-    if not (np.isfinite(found.x).all() and slope > 0.0):
-        raise ValueError(
-            "the probability does not rise with intensity, so that no fragility curve fits: check the intensities"
-        )
-    return FragilityCurve(float(np.exp(centre - width * offset / slope)), float(width / slope))
-
-
-def _curve_with_errors(
-    intensity: np.ndarray, exceeds: np.ndarray, counted: np.ndarray, effective: float, rng: np.random.Generator
-) -> FragilityCurve:
-    """Fit the curve to exceedances (n_records, n_samples), with errors by resampling whole samples."""
-    n = exceeds.shape[1]
-    curve = fit_fragility(intensity, exceeds.sum(axis=1), counted.sum(axis=1))
-    found = []
-    draws = max(int(round(effective)), 1)
-    for weights in rng.multinomial(draws, np.full(n, 1.0 / n), size=_REPLICATES):
-        try:
-            found.append(fit_fragility(intensity, exceeds @ weights, counted @ weights)[:2])
-        except ValueError:  # this resampling does not determine a curve
-            continue
-    if len(found) < 0.9 * _REPLICATES:  # the resamplings with a curve would be a biased selection
-        return curve
-    return curve._replace(
-        **dict(zip(("median_error", "dispersion_error"), np.std(found, axis=0).tolist(), strict=True))
+    return Fragility(
+        tuple(_name(record) for record in records),
+        intensities,
+        found.probability,
+        found.standard_error,
+        found.lower,
+        found.upper,
+        np.isnan(values).sum(axis=0),
+        curve,
+        float(limit),
+        state,
+        found.draws,
+        contents(bool(noise), spread),
     )
+
+
+def _chosen(
+    posterior_or_model: Any,
+    samples: Any,
+    part: str | None,
+    ratios: EventRatios | LevelRatios | None,
+    noise: bool | str | None,
+    n: int,
+    seed: int | None,
+) -> tuple[Any, Any, bool | str, np.ndarray | None]:
+    """The object to predict with, its samples, the noise to predict with, and the weights of draws of a new event."""
+    if ratios is not None and noise:
+        raise ValueError("ratios contain the error of the model already: leave out noise, or give noise=False")
+    of_population = isinstance(samples, Hierarchy)
+    predictor, rows = (
+        (posterior_or_model, None) if of_population else part_of(posterior_or_model, samples, part, bool(noise))
+    )
+    source = read_source(predictor)
+    if noise is None and ratios is None and source.noise is not None and follows_response(source.noise):
+        names = source.noise.parameter_names
+        if of_population:
+            noise = "model" if set(names) <= {*samples.posterior.varying, *samples.posterior.common} else None
+        elif (complete := _with_noise(posterior_or_model, samples, part, source)) is not None:
+            noise, rows = "model", complete
+    if noise is None and ratios is None:
+        warn_of_missing_error("fragility", "calibrate with a RelativeNoise and give samples of all parameters", 4)
+    noise = noise or False
+    if not of_population:
+        return predictor, rows, noise, None
+    if noise and source.noise is None:
+        raise ValueError(f"noise={noise!r} needs a posterior; got a model")
+    names = [*source.model.parameter_names, *(source.noise.parameter_names if noise else ())]
+    seeds = np.random.SeedSequence(seed).spawn(1)
+    draws, weights = draw_new_event(samples, names, n, source.noise if noise else None, seeds[0])
+    return predictor, draws, noise, weights
+
+
+def _with_noise(posterior: Any, samples: Any, part: str | None, source: PredictionSource) -> Any:
+    """The samples with the parameters of the noise, None if they have structural parameters only."""
+    try:
+        rows = part_of(posterior, samples, part, True)[1]
+    except ValueError:  # of a joint likelihood, without the parameters of the noise
+        return None
+    names = [*source.model.parameter_names, *source.noise.parameter_names]
+    complete = set(names) <= set(rows) if isinstance(rows, Mapping) else np.shape(rows)[-1:] == (len(names),)
+    return rows if complete else None
+
+
+class _Found(NamedTuple):
+    single: np.ndarray
+    counted: np.ndarray
+    probability: np.ndarray
+    standard_error: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    draws: np.ndarray | None
+
+
+def _probabilities(
+    spread: EventSpread, limit: float, failures_exceed: bool, effective: float, level: float, seed: int | None
+) -> _Found:
+    """Probabilities of samples (n_records, n) and of records, from values (n, n_records) with NaN for failures."""
+    values = spread.values
+    failed = np.isnan(values)
+    known, limits = np.where(failed, 1.0, values), np.full(values.shape, limit)
+    single = np.where(failed, float(failures_exceed), exceedance_of_samples(known, limits, spread.ratios)).T
+    counted = np.ones(single.shape) if failures_exceed else 1.0 - failed.T
+    trials = effective * counted.mean(axis=1)
+    share = single.sum(axis=1) / counted.sum(axis=1)
+    if spread.ratios is None and spread.weights is None:
+        lower, upper = binomial_interval(share, trials, level)
+        return _Found(single, counted, share, np.sqrt(share * (1.0 - share) / trials), lower, upper, None)
+    rng = np.random.default_rng(seed)
+    draws = exceedance_draws(values, limits, spread, rng, failed=failed, failures_exceed=failures_exceed)
+    lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    deviation = np.sqrt((np.square(single - share[:, None]) * counted).sum(axis=1) / counted.sum(axis=1))
+    return _Found(single, counted, share, deviation / np.sqrt(trials), lower, upper, draws)

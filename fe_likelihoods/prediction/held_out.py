@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike
 
 from ..probability.leave_one_out import LeftOut
 from ..probability.posterior import Posterior
-from .new_event import EventRatios, predict_new_event
+from .event_ratios import EventRatios
+from .new_event import predict_new_event
 from .prediction import Prediction
 from .quantities import Quantity
 from .score_tables import HistoryScores, QuantityScores

@@ -19,6 +19,7 @@ from ..probability.noise_draws import SampleNoise, sample_noise
 from ..simulation.executors import as_executor
 from ..simulation.memory_cache import distinct_keys
 from ..simulation.model import Model
+from .model_error import ModelError, model_error
 
 __all__ = [
     "PredictionSource",
@@ -128,8 +129,8 @@ def simulates_in_batches(model: Model) -> bool:
 
 def split_samples(
     source: PredictionSource, samples: Any, noise: bool | str, other_record: bool = False
-) -> tuple[np.ndarray, SampleNoise | None]:
-    """Split samples into structural parameters and, if wanted, the noise of each sample.
+) -> tuple[np.ndarray, SampleNoise | ModelError | None]:
+    """Split samples into structural parameters and, if wanted, the noise or the model's error of each sample.
 
     Parameters
     ----------
@@ -138,7 +139,8 @@ def split_samples(
     samples : (n, ndim) array_like, or named values of shape (n,)
         All parameters, or without `noise` the structural parameters alone.
     noise : bool or str
-        Whether the noise is wanted; the name of an event for the noise that was calibrated with it (`EventNoise`).
+        Whether the noise is wanted; the name of an event for the noise that was calibrated with it (`EventNoise`);
+        "model" for the error of the model alone (`model_error`).
     other_record : bool
         Whether the prediction is of another record than that of the likelihood.
 
@@ -146,7 +148,7 @@ def split_samples(
     -------
     thetas : ndarray, shape (n, n_structural)
         Structural parameters.
-    sample_noise : SampleNoise or None
+    sample_noise : SampleNoise, ModelError or None
         Noise of each sample, None if it is not wanted.
 
     Raises
@@ -182,11 +184,12 @@ def split_samples(
     parameters = points[:, len(structural) :]
     if isinstance(noise_model, EventNoise):
         return thetas, _noise_of_events(noise_model, parameters, model, noise, other_record)
-    if isinstance(noise, str):
+    if isinstance(noise, str) and noise != "model":
         raise ValueError(
             f"noise={noise!r} names an event, and {type(noise_model).__name__} has no levels per event; give noise=True"
         )
-    return thetas, sample_noise(noise_model, parameters, len(model.channels), model.dt)
+    whole = sample_noise(noise_model, parameters, len(model.channels), model.dt)  # refuses impossible parameters
+    return thetas, model_error(noise_model, parameters, model.dt) if noise == "model" else whole
 
 
 def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,112 +12,48 @@ Equations are on the page ``docs/theory/prediction.rst``.
 """
 
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..probability.hierarchy import Hierarchy
 from ..signals.records import Record
+from .event_ratios import EventRatios, LevelRatios
+from .event_spread import EventSpread
 from .inputs import part_of, read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, measured_quantity
 from .streaming import quantiles_with_errors
 
-__all__ = ["EventRatios", "event_ratio", "predict_new_event"]
+__all__ = ["draw_new_event", "event_level", "event_ratio", "predict_new_event"]
 
 _LARGEST_IMPOSSIBLE = 0.01  # share of draws with an impossible noise without a warning
 
 
-@dataclass(frozen=True, eq=False)
-class EventRatios:
-    r"""Ratios of measured to fitted values in several events, and the distribution of the ratio in a new event.
+def event_level(
+    posterior: Any, samples: Any, quantity: ChannelQuantity | list[ChannelQuantity], part: str | None = None
+) -> np.ndarray:
+    """Fitted value of a quantity in the event that a posterior was calibrated with, for `LevelRatios`.
 
     Parameters
     ----------
-    values : (n_events,) or (n_events, n_quantities) array_like
-        Positive ratios, one row per calibration event, see `event_ratio`.
-    prior_sd : float
-        Guess of the standard deviation of the logarithm of the ratio between events, made before these events.
-    prior_events : float
-        Number of events that this guess is worth; 0 for none. Where there is one event only, the ratio of a new one
-        depends on the guess, which must then be given.
+    posterior, samples, quantity, part
+        As for `event_ratio`.
+
+    Returns
+    -------
+    ndarray, shape () or (n_quantities,)
+        Median of the response of the samples [SI], without noise.
 
     Raises
     ------
     ValueError
-        If a ratio is not positive, the guess is not, or neither two events nor a guess are given.
-
-    Notes
-    -----
-    The logarithms of the ratios are normal with unknown mean and variance. With a flat prior of the mean and a scaled
-    inverse chi-squared prior of the variance (`prior_events` degrees of freedom, scale `prior_sd`), the logarithm of
-    the ratio of a new event has Student's t distribution (Gelman et al. 2013, section 3.2-3.3) with
-
-    .. math:: \nu = \nu_0 + K - 1, \qquad s^2 = \frac{\nu_0 s_0^2 + \sum_k (\ln r_k - m)^2}{\nu}
-
-    degrees of freedom, the mean m of the K logarithms as its center and the scale :math:`s \sqrt{1 + 1 / K}`.
-
-    References
-    ----------
-    A. Gelman, J. B. Carlin, H. S. Stern, D. B. Dunson, A. Vehtari, D. B. Rubin (2013), Bayesian Data Analysis, 3rd
-    edition, Chapman and Hall/CRC.
-
-    Examples
-    --------
-    >>> EventRatios([0.95, 1.08, 0.99, 1.04]).factor(0.9)  # ends of the 90 % interval: median times or divided by this
+        As `propagate`.
     """
-
-    values: ArrayLike
-    prior_sd: float = 0.1
-    prior_events: float = 0.0
-
-    def __post_init__(self) -> None:
-        values = np.array(self.values, dtype=float)
-        if values.ndim not in (1, 2) or not values.size or not ((values > 0.0) & (values < np.inf)).all():
-            raise ValueError(f"EventRatios: expected positive ratios, one row per event; got {self.values!r}")
-        if not (0.0 < self.prior_sd < np.inf and 0.0 <= self.prior_events < np.inf):
-            raise ValueError(
-                "EventRatios: prior_sd must be positive and prior_events zero or more; got "
-                f"{self.prior_sd!r} and {self.prior_events!r}"
-            )
-        if len(values) < 2 and not self.prior_events:
-            raise ValueError(
-                "EventRatios: one event does not show how ratios differ between events; give a guess of their standard "
-                "deviation, such as prior_sd=0.15, and the number of events that it is worth, prior_events=3"
-            )
-        object.__setattr__(self, "values", values)
-
-    @property
-    def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of Student's t distribution."""
-        return self.prior_events + len(self.values) - 1.0
-
-    @property
-    def median(self) -> np.ndarray:
-        """Median of the ratio of a new event, of the shape of one row: the geometric mean of the ratios."""
-        return np.exp(np.log(self.values).mean(axis=0))
-
-    @property
-    def scale(self) -> np.ndarray:
-        """Scale of the t distribution of the logarithm of the ratio of a new event."""
-        logs = np.log(self.values)
-        squares = np.square(logs - logs.mean(axis=0)).sum(axis=0) + self.prior_events * self.prior_sd**2
-        return np.sqrt(squares / self.degrees_of_freedom * (1.0 + 1.0 / len(logs)))
-
-    def factor(self, level: float = 0.9) -> np.ndarray:
-        """Ratio of the upper end of the central interval of a level to the median; the lower end is as far below."""
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"EventRatios.factor: level must be between 0 and 1; got {level!r}")
-        from scipy.stats import t
-
-        return np.exp(t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.scale)
-
-    def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw ratios of a new event, shape (n,) or (n, n_quantities); independent between quantities."""
-        return self.median * np.exp(self.scale * rng.standard_t(self.degrees_of_freedom, (n, *self.values.shape[1:])))
+    return propagate(posterior, samples, part=part, quantity=quantity, quantiles=(0.5,), progress=False).quantile(0.5)
 
 
 def event_ratio(
@@ -153,7 +89,7 @@ def event_ratio(
     if source.likelihood is None:
         raise ValueError(f"event_ratio needs a posterior or a likelihood with measurements; got {posterior!r}")
     measured = measured_quantity(quantity, source.likelihood.measurements)
-    fitted = propagate(likelihood, rows, quantity=quantity, quantiles=(0.5,), progress=False).quantile(0.5)
+    fitted = event_level(likelihood, rows, quantity)
     if not ((measured > 0.0) & (fitted > 0.0)).all():
         raise ValueError(f"event_ratio needs positive values; measured {measured}, fitted {fitted}")
     return measured / fitted
@@ -165,8 +101,8 @@ def predict_new_event(
     record: Record | Any,
     *,
     quantity: Quantity = None,
-    ratios: EventRatios | None = None,
-    noise: bool = False,
+    ratios: EventRatios | LevelRatios | None = None,
+    noise: bool | str = False,
     n: int = 500,
     seed: int | None = None,
     **options: Any,
@@ -184,13 +120,14 @@ def predict_new_event(
         Excitation of the new event.
     quantity : optional
         As for `propagate`. Default: the histories of all channels.
-    ratios : EventRatios, optional
+    ratios : EventRatios or LevelRatios, optional
         Ratios of measured to fitted values of the quantity in the calibration events, for numbers such as
-        ``peak(name)`` or several of them. The prediction is that of the measured value.
-    noise : bool
-        Whether histories are predicted with noise. The parameters of the noise must be varying, common, or have the
-        same prior in all events. Shares of the response (`RelativeNoise`) transfer between events, levels in SI units
-        do not.
+        ``peak(name)`` or several of them. The prediction is that of the measured value. With `LevelRatios` (one number
+        only) the ratio of each draw is that at its predicted value.
+    noise : bool or str
+        Whether histories are predicted with noise, as for `propagate`. The parameters of the noise must be varying,
+        common, or have the same prior in all events. Shares of the response (`RelativeNoise`) transfer between events,
+        levels in SI units do not.
     n : int
         Number of draws, each one simulation. Draws with an impossible noise, such as a share of 1 or more, are left
         out.
@@ -202,7 +139,8 @@ def predict_new_event(
     Returns
     -------
     Prediction
-        Its spread contains that between events.
+        Its spread contains that between events. `exceedance` of it has intervals that contain what is unknown of the
+        population and of the ratios.
 
     Raises
     ------
@@ -237,9 +175,7 @@ def predict_new_event(
                 "measurements already: give quantity=peak(channel), and noise=False"
             )
     parameters, drawn, errors = np.random.SeedSequence(seed).spawn(3)
-    draws = hierarchy.new_test(n, names, np.random.default_rng(parameters))
-    if noise:
-        draws = _possible(draws, source.noise)
+    draws, weights = draw_new_event(hierarchy, names, n, source.noise if noise else None, parameters)
     settings = {"progress": False} | options
     prediction = propagate(
         posterior_or_model,
@@ -250,7 +186,52 @@ def predict_new_event(
         seed=int(errors.generate_state(1)[0]),
         **settings,
     )
+    if isinstance(prediction, Mapping):  # several quantities of the same draws
+        return {name: _with_spread(each, weights, None) for name, each in prediction.items()}
+    prediction = _with_spread(prediction, weights, ratios)
     return prediction if ratios is None else _corrected(prediction, ratios, np.random.default_rng(drawn))
+
+
+def _with_spread(prediction: Prediction, weights: np.ndarray, ratios: EventRatios | LevelRatios | None) -> Prediction:
+    """The prediction with what is unknown of the events; histories, whose values are not kept, as they are."""
+    if prediction.values is None:
+        return prediction
+    weights = np.delete(weights, prediction.failed, axis=1)
+    spread = EventSpread(prediction.values, weights / weights.sum(axis=1, keepdims=True), ratios)
+    return replace(prediction, spread=spread)
+
+
+def draw_new_event(
+    hierarchy: Hierarchy, names: list[str], n: int, noise: Any, seed: np.random.SeedSequence
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Draw the parameters of a new event, and their weights in single populations.
+
+    Parameters
+    ----------
+    hierarchy : Hierarchy
+        The population.
+    names : list of str
+        Parameters to draw.
+    n : int
+        Number of draws.
+    noise : Noise or None
+        Noise whose parameters are among the names; draws where it is impossible are left out, with a warning if they
+        are more than 1 %.
+    seed : numpy.random.SeedSequence
+        Seed of the draws.
+
+    Returns
+    -------
+    draws : dict of str to (m,) ndarray
+        Draws of these parameters.
+    weights : (n_populations, m) ndarray
+        See `Hierarchy.population_weights`.
+    """
+    own = [name for name in hierarchy.posterior.varying if name not in names]
+    draws = hierarchy.new_test(n, [*names, *own], np.random.default_rng(seed))
+    if noise is not None:
+        draws = _possible(draws, noise)
+    return {name: draws[name] for name in names}, hierarchy.population_weights(draws)
 
 
 def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]:
@@ -269,14 +250,14 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
     return {name: values[possible] for name, values in draws.items()}
 
 
-def _corrected(prediction: Prediction, ratios: EventRatios, rng: np.random.Generator) -> Prediction:
+def _corrected(prediction: Prediction, ratios: EventRatios | LevelRatios, rng: np.random.Generator) -> Prediction:
     """The prediction times draws of the ratio of a new event."""
-    if prediction.values is None or ratios.values.shape[1:] != prediction.mean.shape:
+    if ratios.shape != prediction.mean.shape:
         raise ValueError(
             f"predict_new_event: expected ratios (n_events, ...) of a quantity of shape {prediction.mean.shape}; got "
             f"{ratios.values.shape}"
         )
-    values = prediction.values * ratios.draw(len(prediction.values), rng)
+    values = prediction.values * ratios.draw_at(prediction.values, rng)
     effective = prediction.effective_sample_size
     quantiles, errors = quantiles_with_errors(
         values.reshape(len(values), -1), np.ones(len(values), dtype=int), prediction.probabilities, effective

@@ -12,6 +12,7 @@ from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_shifted, compare_with
 from ..signals.error_measures import rrmse
 from ..units import find_unit
+from .event_spread import EventSpread
 from .quantities import measured_quantity
 from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
 
@@ -65,7 +66,7 @@ class Prediction:
     dt : float or None
         Time step of the histories [s], None for other quantities.
     noise : bool
-        Whether the measurement noise is included.
+        Whether the measurement noise, or the error of the model, is included.
     from_state : str
         State of the structure at the beginning: "virgin", that of the model before any excitation, or "end", that after
         the excitation with which the model was made.
@@ -74,6 +75,9 @@ class Prediction:
         of the response, without a shift.
     quantity : object
         The quantity as it was given to `fe_likelihoods.propagate`.
+    spread : EventSpread or None
+        What is unknown of the events, for the intervals of `fe_likelihoods.exceedance`; None unless the prediction is
+        that of a new event (`fe_likelihoods.predict_new_event`).
     """
 
     mean: np.ndarray
@@ -94,6 +98,7 @@ class Prediction:
     from_state: str = "virgin"
     shifted: tuple[str, ...] = ()
     quantity: object = None
+    spread: EventSpread | None = None
 
     @property
     def sd(self) -> np.ndarray:

@@ -48,8 +48,9 @@ from .inputs import (
     simulates_in_batches,
     split_samples,
 )
+from .model_error import follows_response
 from .prediction import Prediction
-from .quantities import Quantity, evaluator
+from .quantities import Quantity, evaluator, measured_quantity
 
 __all__ = ["check_effective_sample_size", "fit_measures", "propagate"]
 
@@ -111,8 +112,10 @@ def propagate(
         Predict measurements: the response plus the noise of each sample, with its correlation in time. For histories,
         mean and variance are exact in the noise (the law of total variance adds the mean variance of the noise), and
         quantiles use one draw of the noise per sample. For other quantities, one draw per sample is added to the
-        response. A noise with levels per event (`EventNoise`) has those of each event in that event; under another
-        `record`, give the name of the event whose levels hold for it.
+        response. "model" predicts the response of the structure with the error of the model and without the noise of
+        the sensors, for a noise that follows the response (`RelativeNoise`); the errors have the spectrum of the
+        response, because white errors make peaks too large. A noise with levels per event (`EventNoise`) has those of
+        each event in that event; under another `record`, give the name of the event whose levels hold for it.
     quantiles : sequence of float
         Probabilities of the quantiles, between 0 and 1. An empty sequence for none.
     effective_sample_size : float, optional
@@ -156,8 +159,8 @@ def propagate(
     Warns
     -----
     UserWarning
-        If histories under another record are predicted with noise in SI units, and their level is more than three times
-        that of the measurements of the calibration, or less than a third.
+        If histories, or quantities of channels, under another record are predicted with noise in SI units, and their
+        level is more than three times that of the measurements of the calibration, or less than a third.
     """
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     source = read_source(posterior_or_model, pool)
@@ -218,9 +221,9 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
-    histories = next((each for each in predictions.values() if each.dt is not None), None)
-    if record is not None and noise and histories is not None:
-        _warn_of_level(histories, source)
+    if record is not None and noise:
+        histories = [each for each in predictions.values() if each.dt is not None]
+        _warn_of_level((histories or list(predictions.values()))[0], source)
     return predictions if isinstance(quantity, Mapping) else predictions[""]
 
 
@@ -344,17 +347,25 @@ def _prediction(
 
 def _warn_of_level(prediction: Prediction, source: PredictionSource) -> None:
     """Warn if noise in SI units was calibrated with a much stronger or weaker response than the predicted one."""
-    if hasattr(source.noise, "response_deviations") and getattr(source.noise, "relative", True):
+    if follows_response(source.noise) or not prediction.channels:
         return
-    far = []
-    for channel, mean in zip(prediction.channels, prediction.mean, strict=True):
-        measured = np.sqrt(np.nanmean(np.square(source.likelihood.measurements.channel(channel.name))))
-        ratio = np.sqrt(np.mean(np.square(mean))) / measured if measured > 0.0 else 1.0
+    measurements, far = source.likelihood.measurements, []
+    if prediction.dt is not None:
+        levels = np.sqrt(np.mean(np.square(prediction.mean), axis=1))
+        measured = [np.sqrt(np.nanmean(np.square(measurements.channel(c.name)))) for c in prediction.channels]
+    else:
+        levels = np.atleast_1d(prediction.mean)
+        try:
+            measured = np.atleast_1d(measured_quantity(prediction.quantity, measurements))
+        except ValueError:  # samples are missing, so that the level of the calibration is not known
+            return
+    for channel, level, reference in zip(prediction.channels, levels, measured, strict=True):
+        ratio = abs(level / reference) if reference else 1.0
         if not 1.0 / _LARGEST_LEVEL_RATIO <= ratio <= _LARGEST_LEVEL_RATIO:
             far.append(f"{channel.name} ({ratio:.2g} times)")
     if far:
         warnings.warn(
-            "the predicted response has another level (root mean square) than the measurements of the calibration: "
+            "the predicted response has another level than the measurements of the calibration: "
             f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
             "too narrow for a stronger motion; ModulatedNoise, BandNoise and RelativeNoise scale with the response",
             stacklevel=3,

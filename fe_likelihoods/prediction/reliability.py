@@ -1,8 +1,10 @@
 """Probability that a response exceeds a limit, given the data.
 
-The posterior probability of an exceedance is estimated by the fraction of the samples whose quantity exceeds the
-threshold: the robust reliability of Papadimitriou, Beck & Katafygiotis (2001). Its uncertainty is given by the interval
-of Clopper & Pearson (1934), which is also valid if none or all of the samples exceed. See
+The posterior probability of an exceedance is estimated by the mean over the samples of the probability that each of
+them exceeds the threshold: the robust reliability of Papadimitriou, Beck & Katafygiotis (2001). Without an error of the
+model this is the fraction of the samples whose quantity exceeds the threshold, and its uncertainty is given by the
+interval of Clopper & Pearson (1934), which is also valid if none or all of the samples exceed. The error of the model
+is in the prediction (``propagate(..., noise="model")``, `predict_new_event`) or in ``ratios=``. See
 ``docs/theory/prediction.rst``. Fragility curves are in `fe_likelihoods.prediction.fragility`.
 
 References
@@ -15,6 +17,7 @@ Biometrika 26(4), 404-413, doi:10.1093/biomet/26.4.404.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,10 +27,21 @@ from scipy import stats
 
 from ..signals.channels import Channel
 from ..units import to_si
+from .event_ratios import EventRatios, LevelRatios
+from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .prediction import Prediction
 from .propagation import check_effective_sample_size
 
-__all__ = ["Exceedance", "binomial_interval", "check_level", "exceedance", "threshold_in_si"]
+__all__ = [
+    "Exceedance",
+    "binomial_interval",
+    "check_level",
+    "contents",
+    "exceedance",
+    "exceedance_probability",
+    "threshold_in_si",
+    "warn_of_missing_error",
+]
 
 
 class Exceedance(NamedTuple):
@@ -40,14 +54,19 @@ class Exceedance(NamedTuple):
     threshold : ndarray
         Threshold [SI].
     probability : ndarray
-        Fraction of the samples above the threshold.
+        Mean over the samples of the probability to exceed the threshold; without ratios, the fraction of the samples
+        above the threshold.
     standard_error : ndarray
-        Monte Carlo error sqrt(p (1 - p) / effective sample size). It is zero if none or all of the samples exceed; use
-        the interval in these cases.
+        Monte Carlo error. Without ratios it is sqrt(p (1 - p) / effective sample size), which is zero if none or all of
+        the samples exceed; use the interval in these cases.
     lower, upper : ndarray
-        Clopper-Pearson interval of the probability, for the effective sample size.
+        Interval of the probability. With ratios, or for a new event, it contains what is unknown of the ratios and of
+        the population of the events. Otherwise it is the Clopper-Pearson interval for the effective sample size, which
+        contains the Monte Carlo error only.
     effective_sample_size : float
         Effective number of independent samples.
+    uncertainty : str
+        What the probability contains.
     """
 
     threshold: np.ndarray
@@ -56,6 +75,7 @@ class Exceedance(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     effective_sample_size: float
+    uncertainty: str = ""
 
 
 def exceedance(
@@ -63,8 +83,11 @@ def exceedance(
     threshold: ArrayLike,
     *,
     unit: str | None = None,
+    ratios: EventRatios | LevelRatios | None = None,
+    noise: bool | None = None,
     effective_sample_size: float | None = None,
     level: float = 0.95,
+    seed: int = 0,
 ) -> Exceedance:
     """Estimate the probability that a quantity exceeds a threshold, given the data.
 
@@ -74,13 +97,21 @@ def exceedance(
         A prediction with `values`, for instance of ``quantity=peak(...)``, or the values of the samples.
     threshold : float or array_like
         If the quantity is a number: one threshold or an array of any shape. If it is an array: one threshold, or one
-        for each entry, shape (...).
+        for each entry, shape (...). Positive if there are ratios.
     unit : str, optional
         Unit of the threshold. It must have the dimension of the channel of the prediction. Default: SI.
+    ratios : EventRatios or LevelRatios, optional
+        Ratios of measured to fitted values of the quantity in several events: the error of the model, for a prediction
+        without noise. The prediction of `predict_new_event` has its own.
+    noise : bool, optional
+        False states that the error of the model is left out on purpose. Default: a prediction without it gives a
+        warning.
     effective_sample_size : float, optional
         Effective number of independent samples. Default: that of the prediction, or the number of values.
     level : float
         Probability of the interval, between 0 and 1.
+    seed : int
+        Seed of the draws for the interval, where there are ratios or a population of events.
 
     Returns
     -------
@@ -90,34 +121,145 @@ def exceedance(
     Raises
     ------
     ValueError
-        If the threshold has the wrong shape or unit or is not finite, or the values are missing or not finite.
+        If the threshold has the wrong shape or unit, is not finite, or is not positive where there are ratios; the
+        values are missing or not finite; the ratios are for another number of quantities, or are given for a prediction
+        that contains errors already; or the prediction has noise and ``noise=False``.
+
+    Warns
+    -----
+    UserWarning
+        If a prediction contains no error of the model: its probability is then too close to 0 or to 1.
+
+    Examples
+    --------
+    >>> drift = propagate(posterior, samples, quantity=peak("top"), record=record, noise="model")  # with RelativeNoise
+    >>> exceedance(drift, 50.0, unit="mm")
+    >>> drift = propagate(posterior, samples, quantity=peak("top"), record=record)
+    >>> exceedance(drift, 50.0, unit="mm", ratios=EventRatios([0.93, 1.10, 1.02]))
     """
-    if isinstance(prediction_or_values, Prediction):
-        values, channels = prediction_or_values.values, prediction_or_values.channels
-        if values is None:
+    prediction = prediction_or_values if isinstance(prediction_or_values, Prediction) else None
+    if prediction is not None:
+        if prediction.values is None:
             raise ValueError(
                 "exceedance needs the values of the samples, but this prediction has none: propagate with a number as "
                 "quantity, such as peak(channel)"
             )
-        effective = prediction_or_values.effective_sample_size
+        spread = EventSpread(prediction.values) if prediction.spread is None else prediction.spread
+        effective, channels, has_error = prediction.effective_sample_size, prediction.channels, prediction.noise
     else:
-        values, channels = np.asarray(prediction_or_values, dtype=float), ()
+        values, channels, has_error = np.asarray(prediction_or_values, dtype=float), (), False
         if values.ndim == 0 or len(values) == 0 or not np.isfinite(values).all():
             raise ValueError(f"values must be finite, one row per sample; got {values.size} of shape {values.shape}")
-        effective = float(len(values))
+        spread, effective = EventSpread(values), float(len(values))
+    if noise is False and has_error:
+        raise ValueError(
+            "noise=False states that there is no error of the model, but the prediction contains one: propagate with "
+            "noise=False, and predict_new_event without ratios"
+        )
+    if ratios is not None:
+        if has_error:
+            raise ValueError("ratios contain the error of the model, and the prediction contains it already: leave one")
+        spread = spread._replace(ratios=ratios)
+    elif prediction is not None and noise is None and not has_error:
+        warn_of_missing_error("exceedance", 'propagate with noise="model" and a RelativeNoise')
     effective = float(check_effective_sample_size(effective_sample_size, effective))
-    limits = threshold_in_si(threshold, unit, channels)
+    limits, values = threshold_in_si(threshold, unit, channels), spread.values
     if values.ndim > 1 and limits.shape not in ((), values.shape[1:]):
         raise ValueError(
             f"expected one threshold, or one for each entry of the quantity, shape {values.shape[1:]}; got shape "
             f"{limits.shape}"
         )
-    if values.ndim == 1:
-        share = 1.0 - np.searchsorted(np.sort(values), limits, side="right") / len(values)
-    else:
-        share = (values > limits).mean(axis=0)
-    lower, upper = binomial_interval(share, effective, level)
-    return Exceedance(limits, share, np.sqrt(share * (1.0 - share) / effective), lower, upper, effective)
+    check_level(level)
+    said = contents(has_error, spread)
+    if spread.ratios is None and spread.weights is None:
+        if values.ndim == 1:
+            share = 1.0 - np.searchsorted(np.sort(values), limits, side="right") / len(values)
+        else:
+            share = (values > limits).mean(axis=0)
+        lower, upper = binomial_interval(share, effective, level)
+        error = np.sqrt(share * (1.0 - share) / effective)
+        return Exceedance(limits, share, error, lower, upper, effective, said)
+    if spread.ratios is not None:
+        if not (limits > 0.0).all():
+            raise ValueError(f"with ratios, thresholds must be positive; got {limits}")
+        if spread.ratios.shape not in ((), values.shape[1:]):
+            raise ValueError(
+                f"expected ratios (n_events, ...) of a quantity of shape {values.shape[1:]}; got "
+                f"{spread.ratios.values.shape}"
+            )
+    if spread.ratios is not None and spread.ratios.shape:  # each quantity has ratios of its own
+        rows = np.broadcast_to(limits, values.shape[1:])
+        columns = [
+            exceedance_probability(
+                values[:, k], rows[k], spread._replace(ratios=spread.ratios.of_quantity(k)), effective, level, seed
+            )
+            for k in range(len(rows))
+        ]
+        numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
+        return Exceedance(limits, *numbers, effective, said)
+    if values.ndim == 1 and limits.ndim:
+        values = values.reshape(-1, *(1,) * limits.ndim)
+    found = exceedance_probability(values, limits, spread, effective, level, seed)
+    return found._replace(threshold=limits, uncertainty=said)
+
+
+def exceedance_probability(
+    values: np.ndarray,
+    limits: np.ndarray,
+    spread: EventSpread,
+    effective: float,
+    level: float,
+    seed: int,
+    below: bool = False,
+) -> Exceedance:
+    """Probability of an exceedance with ratios, or in a population of events, from the quantiles of its draws.
+
+    Parameters
+    ----------
+    values : (n, ...) ndarray
+        Values of the samples, before they are multiplied by ratios.
+    limits : ndarray
+        Limits that are broadcast to the values.
+    spread : EventSpread
+        Ratios of one quantity, and weights.
+    effective, level, seed
+        As for `exceedance`.
+    below : bool
+        Whether the limit is exceeded by values below it.
+
+    Returns
+    -------
+    Exceedance
+    """
+    values, limits = np.broadcast_arrays(values, limits)
+    single = exceedance_of_samples(values, limits, spread.ratios, below)
+    draws = exceedance_draws(values, limits, spread, np.random.default_rng(seed), below)
+    lower, upper = np.quantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    error = single.std(axis=0) / np.sqrt(effective)
+    return Exceedance(limits[0], single.mean(axis=0), error, lower, upper, effective, contents(False, spread))
+
+
+def contents(has_noise: bool, spread: EventSpread) -> str:
+    """What a probability contains, in words."""
+    found = ["the uncertainty of the parameters"]
+    if spread.weights is not None:
+        found.append("their spread between events")
+    if spread.ratios is not None:
+        found.append(f"the error of the model, from the ratios of {len(spread.ratios.values)} events")
+    elif has_noise:
+        found.append("the error of the model, from the noise of the calibration")
+    said = found[0] if len(found) == 1 else f"{', '.join(found[:-1])} and {found[-1]}"
+    return said if has_noise or spread.ratios is not None else f"{said}, not the error of the model"
+
+
+def warn_of_missing_error(caller: str, how: str, stacklevel: int = 3) -> None:
+    """Warn that a probability leaves the error of the model out; `how` says how else to have it than by ratios."""
+    warnings.warn(
+        f"{caller}: the probabilities leave the error of the model out, so that they are too close to 0 or to 1. Give "
+        f"ratios=EventRatios(...) of measured to fitted values in several events, or {how}; noise=False states that "
+        "the error is left out on purpose",
+        stacklevel=stacklevel,
+    )
 
 
 def threshold_in_si(threshold: ArrayLike, unit: str | None, channels: Sequence[Channel]) -> np.ndarray:

@@ -5,7 +5,7 @@ checks where the stored posteriors do not suffice, and draws the parameters of t
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -126,6 +126,53 @@ class Hierarchy:
         for name in () if names is None else [name for name in names if name not in own]:
             found[name] = self._prior_draws(name, n, generator)
         return found if names is None else {name: found[name] for name in names}
+
+    def population_weights(self, draws: Mapping[str, np.ndarray], n: int = 200) -> np.ndarray:
+        """Weights by which draws of a new test are draws from single populations.
+
+        The draws of `new_test` are those of many populations together, each from one sample of the hyper-parameters.
+        With these weights they stand for each population alone, without further simulations: the difference between
+        populations is what is unknown of them, and the difference between draws of one is the spread between tests.
+
+        Parameters
+        ----------
+        draws : mapping of str to (m,) array_like
+            Result of `new_test`. Common parameters, which do not vary within a population, and parameters that belong
+            to each test alone are not compared.
+        n : int
+            Number of populations, at most the number of samples of the hyper-parameters.
+
+        Returns
+        -------
+        (n, m) ndarray
+            Each row sums to one.
+
+        Raises
+        ------
+        ValueError
+            If a varying parameter is missing.
+
+        Notes
+        -----
+        Importance sampling with the mixture of all populations as its proposal (the balance heuristic of Veach & Guibas
+        1995, doi:10.1145/218380.218498).
+        """
+        names = list(self.posterior.varying)
+        if missing := [name for name in names if name not in draws]:
+            raise ValueError(f"population_weights: expected draws of {', '.join(names)}; missing {', '.join(missing)}")
+        used = np.linspace(0, len(self.samples) - 1, min(len(self.samples), n)).astype(int)
+        center, factor = self.posterior.population(self.samples[used])
+        values = np.stack([np.asarray(draws[name], dtype=float) for name in names], axis=1)
+        logarithmic = np.array([self.posterior.varying[name].scale == "log" for name in names])
+        points = np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+        log_densities = np.empty((len(used), len(points)))
+        for row, (mean, root) in enumerate(zip(center[:, : len(names)], factor, strict=True)):
+            z = np.linalg.solve(root, (points - mean).T)
+            log_densities[row] = -0.5 * np.square(z).sum(axis=0) - np.log(np.diagonal(root)).sum()
+        log_densities -= log_densities.max(axis=0)
+        weights = np.exp(log_densities)
+        weights /= weights.sum(axis=0)
+        return weights / weights.sum(axis=1, keepdims=True)
 
     def weights(self, test: str) -> np.ndarray:
         """Weights of the stored samples of one test, by which they are samples of its posterior in the hierarchy.

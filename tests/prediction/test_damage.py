@@ -1,14 +1,17 @@
 """Damage: measures against closed forms and the histories of the column, limit states, and what is refused."""
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from fe_likelihoods import (
     Channel,
     DisplacementHistory,
+    EventRatios,
     Events,
     IsolatedBridge,
     LimitState,
@@ -339,3 +342,56 @@ def test_columns_of_the_table_are_separated(prediction):
     wide = {name: 1.23456e-5 * np.ones_like(values) for name, values in found.extent.items()}
     for line in found._replace(extent=wide).table().split("\n\n")[1].splitlines():
         assert len(re.split(r" {2,}", line)) == 4, line
+
+
+def test_ratios_add_the_error_of_the_model_to_limit_states_and_extent():
+    model, rng = Loop(), np.random.default_rng(1)
+    measures = damage_measures(model, displacement="u", acceleration="a", measures=("peak drift", "stiffness ratio"))
+    samples = 0.05 * np.exp(0.1 * rng.standard_normal((400, 1)))
+    prediction = propagate(model, samples, quantity=measures, progress=False)
+    states = [LimitState("moved", "peak drift", 0.07), LimitState("softer", "stiffness ratio", 0.9)]
+    ratios = EventRatios([1.1, 0.9, 1.3, 1.0])
+    found = damage(prediction, states, ratios={"peak drift": ratios}, noise=False)
+    drift = measures.split(prediction.values)["peak drift"][:, 0]
+    t = stats.t(3, np.log(ratios.median), ratios.scale)
+    moved = found.presence["moved"]
+    assert moved.probability[0] == pytest.approx(t.sf(np.log(0.07 / drift)).mean(), rel=1e-9)
+    assert moved.lower[0] < (drift > 0.07).mean() < moved.upper[0] and moved.upper[0] - moved.lower[0] > 0.3
+    assert moved.threshold == 0.07
+    np.testing.assert_allclose(
+        found.extent["peak drift"][:, 0],
+        np.quantile(np.exp(np.log(drift[:, None]) + t.rvs((1, 2000), random_state=1)), (0.05, 0.5, 0.95)),
+        rtol=0.12,
+    )
+    assert "the error of the model in peak drift, not that of the limits" in found.uncertainty
+    plain = damage(prediction, states, noise=False)
+    assert plain.uncertainty == "the uncertainty of the parameters, not the error of the model or of the limits"
+    assert plain.presence["softer"].probability[0] == 0.0 == found.presence["softer"].probability[0]
+    both = damage(prediction, states, ratios=ratios)
+    assert both.presence["softer"].probability[0] == pytest.approx(t.cdf(np.log(0.9)), rel=1e-9)  # decreases
+    assert "and the error of the model, not that of the limits" in both.table()
+
+
+def test_ratios_of_strains_are_common_to_all_places(prediction):
+    stated = EventRatios([1.0], prior_sd=0.3, prior_events=10.0)
+    found = damage(prediction, ratios={"bar tension": stated}, noise=False)
+    place, anywhere = found.location["bar yield"].probability, found.presence["bar yield"].probability
+    np.testing.assert_allclose(anywhere, place.max(axis=(1, 2)), atol=0.02)
+    assert np.all((0.0 < anywhere) & (anywhere < 1.0))
+
+
+def test_an_error_of_the_model_that_is_left_out_is_told(prediction):
+    with pytest.warns(UserWarning, match=r"damage \(bar yield, .*the error of the model out"):
+        damage(prediction)
+    with pytest.warns(UserWarning, match=r"damage \(cover spalling"):
+        damage(prediction, ratios={"bar tension": EventRatios([1.0, 1.1])})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        damage(prediction, noise=False)
+        damage(prediction, ratios=EventRatios([1.0, 1.1]))
+    with pytest.raises(ValueError, match="ratios of strain; the measures are"):
+        damage(prediction, ratios={"strain": EventRatios([1.0, 1.1])})
+    with pytest.raises(ValueError, match="must be EventRatios or LevelRatios of one quantity"):
+        damage(prediction, ratios=EventRatios([[1.0, 1.1]] * 2))
+    with pytest.raises(ValueError, match="noise of sensors does no damage"):
+        damage(prediction, noise=True)

@@ -78,7 +78,7 @@ def test_default_is_named_in_a_warning_at_the_line_of_the_user(record):
         prediction = propagate(model, samples, record=record.scale(2.0), progress=False)
     assert prediction.from_state == "virgin" and caught[0].filename == __file__
     with pytest.warns(UserWarning, match="virgin structure") as caught:
-        result = fragility(model, samples, [record, record.scale(2.0)], peak("slip"), 1.0, progress=False)
+        result = fragility(model, samples, [record, record.scale(2.0)], peak("slip"), 1.0, noise=False, progress=False)
     assert result.from_state == "virgin" and len(caught) == 1 and caught[0].filename == __file__
 
 
@@ -89,7 +89,7 @@ def test_no_warning_before_an_error(record):
         with pytest.raises(ValueError, match="has one excitation, which its code contains"):
             propagate(model, np.ones((2, 1)), record=record, progress=False)
         with pytest.raises(ValueError, match="has one excitation, which its code contains"):
-            fragility(model, np.ones((2, 1)), [record], peak("slip"), 1.0, progress=False)
+            fragility(model, np.ones((2, 1)), [record], peak("slip"), 1.0, noise=False, progress=False)
 
 
 def test_no_warning_without_memory_or_without_a_record(record):

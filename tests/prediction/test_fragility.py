@@ -6,7 +6,8 @@ from scipy import stats
 
 from fe_likelihoods import BridgeDeck, IsolatedBridge, LinearStructure, Record
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.prediction.fragility import fit_fragility, fragility, peak_ground_acceleration
+from fe_likelihoods.prediction.fragility import fragility, peak_ground_acceleration
+from fe_likelihoods.prediction.fragility_curve import fit_fragility
 from fe_likelihoods.prediction.quantities import peak
 from fe_likelihoods.simulation.model import SimulationFailed
 from fe_likelihoods.units import G0

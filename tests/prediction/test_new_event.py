@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.prediction.new_event import EventRatios, event_ratio, predict_new_event
+from fe_likelihoods.prediction.event_ratios import EventRatios
+from fe_likelihoods.prediction.new_event import event_ratio, predict_new_event
 from fe_likelihoods.prediction.quantities import peak, rms
 from fe_likelihoods.probability.distributions import HalfNormal, LogNormal
 from fe_likelihoods.probability.hierarchical_posterior import HierarchicalPosterior, Varying

@@ -1,0 +1,139 @@
+r"""Probability of an exceedance in a new event: per sample, and for draws of what is unknown of the events.
+
+The value in a new event is :math:`r\, g(\theta)`, with the ratio r of the error of the model and parameters that are
+those of the structure, or those of one event of a population. Given the population :math:`h`, the probability of an
+exceedance is a number :math:`P_h`. Its mean over the posterior of :math:`h` is the probability that is reported, and
+its quantiles are the interval. See ``docs/theory/prediction.rst``.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from .event_ratios import EventRatios, LevelRatios, RatioPopulations
+
+__all__ = ["EventSpread", "exceedance_draws", "exceedance_of_samples"]
+
+_DRAWS = 1000  # of the population, where the samples have no weights
+_CHUNK = 2**20  # values of a temporary array
+
+
+class EventSpread(NamedTuple):
+    """What the probability of an exceedance in a new event depends on, and is not known exactly.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n_samples, ...)
+        Values of the samples, before they are multiplied by a ratio.
+    weights : ndarray, shape (n_populations, n_samples), or None
+        Weights by which the samples are draws of each of several populations (`Hierarchy.population_weights`). None if
+        the samples are those of the parameters of the structure, which are the same in all events.
+    ratios : EventRatios, LevelRatios or None
+        Ratios of the error of the model, None for none.
+    """
+
+    values: np.ndarray
+    weights: np.ndarray | None = None
+    ratios: EventRatios | LevelRatios | None = None
+
+
+def exceedance_of_samples(
+    values: np.ndarray, limits: np.ndarray, ratios: EventRatios | LevelRatios | None, below: bool = False
+) -> np.ndarray:
+    """Probability of each sample that its value in a new event exceeds the limit.
+
+    Parameters
+    ----------
+    values : (n, ...) ndarray
+        Values of the samples.
+    limits : ndarray
+        Limits of the same shape; positive if there are ratios.
+    ratios : EventRatios, LevelRatios or None
+        Ratios of one quantity.
+    below : bool
+        Whether the limit is exceeded by values below it.
+
+    Returns
+    -------
+    (n, ...) ndarray
+        Probabilities, 0 or 1 without ratios.
+    """
+    if ratios is None:
+        return (values < limits if below else values > limits).astype(float)
+    positive = values > 0.0  # times a ratio, others stay below a positive limit
+    known = np.where(positive, values, 1.0)
+    above = np.where(positive, ratios.probability_above(limits / known, np.log(known)), 0.0)
+    return 1.0 - above if below else above
+
+
+def exceedance_draws(
+    values: np.ndarray,
+    limits: np.ndarray,
+    spread: EventSpread,
+    rng: np.random.Generator,
+    below: bool = False,
+    failed: np.ndarray | None = None,
+    failures_exceed: bool = False,
+) -> np.ndarray:
+    """Draws of the probability that the value in a new event exceeds the limit.
+
+    Parameters
+    ----------
+    values, limits, below
+        As for `exceedance_of_samples`.
+    spread : EventSpread
+        Weights and ratios; its values are not used.
+    rng : numpy.random.Generator
+        Draws of the samples and of the ratios' population. All entries of the values have the same draws.
+    failed : (n, ...) ndarray of bool, optional
+        Values that are not known, because their simulation failed. Default: none.
+    failures_exceed : bool
+        Whether failed values count as exceedances. Otherwise they are left out.
+
+    Returns
+    -------
+    (n_draws, ...) ndarray
+        Probability given each draw of the population; NaN where its sample failed and is left out.
+    """
+    failed = np.zeros(values.shape, dtype=bool) if failed is None else failed
+    known = np.where(failed, np.nanmax(np.where(failed, -np.inf, values), initial=-np.inf), values)
+    if spread.weights is None:  # each draw has one of the samples
+        rows = rng.permutation(np.resize(rng.permutation(len(values)), _DRAWS))[:, None]
+    else:  # each draw has all samples, with the weights of its population
+        rows = np.tile(np.arange(len(values)), (len(spread.weights), 1))
+    populations = None
+    if spread.ratios is not None:
+        positive = known[known > 0.0]
+        populations = spread.ratios.draw_populations(len(rows), rng, np.log(positive) if positive.size else np.zeros(1))
+    found = np.empty((len(rows), *values.shape[1:]))
+    size = max(1, _CHUNK // (rows.shape[1] * max(1, known[0].size)))
+    for first in range(0, len(rows), size):
+        chunk = slice(first, first + size)
+        at = rows[chunk]
+        if populations is None:
+            single = exceedance_of_samples(known[at], limits[at], None, below)
+        else:
+            part = RatioPopulations(populations.log_levels, populations.center[chunk], populations.sd[chunk])
+            single = _given_populations(known[at], limits[at], part, below)
+        counted = np.ones(single.shape)
+        if failures_exceed:
+            single = np.where(failed[at], 1.0, single)
+        else:
+            counted[failed[at]] = 0.0
+        weights = np.ones(at.shape) if spread.weights is None else spread.weights[chunk]
+        total = np.einsum("hj,hj...->h...", weights, counted)
+        share = np.einsum("hj,hj...->h...", weights, single * counted)
+        found[chunk] = np.where(total > 0.0, share / np.where(total > 0.0, total, 1.0), np.nan)
+    return found
+
+
+def _given_populations(
+    values: np.ndarray, limits: np.ndarray, populations: RatioPopulations, below: bool
+) -> np.ndarray:
+    """Probability that values (n_draws, m, ...) times a ratio of the population of their draw exceed limits."""
+    positive = values > 0.0
+    logs = np.log(np.where(positive, values, 1.0))
+    sd = populations.sd.reshape(-1, *(1,) * (values.ndim - 1))
+    above = np.where(positive, special.ndtr((logs - np.log(limits) + populations.center_at(logs)) / sd), 0.0)
+    return 1.0 - above if below else above

@@ -1,0 +1,89 @@
+r"""Error of a model in the response of a structure, without the noise of the sensors.
+
+A noise whose standard deviation follows the response (`RelativeNoise`, `ModulatedNoise`) has two parts: the noise of
+the sensor, which is no motion of the structure, and the error of the model. Their variances add,
+:math:`\sigma^2 = s^2 + \sigma_m^2`. The likelihood takes both as white. Peaks are sensitive to this: the largest of
+many independent errors adds to each peak, while the errors of a model are motions of a structure and change as slowly
+as its response. A draw of the error of the model therefore has the amplitudes of the spectrum of the response, random
+phases, and the standard deviation :math:`\sigma_m` at each step. A noise with a spectrum of its own (`BandNoise`) keeps
+it. See ``docs/theory/prediction.rst``.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["ModelError", "follows_response", "model_error"]
+
+
+class ModelError(NamedTuple):
+    """Error of the model of every sample; the members that a prediction uses are those of `SampleNoise`.
+
+    Attributes
+    ----------
+    noise : Noise
+        The noise.
+    deviations : ndarray, shape (n, n_noise)
+        Parameters of the noise.
+    dt : float
+        Time step of the responses [s].
+    """
+
+    noise: Any
+    deviations: np.ndarray
+    dt: float
+
+    def of_response(self, parameters: np.ndarray, response: np.ndarray) -> np.ndarray:
+        """Standard deviations (n_channels, n_steps) [SI] of one sample, without the noise of the sensors."""
+        total = self.noise.response_deviations(parameters, response, dt=self.dt)
+        sensor = getattr(self.noise, "sensor", None)
+        if sensor is None:
+            return total
+        return np.sqrt(np.maximum(np.square(total) - np.square(np.array(sensor))[:, None], 0.0))
+
+    def draw(self, sample: int, n_steps: int, rng: np.random.Generator, response: np.ndarray) -> np.ndarray:
+        """Draw the error of one sample, shape (n_channels, n_steps) [SI]."""
+        parameters, normal = self.deviations[sample], rng.standard_normal(response.shape)
+        deviations = self.of_response(parameters, response)
+        if hasattr(self.noise, "response_errors"):  # the noise has a spectrum of its own
+            total = self.noise.response_deviations(parameters, response, dt=self.dt)
+            errors = self.noise.response_errors(parameters, response, normal, dt=self.dt)
+            return errors * np.divide(deviations, total, out=np.zeros_like(total), where=total > 0.0)
+        level = np.sqrt(np.sum(np.square(response), axis=1, keepdims=True))
+        spectrum = np.abs(np.fft.rfft(response, axis=1)) / np.where(level > 0.0, level, 1.0)  # of mean square 1
+        return deviations * np.fft.irfft(spectrum * np.fft.rfft(normal, axis=1), n=n_steps, axis=1)
+
+
+def follows_response(noise: Any) -> bool:
+    """Return whether the standard deviation of a noise is a share of the response, which holds for other motions."""
+    return hasattr(noise, "response_deviations") and getattr(noise, "relative", True)
+
+
+def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
+    """Error of the model of samples of the parameters of a noise.
+
+    Parameters
+    ----------
+    noise : Noise
+        With a method ``response_deviations``, such as `RelativeNoise`, and ``sensor``, the standard deviations of the
+        noise of the sensors, or None.
+    parameters : (n, n_noise) float
+        Parameters of the noise.
+    dt : float
+        Time step of the responses [s].
+
+    Returns
+    -------
+    ModelError
+
+    Raises
+    ------
+    ValueError
+        If the noise does not follow the response: its levels do not tell the error of the model from that of sensors.
+    """
+    if not follows_response(noise):
+        raise ValueError(
+            f'noise="model" needs a noise that follows the response, such as RelativeNoise; {type(noise).__name__} '
+            "does not tell the error of the model from that of the sensors: use noise=True, or ratios="
+        )
+    return ModelError(noise, parameters, dt)

@@ -1,0 +1,270 @@
+"""Exceedance and fragility with the error of the model: closed forms, what is unknown of the events, controls."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.prediction.event_ratios import EventRatios, LevelRatios
+from fe_likelihoods.prediction.fragility import fragility
+from fe_likelihoods.prediction.model_error import model_error
+from fe_likelihoods.prediction.new_event import event_level, event_ratio, predict_new_event
+from fe_likelihoods.prediction.propagation import propagate
+from fe_likelihoods.prediction.quantities import peak, rms
+from fe_likelihoods.prediction.reliability import exceedance
+from fe_likelihoods.probability.distributions import HalfNormal, LogNormal
+from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.noise import GaussianNoise
+from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.relative_noise import RelativeNoise
+from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
+from tests.benchmarks.decisions import fragility_twin
+from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible
+from tests.prediction.test_new_event import SHAPE, Amplified, hierarchy  # noqa: F401  a fixture
+
+LOGS = np.array([0.1, -0.05, 0.2, 0.0])
+RATIOS = EventRatios(np.exp(LOGS))
+T = stats.t(3, LOGS.mean(), LOGS.std(ddof=1) * np.sqrt(1.25))
+
+
+class Wave(FunctionModel):
+    """A sine wave of five periods in a window, whose amplitude is the gain times the peak of the record."""
+
+    def __init__(self, record):
+        super().__init__(self.respond, ["gain"], [Channel("top", "displacement", "m")], record.dt, record.n_steps)
+        self.record, self.path_dependent = record, False
+        time = np.linspace(0.0, 1.0, record.n_steps)
+        self.shape = np.sin(10.0 * np.pi * time) * np.sin(np.pi * time)
+
+    def respond(self, theta):
+        return [theta[0] * np.abs(self.record.acceleration).max() * self.shape]
+
+    def with_record(self, record):
+        return Wave(record)
+
+
+@pytest.fixture
+def wave():
+    return Wave(Record("motion", 0.01, np.linspace(-1.0, 1.0, 500)))
+
+
+def with_noise(model, kind, **options):
+    measured = Measurements(model.channels, model.dt, model.simulate([1.0]))
+    noise = kind.of(measured, **options) if kind is RelativeNoise else kind(model.channels)
+    prior = {"gain": LogNormal(1.0, 0.5), noise.parameter_names[0]: HalfNormal(0.5)}
+    return Posterior(FELikelihood(model, measured, noise), prior)
+
+
+def test_exceedance_with_ratios_is_the_integral_over_samples_and_ratios(rng):
+    values = np.exp(0.3 * rng.standard_normal(500))
+    limits = np.array([0.5, 1.0, 2.0])
+    found = exceedance(values, limits, ratios=RATIOS)
+    single = T.sf(np.log(limits / values[:, None]))
+    np.testing.assert_allclose(found.probability, single.mean(axis=0), rtol=1e-10)
+    np.testing.assert_allclose(found.standard_error, single.std(axis=0) / np.sqrt(500), rtol=1e-10)
+    drawn = values * np.exp(T.rvs(size=500, random_state=1))  # the same by draws
+    assert np.all(np.abs((drawn[:, None] > limits).mean(axis=0) - found.probability) < 4.0 * np.sqrt(0.25 / 500))
+    assert found.uncertainty == (
+        "the uncertainty of the parameters and the error of the model, from the ratios of 4 events"
+    )
+    assert exceedance([-1.0, -2.0], 1.0, ratios=RATIOS).probability == 0.0  # times a positive ratio, it stays negative
+    two = exceedance(np.stack([values, 2.0 * values], axis=1), 1.5, ratios=EventRatios(np.exp([LOGS, LOGS - 0.1]).T))
+    one = exceedance(2.0 * values, 1.5, ratios=EventRatios(np.exp(LOGS - 0.1)))
+    assert two.probability[1] == one.probability and two.lower[1] == one.lower
+
+
+@pytest.mark.parametrize("limit", (0.9, 1.1, 1.5))
+def test_intervals_of_the_probability_cover_the_true_probability(limit, rng):
+    """Exact for one value and ratios of five events; the interval of Clopper and Pearson of one value is of no use."""
+    truth, inside = stats.norm.sf(np.log(limit), 0.1, 0.2), []
+    for _ in range(300):
+        ratios = EventRatios(np.exp(0.1 + 0.2 * rng.standard_normal(5)))
+        found = exceedance(np.ones(50), limit, ratios=ratios, level=0.9)
+        inside.append(found.lower <= truth <= found.upper)
+    assert abs(np.mean(inside) - 0.9) < 4.0 * np.sqrt(0.09 / 300)
+    control = exceedance(np.ones(50), limit, level=0.9)
+    assert not control.lower <= truth <= control.upper
+
+
+def test_exceedance_of_a_new_event_has_the_spread_of_the_population(hierarchy):  # noqa: F811
+    options = {"quantity": peak("top"), "n": 2000, "seed": 1}
+    plain = predict_new_event(hierarchy, Amplified(), 2.0, **options)
+    corrected = predict_new_event(hierarchy, Amplified(), 2.0, ratios=RATIOS, **options)
+    limit = 2.0 * 0.03 * np.abs(SHAPE).max() * 1.2
+    found = exceedance(corrected, limit)
+    draws = np.log(plain.values[:, None] / limit) + T.rvs(size=(1, 4000), random_state=2)
+    assert float(found.probability) == pytest.approx((draws > 0.0).mean(), abs=0.01)
+    assert "their spread between events and the error of the model, from the ratios of 4 events" in found.uncertainty
+    assert found.lower < (corrected.values > limit).mean() < found.upper
+    again = exceedance(plain, limit, ratios=RATIOS)
+    assert again[1:5] == found[1:5]
+    with pytest.warns(UserWarning, match="exceedance: the probabilities leave the error of the model out"):
+        without = exceedance(plain, limit)
+    assert without.uncertainty.endswith("their spread between events, not the error of the model")
+    with pytest.raises(ValueError, match="contains it already"):
+        exceedance(corrected, limit, ratios=RATIOS)
+    # The hyper-parameters of this fixture are known, so that only the error by draws is left.
+    assert without.upper - without.lower < 0.1
+    varied = type(hierarchy)(hierarchy.posterior, hierarchy.samples * np.exp(0.2 * np.sin(np.arange(200)))[:, None])
+    wide = exceedance(predict_new_event(varied, Amplified(), 2.0, **options), limit, noise=False)
+    assert wide.upper - wide.lower > 3.0 * (without.upper - without.lower)
+
+
+def test_weights_of_draws_are_those_of_single_populations(hierarchy):  # noqa: F811
+    varied = type(hierarchy)(hierarchy.posterior, hierarchy.samples * np.exp(0.2 * np.sin(np.arange(200)))[:, None])
+    draws = varied.new_test(4000, rng=1)
+    weights = varied.population_weights(draws, n=50)
+    assert weights.shape == (50, 4000) and np.allclose(weights.sum(axis=1), 1.0)
+    used = np.linspace(0, 199, 50).astype(int)
+    mean = weights @ np.log(draws["gain"])
+    effective = 1.0 / np.square(weights).sum(axis=1)
+    z = (mean - np.log(varied.samples[used, 0])) / (0.25 * np.exp(0.2) / np.sqrt(effective))
+    assert np.abs(z).max() < 4.5 and np.mean(np.square(z)) < 2.0
+    with pytest.raises(ValueError, match="missing share_top"):
+        varied.population_weights({"gain": draws["gain"]})
+
+
+def test_level_ratios_correct_each_draw_at_its_own_level(hierarchy):  # noqa: F811
+    levels = np.array([0.005, 0.01, 0.03, 0.1, 0.3])
+    ratios = LevelRatios((levels / 0.03) ** 0.4 * np.exp([0.01, -0.01, 0.0, 0.01, -0.01]), levels, "linear")
+    options = {"quantity": peak("top"), "n": 500, "seed": 1}
+    plain = predict_new_event(hierarchy, Amplified(), 2.0, **options)
+    corrected = predict_new_event(hierarchy, Amplified(), 2.0, ratios=ratios, **options)
+    expected = plain.values * (plain.values / 0.03) ** 0.4
+    assert np.median(np.abs(np.log(corrected.values / expected))) < 0.03
+    limit = float(np.median(expected))
+    assert float(exceedance(corrected, limit).probability) == pytest.approx(0.5, abs=0.03)
+    with pytest.raises(ValueError, match="expected ratios"):
+        predict_new_event(hierarchy, Amplified(), 2.0, ratios=ratios, quantity=[peak("top"), rms("top")], n=20)
+
+
+def test_event_level_is_what_the_ratio_divides_by(wave):
+    posterior = with_noise(wave, RelativeNoise)
+    samples = np.array([[0.8, 0.1], [1.1, 0.1], [0.9, 0.1]])
+    level = event_level(posterior, samples, peak("top"))
+    assert level == pytest.approx(0.9 * np.abs(wave.shape).max())
+    assert event_ratio(posterior, samples, peak("top")) * level == pytest.approx(np.abs(wave.shape).max())
+
+
+def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_response(wave):
+    noise = RelativeNoise.of(
+        Measurements(wave.channels, wave.dt, wave.simulate([1.0])), window=1.0, sensor={"top": 0.1}
+    )
+    response, rng = wave.simulate([1.0]), np.random.default_rng(1)
+    error = model_error(noise, np.full((1, 1), 0.3), wave.dt)
+    draws = np.stack([error.draw(0, wave.n_steps, rng, response)[0] for _ in range(4000)])
+    expected = np.square(noise.response_deviations([0.3], response, wave.dt)[0]) - 0.1**2  # without that of the sensor
+    assert np.all(expected > 0.0)
+    np.testing.assert_allclose(draws.std(axis=0), np.sqrt(expected), rtol=0.1)
+    powers = np.square(np.abs(np.fft.rfft(draws, axis=1))).mean(axis=0)
+    slow = slice(0, 15)  # the response has five periods
+    assert powers[slow].sum() > 0.98 * powers.sum()
+    assert np.square(np.abs(np.fft.rfft(response[0])))[slow].sum() > 0.99 * wave.n_steps * np.square(response).sum() / 2
+    # White errors add to every peak; those of the model do not add more than their own few peaks do.
+    posterior, samples = with_noise(wave, RelativeNoise), np.tile([1.0, 0.2], (400, 1))
+    plain = np.abs(response).max()
+    medians = {
+        kind: propagate(posterior, samples, quantity=peak("top"), noise=kind, seed=1, progress=False).quantile(0.5)
+        for kind in (True, "model")
+    }
+    assert medians[True] > 1.15 * plain and 0.98 * plain < medians["model"] < 1.06 * plain
+    with pytest.raises(ValueError, match='noise="model" needs a noise that follows the response'):
+        propagate(with_noise(wave, GaussianNoise), samples, quantity=peak("top"), noise="model")
+
+
+def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):
+    posterior = with_noise(wave, RelativeNoise)
+    samples = np.stack([np.exp(0.02 * rng.standard_normal(300)), 0.3 * np.exp(0.05 * rng.standard_normal(300))], axis=1)
+    records = [wave.record.scale(k) for k in (0.7, 0.85, 1.0, 1.15, 1.4)]
+    arguments = (records, peak("top"), float(np.abs(wave.shape).max()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        default = fragility(posterior, samples, *arguments, seed=1, progress=False)
+        named = fragility(posterior, samples, *arguments, noise="model", seed=1, progress=False)
+        parameters = fragility(posterior, samples, *arguments, noise=False, progress=False)
+    np.testing.assert_array_equal(default.probability, named.probability)
+    assert 0.1 < default.curve.dispersion < 0.4
+    assert parameters.probability[[0, 1, 3, 4]].tolist() == [0.0, 0.0, 1.0, 1.0]
+    assert default.uncertainty.endswith("the error of the model, from the noise of the calibration")
+    with pytest.warns(UserWarning, match="fragility: the probabilities leave the error of the model out"):
+        structural = fragility(posterior, samples[:, :1], *arguments, progress=False)
+    np.testing.assert_array_equal(structural.probability, parameters.probability)
+    gaussian = with_noise(wave, GaussianNoise)
+    with pytest.warns(UserWarning, match="ratios=EventRatios"):
+        fragility(gaussian, samples, *arguments, progress=False)
+    with pytest.warns(UserWarning, match="keeps its level in SI units"):
+        far = [wave.record.scale(k) for k in (4.0, 5.0)]
+        fragility(gaussian, samples, far, *arguments[1:], noise=True, progress=False)
+
+
+def test_fragility_with_ratios_is_that_of_the_closed_form(record, rng):
+    samples = rng.normal(0.0, DISPERSION, size=(2000, 1))
+    records = [record.scale(MEDIAN * k) for k in (0.4, 0.7, 1.0, 1.5, 2.5)]
+    certain = EventRatios(np.exp([0.2]), prior_sd=0.3, prior_events=1e8)  # a known spread and an unknown mean
+    options = dict(ratios=certain, level=0.5, seed=1, progress=False)
+    found = fragility(Flexible(record), samples, records, peak("displacement"), 0.1, **options)
+    spread = np.sqrt(DISPERSION**2 + 2.0 * 0.3**2)
+    exact = stats.norm.cdf((np.log([0.4, 0.7, 1.0, 1.5, 2.5]) + 0.2) / spread)
+    assert np.all(np.abs(found.probability - exact) < 4.0 * found.standard_error)
+    assert found.curve.dispersion == pytest.approx(spread, rel=0.05)
+    assert found.curve.median == pytest.approx(MEDIAN * np.exp(-0.2), rel=0.05)
+    # Draws: samples and means of the ratio are unknown, the spread between events is not.
+    z = (np.log(1.5) + 0.2 + np.hypot(DISPERSION, 0.3) * stats.norm.ppf([0.25, 0.75])) / 0.3
+    np.testing.assert_allclose([found.lower[3], found.upper[3]], special.ndtr(z), atol=0.05)
+    lower, upper = found.band(0.9)
+    inside = ((lower <= found.draws) & (found.draws <= upper)).all(axis=1)
+    assert 0.9 <= inside.mean() < 0.92
+    wider = np.quantile(found.draws, [0.05, 0.95], axis=0)
+    assert np.all(lower <= wider[0]) and np.all(upper >= wider[1])
+    single = fragility(Flexible(record), samples, records[2:3], peak("displacement"), 0.1, **options)
+    assert single.probability[0] == pytest.approx(found.probability[2], rel=1e-12)
+    one = exceedance(
+        propagate(Flexible(record), samples, quantity=peak("displacement"), record=records[2], progress=False),
+        0.1,
+        ratios=certain,
+    )
+    assert float(one.probability) == pytest.approx(found.probability[2], rel=1e-12)
+
+
+def test_failures_and_what_cannot_be_used(record, rng):
+    samples = rng.normal(0.0, DISPERSION, size=(200, 1))
+    records = [record.scale(MEDIAN * k) for k in (0.5, 1.0, 2.0)]
+    model = Flexible(record, collapse=0.15)
+    options = dict(ratios=RATIOS, seed=1, progress=False)
+    counted = fragility(model, samples, records, peak("displacement"), 0.1, failures_exceed=True, **options)
+    left_out = fragility(model, samples, records, peak("displacement"), 0.1, **options)
+    assert counted.n_failed[2] > 50 and np.array_equal(counted.n_failed, left_out.n_failed)
+    assert counted.probability[2] > left_out.probability[2] + 0.05 and np.isfinite(counted.draws).all()
+    assert np.isnan(left_out.draws[:, 2]).mean() == pytest.approx(left_out.n_failed[2] / 200, abs=0.01)
+    assert np.all(left_out.lower < left_out.probability) and np.all(left_out.probability < left_out.upper)
+    plain = fragility(Flexible(record), samples, records, peak("displacement"), 0.1, noise=False, progress=False)
+    with pytest.raises(ValueError, match="a band needs what is unknown"):
+        plain.band()
+    with pytest.raises(ValueError, match="level must be between"):
+        counted.band(90)
+    with pytest.raises(ValueError, match="ratios contain the error of the model already"):
+        fragility(model, samples, records, peak("displacement"), 0.1, ratios=RATIOS, noise=True)
+    with pytest.raises(ValueError, match="those of one quantity"):
+        fragility(model, samples, records, peak("displacement"), 0.1, ratios=EventRatios([[1.0, 1.0]] * 2))
+    with pytest.raises(ValueError, match="positive threshold"):
+        fragility(model, samples, records, peak("displacement"), -0.1, ratios=RATIOS)
+    with pytest.raises(ValueError, match="thresholds must be positive"):
+        exceedance([1.0, 2.0], 0.0, ratios=RATIOS)
+    with pytest.raises(ValueError, match=r"ratios \(n_events, ...\) of a quantity of shape \(\)"):
+        exceedance([1.0, 2.0], 1.0, ratios=EventRatios([[1.0, 1.0]] * 2))
+    prediction = propagate(Flexible(record), samples, quantity=peak("displacement"), progress=False)
+    with pytest.raises(ValueError, match="the prediction contains one"):
+        exceedance(replace(prediction, noise=True), 0.1, noise=False)
+
+
+@pytest.mark.slow
+def test_fragility_of_new_events_holds_the_true_curve_and_without_the_error_it_does_not():
+    found = [fragility_twin(5, seed) for seed in range(60)]
+    whole, points, control = (np.array(each) for each in zip(*found, strict=True))
+    assert whole.mean() > 0.9 - 4.0 * np.sqrt(0.09 / 60)
+    assert points.mean() > 0.75
+    assert control.mean() < 0.3 and not control.all(axis=1).any()
