@@ -67,8 +67,8 @@ class ColumnHistory(History):
         fracture, whereas the law of the steel was continued along its tangent. A warning about this is logged once per
         model, also where simulations come from a cache on disk.
     bar_damage : ndarray[n_bars] or None
-        Miner's sum of each bar at the last sample, in the section where it is largest; a bar has fractured above 1. In
-        the order of ``model.section.fibers()[2]``. None without fatigue.
+        Miner's sum of each bar at the last sample, in the section where it is largest; a bar has fractured above 1. The
+        bars are those of ``model.section.fibers()[2]``: two at the same position count as one. None without fatigue.
     """
 
     retries: int
