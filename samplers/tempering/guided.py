@@ -20,7 +20,7 @@ from .budget import Budget
 from .cohorts import Cohort, let_arrive, submit_cohort
 from .guide import AdaptedGuide, GuideSession
 from .population import Density, GuidedRound, GuideTick, Population, Report
-from .rounds import PooledRounds, Round, pool_rounds
+from .rounds import PooledRounds, Round, pool_rounds, tails_are_light
 from .settings import GuidedSettings
 from .stopping import LARGEST_SHAPE, StoppedEarly, usable
 
@@ -38,6 +38,10 @@ __all__ = [
 FEW_DRAWS = 100
 # mean effective sample size of rounds below which the guide is given up
 FEWEST_OF_ROUND = 1.5
+LIGHT_TAILS = (
+    "the weights of the draws grow towards the tails: those of the guide are lighter than those of the posterior, so "
+    "standard deviations may be too small. Give the draws of the guide heavier tails, or use no guide"
+)
 
 
 class Guidance(NamedTuple):
@@ -79,7 +83,7 @@ class RoundsOfGuide(NamedTuple):
     doubt : str
         Why the draws cannot be used; empty if they can.
     shortfall : str
-        What was not reached although the draws can be used; empty if all was.
+        What was not reached although the draws can be used, or that their tails are too light; empty if all was.
     pooled : PooledRounds, or None
         All draws; None if the limit of simulations did not allow one.
     last : Round, or None
@@ -206,7 +210,8 @@ def _outcome(
     """How the rounds end; None if they go on."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
     if enough and trusted(last, settings) and _even(pooled, settings):
-        return RoundsOfGuide("", "", pooled, last)
+        light = tails_are_light([r for r in rounds if trusted(r, settings)])
+        return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, last)
     if doubt := _impossible(rounds) or _hopeless(rounds, settings):
         return RoundsOfGuide(doubt, "", pooled, last)
     if len(rounds) < settings.most_rounds:

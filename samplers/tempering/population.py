@@ -236,7 +236,8 @@ class GuidedStart(NamedTuple):
     doubt : str
         Why the draws of the guide are not used as draws of the posterior; empty if they are.
     shortfall : str
-        What the rounds did not reach although their draws are used; empty if they reached all.
+        What the rounds did not reach although their draws are used, or that the tails of the guide are too light; empty
+        for neither.
     pareto_shape : float
         Pareto shape of the largest weights of all rounds.
     """

@@ -27,7 +27,16 @@ import numpy as np
 from .evidence_check import pareto_shape
 from .weights import effective_sample_size, log_mean_weight, normalised_weights
 
-__all__ = ["PooledRounds", "Round", "pool_rounds", "round_shares", "tail_shape", "tail_variance"]
+__all__ = [
+    "PooledRounds",
+    "Round",
+    "pool_rounds",
+    "round_shares",
+    "tail_growth",
+    "tail_shape",
+    "tail_variance",
+    "tails_are_light",
+]
 
 
 # Pareto shape that is assumed for fewer weights than an estimate needs
@@ -35,6 +44,10 @@ SHAPE_OF_FEW = 0.7
 FEWEST_EFFECTIVE = 5.0
 # part of the sum of all weights by which the largest must exceed the others for their shape to matter
 SMALLEST_EXCESS = 0.05
+# Growth of the weights towards the tails, and its size in standard errors, from which on the tails of a proposal are
+# too light: 0 or less for a proposal with the tails of the posterior, 0.14 to 0.4 for a normal one on a Student t.
+LARGE_GROWTH, SIGNIFICANT = 0.1, 4.0
+FEWEST_FOR_GROWTH = 8
 
 
 class Round(NamedTuple):
@@ -135,6 +148,46 @@ def tail_shape(log_weights: np.ndarray) -> float:
     count = int(min(n / 5.0, 3.0 * np.sqrt(n)))
     excess = float((ordered[-count:] - ordered[-count - 1]).sum())
     return shape if excess >= SMALLEST_EXCESS else 0.0
+
+
+def tail_growth(rounds: Sequence[Round]) -> tuple[float, float]:
+    r"""Slope of the log-weights over minus the log-posterior, among the half of the draws with the lowest posterior.
+
+    Where the posterior :math:`\pi` is in proportion to a power :math:`q^c` of the proposal density, the slope is
+    :math:`(1 - c) / c`: positive for tails of the proposal that are lighter than those of the posterior. No weight
+    need be large for that, since draws of light tails do not reach the places where weights are large. Errors of a
+    proposal, and jumps of a likelihood, do not make the slope positive on average.
+
+    Parameters
+    ----------
+    rounds : sequence of Round
+        Draws of proposals that were fixed before them.
+
+    Returns
+    -------
+    slope, error : float
+        The slope and its standard error, by least squares; (0, inf) for fewer than 16 draws.
+    """
+    log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
+    log_weights = np.concatenate([r.log_weights for r in rounds])
+    possible = np.isfinite(log_weights) & np.isfinite(log_prob)
+    depth, log_weights = -log_prob[possible], log_weights[possible]
+    if len(depth) < 2 * FEWEST_FOR_GROWTH:
+        return 0.0, float("inf")
+    outer = depth >= np.median(depth)
+    depth, log_weights = depth[outer] - depth[outer].mean(), log_weights[outer] - log_weights[outer].mean()
+    squares = float(depth @ depth)
+    if squares == 0.0:
+        return 0.0, float("inf")
+    slope = float(depth @ log_weights) / squares
+    left = log_weights - slope * depth
+    return slope, float(np.sqrt(left @ left / (len(depth) - 2) / squares))
+
+
+def tails_are_light(rounds: Sequence[Round]) -> bool:
+    """Whether the weights of rounds grow significantly towards the tails (`tail_growth`)."""
+    slope, error = tail_growth(rounds)
+    return slope > max(LARGE_GROWTH, SIGNIFICANT * error)
 
 
 def tail_variance(log_weights: np.ndarray) -> float:

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from samplers import SMCSampler
 from tests.contract.targets import Box, Gaussian
@@ -107,6 +108,61 @@ def test_a_share_of_the_prior_finds_a_missing_mode_or_shows_that_something_is_mi
     wrong = np.abs(deviations[:, 0]) > 4.0
     assert not np.any(wrong & (statuses == "converged"))
     assert np.mean(~wrong & (statuses != "not usable")) > 0.5
+
+
+class Student:
+    """Student t in a wide normal prior; a large number of degrees of freedom gives a Gaussian."""
+
+    def __init__(self, ndim, dof):
+        self.ndim, self.law = ndim, stats.multivariate_t(np.zeros(ndim), np.eye(ndim), df=dof)
+        self.mean, self.log_evidence = np.zeros(ndim), 0.0
+        self.variance = dof / (dof - 2.0)
+
+    def log_prior(self, x):
+        return np.sum(stats.norm.logpdf(x, 0.0, 50.0), axis=-1)
+
+    def __call__(self, x):
+        return np.atleast_1d(self.law.logpdf(x))
+
+    def sample_prior(self, n, random):
+        return 50.0 * random.standard_normal((n, self.ndim))
+
+
+class DrawsOf:
+    """A guide that draws from a distribution of scipy and does not learn."""
+
+    concerns = ()
+
+    def __init__(self, law):
+        self.law = law
+
+    def draw(self, n, random):
+        return self.law.rvs(size=n, random_state=random)
+
+    def log_density(self, x):
+        return np.atleast_1d(self.law.logpdf(x))
+
+    def refine(self, coords, log_prob, session):
+        pass
+
+
+@pytest.mark.parametrize(("dof", "ndim", "least"), [(3.0, 2, 0.2), (5.0, 2, 0.8), (5.0, 5, 0.8)])
+def test_tails_of_a_guide_that_are_too_light_are_reported(dof, ndim, least):
+    """A normal guide with half of the variance: the standard deviations are 0.7 to 0.8 of the true ones."""
+    posterior = Student(ndim, dof)
+    guide = DrawsOf(stats.multivariate_normal(np.zeros(ndim), 0.5 * posterior.variance * np.eye(ndim)))
+    _, statuses = outcomes(posterior, guide, 2000, runs=10)
+    assert np.mean(statuses != "converged") >= least
+
+
+@pytest.mark.parametrize(("dof", "guide_dof"), [(1e7, 1e7), (1e7, 5.0), (5.0, 5.0), (4.0, 6.0)])
+def test_tails_of_a_guide_that_are_heavy_enough_are_not_reported(dof, guide_dof):
+    posterior = Student(3, dof)
+    law = stats.multivariate_t(
+        np.zeros(3), posterior.variance * (guide_dof - 2.0) / guide_dof * np.eye(3), df=guide_dof
+    )
+    _, statuses = outcomes(posterior, DrawsOf(law), 2000, runs=10)
+    assert np.all(statuses == "converged")
 
 
 def test_a_heavy_tail_is_not_called_converged():

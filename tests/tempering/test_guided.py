@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from samplers import GuidedSettings, GuideMove, SamplingWarning, SMCSampler, TMCMCSampler
-from samplers.tempering.rounds import Round, pool_rounds, round_shares, tail_shape, tail_variance
+from samplers.tempering.rounds import (
+    Round,
+    pool_rounds,
+    round_shares,
+    tail_growth,
+    tail_shape,
+    tail_variance,
+    tails_are_light,
+)
 from tests.contract.targets import Gaussian
 from tests.tempering.guides import FixedGuide, LearningGuide, SearchingGuide
 
@@ -210,6 +218,22 @@ def test_shares_of_rounds_depend_on_earlier_rounds_only():
     shares = round_shares([30, 60, 60], [0.1, 0.5, 0.9])
     assert np.allclose(shares, np.array([3.0, 6.0, 30.0]) / 39.0)
     assert np.array_equal(round_shares([30, 60, 60], [0.1, 0.5, 0.01]), shares)
+
+
+@pytest.mark.parametrize("variance", [0.5, 0.8, 1.0, 2.0])
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_weights_grow_towards_tails_that_are_too_light(variance, noise, rng):
+    """The posterior is in proportion to a power of the density of the draws: slope 1 / variance - 1, if it is exact."""
+    records = np.zeros(2000, dtype=[("log_prob", float), ("log_prior", float)])
+    x = np.sqrt(variance) * rng.standard_normal((2000, 3))
+    records["log_prob"] = -0.5 * np.sum(x**2, axis=1)
+    # errors of the density of the draws are part of the weights, and cause no slope
+    log_weights = (1.0 - 1.0 / variance) * records["log_prob"] + noise * rng.standard_normal(2000)
+    rounds = [Round(x[:800], records[:800], log_weights[:800]), Round(x[800:], records[800:], log_weights[800:])]
+    slope, error = tail_growth(rounds)
+    assert abs(slope - (1.0 / variance - 1.0)) < 4.0 * error + 1e-9
+    assert tails_are_light(rounds) == (variance < 1.0)
+    assert tail_growth([Round(x[:15], records[:15], log_weights[:15])]) == (0.0, np.inf)
 
 
 @pytest.mark.parametrize("spread", [0.3, 0.7, 1.0])
