@@ -7,6 +7,17 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from fe_likelihoods import (
+    BridgeDeck,
+    FELikelihood,
+    HalfNormal,
+    LinearStructure,
+    Measurements,
+    Posterior,
+    Record,
+    RelativeNoise,
+)
+from fe_likelihoods.models.linear_system import respond_structure
 from samplers import SMCSampler
 from tests.benchmarks import job, new_event, noises, peers, transfer, truth, truth_targets
 from tests.benchmarks.comparison import compare
@@ -212,6 +223,50 @@ def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, mon
     for part in (noises._painter_street, noises._meloland):
         (row,) = part(1)
         assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+
+
+def test_the_amplitude_dependent_posterior_of_one_event_is_that_of_its_linear_model(rng):
+    """Equal likelihoods, and weights with a determinant by differences of the level."""
+    supports = [Record(str(number), 0.02, rng.standard_normal(200)) for number in transfer._INPUTS]
+    model = LinearStructure(BridgeDeck("ch7"), supports)
+    (response,) = model.simulate([4.0, 0.08, 0.7])
+    measured = Measurements(model.channels, 0.02, [response + 0.2 * response.std() * rng.standard_normal(200)])
+    likelihood = FELikelihood(model, measured, RelativeNoise.of(measured))
+    spread = np.exp([0.005, 0.02, 0.01, 0.02] * rng.standard_normal((100, 4)))  # stands for posterior samples
+    posterior = Posterior(likelihood, transfer._PRIOR | {"share_ch7": HalfNormal(1.0)})
+    linear = transfer._Fit(posterior, np.array([4.0, 0.08, 0.7, 0.2]) * spread, 0.0, 0.0)
+    found = transfer._amplitude_dependent(linear, 1)
+    rows = np.arange(0, 100, 20)
+    amplitude, plain = found.posterior.likelihood, linear.posterior.likelihood
+    np.testing.assert_allclose(
+        amplitude.log_likelihood(found.samples[rows]), plain.log_likelihood(linear.samples[rows]), rtol=1e-9
+    )
+    acceleration = np.stack([support.acceleration for support in model.supports])
+
+    def mapped(frequency, damping, share, p, q):
+        system = model.parts.assemble(np.array([frequency, damping, share]))
+        displacement = respond_structure(system, acceleration, 0.02).displacement[0]
+        ratio = np.sqrt((displacement**4).sum() / (displacement**2).sum()) / transfer._REFERENCE
+        return np.array([frequency * ratio ** (p / 2), damping * ratio**-q])
+
+    for row in rows:
+        f, zeta, share, noise = linear.samples[row]
+        p, q = found.samples[row, 3:5]
+        steps = [1e-4 * f, 1e-4 * zeta]
+        columns = [
+            (mapped(f + steps[0], zeta, share, p, q) - mapped(f - steps[0], zeta, share, p, q)) / (2 * steps[0]),
+            (mapped(f, zeta + steps[1], share, p, q) - mapped(f, zeta - steps[1], share, p, q)) / (2 * steps[1]),
+        ]
+        before = linear.posterior.prior.logpdf(linear.samples[row])
+        after = sum(
+            distribution.logpdf(value)
+            for distribution, value in zip(
+                found.posterior.prior.distributions.values(), found.samples[row], strict=True
+            )
+        )
+        powers = sum(prior.logpdf(value) for prior, value in zip(transfer._POWERS.values(), (p, q), strict=True))
+        expected = after - before - powers + np.log(np.linalg.det(columns))
+        assert found.log_weights[row] == pytest.approx(expected, abs=1e-4)
 
 
 def test_hyper_samples_of_the_synthetic_twins_are_those_of_the_posterior():

@@ -33,7 +33,7 @@ from ..simulation.model import SimulationFailed
 from .linear_system import LinearSystem, Parts, complex_modes, superpose
 from .validation import check_positive
 
-__all__ = ["EquivalentLinear", "Settled"]
+__all__ = ["EquivalentLinear", "Settled", "response_level"]
 
 _LARGEST_LOG = math.log(1000.0)  # of a level as a multiple of the reference
 _STEP = 0.5  # of the search for a sign change, in the logarithm of the level
@@ -219,13 +219,11 @@ class EquivalentLinear:
             modes = complex_modes(self._settled(x, theta, reference).system._replace(influence=influence))
             displacement[:] = 0.0
             superpose(modes, modes.shapes[:, :1] @ shape, motion, dt, displacement)
-            largest = np.abs(displacement).max()
-            if not largest < np.inf:
+            level = response_level(displacement[0])
+            if not level < math.inf:
                 raise SimulationFailed(f"the response at {math.exp(x):.3g} times the reference level is not finite")
-            if largest == 0.0:
+            if level == 0.0:
                 return -math.inf
-            squares = np.square(displacement[0] / largest)  # scaled, so that fourth powers do not underflow
-            level = largest * math.sqrt(squares @ squares / squares.sum())
             return math.log(level / self.reference) - x
 
         return reference, excess
@@ -240,6 +238,15 @@ class EquivalentLinear:
                 damping=damping * np.sqrt(stiffness) * reference.damping,
             )
         return Settled(self.reference * math.exp(x), float(stiffness), float(damping), system)
+
+
+def response_level(displacement: np.ndarray) -> float:
+    """Energy-weighted root mean square of a relative displacement (n_steps,) [m]: sqrt(sum u^4 / sum u^2)."""
+    largest = np.abs(displacement).max()
+    if not 0.0 < largest < math.inf:
+        return 0.0 if largest == 0.0 else math.inf
+    squares = np.square(displacement / largest)  # scaled, so that fourth powers do not underflow
+    return float(largest * math.sqrt(squares @ squares / squares.sum()))
 
 
 def _root(excess: Callable[[float], float], one: float, other: float) -> float:
