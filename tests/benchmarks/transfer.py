@@ -14,8 +14,9 @@ middle (channel 7) is predicted. Three ways to predict an event:
 
 The rows are medians over the events (RRMSE, CRPS, interval score and width as multiples of the root mean square of the
 measured channel; coverage of the 90 % band, and of its strong part), the share of measured peaks within their 50 and
-90 % intervals, and the median ratio of the upper end of the 90 % interval of the peak to its middle. The last rows are
-the evidence of the amplitude-dependent model of all events relative to the linear one, and its common parameters.
+90 % intervals, the median ratios of the upper end of the 90 % interval of the peak to its middle and to its lower end,
+and the root mean square error of the logarithm of the peak as a multiple of the stated one. The last rows are the
+evidence of the amplitude-dependent model of all events relative to the linear one, and its common parameters.
 
 The data are no part of this project: set FE_SHARED to a folder with the downloads from https://www.strongmotioncenter.org
 (``*ce89324p.zip``) in ``measured/painter_street_bridge``. Without them one row says so.
@@ -228,8 +229,8 @@ def _population(
     }
     varying = {name: each for name, each in _VARYING.items() if noise or name != _NOISE}
     correlation = 1.0 if len(fits) > 1 else None  # one event does not show correlations
-    posterior = HierarchicalPosterior(tests, varying, common=common, correlation=correlation, max_samples=100)
-    sampler = SMCSampler(150, posterior.ndim, posterior, vectorize=True, seed=seed)
+    posterior = HierarchicalPosterior(tests, varying, common=common, correlation=correlation, max_samples=200)
+    sampler = SMCSampler(300, posterior.ndim, posterior, vectorize=True, seed=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # few particles
         sampler.run_mcmc(None, 1, progress=False)
@@ -306,6 +307,12 @@ def _rows(case: str, seed: int, scored: list[_Scored]) -> list[Row]:
         rows.append(Row(f"peaks within {level:.0%}", case, share_within(pit, level), ""))
     ends = [each.upper[0] / each.median[0] for each in peaks]
     rows.append(Row("upper end / median of the peak", case, median(ends), "", f"{min(ends):.2f} to {max(ends):.2f}"))
+    apart = [each.upper[0] / each.lower[0] for each in peaks]
+    rows.append(Row("upper / lower end of the peak", case, median(apart), "", f"{min(apart):.2f} to {max(apart):.2f}"))
+    errors = [np.log(each.measured[0] / each.median[0]) for each in peaks]
+    stated = np.log(apart) / (2.0 * norm.ppf(0.95))  # standard deviation of a normal distribution with these ends
+    ratio = float(np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stated))))
+    rows.append(Row("error / stated error of the log peak", case, ratio, "", "root mean squares; 1 is right"))
     score = [each.interval_score[0] / each.measured[0] for each in peaks]
     rows.append(Row("interval score / measured peak", case, median(score), "", f"{min(score):.2g} to {max(score):.2g}"))
     return rows
