@@ -255,7 +255,7 @@ def fragility(
                 noise=noise,
                 quantiles=(),
                 seed=seed,
-                **settings,
+                **(settings if k == np.argmax(intensities) else settings | {"calibrated": ()}),  # warned of once
             )
         except SimulationFailed as error:
             if not failures_exceed:

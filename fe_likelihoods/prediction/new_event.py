@@ -151,7 +151,9 @@ def predict_new_event(
     Warns
     -----
     UserWarning
-        As `Hierarchy.new_test`, and if more than 1 % of the draws have an impossible noise.
+        As `Hierarchy.new_test`, and if more than 1 % of the draws have an impossible noise. As `propagate` for peaks
+        outside of the range of all events, if their `StoredPosterior` have their measurements. The residuals of the
+        single calibrations are not checked here.
 
     Examples
     --------
@@ -176,7 +178,8 @@ def predict_new_event(
             )
     parameters, drawn, errors = np.random.SeedSequence(seed).spawn(3)
     draws, weights = draw_new_event(hierarchy, names, n, source.noise if noise else None, parameters)
-    settings = {"progress": False} | options
+    measured = [each.measurements for each in hierarchy.posterior.tests.values() if each.measurements is not None]
+    settings = {"progress": False, "calibrated": measured, "check": False} | options
     prediction = propagate(
         posterior_or_model,
         draws,

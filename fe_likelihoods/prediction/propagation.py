@@ -32,7 +32,7 @@ from tqdm import tqdm
 from ..probability.inputs import as_points
 from ..probability.noise import noise_time_shifts
 from ..probability.time_shift_noise import TimeShiftNoise
-from ..signals.channels import Channel
+from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
 from ..simulation.kept_states import KEPT_STATES
@@ -51,6 +51,7 @@ from .inputs import (
 from .model_error import follows_response
 from .prediction import Prediction
 from .quantities import Quantity, evaluator, measured_quantity
+from .transfer_checks import Peaks, calibration_of, sample_to_check, warn_of_peaks, warn_of_residuals
 
 __all__ = ["check_effective_sample_size", "fit_measures", "propagate"]
 
@@ -78,6 +79,8 @@ def propagate(
     memory_bytes: int | None = 512 * 2**20,
     state_bytes: int | None = 256 * 2**20,
     pool: Any = None,
+    calibrated: Sequence[Measurements] | None = None,
+    check: bool = True,
     seed: int | None = None,
     progress: bool = True,
 ) -> Prediction | dict[str, Prediction]:
@@ -135,6 +138,13 @@ def propagate(
         None: no limit. Models without a method ``simulate_from`` run the whole excitation.
     pool : optional
         Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
+    calibrated : sequence of Measurements, optional
+        Measurements of the events with which the parameters were calibrated, whose amplitudes a prediction under
+        another record is compared with. Default: those of the likelihood. An empty sequence for no comparison.
+    check : bool
+        Whether the residuals of the calibration are compared with the noise, once for each likelihood, where samples
+        of all parameters are given. Under another record this needs one simulation of that of the calibration, which
+        the likelihood counts, or none if it has stored responses.
     seed : int, optional
         Seed of the noise and of the subsample for quantiles. The result depends neither on `batch` nor on `pool`,
         except for round-off.
@@ -159,9 +169,14 @@ def propagate(
     Warns
     -----
     UserWarning
+        If the median of the predicted peak of a channel, under another record, is more than twice the largest measured
+        peak of the calibration, or less than half of the smallest one.
         If histories, or quantities of channels, under another record are predicted with noise in SI units, and their
         level is more than three times that of the measurements of the calibration, or less than a third.
+        Once for each likelihood, if its residuals are correlated and `GaussianNoise`, `SharedGaussianNoise`,
+        `RelativeNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent.
     """
+    known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     source = read_source(posterior_or_model, pool)
     thetas, sample_noise = split_samples(source, samples, noise, record is not None)
@@ -208,11 +223,18 @@ def propagate(
     if batch is None:
         together = source.executor is not None or simulates_in_batches(model)
         batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
+    peaks = Peaks() if record is not None and known else None
+    checked = sample_to_check(source, samples) if check else None
+    own_response = None  # of the checked sample to the excitation of the calibration
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
             responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor)
             for accumulator in accumulators.values():
                 accumulator.add(start, responses, reasons)
+            if checked is not None and record is None and 0 <= (row := row_of_sample[checked] - start) < len(responses):
+                own_response = None if reasons[row] else responses[row].copy()
+            if peaks is not None:
+                peaks.add(responses, reasons, accumulator.members[start : start + batch])
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
     predictions = {
@@ -221,9 +243,14 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
+    if peaks is not None:
+        warn_of_peaks(peaks, model.channels, known)
     if record is not None and noise:
         histories = [each for each in predictions.values() if each.dt is not None]
         _warn_of_level((histories or list(predictions.values()))[0], source)
+    if checked is not None and (record is not None or own_response is not None):
+        point = as_points(samples, (*source.model.parameter_names, *source.noise.parameter_names))[checked]
+        warn_of_residuals(source, point, own_response)
     return predictions if isinstance(quantity, Mapping) else predictions[""]
 
 

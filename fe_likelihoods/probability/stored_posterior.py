@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..signals.channels import Measurements
 from .distributions import TruncatedNormal
 from .inputs import as_points
 from .mixture_prior import MixtureDistribution, fit_mixture
@@ -47,6 +48,8 @@ class StoredPosterior:
     effective_sample_size : float, optional
         Effective number of independent samples, for the statistical errors. Default: the number of distinct samples,
         or for weighted samples the effective sample size of the weights.
+    measurements : Measurements, optional
+        What was measured in the test. `predict_new_event` warns of predictions outside of the range of all tests.
 
     Raises
     ------
@@ -65,6 +68,7 @@ class StoredPosterior:
     log_evidence: float | None = None
     log_evidence_error: float = 0.0
     effective_sample_size: float | None = None
+    measurements: Measurements | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.prior, Prior):
@@ -72,6 +76,8 @@ class StoredPosterior:
                 f"StoredPosterior: prior must be the Prior with which the samples were drawn (posterior.prior); got "
                 f"{self.prior!r}"
             )
+        if self.measurements is not None and not isinstance(self.measurements, Measurements):
+            raise ValueError(f"StoredPosterior: measurements must be Measurements, or None; got {self.measurements!r}")
         points = as_points(self.samples, self.prior.names)
         if points.ndim != 2 or not len(points):
             raise ValueError(f"StoredPosterior: expected samples of shape (n, {self.prior.dim}); got {points.shape}")

@@ -1,0 +1,203 @@
+"""Whether a prediction goes beyond its calibration: other amplitudes than those measured, or a noise that is wrong.
+
+Parameters of structures depend on the amplitude of the response, and noise in SI units does not scale with it. A
+posterior under white noise is too narrow where the residuals are correlated. Both are said as warnings.
+"""
+
+import logging
+import warnings
+import weakref
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..probability.autoregressive_noise import AutoregressiveNoise
+from ..probability.event_noise import find_events
+from ..probability.failures import TooManyFailures
+from ..probability.inputs import as_points
+from ..probability.joint import JointLikelihood
+from ..probability.noise import GaussianNoise, SharedGaussianNoise
+from ..probability.relative_noise import RelativeNoise
+from ..probability.residuals import effective_samples, innovations, residual_checks
+from ..signals.channels import Channel, Measurements
+from ..simulation.faults import ChangedModel
+from ..simulation.verification import StaleCache
+from .inputs import PredictionSource
+
+__all__ = [
+    "Calibrated",
+    "Peaks",
+    "calibration_of",
+    "sample_to_check",
+    "warn_of_peaks",
+    "warn_of_residuals",
+]
+
+logger = logging.getLogger(__name__)
+
+_LARGEST_PEAK_RATIO = 2.0  # of a predicted peak to the largest calibrated one, or of the smallest one to it
+_UNLIKELY = 0.01  # probability of a correlation under white noise, for all channels together
+_WEAK = 0.2  # lag-one correlation that hardly changes intervals, as in `residual_checks`
+_LARGEST_COUNT_RATIO = 2.0  # of independent samples: assumed by the noise, and found
+_OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
+Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
+_CHECKED = weakref.WeakSet()  # likelihoods whose residuals were checked
+
+
+class Peaks:
+    """Peaks of the channels of simulated responses, collected while they are simulated."""
+
+    def __init__(self) -> None:
+        self._peaks: list[np.ndarray] = []
+
+    def add(self, responses: np.ndarray, reasons: Sequence[str], members: Sequence[np.ndarray]) -> None:
+        """Add responses (m, n_channels, n_steps) that did not fail, once for each sample that they stand for."""
+        usable = [j for j, reason in enumerate(reasons) if not reason]
+        if usable:
+            peaks = np.maximum(responses.max(axis=2), -responses.min(axis=2))[usable]
+            self._peaks.append(np.repeat(peaks, [len(members[j]) for j in usable], axis=0))
+
+    def median(self) -> np.ndarray | None:
+        """Median over the samples of the peak of each channel [SI]; None without a response."""
+        return np.median(np.concatenate(self._peaks), axis=0) if self._peaks else None
+
+
+def calibration_of(posterior_or_model: Any) -> Calibrated:
+    """What parameters were calibrated with: of each event, the measured history of each channel [SI].
+
+    Takes a posterior, a likelihood, a sequence of `Measurements`, or a bare model, with which nothing was calibrated.
+    """
+    if isinstance(posterior_or_model, Sequence):
+        return [dict(zip(_names(each), each.values, strict=True)) for each in posterior_or_model]
+    likelihood = getattr(posterior_or_model, "likelihood", posterior_or_model)
+    if isinstance(likelihood, JointLikelihood):
+        return [one for each in likelihood.likelihoods.values() for one in calibration_of(each)]
+    if not (hasattr(likelihood, "measurements") and hasattr(likelihood, "model")):
+        return []
+    events, measured = find_events(likelihood.model), likelihood.measurements
+    parts = [slice(None)]
+    if events is not None and measured.simultaneous and measured.start == 0.0:
+        parts = [slice(round(each.start / measured.dt), round(each.end / measured.dt) + 1) for each in events.windows]
+    return [dict(zip(_names(measured), measured.values[:, part], strict=True)) for part in parts]
+
+
+def _names(measured: Measurements) -> list[str]:
+    return [channel.name for channel in measured.channels]
+
+
+def warn_of_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibrated) -> None:
+    """Warn if the median of the peak of a channel is beyond the peaks of the calibration, by a factor of two."""
+    predicted, far = peaks.median(), []
+    if predicted is None:
+        return
+    for channel, value in zip(channels, predicted, strict=True):
+        measured = [np.abs(history[~np.isnan(history)]).max() for history in _histories(calibrated, channel.name)]
+        if not measured or not max(measured) > 0.0:
+            continue
+        if value > _LARGEST_PEAK_RATIO * max(measured):
+            far.append(f"{channel.name} ({value / max(measured):.2g} times the largest calibrated one)")
+        elif value < min(measured) / _LARGEST_PEAK_RATIO:
+            far.append(f"{channel.name} ({value / min(measured):.2g} times the smallest calibrated one)")
+    if far:
+        warnings.warn(
+            f"the predicted peaks are outside of the range of the calibration by more than a factor of "
+            f"{_LARGEST_PEAK_RATIO:g}: {', '.join(far)}. The parameters were calibrated at other amplitudes; where "
+            "stiffness and damping depend on the amplitude, the prediction is beside the truth, and its spread does "
+            "not show it. Calibrate with events of this amplitude, or let parameters vary between events (Hierarchy)",
+            stacklevel=3,
+        )
+
+
+def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
+    """Index of the sample nearest to the mean, whose residuals are compared with the noise.
+
+    None if there is nothing to check: without a likelihood, for a noise that is not listed in `propagate`, for samples
+    of the structural parameters alone, and after the first check of a likelihood.
+    """
+    kinds = (GaussianNoise, SharedGaussianNoise, RelativeNoise, AutoregressiveNoise)
+    if source.likelihood is None or not isinstance(source.noise, kinds) or source.likelihood in _CHECKED:
+        return None
+    names = (*source.model.parameter_names, *source.noise.parameter_names)
+    if (len(samples) if isinstance(samples, Mapping) else np.shape(samples)[-1]) != len(names):
+        return None
+    points = as_points(samples, names)
+    spread = points.std(axis=0)
+    scaled = (points - points.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0)
+    return int(np.argmin(np.square(scaled).sum(axis=1)))
+
+
+def warn_of_residuals(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> None:
+    """Warn, once for a likelihood, if its residuals contradict the noise with which it was sampled.
+
+    Samples that do not fit, such as draws of the prior, are not judged.
+
+    Parameters
+    ----------
+    source : PredictionSource
+        With a likelihood.
+    point : (ndim,) ndarray
+        A sample of all parameters.
+    response : (n_channels, n_steps) ndarray, or None
+        Its response to the excitation of the calibration [SI]. None: it is taken from the responses that the likelihood
+        has stored, or simulated.
+    """
+    likelihood, noise = source.likelihood, source.noise
+    n_structural = len(source.model.parameter_names)
+    if response is None:
+        response = _response(likelihood, point[:n_structural])
+    if response is None:
+        return
+    residuals, parameters = likelihood.residuals_of(response, point), point[None, n_structural:]
+    channels = source.model.channels
+    if not (np.isfinite(residuals).sum(axis=1) > 1).all() or not np.nanmax(np.abs(residuals), axis=1).all():
+        return
+    stated = noise.standard_deviations(parameters)[0]
+    found = np.sqrt(np.nanmean(np.square(residuals), axis=1))
+    if (np.maximum(found / stated, stated / found) > _OTHER_LEVEL).any():
+        return
+    _CHECKED.add(likelihood)
+    autoregressive = isinstance(noise, AutoregressiveNoise)
+    if autoregressive:
+        residuals = innovations(residuals, noise.lag_one_correlations(parameters)[0])
+    try:
+        checks = residual_checks(residuals)
+    except ValueError:  # no two successive samples of a channel: nothing to check
+        return
+    independent = effective_samples(residuals)
+    assumed = getattr(noise, "effective_samples", None)
+    assumed = checks.n_samples if assumed is None else np.minimum(assumed, checks.n_samples)
+    wrong = (checks.white < _UNLIKELY / len(channels)) & (np.abs(checks.lag_one) > _WEAK)
+    wrong &= np.asarray(assumed) > _LARGEST_COUNT_RATIO * independent
+    if not wrong.any():
+        return
+    names = ", ".join(
+        f"{channel.name} (correlation {lag:.2f} from sample to sample, {count:.0f} samples are worth {worth:.0f})"
+        for channel, lag, count, worth, is_wrong in zip(
+            channels, checks.lag_one, np.broadcast_to(assumed, wrong.shape), independent, wrong, strict=True
+        )
+        if is_wrong
+    )
+    what = "innovations of the calibration are" if autoregressive else "residuals of the calibration are"
+    warnings.warn(
+        f"the {what} not independent, as the noise says they are: {names}. The posterior is too narrow, and so is the "
+        "spread of the predictions between its samples. Calibrate with AutoregressiveNoise or effective_samples=, see "
+        "residual_checks, or predict with the spread between events (predict_new_event). This is said once",
+        stacklevel=3,
+    )
+
+
+def _response(likelihood: Any, theta: np.ndarray) -> np.ndarray | None:
+    """The response of one simulation, which the likelihood counts; None if it fails."""
+    try:
+        batch = likelihood.simulate(theta[None])
+    except (ChangedModel, StaleCache, TooManyFailures) as error:  # of the next sampling, not of this prediction
+        logger.warning("the residuals of the calibration are not checked: %s", error)
+        return None
+    return None if batch.reasons[0] else batch.response[0]
+
+
+def _histories(calibrated: Calibrated, name: str) -> list[np.ndarray]:
+    """The measured histories of a channel that have samples."""
+    found = [each[name] for each in calibrated if name in each]
+    return [history for history in found if np.isfinite(history).any()]

@@ -1,0 +1,196 @@
+"""Warnings of predictions beyond their calibration: on runs that are wrong, and how often on runs that are right."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    FELikelihood,
+    GaussianNoise,
+    HalfNormal,
+    HierarchicalPosterior,
+    Hierarchy,
+    JointLikelihood,
+    LogNormal,
+    Measurements,
+    Posterior,
+    StoredPosterior,
+    Uniform,
+    Varying,
+    peak,
+    predict_new_event,
+    propagate,
+)
+
+TOP = Channel("top", "displacement", "mm")
+N, DT, SIGMA = 600, 0.02, 0.004
+SEEDS = 100
+
+
+class Filter:
+    """Response of a damped oscillation to an excitation (n_steps,), times a gain."""
+
+    parameter_names, channels, dt, n_steps, path_dependent = ("gain",), (TOP,), DT, N, False
+
+    def __init__(self, excitation):
+        self.unit = lfilter([0.01], [1.0, -1.9, 0.98], excitation)
+        self.fingerprint = f"filter {excitation.tobytes().hex()}"
+
+    def simulate(self, theta):
+        return theta[0] * self.unit[None]
+
+    def with_record(self, excitation):
+        return Filter(excitation)
+
+
+def excitation(rng, strength=1.0):
+    return strength * rng.standard_normal(N)
+
+
+def calibrated(rng, *, noise=None, rho=0.0, strength=1.0, n=200):
+    """A posterior of measured data with AR(1) errors, and samples of it (the gain is known up to its error)."""
+    model = Filter(excitation(rng, strength))
+    white = rng.standard_normal(N + 200)
+    errors = SIGMA * strength * lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[200:]
+    values = model.unit + errors
+    measured = Measurements([TOP], DT, values[None])
+    noise = GaussianNoise([TOP]) if noise is None else noise
+    prior = {"gain": LogNormal(1.0, 0.5)} | {"sigma_top": HalfNormal(0.02)}
+    prior |= {"rho_top": Uniform(-0.999, 0.999)} if isinstance(noise, AutoregressiveNoise) else {}
+    posterior = Posterior(FELikelihood(model, measured, noise), prior)
+    gain, power = values @ model.unit / (model.unit @ model.unit), model.unit @ model.unit
+    sd = np.std(values - gain * model.unit)
+    columns = [
+        gain + sd / np.sqrt(power) * rng.standard_normal(n),
+        sd * (1.0 + rng.standard_normal(n) / np.sqrt(2 * N)),
+    ]
+    columns += [rho + 0.01 * rng.standard_normal(n)] if isinstance(noise, AutoregressiveNoise) else []
+    return posterior, np.stack(columns, axis=1)
+
+
+def said(function, *arguments, **options) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        function(*arguments, **options, progress=False)
+    return [str(each.message) for each in caught]
+
+
+def test_peaks_beyond_the_calibration_are_said_whatever_is_predicted(rng):
+    posterior, samples = calibrated(rng)
+    options = {"record": excitation(rng, 5.0), "noise": True, "seed": 1}
+    for quantity in (None, "top", peak("top"), lambda response: response[0, 3]):
+        found = said(propagate, posterior, samples, quantity=quantity, **options)
+        assert sum("predicted peaks are outside" in text for text in found) == 1
+        (text,) = (text for text in found if "predicted peaks" in text)
+        assert "top (" in text and "times the largest calibrated one" in text and "factor of 2" in text
+    (text,) = said(propagate, posterior, samples, record=excitation(rng, 0.1), quantity=peak("top"))
+    assert "times the smallest calibrated one" in text
+    # the ratio that is stated is that of the peaks
+    ratio = float(text.split("top (")[1].split(" times")[0])
+    weaker = propagate(
+        posterior, samples, record=excitation(np.random.default_rng(2), 0.1), check=False, progress=False
+    )
+    measured = np.abs(posterior.likelihood.measurements.values).max()
+    assert ratio == pytest.approx(np.abs(weaker.mean).max() / measured, rel=0.5) and ratio < 0.5
+
+
+def test_the_range_is_that_of_all_calibrated_events(rng):
+    weak, samples = calibrated(rng)
+    strong, _ = calibrated(rng, strength=5.0)
+    record = excitation(rng, 5.0)
+    joint = JointLikelihood({"weak": weak.likelihood, "strong": strong.likelihood})
+    assert said(propagate, weak, samples, record=record)
+    assert not said(propagate, joint, samples, part="weak", record=record)
+    events = [weak.likelihood.measurements, strong.likelihood.measurements]
+    assert not said(propagate, weak, samples, record=record, calibrated=events)
+    assert not said(propagate, weak.likelihood.model, samples[:, :1], record=record)  # nothing is known of a bare model
+    assert said(propagate, weak.likelihood.model, samples[:, :1], record=record, calibrated=events[:1])
+    assert not said(propagate, weak, samples, record=record, calibrated=())
+
+
+def test_a_new_event_is_compared_with_the_events_of_the_hierarchy(rng):
+    events = {name: calibrated(rng, strength=each) for name, each in (("weak", 1.0), ("strong", 4.0))}
+    for stored, expected in ((True, 1), (False, 0)):
+        tests = {
+            name: StoredPosterior(samples, each.prior, measurements=each.likelihood.measurements if stored else None)
+            for name, (each, samples) in events.items()
+        }
+        population = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            hierarchy = Hierarchy(population, [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2))))
+        model = events["weak"][0].likelihood.model
+        for strength, number in ((4.0, 0), (1.0, 0), (12.0, expected), (0.2, expected)):
+            found = said(predict_new_event, hierarchy, model, excitation(rng, strength), quantity=peak("top"), n=50)
+            assert len(found) == number
+    with pytest.raises(ValueError, match="measurements must be Measurements"):
+        StoredPosterior(events["weak"][1], events["weak"][0].prior, measurements=[1.0])
+
+
+def test_correlated_residuals_under_white_noise_are_said_once(rng):
+    posterior, samples = calibrated(rng, rho=0.9)
+    (text,) = said(propagate, posterior, samples, noise=True, seed=1)
+    assert "residuals of the calibration are not independent" in text and "600 samples are worth" in text
+    lag = float(text.split("(correlation ")[1].split()[0])
+    assert lag == pytest.approx(0.9, abs=0.08)
+    assert not said(propagate, posterior, samples, noise=True, seed=1)
+    other, _ = calibrated(np.random.default_rng(5), rho=0.9)
+    assert not said(propagate, other, samples[:, :1])  # nothing is known of the noise
+    assert not said(propagate, other, other.sample_prior(100, 1), noise=True)  # draws of the prior do not fit
+
+
+@pytest.mark.parametrize("kind", ("effective samples", "autoregressive"))
+def test_a_noise_that_knows_of_the_correlation_is_right(kind, rng):
+    noise = AutoregressiveNoise([TOP]) if kind == "autoregressive" else GaussianNoise([TOP], effective_samples=60)
+    posterior, samples = calibrated(rng, rho=0.9, noise=noise)
+    assert not said(propagate, posterior, samples, noise=True, seed=1)
+    if kind == "autoregressive":  # control: a correlation of 0.3 does not explain one of 0.9
+        wrong, _ = calibrated(np.random.default_rng(5), rho=0.9, noise=noise)
+        assert "innovations of the calibration are not independent" in said(propagate, wrong, samples * [1, 1, 0.3])[0]
+
+
+def test_the_check_is_one_simulation_that_is_counted_and_taken_from_the_cache(rng):
+    posterior, samples = calibrated(rng, rho=0.9)
+    record = excitation(rng)
+    assert len(said(propagate, posterior, samples, record=record)) == 1
+    assert posterior.report()["simulations"] == 1
+    propagate(posterior, samples, record=record, progress=False)
+    assert posterior.report()["simulations"] == 1
+    second, samples = calibrated(rng, rho=0.9)
+    second.likelihood.simulate(samples[:, :1])  # as a run that stores responses
+    simulated = second.report()["simulations"]
+    assert len(said(propagate, second, samples, record=record)) == 1
+    assert second.report()["simulations"] == simulated > 100
+    third, samples = calibrated(rng, rho=0.9)
+    assert not said(propagate, third, samples, record=record, check=False)
+    assert third.report()["simulations"] == 0
+
+
+def test_false_alarms_of_100_runs_that_are_right():
+    """Records of the strength of the calibration, white errors: no alarm of the residuals, 1 % have other peaks."""
+    of_residuals, of_peaks = 0, 0
+    for seed in range(SEEDS):
+        rng = np.random.default_rng([7, seed])
+        posterior, samples = calibrated(rng, n=50)
+        record = excitation(rng)
+        found = " ".join(said(propagate, posterior, samples, record=record, noise=True, seed=seed))
+        of_residuals += "not independent" in found
+        of_peaks += "predicted peaks" in found
+        ratio = np.abs(Filter(record).unit).max() / np.abs(posterior.likelihood.measurements.values).max()
+        assert ("predicted peaks" in found) == (abs(np.log(ratio)) > np.log(2.0))
+    assert of_residuals == 0 and of_peaks <= 3
+
+
+def test_missed_alarms_of_100_runs_that_are_wrong():
+    """Three times the strength, and errors with a correlation of 0.8."""
+    missed = np.zeros(2)
+    for seed in range(SEEDS):
+        rng = np.random.default_rng([8, seed])
+        posterior, samples = calibrated(rng, rho=0.8, n=50)
+        found = " ".join(said(propagate, posterior, samples, record=excitation(rng, 3.0), noise=True, seed=seed))
+        missed += [each not in found for each in ("predicted peaks are outside", "not independent")]
+    assert missed[0] <= 10 and missed[1] <= 5
