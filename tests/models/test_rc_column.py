@@ -12,12 +12,14 @@ import pytest
 from scipy import optimize, stats
 
 from fe_likelihoods import (
+    BarBuckling,
     Bars,
     Concrete,
     DisplacementHistory,
     FELikelihood,
     HalfNormal,
     Hoops,
+    LowCycleFatigue,
     Measurements,
     Patches,
     Posterior,
@@ -277,6 +279,8 @@ CHANGED = dict(  # another value of every argument; `loading`, `units` and `outp
     mass=2.2e5,
     axial_load=2.2e6,
     rotational_inertia=1e5,
+    fatigue=LowCycleFatigue(),
+    buckling=BarBuckling(slenderness=12.0),
     vertical_mass=False,
     a0=0.8,
     a1=0.0003,
@@ -358,6 +362,10 @@ def test_parameters_are_multiples_of_nominal_values(strong, pushed, name):
     places |= {"fy": ("steel", "fy"), "fu": ("steel", "fu"), "Esh": ("steel", "esh")}
     base = RCColumn.lhpost(strong) if name in ("a0", "a1", "mass") else replace(pushed, loading=cycles(0.05, 0.3))
     base = replace(base, penetration=0.2)
+    failing = {"Cf": ("fatigue", "cf"), "Cd": ("fatigue", "cd"), "slenderness": ("buckling", "slenderness")}
+    if name in failing:
+        base = replace(base, fatigue=LowCycleFatigue(), buckling=BarBuckling(slenderness=10.0))
+    places |= failing
     if name in places:
         group, key = places[name]
         other = varied(base, group, {key: factor * getattr(getattr(base, group), key)})
