@@ -39,6 +39,7 @@ from fe_likelihoods import (
     peak,
     plot_bands,
     plot_fit,
+    plot_scores,
     problems,
     propagate,
     to_si,
@@ -232,8 +233,11 @@ save(plot_fit(measured, {title: model.simulate(values) for title, values in thet
 # -------------
 #
 # Every sample is one oscillator that is consistent with the data. Together, the samples give a band at each time; with
-# the noise of the sensors included, the 90 % band should contain 90 % of the measured samples. The same samples predict
-# the response to an earthquake that was not used in the update: here the peak displacement and its uncertainty.
+# the noise of the sensors included, the 90 % band should contain 90 % of the measured samples. A band that is too wide
+# contains more, so the share alone shows little: the interval score is the width of the band plus a penalty for every
+# sample outside of it, and the CRPS compares the whole distribution with the measured value; smaller is better. The same
+# samples predict the response to an earthquake that was not used in the update: here the peak displacement and its
+# uncertainty.
 
 draws = samples["SMC"][:: max(1, len(samples["SMC"]) // 400)]
 band = propagate(posterior, draws, noise=True, seed=args.seed, progress=False)
@@ -241,12 +245,12 @@ figure = plot_bands(band, measured)
 for axes in figure.axes:
     axes.set_xlim(4.0, 14.0)
 save(figure, "prediction")
-covered = band.coverage(measured)
+scores = band.score(measured)
 another = problems.isolated_bridge_data().record
 future = propagate(posterior, draws, quantity=peak("displacement"), record=another, progress=False)
 low, middle, high = (float(from_si(future.quantile(p), "cm")) for p in (0.05, 0.5, 0.95))
-shares = (f"{channel.name} {100 * s:.1f} %" for channel, s in zip(band.channels, covered, strict=True))
-print(f"measured samples inside the 90 % band: {', '.join(shares)}")
+print(scores)
+save(plot_scores(scores), "scores")
 print(f"peak displacement under {another.name!r}: median {middle:.2f} cm, 90 % interval {low:.2f} to {high:.2f} cm")
 at_nominal = from_si(np.abs(model.with_record(another).simulate([1.0, 1.0])[1]).max(), "cm")
 print(f"peak displacement at the nominal values: {at_nominal:.2f} cm")
@@ -260,7 +264,8 @@ result = {
     "grid": exact.tolist(),
     "log_evidence_grid": log_evidence,
     "peak_displacement_cm": [low, middle, high],
-    "coverage": covered.tolist(),
+    "coverage": scores.coverage.tolist(),
+    "interval_score": (scores.interval_score / scores.rms).tolist(),
     "samplers": {
         name: {
             "mean": x.mean(axis=0).tolist(),

@@ -281,7 +281,10 @@ def prediction_rows(
     noise: str,
     predictions: dict[str, tuple[Measurements, Prediction, Prediction]],
 ) -> list[dict]:
-    """RRMSE and coverage per channel, over all samples and over the strong motion (5 to 95 % of the sum of squares)."""
+    """Errors, coverage and scores per channel; strong motion is between 5 and 95 % of the sum of squares.
+
+    Interval score, CRPS and width of the band with noise are multiples of the root mean square of the channel.
+    """
     rows = []
     for name, (measured, total, response) in predictions.items():
         for k, channel in enumerate(measured.channels):
@@ -295,6 +298,10 @@ def prediction_rows(
             row["rrmse"] = float(response.rrmse(measured)[k])
             row["coverage"] = float(total.coverage(measured)[k])
             row["coverage_strong"] = float(total.coverage(measured, part=strong)[k])
+            scores = total.score(measured)
+            row["interval_score"], row["crps"], row["width"] = (
+                float(getattr(scores, what)[k] / scores.rms[k]) for what in ("interval_score", "crps", "width")
+            )
             row["coverage_response"] = float(response.coverage(measured)[k])
             rows.append(row)
     return rows
@@ -354,12 +361,14 @@ def study(name: str, args: argparse.Namespace) -> dict:
     heads = "".join(
         f"{head:>15}"
         for head in ("RRMSE", "RRMSE of end", "delay [ms]", "in 90 % band", "strong motion", "response only")
+        + ("score / RMS", "CRPS / RMS", "width / RMS")
     )
     print(f"{'noise':<8}{'case':<20}{'channel':<8}{heads}")
     for row in rows:
         numbers = [100 * row["rrmse"], 100 * row["rrmse_of_the_end"], 1e3 * row["delay"]]
         numbers += [100 * row[what] for what in ("coverage", "coverage_strong", "coverage_response")]
         cells = "".join(f"{number:>15.1f}" for number in numbers)
+        cells += "".join(f"{row[what]:>15.3f}" for what in ("interval_score", "crps", "width"))
         print(f"{row['noise']:<8}{row['case']:<20}{row['channel']:<8}{cells}")
     names = white.posterior.parameter_names[:3]
     return {

@@ -148,11 +148,12 @@ print(table)
 #
 # ``from_state="end"`` starts a new record from the state after the events of the calibration, ``"virgin"`` from an
 # uncracked column. With ``noise=True`` the predictions can be compared with measurements: a band from 5 to 95 %
-# should hold 90 % of the samples.
+# should hold 90 % of the samples. The interval score, the width of the band plus a penalty for every sample outside of it,
+# is given in multiples of the root mean square of the channel: a wide band that holds all samples has a large one.
 
 
 def predict(name: str, state: str) -> dict[str, tuple]:
-    """Coverage and error of every event after those of a calibration: per channel, and the prediction itself."""
+    """Coverage, error and interval score of every event after those of a calibration, and the prediction itself."""
     posterior, samples = posteriors[name]
     done = len(posterior.likelihood.model.loading.names)
     chosen = samples[:: max(1, len(samples) // PREDICTED)]
@@ -164,22 +165,24 @@ def predict(name: str, state: str) -> dict[str, tuple]:
         prediction = propagate(posterior, chosen, record=later, from_state="end", rest=PAUSE, **options)
         for window in later.windows:
             where = {"part": window.samples}
-            found[window.name] = (prediction.coverage(joined, **where), prediction.rrmse(joined, **where), prediction)
+            found[window.name] = (prediction.score(joined, **where), prediction)
     else:
         for each, record in zip(events.names[done:], events.records[done:], strict=True):
             prediction = propagate(posterior, chosen, record=record, from_state="virgin", **options)
-            found[each] = (prediction.coverage(measured[each]), prediction.rrmse(measured[each]), prediction)
+            found[each] = (prediction.score(measured[each]), prediction)
     return found
 
 
 predictions = {(name, state): predict(name, state) for name in posteriors for state in ("virgin", "end")}
 rows = [
     f"{'calibrated with':<16}{'state':<8}{'event':<7}{'coverage of 90 % (acc., disp.)':>32}{'RRMSE (acc., disp.)':>24}"
+    f"{'interval score / RMS':>24}"
 ]
 for (name, state), found in predictions.items():
-    for event, (coverage, error, _) in found.items():
-        cells = [f"{100 * a:.0f} %, {100 * d:.0f} %" for a, d in (coverage, error)]
-        rows.append(f"{name:<16}{state:<8}{event:<7}{cells[0]:>32}{cells[1]:>24}")
+    for event, (marks, _) in found.items():
+        cells = [f"{100 * a:.0f} %, {100 * d:.0f} %" for a, d in (marks.coverage, marks.rrmse)]
+        relative = ", ".join(f"{each:.2f}" for each in marks.interval_score / marks.rms)
+        rows.append(f"{name:<16}{state:<8}{event:<7}{cells[0]:>32}{cells[1]:>24}{relative:>24}")
 comparison = "\n".join(rows)
 print(comparison)
 
@@ -194,14 +197,14 @@ shown = {
 }
 instants = measured["EQ4"].time
 for axes, (title, key) in zip(panels, shown.items(), strict=True):
-    coverage, error, prediction = predictions[key]["EQ4"]
+    marks, prediction = predictions[key]["EQ4"]
     last = slice(-len(instants), None)
     row = [channel.name for channel in prediction.channels].index("displacement")
     low, high = (from_si(prediction.quantile(p)[row, last], "in") for p in (0.05, 0.95))
     axes.fill_between(instants, low, high, color="#1f5a8c", alpha=0.35, linewidth=0, label="90 % band")
     values = from_si(measured["EQ4"].channel("displacement"), "in")
     axes.plot(instants, values, color="#d9822b", linewidth=0.9, label="measured")
-    axes.set_title(f"{title}: {100 * coverage[1]:.0f} % of the samples in the band", fontsize=10)
+    axes.set_title(f"{title}: {100 * marks.coverage[1]:.0f} % of the samples in the band", fontsize=10)
     axes.set_ylabel("displacement [in]")
 panels[0].legend(loc="upper right", ncols=2)
 panels[-1].set_xlabel("time in EQ4 [s]")
@@ -258,12 +261,12 @@ result = {
     "mean": {name: x[:, : len(PARAMETERS)].mean(axis=0).tolist() for name, (_, x) in posteriors.items()},
     "sd": {name: x[:, : len(PARAMETERS)].std(axis=0).tolist() for name, (_, x) in posteriors.items()},
     "coverage": {
-        f"{name}, {state}, {event}": values[0].tolist()
+        f"{name}, {state}, {event}": values[0].coverage.tolist()
         for (name, state), found in predictions.items()
         for event, values in found.items()
     },
     "rrmse": {
-        f"{name}, {state}, {event}": values[1].tolist()
+        f"{name}, {state}, {event}": values[0].rrmse.tolist()
         for (name, state), found in predictions.items()
         for event, values in found.items()
     },

@@ -251,15 +251,25 @@ class _CachedResponses:
 def prediction_row(
     predictions: Mapping[str, tuple[Prediction, Prediction]], nominal: np.ndarray, measured: np.ndarray, part: slice
 ) -> tuple[dict[str, str], dict]:
-    """RRMSE and coverage in a part of the history, as a row of a table and as numbers."""
+    """Errors, coverage and interval score in a part of the history, as a row of a table and as numbers.
+
+    Interval score, CRPS and width are those of the 90 % band with noise, as multiples of the root mean square of the
+    measured part.
+    """
     before = float(rrmse(nominal[part], measured[part]))
     row, numbers = {"RRMSE nominal": f"{100 * before:.1f} %"}, {"nominal": before}
     for name, (alone, noisy) in predictions.items():
         data = Measurements(alone.channels, alone.dt, measured[None])
         error = float(alone.rrmse(data, part)[0])
         inside = [float(prediction.coverage(data, part=part)[0]) for prediction in (alone, noisy)]
-        row[f"{name}: RRMSE, in bands"] = f"{100 * error:.1f} %, {100 * inside[0]:.0f} and {100 * inside[1]:.0f} %"
-        numbers[name] = {"rrmse": error, "coverage_response": inside[0], "coverage": inside[1]}
+        scores = noisy.score(data, part=part)
+        relative = {
+            what: float(getattr(scores, what)[0] / scores.rms[0]) for what in ("interval_score", "crps", "width")
+        }
+        row[f"{name}: RRMSE, in bands, score"] = (
+            f"{100 * error:.1f} %, {100 * inside[0]:.0f} and {100 * inside[1]:.0f} %, {relative['interval_score']:.2f}"
+        )
+        numbers[name] = {"rrmse": error, "coverage_response": inside[0], "coverage": inside[1]} | relative
     return row, numbers
 
 

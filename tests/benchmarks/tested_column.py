@@ -5,6 +5,7 @@ The data are those that the tutorial names, in the folder ``measured/rc_column_c
 """
 
 import csv
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,7 +31,16 @@ from fe_likelihoods import (
 
 from .targets import SHARED
 
-__all__ = ["autoregressive", "missing", "start", "white"]
+__all__ = [
+    "Specimen",
+    "autoregressive",
+    "failure",
+    "first_half",
+    "missing",
+    "specimen",
+    "start",
+    "white",
+]
 
 FOLDER = SHARED / "measured" / "rc_column_cyclic"
 HISTORY, PROPERTIES = "2017_Lehman_415.csv", "properties_circular_columns.csv"
@@ -48,23 +58,59 @@ PRIOR = {
 }
 
 
-def _model_and_data() -> tuple[RCColumn, Measurements]:
+class Specimen(NamedTuple):
+    """A tested column at the kept samples: model and data of the whole test, and the samples of its parts.
+
+    Attributes
+    ----------
+    name : str
+        Name of the specimen.
+    model : RCColumn
+        Model under the imposed displacements.
+    measured : Measurements
+        Lateral force [N].
+    parts : dict of str to slice
+        "first half" and "second half", which ends where the column fails (`failure`).
+    """
+
+    name: str
+    model: RCColumn
+    measured: Measurements
+    parts: dict[str, slice]
+
+
+def failure(displacement: np.ndarray, force: np.ndarray) -> int:
+    """First sample of the first excursion to the largest displacement so far with less than 80 % of the peak force."""
+    ends = [0, *(np.flatnonzero(np.diff(np.sign(displacement)) != 0) + 1), len(displacement)]
+    reached = 0.0
+    for start, stop in zip(ends[:-1], ends[1:], strict=True):
+        largest = np.abs(displacement[start:stop]).max()
+        if largest > 0.97 * reached and reached > 0.01 * np.abs(displacement).max():
+            if np.abs(force[start:stop]).max() < 0.8 * np.abs(force).max() and start > np.argmax(np.abs(force)):
+                return start
+        reached = max(reached, largest)
+    return len(displacement)
+
+
+def specimen(test: str, history: str, every: int = EVERY) -> Specimen:
+    """Read a test: its name in the table of properties, and the file of its history; one sample in `every` is kept."""
     with (FOLDER / PROPERTIES).open() as rows:
-        row = next(row for row in csv.DictReader(rows) if row["Test"] == "Lehman_415")
+        row = next(row for row in csv.DictReader(rows) if row["Test"] == test)
     v = {key: float(value) for key, value in row.items() if key != "Test"}
 
     def si(key: str, unit: str) -> float:
         return to_si(abs(v[f"{key} ({unit})"]), unit).item()
 
     channel = Channel("force", "lateral force", "kip")
-    test = read_imposed_test(FOLDER / HISTORY, "disp_in", [channel], ["force_kip"])
-    displacement, force = test.history.displacement, test.measurements.values[0]
+    data = read_imposed_test(FOLDER / history, "disp_in", [channel], ["force_kip"])
+    displacement, force = data.history.displacement, data.measurements.values[0]
     moves = np.flatnonzero(np.diff(displacement))
     turns = moves[1:][np.diff(np.sign(np.diff(displacement)[moves])) != 0]
-    kept = np.unique(np.concatenate([np.arange(0, len(displacement), EVERY), turns, [len(displacement) - 1]]))
-    kept = kept[: np.searchsorted(kept, len(displacement) // 2)]  # the first half
+    kept = np.unique(np.concatenate([np.arange(0, len(displacement), every), turns, [len(displacement) - 1]]))
+    half, failed = np.searchsorted(kept, [len(displacement) // 2, failure(displacement, force)]).tolist()
+    name = test.replace("_", " ")
     model = RCColumn(
-        loading=DisplacementHistory("Lehman 415, first half", displacement[kept], HISTORY),
+        loading=DisplacementHistory(name, displacement[kept], history),
         diameter=si("D", "in"),
         height=si("L", "in"),
         cover=si("c", "in"),
@@ -80,7 +126,20 @@ def _model_and_data() -> tuple[RCColumn, Measurements]:
         max_increment=si("L", "in") / 200.0,
         units=(("force", "kip"),),
     )
-    return model, Measurements(model.channels, model.dt, force[None, kept], "Lehman 415, first half")
+    parts = {"first half": slice(0, half), "second half": slice(half, failed)}
+    return Specimen(name, model, Measurements(model.channels, model.dt, force[None, kept], name), parts)
+
+
+def first_half(tested: Specimen) -> tuple[RCColumn, Measurements]:
+    """Model and data of the first half of a test."""
+    part = tested.parts["first half"]
+    history = DisplacementHistory(f"{tested.name}, first half", tested.model.loading.displacement[part], HISTORY)
+    model = tested.model.with_record(history)
+    return model, Measurements(model.channels, model.dt, tested.measured.values[:, part], history.name)
+
+
+def _model_and_data() -> tuple[RCColumn, Measurements]:
+    return first_half(specimen("Lehman_415", HISTORY))
 
 
 def white(seed: int) -> Posterior:
