@@ -235,8 +235,8 @@ save(plot_fit(measured, {title: model.simulate(values) for title, values in thet
 # Every sample is one oscillator that is consistent with the data. Together, the samples give a band at each time; with
 # the noise of the sensors included, the 90 % band should contain 90 % of the measured samples. A band that is too wide
 # contains more, so the share alone shows little: the interval score is the width of the band plus a penalty for every
-# sample outside of it, and the CRPS compares the whole distribution with the measured value; smaller is better. The same
-# samples predict the response to an earthquake that was not used in the update: here the peak displacement and its
+# sample outside of it, and the CRPS compares the whole distribution with the measured value; smaller is better.
+# The same samples predict the response to an earthquake that was not used in the update: here the peak displacement and its
 # uncertainty.
 
 draws = samples["SMC"][:: max(1, len(samples["SMC"]) // 400)]

@@ -311,7 +311,8 @@ for shaking, stem in (("shaking 1", "calibration"), ("shaking 3", "prediction"))
 #   response alone, the uncertainty of the parameters, contains 3 to 15 % of the samples with white noise and 36 to 65 %
 #   with n_eff.
 #   With white noise and a roof like the floors, the interval scores of the bands in the later shakings are 0.55 to 1.6
-#   times the root mean square of the channel, their widths 0.48 to 0.72 (``python -m tests.benchmarks transfer_frame``).
+#   times the root mean square of the channel, their widths 0.48 to 0.72
+#   (``python -m tests.benchmarks transfer_frame``).
 # * **Limits.** The frame is not linear: its frequency is 3.80 Hz at small and 3.68 Hz at large amplitudes, and the
 #   model has one frequency. Three shakings with one motion say nothing about another motion.
 

@@ -148,7 +148,7 @@ print(table)
 #
 # ``from_state="end"`` starts a new record from the state after the events of the calibration, ``"virgin"`` from an
 # uncracked column. With ``noise=True`` the predictions can be compared with measurements: a band from 5 to 95 %
-# should hold 90 % of the samples. The interval score, the width of the band plus a penalty for every sample outside of it,
+# should hold 90 % of the samples. The interval score, the width of the band plus a penalty for every sample outside,
 # is given in multiples of the root mean square of the channel: a wide band that holds all samples has a large one.
 
 
