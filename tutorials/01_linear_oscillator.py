@@ -236,8 +236,8 @@ save(plot_fit(measured, {title: model.simulate(values) for title, values in thet
 # the noise of the sensors included, the 90 % band should contain 90 % of the measured samples. A band that is too wide
 # contains more, so the share alone shows little: the interval score is the width of the band plus a penalty for every
 # sample outside of it, and the CRPS compares the whole distribution with the measured value; smaller is better.
-# The same samples predict the response to an earthquake that was not used in the update: here the peak displacement and its
-# uncertainty.
+# The same samples predict the response to an earthquake that was not used in the update: here the peak displacement and
+# its uncertainty.
 
 draws = samples["SMC"][:: max(1, len(samples["SMC"]) // 400)]
 band = propagate(posterior, draws, noise=True, seed=args.seed, progress=False)
