@@ -127,7 +127,7 @@ def responses() -> Results:
         )
     white = noises()["white"]
     checks = residual_checks(white.likelihood.residuals([1.1, 0.8]))
-    found["residual checks"] = np.concatenate([np.ravel(np.asarray(value, dtype=float)) for value in checks])
+    found["residual checks"] = np.concatenate([np.ravel(np.asarray(value, dtype=float)) for value in checks[:7]])
     return found
 
 

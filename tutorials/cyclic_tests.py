@@ -177,11 +177,12 @@ def _plot_residuals(fit: Fit, name: str, scale: float, unit: str) -> tuple[Figur
     """Figure, checks and a sentence: residuals at the posterior mean, or under AR(1) their innovations."""
     mean, likelihood = fit.samples.mean(axis=0), fit.posterior.likelihood
     shown, title = likelihood.residuals(mean), f"residuals of the fit with {name} errors"
-    if name == "AR(1)":
+    whitened = name == "AR(1)"
+    if whitened:
         shown = innovations(shown, mean[-1:])
         title = f"innovations of the residuals of the fit with AR(1) errors, rho {mean[-1]:.2f}"
-    checks = residual_checks(shown)
-    figure = plot_residuals(shown, likelihood.model.channels, 1.0)
+    checks = residual_checks(shown, whitened=whitened)
+    figure = plot_residuals(shown, likelihood.model.channels, 1.0, whitened=whitened)
     figure.suptitle(title, fontsize="small")
     for axes, label in zip(figure.axes, ("sample", "lag [samples]", "quantile of a normal [-]"), strict=True):
         axes.set_xlabel(label)

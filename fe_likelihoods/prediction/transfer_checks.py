@@ -179,9 +179,10 @@ def warn_of_residuals(source: PredictionSource, point: np.ndarray, response: np.
         if is_wrong
     )
     what = "innovations of the calibration are" if autoregressive else "residuals of the calibration are"
+    other = "fewer samples, BandNoise" if autoregressive else "AutoregressiveNoise"
     warnings.warn(
         f"the {what} not independent, as the noise says they are: {names}. The posterior is too narrow, and so is the "
-        "spread of the predictions between its samples. Calibrate with AutoregressiveNoise or effective_samples=, see "
+        f"spread of the predictions between its samples. Calibrate with {other} or effective_samples=, see "
         "residual_checks, or predict with the spread between events (predict_new_event). This is said once",
         stacklevel=3,
     )

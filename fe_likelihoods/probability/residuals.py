@@ -61,6 +61,8 @@ class ResidualChecks(NamedTuple):
         Number of samples that are there.
     channels : tuple of Channel
         The channels, for names and units of the table; empty if they were not given.
+    whitened : bool
+        Whether a noise model with correlation was already applied, so that the advice must not be to use one.
     """
 
     mean: np.ndarray
@@ -71,6 +73,7 @@ class ResidualChecks(NamedTuple):
     normal: np.ndarray
     n_samples: np.ndarray
     channels: tuple[Channel, ...] = ()
+    whitened: bool = False
 
     def __str__(self) -> str:
         names, units = [f"channel {i}" for i in range(len(self.mean))], [("SI", 1.0)] * len(self.mean)
@@ -89,10 +92,10 @@ class ResidualChecks(NamedTuple):
     @property
     def sentences(self) -> tuple[str, ...]:
         """What the checks of each channel say, and what to do, in words."""
-        return tuple(_sentence(*numbers) for numbers in zip(*self[2:7], strict=True))
+        return tuple(_sentence(*numbers, self.whitened) for numbers in zip(*self[2:7], strict=True))
 
 
-def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n_samples: int) -> str:
+def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n_samples: int, whitened: bool) -> str:
     """The verdict on one channel."""
     if n_samples < _FEWEST:
         return f"Not checked: {n_samples:.0f} samples are too few, {_FEWEST} are needed."
@@ -100,6 +103,12 @@ def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n
         found = ["White: no correlation from sample to sample was found."]
     elif abs(lag_one) < _WEAK:
         found = [f"Nearly white: the correlation from sample to sample, {lag_one:.2f}, changes intervals little."]
+    elif whitened:
+        found = [
+            f"Not white: correlation {lag_one:.2f} from sample to sample is left. The errors have another correlation "
+            "than that of the noise, and intervals may be wrong: use fewer samples until this check passes, BandNoise, "
+            "or GaussianNoise(effective_samples=...)."
+        ]
     else:
         found = [
             f"Not white: correlation {lag_one:.2f} from sample to sample. {n_samples:.0f} samples are worth "
@@ -300,7 +309,9 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     return (residuals[:, 1:] - rho[:, None] * residuals[:, :-1]) / np.sqrt(1.0 - rho[:, None] ** 2)
 
 
-def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> ResidualChecks:
+def residual_checks(
+    residuals: np.ndarray, channels: Sequence[Channel] = (), *, whitened: bool = False
+) -> ResidualChecks:
     """Compare residuals with Gaussian white noise.
 
     Parameters
@@ -310,6 +321,9 @@ def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> 
         missing.
     channels : sequence of Channel, optional
         The channels, one per row: their names and display units are those of the printed table.
+    whitened : bool
+        True if the rows are what a noise with correlation does not predict: `innovations` of `AutoregressiveNoise`, or
+        the result of ``BandNoise.whitened``. The numbers are the same, the sentences advise otherwise.
 
     Returns
     -------
@@ -361,10 +375,13 @@ def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> 
         normal=stats.chi2.sf(score, 2),
         n_samples=(~missing).sum(axis=1),
         channels=tuple(channels),
+        whitened=whitened,
     )
 
 
-def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float) -> "Figure":
+def plot_residuals(
+    residuals: np.ndarray, channels: Sequence[Channel], dt: float, *, whitened: bool = False
+) -> "Figure":
     """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
 
     The shaded band holds 95 % of the autocorrelation coefficients of white residuals. The quantiles of normal
@@ -378,6 +395,8 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
         The channels, one per row of `residuals`.
     dt : float
         Time step [s].
+    whitened : bool
+        See `residual_checks`.
 
     Returns
     -------
@@ -393,7 +412,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     from ..plots.histories import plot_residual_checks
 
     known = channels if len(channels) == len(residuals) else ()
-    checks = residual_checks(residuals, known)
+    checks = residual_checks(residuals, known, whitened=whitened)
     return plot_residual_checks(residuals, channels, dt, checks, autocorrelation(residuals))
 
 

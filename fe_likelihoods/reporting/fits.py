@@ -217,7 +217,7 @@ def _channel_fit(
         try:
             if noise == "autoregressive":
                 left = innovations(left, np.array([values[f"rho_{channel.name}"]]))
-            checks = residual_checks(left)
+            checks = residual_checks(left, whitened=noise in ("autoregressive", "bands"))
         except (ValueError, KeyError):  # too few samples, no rho of this channel, or an exact fit: nothing to check
             checks = None
     samples = int(np.isfinite(measured).sum())

@@ -135,6 +135,7 @@ def test_correlated_residuals_under_white_noise_are_said_once(rng):
     posterior, samples = calibrated(rng, rho=0.9)
     (text,) = said(propagate, posterior, samples, noise=True, seed=1)
     assert "residuals of the calibration are not independent" in text and "600 samples are worth" in text
+    assert "Calibrate with AutoregressiveNoise or effective_samples=" in text
     lag = float(text.split("(correlation ")[1].split()[0])
     assert lag == pytest.approx(0.9, abs=0.08)
     assert not said(propagate, posterior, samples, noise=True, seed=1)
@@ -150,7 +151,9 @@ def test_a_noise_that_knows_of_the_correlation_is_right(kind, rng):
     assert not said(propagate, posterior, samples, noise=True, seed=1)
     if kind == "autoregressive":  # control: a correlation of 0.3 does not explain one of 0.9
         wrong, _ = calibrated(np.random.default_rng(5), rho=0.9, noise=noise)
-        assert "innovations of the calibration are not independent" in said(propagate, wrong, samples * [1, 1, 0.3])[0]
+        (text,) = said(propagate, wrong, samples * [1, 1, 0.3])
+        assert "innovations of the calibration are not independent" in text
+        assert "BandNoise" in text and "AutoregressiveNoise" not in text, "which is the noise in use"
 
 
 def test_the_check_is_one_simulation_that_is_counted_and_taken_from_the_cache(rng):

@@ -138,6 +138,25 @@ def test_verdicts_say_what_to_do(rng):
     assert residual_checks(gappy[None]).n_samples == [600]
 
 
+def test_innovations_are_not_advised_to_use_the_noise_that_left_them(rng):
+    """Errors smoother than AR(1): their innovations are correlated, and AutoregressiveNoise is in use already."""
+    channel = Channel("top", "displacement", "mm")
+    smooth = signal.lfilter([1.0], [1.0, -0.85], autoregressive(rng, 0.85, n=1500), axis=1)
+    residual = residual_checks(smooth)
+    left = innovations(smooth, residual.lag_one)
+    checks = residual_checks(left, [channel], whitened=True)
+    assert checks.lag_one[0] > 0.3 and "AutoregressiveNoise" in residual.sentences[0]
+    (advice,) = checks.sentences
+    assert advice.startswith(f"Not white: correlation {checks.lag_one[0]:.2f} from sample to sample is left.")
+    assert "AutoregressiveNoise" not in advice and "BandNoise" in advice and advice in str(checks)
+    title = plot_residuals(left, [channel], 0.01, whitened=True).axes[0].get_title(loc="left")
+    assert " ".join(title.split()) == advice
+    # white innovations need no advice, and the numbers do not depend on what the rows are
+    white = innovations(autoregressive(rng, 0.9), [0.9])
+    plain, known = residual_checks(white), residual_checks(white, whitened=True)
+    assert plain.sentences == known.sentences and all(np.array_equal(*each) for each in zip(plain[:7], known[:7]))
+
+
 def response_of(theta):
     return np.stack([theta[0] * np.sin(0.1 * np.arange(400)), np.cos(0.1 * np.arange(400))])
 
