@@ -584,6 +584,7 @@ def test_four_earthquakes_damage_a_column(tmp_path):
     """The state that earlier events leave matters. EQ2 informs the yield strength, about which EQ1 says nothing."""
     output = run_tutorial("10_damage.py", "--out", str(tmp_path))
     assert "REDUCED SETTING" in output and "not the error of the model" in output
+    assert "interval score" in output
     summary = json.loads((tmp_path / "summary.json").read_text())
     before, after = (np.array(summary["sd"][name]) for name in ("EQ1", "EQ1 and EQ2"))
     assert before[-1] > 0.05 > 0.02 > after[-1], "fy"
@@ -592,6 +593,10 @@ def test_four_earthquakes_damage_a_column(tmp_path):
         assert (carried < 0.6 * virgin).all()
         carried, virgin = (np.array(summary["coverage"][f"EQ1, {state}, {event}"]) for state in ("end", "virgin"))
         assert (carried > 2.0 * virgin).all() and (virgin < 0.3).all()
+        carried, virgin = (np.array(summary["interval_score"][f"EQ1, {state}, {event}"]) for state in ("end", "virgin"))
+        assert (carried < 0.6 * virgin).all()
+    for found in summary["scores"].values():
+        assert 0.0 <= found["bands"] <= 1.0 and 0.0 < found["width"] <= found["interval_score"]
     for state, true in summary["presence"]["truth"].items():
         assert set(true) <= {0.0, 1.0} and true == sorted(true) or state == "large residual drift"
     assert summary["presence"]["truth"]["bar yield"] == [0.0, 1.0, 1.0, 1.0] == summary["presence"]["EQ1"]["bar yield"]

@@ -306,13 +306,11 @@ for shaking, stem in (("shaking 1", "calibration"), ("shaking 3", "prediction"))
 #   with data. It does not test the model, which may have the same error three times.
 # * **Prediction.** The second floor, which was not used, is predicted with an RRMSE of 9 to 16 %, in the later shakings
 #   as well as in the first. The first floor in the third shaking has the largest error: 27 to 30 %.
-# * **Coverage of the 90 % bands.** In the predictions: 71 to 99 % with white noise, 73 to 99 % with AR(1), 82 to 99 %
-#   with n_eff. Most of the width of a band is sigma, which is nearly the same under all noises. The band of the
-#   response alone, the uncertainty of the parameters, contains 3 to 15 % of the samples with white noise and 36 to 65 %
-#   with n_eff.
-#   With white noise and a roof like the floors, the interval scores of the bands in the later shakings are 0.55 to 1.6
-#   times the root mean square of the channel, their widths 0.48 to 0.72
-#   (``python -m tests.benchmarks transfer_frame``).
+# * **90 % bands.** Most of the width of a band is sigma, which is nearly the same under all noises. With white noise
+#   and a roof like the floors, the interval scores of the bands in the later shakings are 0.55 to 1.6 times the root
+#   mean square of the channel, their widths 0.48 to 0.72 (``python -m tests.benchmarks transfer_frame``). The printed
+#   table has the scores and the coverage of every noise. The band of the response alone, the uncertainty of the
+#   parameters, is not a band for measurements.
 # * **Limits.** The frame is not linear: its frequency is 3.80 Hz at small and 3.68 Hz at large amplitudes, and the
 #   model has one frequency. Three shakings with one motion say nothing about another motion.
 

@@ -40,6 +40,7 @@ from fe_likelihoods import (
     damage_measures,
     damage_outputs,
     from_si,
+    interval_score,
     park_ang_constants,
     plot_damage,
     problems,
@@ -56,7 +57,7 @@ parser.add_argument("--out", type=Path, default=Path("results-damage"), help="fo
 args = parser.parse_args()
 fast = args.fast or bool(os.environ.get("FAST"))
 args.out.mkdir(parents=True, exist_ok=True)
-DT, LENGTH, PAUSE, WALKERS, PREDICTED = (1 / 16, 7.0, 2.0, 24, 8) if fast else (1 / 64, 16.0, 6.0, 200, 100)  # s, s, s
+DT, LENGTH, PAUSE, WALKERS, PREDICTED = (1 / 16, 7.0, 2.0, 24, 20) if fast else (1 / 64, 16.0, 6.0, 200, 100)  # s, s, s
 begin = time.perf_counter()
 if fast:
     print("REDUCED SETTING (fast): coarse steps and few samples; these numbers are not results")
@@ -233,25 +234,32 @@ if not fast:
     plot_damage(damages["EQ1 and EQ2"]).savefig(args.out / "damage_updated.png", dpi=90)
 
 # %%
-# How often the 90 % bands of the measures hold the truth, and the probabilities that were given to states that were
-# reached, and to those that were not:
+# How often the 90 % bands of the measures hold the truth, the medians of their widths and interval scores as multiples
+# of the true values (a band that misses has a score much larger than its width), and the probabilities that were given
+# to states that were reached, and to those that were not:
 
 scores = {}
 for name, found in damages.items():
-    inside = []
-    for measure, quantiles in found.extent.items():
-        true = true_damage.extent[measure][0]
-        inside.append(((quantiles[0] <= true) & (true <= quantiles[-1])).ravel())
+    low, high, true = (
+        np.concatenate([each[k].ravel() for each in values.extent.values()])
+        for values, k in ((found, 0), (found, -1), (true_damage, 0))
+    )
+    inside, known = (low <= true) & (true <= high), true != 0.0  # a damping change is zero in EQ1
+    relative = np.stack([high - low, interval_score(low, high, true, 0.9)])[:, known] / np.abs(true[known])
     reached = np.concatenate([each.probability.ravel() for each in true_damage.presence.values()]) == 1.0
     given = np.concatenate([each.probability.ravel() for each in found.presence.values()])
     scores[name] = {
-        "bands": float(np.concatenate(inside).mean()),
+        "bands": float(inside.mean()),
+        "width": float(np.median(relative[0])),
+        "interval_score": float(np.median(relative[1])),
         "reached": float(given[reached].mean()),
         "not reached": float(given[~reached].mean()),
     }
     print(
-        f"{name}: {100 * scores[name]['bands']:.0f} % of the bands hold the truth; mean probability of states that are "
-        f"reached {scores[name]['reached']:.2f}, of others {scores[name]['not reached']:.2f}"
+        f"{name}: {100 * scores[name]['bands']:.0f} % of {len(true)} bands hold the truth, median width "
+        f"{scores[name]['width']:.3f} and interval score {scores[name]['interval_score']:.3f} times the true value; "
+        f"mean probability of states that are reached {scores[name]['reached']:.2f}, of others "
+        f"{scores[name]['not reached']:.2f}"
     )
 
 seconds = time.perf_counter() - begin
@@ -264,6 +272,14 @@ result = {
         f"{name}, {state}, {event}": values[0].coverage.tolist()
         for (name, state), found in predictions.items()
         for event, values in found.items()
+    },
+    **{
+        what: {
+            f"{name}, {state}, {event}": (getattr(values[0], what) / values[0].rms).tolist()
+            for (name, state), found in predictions.items()
+            for event, values in found.items()
+        }
+        for what in ("interval_score", "crps", "width")
     },
     "rrmse": {
         f"{name}, {state}, {event}": values[0].rrmse.tolist()
