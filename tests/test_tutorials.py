@@ -592,9 +592,9 @@ def test_four_earthquakes_damage_a_column(tmp_path):
         carried, virgin = (np.array(summary["rrmse"][f"EQ1, {state}, {event}"]) for state in ("end", "virgin"))
         assert (carried < 0.6 * virgin).all()
         carried, virgin = (np.array(summary["coverage"][f"EQ1, {state}, {event}"]) for state in ("end", "virgin"))
-        assert (carried > 2.0 * virgin).all() and (virgin < 0.3).all()
+        assert (carried > 2.0 * virgin).all()
         carried, virgin = (np.array(summary["interval_score"][f"EQ1, {state}, {event}"]) for state in ("end", "virgin"))
-        assert (carried < 0.6 * virgin).all()
+        assert (carried < 0.2 * virgin).all(), "misses, which the width does not show"
     for found in summary["scores"].values():
         assert 0.0 <= found["bands"] <= 1.0 and 0.0 < found["width"] <= found["interval_score"]
     for state, true in summary["presence"]["truth"].items():
