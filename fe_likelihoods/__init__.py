@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .prediction.fragility import Fragility, fragility, peak_ground_acceleration
     from .prediction.fragility_curve import fit_fragility
     from .prediction.held_out import score_left_out
-    from .prediction.new_event import event_level, event_ratio, predict_new_event
+    from .prediction.new_event import event_level, event_ratio, predict_from_median, predict_new_event
     from .prediction.park_ang import ParkAng, park_ang_constants
     from .prediction.prediction import Prediction
     from .prediction.propagation import fit_measures, propagate
@@ -247,6 +247,7 @@ __all__ = [
     "plot_residuals",
     "plot_scores",
     "plot_sensors",
+    "predict_from_median",
     "predict_new_event",
     "problems",
     "propagate",
@@ -342,7 +343,7 @@ _EXPORTS = {
     "prediction.fragility_curve": ("fit_fragility",),
     "prediction.event_ratios": ("EventRatios", "LevelRatios"),
     "prediction.held_out": ("score_left_out",),
-    "prediction.new_event": ("event_level", "event_ratio", "predict_new_event"),
+    "prediction.new_event": ("event_level", "event_ratio", "predict_from_median", "predict_new_event"),
     "prediction.park_ang": (
         "ParkAng",
         "park_ang_constants",

@@ -8,6 +8,7 @@ corrects quantities such as peaks by the ratio of measured to fitted values in t
 .. math:: g_\mathrm{new} = r_\mathrm{new}\, g(\theta_\mathrm{new}), \qquad
    \ln r_\mathrm{new} \sim t_\nu\!\left(m,\ s \sqrt{1 + 1 / K}\right).
 
+Where the errors of ratio and parameters depend on each other, `predict_from_median` has both in one ratio.
 Equations are on the page ``docs/theory/prediction.rst``.
 """
 
@@ -28,7 +29,7 @@ from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, measured_quantity
 from .streaming import quantiles_with_errors
 
-__all__ = ["draw_new_event", "event_level", "event_ratio", "predict_new_event"]
+__all__ = ["draw_new_event", "event_level", "event_ratio", "predict_from_median", "predict_new_event"]
 
 _LARGEST_IMPOSSIBLE = 0.01  # share of draws with an impossible noise without a warning
 
@@ -193,6 +194,99 @@ def predict_new_event(
         return {name: _with_spread(each, weights, None) for name, each in prediction.items()}
     prediction = _with_spread(prediction, weights, ratios)
     return prediction if ratios is None else _corrected(prediction, ratios, np.random.default_rng(drawn))
+
+
+def predict_from_median(
+    hierarchy: Hierarchy,
+    posteriors: Mapping[str, Any],
+    posterior_or_model: Any,
+    record: Record | Any,
+    *,
+    quantity: ChannelQuantity | list[ChannelQuantity],
+    prior_sd: float = 0.1,
+    prior_events: float = 0.0,
+    n: int = 500,
+    seed: int | None = None,
+    **options: Any,
+) -> Prediction:
+    r"""Predict the measured peaks of a new event by the parameters in the middle of the population, and a ratio.
+
+    The ratios are those of the measured values to the values at these parameters, :math:`r_k = y_k / g_k(\bar\theta)`.
+    They contain the difference of each event from the middle as well as the error of its fit, with all that these have
+    to do with each other. `predict_new_event` adds both as if they were independent, which makes intervals too wide
+    where a fit that is too low goes with parameters whose response is too low.
+
+    Parameters
+    ----------
+    hierarchy : Hierarchy
+        The population of the parameters of the calibration events.
+    posteriors : mapping of str to Posterior or FELikelihood
+        The likelihood with the measurements of each event of the hierarchy; others are not used.
+    posterior_or_model : Posterior, FELikelihood or Model
+        The model to predict with. All its parameters must be varying or common.
+    record : Record, or sequence of Record
+        Excitation of the new event; None for that of the model.
+    quantity : ChannelQuantity or list of ChannelQuantity
+        Positive numbers, such as ``peak("deck")``.
+    prior_sd, prior_events : float
+        Guess of the standard deviation of the logarithm of the ratio, and the number of events that it is worth, as for
+        `EventRatios`. Needed for one event.
+    n : int
+        Number of draws of the ratio. Each event of the hierarchy, and the new one, is simulated once.
+    seed : int, optional
+        Seed of the draws.
+    **options
+        Further options of `propagate`, such as ``quantiles=`` and ``from_state=``.
+
+    Returns
+    -------
+    Prediction
+        Its values are those of measurements. `exceedance` of it has intervals that contain what is unknown of the
+        ratio.
+
+    Raises
+    ------
+    ValueError
+        If the posterior of an event is missing, a parameter of the model is neither varying nor common, the quantity is
+        a history, and as `event_ratio` and `EventRatios`.
+    SimulationFailed
+        If the simulation at these parameters fails.
+
+    Warns
+    -----
+    UserWarning
+        As `predict_new_event`, of peaks outside of the range of all events.
+
+    Notes
+    -----
+    The intervals are exact for normal log ratios whose scatter is the same in all events: the same change of the
+    parameters changes the logarithm of the peak by the same amount. See ``docs/theory/prediction.rst``.
+
+    Examples
+    --------
+    >>> predict_from_median(hierarchy, posteriors, model, record, quantity=peak("deck")).quantiles
+    """
+    several = (quantity,) if isinstance(quantity, ChannelQuantity) else quantity
+    if not isinstance(several, list | tuple) or not all(isinstance(each, ChannelQuantity) for each in several):
+        raise ValueError(f"predict_from_median needs numbers such as quantity=peak(channel); got {quantity!r}")
+    if missing := [name for name in hierarchy.posterior.tests if name not in posteriors]:
+        raise ValueError(f"predict_from_median: posteriors of {', '.join(map(repr, missing))} are missing")
+    median = hierarchy.median_test()
+    wanted = read_source(posterior_or_model).model.parameter_names
+    if missing := [name for name in wanted if name not in median]:
+        raise ValueError(
+            f"predict_from_median: {', '.join(missing)} belong to each event alone and have no median; make them "
+            "varying or common, or use predict_new_event"
+        )
+    events = [posteriors[name] for name in hierarchy.posterior.tests]
+    at_median = {name: np.array([median[name]]) for name in wanted}
+    ratios = EventRatios([event_ratio(each, at_median, quantity) for each in events], prior_sd, prior_events)
+    rows = {name: np.full(n, median[name]) for name in wanted}  # equal rows are simulated once
+    measured = [read_source(each).likelihood.measurements for each in events]
+    settings = {"progress": False, "calibrated": measured, "check": False} | options
+    prediction = propagate(posterior_or_model, rows, record=record, quantity=quantity, **settings)
+    prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))
+    return _corrected(prediction, ratios, np.random.default_rng(seed))
 
 
 def _with_spread(prediction: Prediction, weights: np.ndarray, ratios: EventRatios | LevelRatios | None) -> Prediction:

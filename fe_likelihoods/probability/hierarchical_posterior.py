@@ -103,8 +103,9 @@ class HierarchicalPosterior:
         Parameters with one value for all tests, and their priors. All parameters that are neither varying nor common
         belong to each test alone, with the prior of its stored posterior.
     correlation : float, optional
-        Shape eta > 0 of the LKJ prior of the correlations between the varying parameters: 1 is uniform over correlation
-        matrices, larger values favour small correlations. Default: the varying parameters are independent.
+        Shape eta >= 1 of the LKJ prior of the correlations between the varying parameters: 1 is uniform over
+        correlation matrices, larger values favour small correlations. Below 1 the density is infinite at correlations
+        of 1 and -1. Default: the varying parameters are independent.
     max_samples : int
         Largest number of samples of each test. More are thinned; the time of an evaluation is proportional to it.
 
@@ -307,10 +308,10 @@ def _check(tests: Any, varying: Any, common: Any, correlation: Any, max_samples:
         raise ValueError(f"HierarchicalPosterior: common must be a mapping of names to distributions; got {common!r}")
     if both := sorted(set(varying) & set(common)):
         raise ValueError(f"HierarchicalPosterior: {', '.join(both)} cannot be both varying and common")
-    if correlation is not None and not 0.0 < correlation < np.inf:
+    if correlation is not None and not 1.0 <= correlation < np.inf:
         raise ValueError(
-            f"HierarchicalPosterior: correlation is the shape of the LKJ prior, above 0, or None for independent "
-            f"parameters; got {correlation!r}"
+            f"HierarchicalPosterior: correlation is the shape of the LKJ prior, 1 or more, or None for "
+            f"independent parameters; got {correlation!r}"
         )
     if not isinstance(max_samples, int | np.integer) or max_samples < 100:
         raise ValueError(f"HierarchicalPosterior: max_samples must be a whole number, 100 or more; got {max_samples!r}")

@@ -127,6 +127,19 @@ class Hierarchy:
             found[name] = self._prior_draws(name, n, generator)
         return found if names is None else {name: found[name] for name in names}
 
+    def median_test(self) -> dict[str, float]:
+        """Parameters in the middle of the population: medians of the varying parameters, and the common ones.
+
+        Returns
+        -------
+        dict of str to float
+            Means over the hyper-samples of the centers on the scales of the populations: the geometric mean of the
+            medians for the scale "log".
+        """
+        center, _ = self.posterior.population(self.samples)
+        names = [*self.posterior.varying, *self.posterior.common]
+        return dict(zip(names, self.posterior.from_scale(center.mean(axis=0)).tolist(), strict=True))
+
     def population_weights(self, draws: Mapping[str, np.ndarray], n: int = 200) -> np.ndarray:
         """Weights by which draws of a new test are draws from single populations.
 

@@ -368,7 +368,8 @@ def test_stored_posterior_refuses(arguments, message):
         ({"common": ["b"]}, "common must be a mapping"),
         ({"varying": {"c": LINEAR}}, "test 'T': the stored samples have no parameters c; they have a, b"),
         ({"varying": {"a": Varying(HalfNormal(1.0), HalfNormal(1.0))}}, "needs positive samples of a; use scale"),
-        ({"correlation": 0.0}, "above 0, or None"),
+        ({"correlation": 0.0}, "1 or more, or None"),
+        ({"correlation": 0.3}, "1 or more, or None"),
         ({"max_samples": 10}, "100 or more"),
     ],
 )
