@@ -33,6 +33,8 @@ __all__ = ["Shear", "apply_shears", "find_shears", "invert_shears"]
 
 # Smallest share of the variance left by the linear term that the quadratic term must explain.
 MIN_CURVATURE = 0.1
+# Share of its standard deviation below which nothing is left of a target: the points are too few to show a curvature.
+DEGENERATE = 1e-6
 
 
 class Shear(NamedTuple):
@@ -124,6 +126,10 @@ def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
         quadratic = covariance[target, source] / max(fourth[source] - 1.0 - own[source] ** 2, 1e-12)
         linear = correlation[target, source] - quadratic * own[source]
         shear = Shear(target, source, mean[source], sd[source], sd[target] * linear, sd[target] * quadratic)
+        straight = apply_shears([shear], coords)
+        rest = straight[:, target] - weights @ straight[:, target]
+        if not weights @ rest**2 > (DEGENERATE * sd[target]) ** 2:  # few different points lie on any parabola
+            break
         shears.append(shear)
-        coords = apply_shears([shear], coords)
+        coords = straight
     return tuple(shears)

@@ -249,3 +249,15 @@ def test_exponential_at_a_bound_becomes_symmetric_and_a_gaussian_stays_one(rng):
     assert np.abs(stats.skew(z[:, 0])) < 0.05
     assert np.quantile(z[:, 0], [0.1, 0.9]) == pytest.approx(stats.logistic.ppf([0.1, 0.9]), abs=0.05)
     assert abs(stats.skew(z[:, 1])) < 0.2 and abs(stats.kurtosis(z[:, 1])) < 0.2
+
+
+@pytest.mark.parametrize("distinct", [1, 2, 3, 4])
+def test_a_population_of_few_different_points_gives_finite_mixtures(rng, distinct):
+    """After a collapse, three different points are left of 150: every parabola goes through them."""
+    points = rng.normal(size=(distinct, 5))
+    coords = points[rng.integers(distinct, size=150)]
+    weights = np.full(150, 1.0 / 150)
+    assert not any(abs(shear.quadratic) > 1e6 for shear in find_shears(coords, weights))
+    mixture = fit_mixture(coords, weights)
+    assert np.isfinite(mixture.means).all() and np.isfinite(mixture.roots).all()
+    assert np.isfinite(draw(mixture, 20, np.random.RandomState(1))).all()
