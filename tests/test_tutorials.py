@@ -608,6 +608,26 @@ def test_four_earthquakes_damage_a_column(tmp_path):
     assert len(shown) > 50 and len(panels[1].collections) == 1
 
 
+# 11
+
+
+def test_many_events_predict_new_ones(tmp_path):
+    """The posterior of one event misses new peaks, the population of events does not; amplitude matters."""
+    output = run_tutorial("11_many_events.py", "--out", str(tmp_path))
+    assert "REDUCED SETTING" in output and "pairs of tests disagree" in output and "propagate warned" in output
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    usual, events = summary["one event, as usual"], summary["population of events"]
+    assert usual["within 90 %"] <= 0.5 <= events["within 90 %"]
+    for score in ("CRPS / measured", "interval score / measured"):
+        assert events[score] < 0.6 * usual[score]
+    assert usual["upper / lower end"] < 1.2 < events["upper / lower end"]
+    assert summary["evidence"]["by amplitude"] > summary["evidence"]["constant"] + 50.0
+    (axes,) = read_figure(tmp_path, "fragility").axes
+    assert len(texts(axes)) == 3 and axes.get_xlabel() == "Peak acceleration of the base [g]"
+    for name in ("scores_as_usual", "scores_events", "events"):
+        assert len(read_figure(tmp_path, name).axes) >= 2
+
+
 # the data, and the form of the scripts
 
 

@@ -29,6 +29,7 @@ import argparse
 import json
 import os
 import time
+import warnings
 from pathlib import Path
 
 import matplotlib
@@ -79,7 +80,7 @@ parser.add_argument("--out", type=Path, default=Path("results-events"), help="fo
 args = parser.parse_args()
 fast = args.fast or bool(os.environ.get("FAST"))
 args.out.mkdir(parents=True, exist_ok=True)
-CALIBRATED, NEW, WALKERS, DRAWS = (4, 4, 120, 60) if fast else (8, 20, 300, 300)
+CALIBRATED, NEW, WALKERS, DRAWS, STEPS = (4, 4, 120, 60, 450) if fast else (8, 20, 300, 300, 900)
 begin = time.perf_counter()
 if fast:
     print("REDUCED SETTING (fast): few events and few samples; these numbers are not results")
@@ -115,7 +116,7 @@ def filtered_noise(rng: np.random.Generator, n: int) -> np.ndarray:
 def ground_motion(seed: int, level: float) -> tuple[Record, ...]:
     """Accelerations of the base of the column and of the two ends, with a peak of `level` [g] at the base."""
     rng = np.random.default_rng([args.seed, 1, seed])
-    base, *others = (filtered_noise(rng, 900) for _ in range(3))
+    base, *others = (filtered_noise(rng, STEPS) for _ in range(3))
     return tuple(
         Record(f"synthetic {seed}, {place}", DT, G * level * motion)
         for place, motion in zip(
@@ -206,16 +207,21 @@ fig.savefig(args.out / "events.png", dpi=150)
 #
 # The posterior of the strongest event predicts the new events. Its intervals contain the errors of its parameters, and
 # nothing of what differs between events. `Prediction.score` compares the peaks with the measured ones. CRPS and
-# interval score are proper: narrow intervals at the wrong place lose as much as wide ones.
+# interval score are proper: narrow intervals at the wrong place lose as much as wide ones. `propagate` warns where the
+# predicted peaks are outside of the calibrated range, or where the residuals contradict the noise.
 
 chain = samplers[strongest].get_chain(flat=True)
-as_usual = {}
+as_usual, warned = {}, {}
 for name, supports in new_events.items():
     rows = chain[:: max(1, len(chain) // DRAWS)]
-    prediction = propagate(
-        posteriors[strongest], rows, record=supports, quantity=PEAK, noise=False, seed=args.seed, progress=False
-    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        prediction = propagate(
+            posteriors[strongest], rows, record=supports, quantity=PEAK, seed=args.seed, progress=False
+        )
+    warned |= {name: str(caught[0].message)} if caught else {}
     as_usual[name] = prediction.score(new_measured[name])
+print(f"\npropagate warned about {len(warned)} of {NEW} new events, such as:\n{next(iter(warned.values()), 'nothing')}")
 
 # %%
 # New events from the population of the events
@@ -281,24 +287,24 @@ for file, scores in (("scores_as_usual", as_usual), ("scores_events", from_event
 # Does the amplitude explain the spread?
 # --------------------------------------
 #
-# All events together, with common parameters: once with constant stiffness and damping, once with stiffness and damping
-# that follow the level of the response (`EquivalentLinear`, two parameters more). The evidence compares them.
+# All events together, with common parameters (and one share of noise): once with constant stiffness and damping, once
+# with stiffness and damping that follow the level of the response (`EquivalentLinear`, two parameters more). Their
+# evidences are compared. The parameters still vary between events, so that their stated errors are too small.
 
 
 def joint(amplitude: bool) -> tuple[Posterior, SMCSampler]:
     """The joint posterior of all events, and the sampler that has run."""
     likelihoods = {}
-    for number, (name, supports) in enumerate(events.items(), start=1):
+    chosen = list(events)[:: 3 if fast else 1]
+    for number, (name, supports) in enumerate([(name, events[name]) for name in chosen], start=1):
         parts = BridgeDeck("deck", share=TRUTH["share"])
         model = LinearStructure(EquivalentLinear(parts, REFERENCE) if amplitude else parts, supports)
         noise = RelativeNoise.of(measured[name], window=1.0, sensor=(SENSOR,))
         likelihoods[f"E{number}"] = FELikelihood(model, measured[name], noise)
-    likelihood = JointLikelihood(likelihoods, separate=["share_deck"])
     own = {"softening": Uniform(0.0, 0.6), "damping_growth": Uniform(0.0, 1.0)} if amplitude else {}
-    shares = {name: HalfNormal(1.0) for name in likelihood.parameter_names if name.startswith("share_deck")}
-    prior = {name: MODEL_PRIOR[name] for name in ("frequency", "damping")}
-    posterior = Posterior(likelihood, prior | own | shares)
-    sampler = SMCSampler(WALKERS // 2, posterior.ndim, posterior, vectorize=True, seed=args.seed)
+    prior = {name: MODEL_PRIOR[name] for name in ("frequency", "damping")} | {"share_deck": HalfNormal(1.0)}
+    posterior = Posterior(JointLikelihood(likelihoods), prior | own)
+    sampler = SMCSampler(60 if fast else 120, posterior.ndim, posterior, vectorize=True, seed=args.seed)
     sampler.run_mcmc(None, 2, progress=False)
     return posterior, sampler
 
@@ -417,5 +423,6 @@ else:
     summary["Painter Street, each from the others"] = show_scores("Painter Street, each from the others", real_scores)
     plot_scores(real_scores).savefig(args.out / "scores_painter_street.png", dpi=150)
 
-(args.out / "summary.json").write_text(json.dumps(summary | {"fragility": inside}, indent=2))
+summary |= {"fragility": inside, "evidence": {name: sampler.log_evidence for name, (_, sampler) in joints.items()}}
+(args.out / "summary.json").write_text(json.dumps(summary, indent=2))
 print(f"{time.perf_counter() - begin:.0f} s; figures and summary.json in {args.out}/")

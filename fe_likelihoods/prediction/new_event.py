@@ -54,7 +54,8 @@ def event_level(
     ValueError
         As `propagate`.
     """
-    return propagate(posterior, samples, part=part, quantity=quantity, quantiles=(0.5,), progress=False).quantile(0.5)
+    options = {"quantiles": (0.5,), "check": False, "progress": False}  # the median does not depend on the noise
+    return propagate(posterior, samples, part=part, quantity=quantity, **options).quantile(0.5)
 
 
 def event_ratio(
