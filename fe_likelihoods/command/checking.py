@@ -8,6 +8,7 @@ import numpy as np
 
 from ..signals.error_measures import rrmse
 from ..units import from_si
+from .events import read_events
 from .job import read_job
 from .models import USER_MODELS, Problem, make_problem, noise_channels_of
 from .runs import default_folder, make_sampler
@@ -41,8 +42,13 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
     job = read_job(file)
     problem = make_problem(job)
     sampler = make_sampler(job, problem)
+    events = read_events(job, problem)
     _say_data(problem, say)
     seconds = _say_simulation(problem, job.kind in USER_MODELS, say)
+    for event in events:
+        steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
+        compared = "without measurements" if event.measured is None else "compared with measurements"
+        say(f"Event {event.name}: {event.record.name}, {steps}, {compared}")
     guided = job.sampler.get("guide", False)
     _say_cost(problem, sampler, guided, job.budget, say)
     _draw(problem, seconds, picture)

@@ -1,5 +1,6 @@
 """Predictions of other events: base motions that a TOML file lists as ``[events.NAME]``."""
 
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,7 +9,7 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import QuantityScores
 from ..probability.posterior import Posterior
-from ..signals.channels import Measurements
+from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..units import from_si
 from .data import read_base_motion, read_measured
@@ -75,10 +76,20 @@ def _read_event(job: Job, problem: Problem, name: str) -> Event:
     if state not in _STATES:
         raise ValueError(f"{where} from_state: expected one of {', '.join(_STATES)}; got {state!r}")
     record = read_base_motion(own)
-    measured = read_measured(own, model.channels, record) if own.measurements else None
+    measured = _measured(own, model.channels, record) if own.measurements else None
     record, measured = reduce_data(own, record, measured)
+    if not math.isclose(record.dt, problem.record.dt, rel_tol=1e-9):  # the step that the model was calibrated with
+        record = record.resample(problem.record.dt)
     options = {"from_state": state} | ({"rest": given["rest"]} if "rest" in given else {})
     return Event(name, record, measured, options)
+
+
+def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measurements:
+    """The measured response; messages name the key of the event."""
+    try:
+        return read_measured(own, channels, record)
+    except ValueError as error:
+        raise ValueError(str(error).replace("] file: ", "] measured: ", 1)) from error
 
 
 def predict_events(
@@ -115,20 +126,24 @@ def _predict_event(
     from ..prediction.quantities import peak
 
     channels = posterior.likelihood.model.channels
-    quantiles = tuple(sorted({*prediction_options(job)["quantiles"], *_ENDS}))
+    options = prediction_options(job) | event.options
+    options["quantiles"] = tuple(sorted({*options["quantiles"], *_ENDS}))
+    if event.measured is not None:  # measurements contain noise
+        options["noise"] = job.prediction.get("noise", True)
     try:
         found = propagate(
             posterior,
             samples,
             record=event.record,
             quantity={"histories": None, "peaks": [peak(channel.name) for channel in channels]},
-            **(prediction_options(job) | event.options | {"quantiles": quantiles}),
+            **options,
             progress=progress,
         )
     except ValueError as error:
         raise ValueError(f"{job.file.name}: [events.{event.name}] {error}") from error
     histories, peaks = found["histories"], found["peaks"]
-    lines = [f"Event {event.name}: {event.record.name}", f"Prediction from {histories.n_samples} samples"]
+    steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
+    lines = [f"Event {event.name}: {event.record.name}, {steps}", f"Prediction from {histories.n_samples} samples"]
     lines[-1] += ", with the noise" if histories.noise else ", without the noise of measurements"
     if histories.n_failed:
         lines += [f"{count} samples left out: {reason}" for reason, count in histories.failure_reasons.items()]

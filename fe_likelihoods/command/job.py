@@ -67,8 +67,6 @@ class Job:
         if measured and not measured["file"].lower().endswith((".h5", ".hdf5")):
             kept = {key: value for key, value in self.measurements.items() if key not in ("file", "bundled")}
             measured = kept | measured
-        if "every" in self.record:
-            given["every"] = self.record["every"]
         return replace(self, record=given, measurements=measured, event=name)
 
     def path(self, section: str, key: str, name: str) -> Path:

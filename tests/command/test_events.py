@@ -43,10 +43,11 @@ def test_events_are_predicted_and_scored(events):
     for largest, row in zip(peaks, rows.values(), strict=True):
         peak = from_si(largest, row["unit"])
         assert float(row["measured"]) == pytest.approx(peak)
-        assert float(row["median"]) == pytest.approx(peak, rel=0.05)
+        assert float(row["median"]) == pytest.approx(peak, rel=0.1)
         assert float(row["q05"]) <= float(row["median"]) <= float(row["q95"])
     text = (events / "r" / "event-weaker.txt").read_text()
-    assert "interval score" in text and "CRPS" in text and "without the noise" in text
+    assert "interval score" in text and "CRPS" in text and "with the noise" in text
+    assert "without the noise" in (events / "r" / "event-after.txt").read_text()
     assert "measurements" not in (events / "r" / "event-after.txt").read_text().splitlines()[-1]
     assert (events / "r" / "event-after.png").stat().st_size > 10_000
 
@@ -72,7 +73,8 @@ def test_the_prediction_is_that_of_propagate(events):
     assert [event.name for event in found] == ["weaker", "after"]
     predict_events(job, found, problem.posterior, samples, events, False)
     for event in found:
-        options = {"record": event.record, "seed": 1, "progress": False} | event.options
+        noise = event.measured is not None
+        options = {"record": event.record, "seed": 1, "noise": noise, "progress": False} | event.options
         expected = propagate(problem.posterior, samples, quantity=peak("displacement"), **options)
         with open(f"event-{event.name}.csv", newline="") as file:
             row = list(csv.DictReader(file))[1]
@@ -83,7 +85,7 @@ def test_the_prediction_is_that_of_propagate(events):
     ("old", "new", "message"),
     [
         ('from_state = "end"', 'from_state = "rest"', "[events.after] from_state: expected one of virgin, end"),
-        ('measured = "weaker.csv"', 'measured = "waker.csv"', "[events.weaker] file: there is no file waker.csv"),
+        ('measured = "weaker.csv"', 'measured = "waker.csv"', "[events.weaker] measured: there is no file waker.csv"),
         ('measured = "weaker.csv"', 'zero = "1 s"', "[events.weaker] zero: this key has no effect without measured"),
         ("scale = 0.5", "factor = 0.5", "[events.weaker] factor: unknown key"),
         ("[events.weaker]\nfile", "[events.weaker]\nformat", "[events.weaker] file: this key is missing"),
@@ -94,3 +96,25 @@ def test_errors_name_section_and_key_before_the_run(events, old, new, message):
     (events / "oscillator.toml").write_text((SETTINGS + EVENTS).replace(old, new))
     assert message in call("run", "oscillator.toml", "--out", "r", code=1)
     assert not (events / "r").exists()
+
+
+@pytest.mark.parametrize("step", [0.005, 0.02, 0.04])
+def test_a_motion_with_another_step_is_resampled_to_that_of_the_model(events, step):
+    """The keys `every` and `dt` of the calibration record do not act on the event by count."""
+    from fe_likelihoods.command.events import read_events
+
+    text = (SETTINGS + EVENTS).replace('file = "base.csv"\n[measure', 'file = "base.csv"\nevery = 2\n[measure')
+    record = read_csv("base.csv").resample(step)
+    rows = [f"{t!r},{a!r}" for t, a in zip(record.time.tolist(), record.acceleration.tolist(), strict=True)]
+    (events / "other.csv").write_text("\n".join(["time_s,base_m_s2", *rows]))
+    (events / "oscillator.toml").write_text(
+        text.replace('[events.after]\nfile = "base.csv"', '[events.after]\nfile = "other.csv"')
+    )
+    job = read_job("oscillator.toml")
+    problem = make_problem(job)
+    assert problem.record.dt == pytest.approx(0.04)
+    weaker, after = read_events(job, problem)
+    assert weaker.record.dt == after.record.dt == pytest.approx(0.04)
+    assert weaker.measured.dt == pytest.approx(0.02)  # compared at their own times
+    propagate(problem.posterior, problem.posterior.sample_prior(3, 1), record=after.record, **after.options)
+    assert "Event after: other" in call("check", "oscillator.toml")
