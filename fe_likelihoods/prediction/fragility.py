@@ -24,10 +24,17 @@ from .excitation import chosen_state, excite, under_record
 from .fragility_curve import FragilityCurve, curve_with_errors
 from .inputs import PredictionSource, part_of, read_source, split_samples
 from .model_error import follows_response
-from .new_event import draw_new_event
+from .new_event import draw_new_event, of_hierarchy
 from .propagation import check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
-from .reliability import binomial_interval, check_level, contents, threshold_in_si, warn_of_missing_error
+from .reliability import (
+    binomial_interval,
+    check_level,
+    contents,
+    interval_of_draws,
+    threshold_in_si,
+    warn_of_missing_error,
+)
 
 __all__ = ["Fragility", "fragility", "peak_ground_acceleration"]
 
@@ -89,7 +96,8 @@ class Fragility(NamedTuple):
         Returns
         -------
         lower, upper : ndarray, shape (n_records,)
-            The narrowest band between quantiles of equal probabilities at all records (Besag et al. 1995, section 6.3).
+            The narrowest band between quantiles of equal probabilities at all records (Besag et al. 1995, section 6.3),
+            extended to the probabilities where these are outside, as intervals are (`fe_likelihoods.Exceedance`).
 
         Raises
         ------
@@ -111,7 +119,8 @@ class Fragility(NamedTuple):
         ranks = np.stack([stats.rankdata(column) for column in whole.T], axis=1)
         outermost = np.maximum(ranks, len(whole) + 1.0 - ranks).max(axis=1)
         last = int(np.ceil(np.quantile(outermost, level, method="higher"))) - 1
-        return ordered[len(whole) - 1 - last], ordered[last]
+        lower, upper = ordered[len(whole) - 1 - last], ordered[last]
+        return np.minimum(lower, self.probability), np.maximum(upper, self.probability)
 
 
 def peak_ground_acceleration(record: Record | Sequence[Record]) -> float:
@@ -213,7 +222,8 @@ def fragility(
     Warns
     -----
     UserWarning
-        If the error of the model is left out without ``noise=False``.
+        If the error of the model is left out without ``noise=False``. As `propagate`; with a `Hierarchy`, for peaks
+        outside of the range of all its tests, if their `StoredPosterior` have their measurements.
     """
     if taken := {"record", "quantiles", "memory_bytes"} & set(settings):
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")
@@ -238,6 +248,8 @@ def fragility(
     intensities = np.array([float(intensity(record)) for record in records])
     if not np.all((intensities > 0.0) & (intensities < np.inf)):
         raise ValueError(f"intensities must be positive and finite; got {intensities}")
+    if isinstance(samples, Hierarchy):  # the range of amplitudes is that of all its tests
+        settings = of_hierarchy(samples) | settings
     n = len(thetas)
     effective = check_effective_sample_size(effective_sample_size, n)
     check_level(level)
@@ -361,6 +373,6 @@ def _probabilities(
         return _Found(single, counted, share, np.sqrt(share * (1.0 - share) / trials), lower, upper, None)
     rng = np.random.default_rng(seed)
     draws = exceedance_draws(values, limits, spread, rng, failed=failed, failures_exceed=failures_exceed)
-    lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    lower, upper = interval_of_draws(draws, share, trials, spread, level)
     deviation = np.sqrt((np.square(single - share[:, None]) * counted).sum(axis=1) / counted.sum(axis=1))
     return _Found(single, counted, share, deviation / np.sqrt(trials), lower, upper, draws)

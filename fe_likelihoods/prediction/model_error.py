@@ -6,7 +6,7 @@ the sensor, which is no motion of the structure, and the error of the model. The
 many independent errors adds to each peak, while the errors of a model are motions of a structure and change as slowly
 as its response. A draw of the error of the model therefore has the amplitudes of the spectrum of the response, random
 phases, and the standard deviation :math:`\sigma_m` at each step. A noise with a spectrum of its own (`BandNoise`) keeps
-it. See ``docs/theory/prediction.rst``.
+it, from which the white noise of the sensor is taken out per frequency. See ``docs/theory/prediction.rst``.
 """
 
 from typing import Any, NamedTuple
@@ -44,13 +44,11 @@ class ModelError(NamedTuple):
     def draw(self, sample: int, n_steps: int, rng: np.random.Generator, response: np.ndarray) -> np.ndarray:
         """Draw the error of one sample, shape (n_channels, n_steps) [SI]."""
         parameters, normal = self.deviations[sample], rng.standard_normal(response.shape)
-        deviations = self.of_response(parameters, response)
         if hasattr(self.noise, "response_errors"):  # the noise has a spectrum of its own
-            total = self.noise.response_deviations(parameters, response, dt=self.dt)
-            errors = self.noise.response_errors(parameters, response, normal, dt=self.dt)
-            return errors * np.divide(deviations, total, out=np.zeros_like(total), where=total > 0.0)
+            return self.noise.response_errors(parameters, response, normal, dt=self.dt, sensor=False)
         level = np.sqrt(np.sum(np.square(response), axis=1, keepdims=True))
         spectrum = np.abs(np.fft.rfft(response, axis=1)) / np.where(level > 0.0, level, 1.0)  # of mean square 1
+        deviations = self.of_response(parameters, response)
         return deviations * np.fft.irfft(spectrum * np.fft.rfft(normal, axis=1), n=n_steps, axis=1)
 
 

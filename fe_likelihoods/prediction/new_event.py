@@ -29,7 +29,7 @@ from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, measured_quantity
 from .streaming import quantiles_with_errors
 
-__all__ = ["draw_new_event", "event_level", "event_ratio", "predict_from_median", "predict_new_event"]
+__all__ = ["draw_new_event", "event_level", "event_ratio", "of_hierarchy", "predict_from_median", "predict_new_event"]
 
 _LARGEST_IMPOSSIBLE = 0.01  # share of draws with an impossible noise without a warning
 
@@ -180,8 +180,7 @@ def predict_new_event(
             )
     parameters, drawn, errors = np.random.SeedSequence(seed).spawn(3)
     draws, weights = draw_new_event(hierarchy, names, n, source.noise if noise else None, parameters)
-    measured = [each.measurements for each in hierarchy.posterior.tests.values() if each.measurements is not None]
-    settings = {"progress": False, "calibrated": measured, "check": False} | options
+    settings = {"progress": False} | of_hierarchy(hierarchy) | options
     prediction = propagate(
         posterior_or_model,
         draws,
@@ -330,6 +329,12 @@ def draw_new_event(
     if noise is not None:
         draws = _possible(draws, noise)
     return {name: draws[name] for name in names}, hierarchy.population_weights(draws)
+
+
+def of_hierarchy(hierarchy: Hierarchy) -> dict[str, Any]:
+    """Arguments of `propagate` for draws of a population, which was calibrated with all tests, not with one of them."""
+    tests = hierarchy.posterior.tests.values()
+    return {"calibrated": [each.measurements for each in tests if each.measurements is not None], "check": False}
 
 
 def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]:

@@ -39,6 +39,7 @@ __all__ = [
     "contents",
     "exceedance",
     "exceedance_probability",
+    "interval_of_draws",
     "threshold_in_si",
     "warn_of_missing_error",
 ]
@@ -61,8 +62,9 @@ class Exceedance(NamedTuple):
         the samples exceed; use the interval in these cases.
     lower, upper : ndarray
         Interval of the probability. With ratios, or for a new event, it contains what is unknown of the ratios and of
-        the population of the events. Otherwise it is the Clopper-Pearson interval for the effective sample size, which
-        contains the Monte Carlo error only.
+        the population of the events, and always the probability itself: small probabilities differ between populations
+        by powers of ten, and their mean can be above nearly all of them. Otherwise it is the Clopper-Pearson
+        interval for the effective sample size, which contains the Monte Carlo error only.
     effective_sample_size : float
         Effective number of independent samples.
     uncertainty : str
@@ -234,9 +236,41 @@ def exceedance_probability(
     values, limits = np.broadcast_arrays(values, limits)
     single = exceedance_of_samples(values, limits, spread.ratios, below)
     draws = exceedance_draws(values, limits, spread, np.random.default_rng(seed), below)
-    lower, upper = np.quantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
-    error = single.std(axis=0) / np.sqrt(effective)
-    return Exceedance(limits[0], single.mean(axis=0), error, lower, upper, effective, contents(False, spread))
+    share, error = single.mean(axis=0), single.std(axis=0) / np.sqrt(effective)
+    lower, upper = interval_of_draws(draws, share, effective, spread, level)
+    return Exceedance(limits[0], share, error, lower, upper, effective, contents(False, spread))
+
+
+def interval_of_draws(
+    draws: np.ndarray, share: np.ndarray, effective: ArrayLike, spread: EventSpread, level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Interval of a probability from its draws, which contains the probability itself.
+
+    Probabilities far in a tail differ between populations by many powers of ten, so that their mean, which is the
+    probability of a new event, can be above nearly all of them. The interval is then extended to it. Without ratios the
+    probabilities of the draws are shares of samples, which may all be zero or one: the interval also contains that of
+    Clopper & Pearson.
+
+    Parameters
+    ----------
+    draws : (n_draws, ...) ndarray
+        Probability given each draw of what is unknown of the events; NaN is left out.
+    share : (...) ndarray
+        The probability.
+    effective : float or (...) ndarray
+        Effective number of independent samples.
+    spread : EventSpread
+        Whether there are ratios.
+    level : float
+        Probability of the interval.
+
+    Returns
+    -------
+    lower, upper : (...) ndarray
+    """
+    lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    least, most = (share, share) if spread.ratios is not None else binomial_interval(share, effective, level)
+    return np.minimum(lower, least), np.maximum(upper, most)
 
 
 def contents(has_noise: bool, spread: EventSpread) -> str:

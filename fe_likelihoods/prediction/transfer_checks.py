@@ -100,11 +100,13 @@ def warn_of_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibra
         elif value < min(measured) / _LARGEST_PEAK_RATIO:
             far.append(f"{channel.name} ({value / min(measured):.2g} times the smallest calibrated one)")
     if far:
+        # Several events show how parameters vary between them, but not at amplitudes that none of them had.
+        other = "" if len(calibrated) > 1 else ", or let parameters vary between events (Hierarchy)"
         warnings.warn(
             f"the predicted peaks are outside of the range of the calibration by more than a factor of "
             f"{_LARGEST_PEAK_RATIO:g}: {', '.join(far)}. The parameters were calibrated at other amplitudes; where "
             "stiffness and damping depend on the amplitude, the prediction is beside the truth, and its spread does "
-            "not show it. Calibrate with events of this amplitude, or let parameters vary between events (Hierarchy)",
+            f"not show it. Calibrate with events of this amplitude{other}",
             stacklevel=3,
         )
 

@@ -308,6 +308,7 @@ class BandNoise:
         response: np.ndarray,
         normal: np.ndarray,
         dt: float | Sequence[float] | None = None,
+        sensor: bool = True,
     ) -> np.ndarray:
         """Errors (n_channels, n_steps) [SI] of a simulated response, from independent standard normal numbers.
 
@@ -317,11 +318,15 @@ class BandNoise:
             As for `response_deviations`.
         normal : (n_channels, n_steps) float
             The standard normal numbers.
+        sensor : bool
+            Whether the errors contain the noise of the sensors. Without it they are those of the model.
         """
         from scipy.fft import idct
 
         found = np.full(np.shape(response), np.nan)
         for c, samples, deviations in self._spectra(parameters, response, dt):
+            if not sensor:  # the sensor's noise is white: the same variance in each coefficient
+                deviations = np.sqrt(np.maximum(np.square(deviations) - self._floor[c] ** 2, 0.0))
             found[c, samples] = idct(deviations * normal[c, samples], norm="ortho")
         return found
 

@@ -76,8 +76,9 @@ class Noise(Protocol):
     * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
       standard deviations (n_channels, n_steps) of the errors of a simulated response; used in predictions in place of
       ``standard_deviations`` where the noise depends on the response.
-    * ``response_errors(parameters, response, normal, dt)``, which returns the errors (n_channels, n_steps) made of
-      standard normal numbers of that shape; for errors that are correlated in time and depend on the response.
+    * ``response_errors(parameters, response, normal, dt, sensor)``, which returns the errors (n_channels, n_steps) made
+      of standard normal numbers of that shape, with ``sensor=False`` without the noise of the sensors; for errors that
+      are correlated in time and depend on the response.
     * ``whitened(residuals, response, parameters)`` and ``log_densities(residuals, response, parameters)`` at the
       measured samples, for checks of residuals and for the log-likelihood in blocks of time.
     * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed where it

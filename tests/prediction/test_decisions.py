@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import special, stats
+from scipy.fft import dct
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.prediction.event_ratios import EventRatios, LevelRatios
@@ -15,11 +16,16 @@ from fe_likelihoods.prediction.new_event import event_level, event_ratio, predic
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak, rms
 from fe_likelihoods.prediction.reliability import exceedance
+from fe_likelihoods.probability.band_noise import BandNoise
 from fe_likelihoods.probability.distributions import HalfNormal, LogNormal
+from fe_likelihoods.probability.hierarchical_posterior import HierarchicalPosterior, Varying
+from fe_likelihoods.probability.hierarchy import Hierarchy
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import GaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.probability.priors import Prior
 from fe_likelihoods.probability.relative_noise import RelativeNoise
+from fe_likelihoods.probability.stored_posterior import StoredPosterior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from tests.benchmarks.decisions import fragility_twin
@@ -88,6 +94,58 @@ def test_intervals_of_the_probability_cover_the_true_probability(limit, rng):
     assert abs(np.mean(inside) - 0.9) < 4.0 * np.sqrt(0.09 / 300)
     control = exceedance(np.ones(50), limit, level=0.9)
     assert not control.lower <= truth <= control.upper
+
+
+def test_intervals_contain_their_own_probability(hierarchy, record, rng):  # noqa: F811
+    few = EventRatios([0.9887505, 1.00023499, 1.00460618])  # P has the tail of t with 2 degrees of freedom
+    limits = np.array([0.01, 0.1, 0.5, 0.9, 1.0, 1.1, 2.0, 10.0, 100.0])
+    found = exceedance(np.ones(200), limits, ratios=few)
+    assert np.all(found.lower <= found.probability) and np.all(found.probability <= found.upper)
+    exact = stats.t.sf(np.log(limits), few.degrees_of_freedom, np.log(few.median), few.scale)
+    np.testing.assert_allclose(found.probability, exact, rtol=1e-10)
+    quantile = np.quantile(few.draw_populations(100_000, rng, np.zeros(1)).sd, 0.99)
+    assert special.ndtr(-np.log(100.0) / quantile) < 1e-100 < 1e-7 < found.probability[-1]  # what made it fail
+    # Shares of samples that are all zero, or all one, are not certain.
+    options = {"quantity": peak("top"), "n": 200, "seed": 1}
+    plain = predict_new_event(hierarchy, Amplified(), 2.0, **options)
+    for limit, share in ((10.0 * plain.values.max(), 0.0), (0.1 * plain.values.min(), 1.0)):
+        found = exceedance(plain, limit, noise=False)
+        assert found.probability == share
+        assert found.upper - found.lower == pytest.approx(1.0 - 0.025 ** (1.0 / 200.0), rel=1e-6)
+    model, samples = Flexible(record), rng.normal(0.0, DISPERSION, size=(200, 1))
+    records = [record.scale(MEDIAN * k) for k in (0.05, 0.3, 1.0, 3.0, 20.0)]
+    curve = fragility(model, samples, records, peak("displacement"), 0.1, ratios=few, seed=1, progress=False)
+    assert np.all(curve.lower <= curve.probability) and np.all(curve.probability <= curve.upper)
+    lower, upper = curve.band()
+    assert np.all(lower <= curve.probability) and np.all(curve.probability <= upper)
+
+
+def test_fragility_of_a_hierarchy_is_compared_with_all_its_events(wave, rng):
+    events, prior = {"weak": 0.2, "strong": 2.0}, Prior({"gain": LogNormal(1.0, 0.5)})
+    posteriors = {name: with_noise(wave.with_record(wave.record.scale(k)), GaussianNoise) for name, k in events.items()}
+    tests = {
+        name: StoredPosterior(
+            {"gain": np.exp(0.05 * rng.standard_normal(200))}, prior, measurements=each.likelihood.measurements
+        )
+        for name, each in posteriors.items()
+    }
+    population = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
+    hierarchy = Hierarchy(population, [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2))))  # noqa: F811
+    options = {"ratios": RATIOS, "n": 50, "seed": 1, "progress": False}
+
+    def said(samples, strength, **more):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            records = [wave.record.scale(strength * k) for k in (0.5, 1.0)]
+            fragility(posteriors["weak"], samples, records, peak("top"), 1.0, **options, **more)
+        return [str(each.message) for each in found if "range of the calibration" in str(each.message)]
+
+    assert not said(hierarchy, 2.0)  # ten times the weak event, but as the strong one
+    (beyond,) = said(hierarchy, 20.0)
+    assert "10 times the largest" in beyond and "Hierarchy" not in beyond
+    assert said(hierarchy, 2.0, calibrated=[posteriors["weak"].likelihood.measurements])
+    (single,) = said(rng.normal(1.0, 0.05, size=(50, 1)), 2.0)
+    assert "vary between events (Hierarchy)" in single
 
 
 def test_exceedance_of_a_new_event_has_the_spread_of_the_population(hierarchy):  # noqa: F811
@@ -174,6 +232,29 @@ def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_r
     assert medians[True] > 1.15 * plain and 0.98 * plain < medians["model"] < 1.06 * plain
     with pytest.raises(ValueError, match='noise="model" needs a noise that follows the response'):
         propagate(with_noise(wave, GaussianNoise), samples, quantity=peak("top"), noise="model")
+
+
+def test_error_of_the_model_with_bands_has_no_noise_of_the_sensor_in_any_band():
+    rng, n, sensor = np.random.default_rng(1), 512, 0.5
+    response = np.sin(2.0 * np.pi * 2.0 * 0.01 * np.arange(n))[None]  # 2 Hz: almost nothing above 5 Hz
+    noise = BandNoise([Channel("top", "displacement", "m")], (1.0, 5.0), sensor={"top": sensor})
+    parameters = np.array([[0.3, 0.2, 0.4]])
+    error = model_error(noise, parameters, 0.01)
+    draws = np.stack([error.draw(0, n, rng, response)[0] for _ in range(3000)])
+    hertz = 0.5 / 0.01 * np.arange(n) / n
+    bands = [hertz < 1.0, (hertz >= 1.0) & (hertz < 5.0), hertz >= 5.0]
+    powers = np.square(dct(draws, norm="ortho", axis=1)).mean(axis=0)
+    own = np.square(dct(response[0], norm="ortho"))
+    for band, share in zip(bands, parameters[0], strict=True):
+        count = 3000 * band.sum()
+        assert powers[band].mean() == pytest.approx(share**2 * own[band].mean(), rel=4.0 * np.sqrt(2.0 / count))
+    assert powers[bands[2]].mean() < 1e-3 * sensor**2
+    np.testing.assert_allclose(
+        np.square(draws).mean(), np.square(error.of_response(parameters[0], response)).mean(), rtol=0.05
+    )
+    normal = rng.standard_normal((1, n))
+    whole = dct(noise.response_errors(parameters[0], response, normal, dt=0.01)[0], norm="ortho")
+    assert np.square(whole[bands[2]]).mean() > 0.8 * sensor**2  # with the sensor
 
 
 def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):
