@@ -16,6 +16,7 @@ Chapman and Hall/CRC, sections 3.2, 3.3 and 14.2.
 C. E. Rasmussen, C. K. I. Williams (2006), Gaussian Processes for Machine Learning, MIT Press, sections 2.2 and 2.7.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-__all__ = ["EventRatios", "LevelRatios", "RatioPopulations"]
+__all__ = ["EventRatios", "LevelRatios", "RatioPopulations", "standardised"]
 
 FORMS = ("constant", "linear", "smooth")
 _LEAST_EVENTS = {"constant": 1, "linear": 4, "smooth": 10}  # for a form to be among those that are averaged
@@ -76,7 +77,20 @@ def _checked_ratios(kind: str, values: Any, prior_sd: float, prior_events: float
             f"{kind}: one event does not show how ratios differ between events; give a guess of their standard "
             "deviation, such as prior_sd=0.15, and the number of events that it is worth, prior_events=3"
         )
+    if not prior_events and (np.ptp(np.log(found), axis=0) <= _REACH).any():
+        warnings.warn(
+            f"{kind}: the ratios of {len(found)} events are equal, so that nothing is left of the error of the model "
+            "between events: intervals have no width, and probabilities are 0 or 1. Give a guess of the standard "
+            "deviation, such as prior_sd=0.15, and the number of events that it is worth, prior_events=3",
+            stacklevel=4,
+        )
     return found
+
+
+def standardised(difference: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Differences divided by a scale; for a scale of zero infinite, and negative for a difference of zero."""
+    positive = np.asarray(scale) > 0.0
+    return np.where(positive, difference / np.where(positive, scale, 1.0), np.where(difference > 0.0, np.inf, -np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +112,11 @@ class EventRatios:
     ValueError
         If a ratio is not positive, the guess is not, or neither two events nor a guess are given.
 
+    Warns
+    -----
+    UserWarning
+        If all ratios of a quantity are equal and there is no guess: their spread is then zero.
+
     Notes
     -----
     The logarithms of the ratios are normal with unknown mean and variance. With a flat prior of the mean and a scaled
@@ -106,7 +125,9 @@ class EventRatios:
 
     .. math:: \nu = \nu_0 + K - 1, \qquad s^2 = \frac{\nu_0 s_0^2 + \sum_k (\ln r_k - m)^2}{\nu}
 
-    degrees of freedom, the mean m of the K logarithms as its center and the scale :math:`s \sqrt{1 + 1 / K}`.
+    degrees of freedom, the mean m of the K logarithms as its center and the scale :math:`s \sqrt{1 + 1 / K}`. The ratio
+    itself has no mean and no variance, because the tails of its logarithm are heavier than exponential: use medians and
+    other quantiles. The CRPS, a mean of distances, is that of the draws, and large by chance where K is small.
 
     References
     ----------
@@ -166,7 +187,7 @@ class EventRatios:
 
     def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:
         """Probability that the ratio of a new event exceeds `ratio`, whatever the predicted value is."""
-        return special.stdtr(self.degrees_of_freedom, (np.log(self.median) - np.log(ratio)) / self.scale)
+        return special.stdtr(self.degrees_of_freedom, standardised(np.log(self.median) - np.log(ratio), self.scale))
 
     def draw_populations(self, n: int, rng: np.random.Generator, log_predicted: np.ndarray) -> RatioPopulations:
         """Draw mean and standard deviation of the logarithm of the ratio from their posterior; one quantity."""
@@ -397,7 +418,8 @@ class LevelRatios:
     def _above(self, logs: np.ndarray, components: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Probability of the mixture above logarithms of ratios (m,)."""
         nu = self.degrees_of_freedom
-        return sum(w * special.stdtr(nu, (c - logs) / s) for w, (c, s) in zip(self._weights, components, strict=True))
+        parts = zip(self._weights, components, strict=True)
+        return sum(w * special.stdtr(nu, standardised(c - logs, s)) for w, (c, s) in parts)
 
     def _components(self, log_predicted: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Center and scale of the t distribution of each part of the mixture, at log levels (m,)."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from .event_ratios import EventRatios, LevelRatios, RatioPopulations
+from .event_ratios import EventRatios, LevelRatios, RatioPopulations, standardised
 
 __all__ = ["EventSpread", "exceedance_draws", "exceedance_of_samples"]
 
@@ -135,5 +135,6 @@ def _given_populations(
     positive = values > 0.0
     logs = np.log(np.where(positive, values, 1.0))
     sd = populations.sd.reshape(-1, *(1,) * (values.ndim - 1))
-    above = np.where(positive, special.ndtr((logs - np.log(limits) + populations.center_at(logs)) / sd), 0.0)
+    differences = logs - np.log(limits) + populations.center_at(logs)
+    above = np.where(positive, special.ndtr(standardised(differences, sd)), 0.0)
     return 1.0 - above if below else above

@@ -141,7 +141,8 @@ def predict_new_event(
     Returns
     -------
     Prediction
-        Its spread contains that between events. `exceedance` of it has intervals that contain what is unknown of the
+        Its spread contains that between events. With ratios, mean, variance and standard error are NaN: the exponential
+        of Student's t has no mean; use quantiles. `exceedance` of it has intervals that contain what is unknown of the
         population and of the ratios.
 
     Raises
@@ -366,11 +367,12 @@ def _corrected(prediction: Prediction, ratios: EventRatios | LevelRatios, rng: n
         values.reshape(len(values), -1), np.ones(len(values), dtype=int), prediction.probabilities, effective
     )
     shape = (len(prediction.probabilities), *prediction.mean.shape)
+    unknown = np.full(prediction.mean.shape, np.nan)  # exp(t) of Student's t has no mean
     return replace(
         prediction,
-        mean=values.mean(axis=0),
-        variance=values.var(axis=0),
-        standard_error=values.std(axis=0) / np.sqrt(effective),
+        mean=unknown,
+        variance=unknown,
+        standard_error=unknown,
         quantiles=quantiles.reshape(shape),
         quantile_error=errors.reshape(shape),
         values=values,

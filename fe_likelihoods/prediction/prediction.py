@@ -36,7 +36,8 @@ class Prediction:
     Attributes
     ----------
     mean : ndarray, shape (...)
-        Mean.
+        Mean. NaN with ratios of events (`fe_likelihoods.EventRatios`), as variance and standard error: the distribution
+        has no mean, however many draws are made. Use the median and other quantiles.
     variance : ndarray, shape (...)
         Variance.
     standard_error : ndarray, shape (...)
@@ -329,6 +330,8 @@ class Prediction:
 
         noise = "with measurement noise" if self.noise else "without measurement noise"
         lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
+        if self.spread is not None and self.spread.ratios is not None:
+            lines.append("the ratio of a new event has no mean: use the quantiles")
         if self.n_failed:
             lines.append(f"{self.n_failed} samples failed and are left out")
         units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]

@@ -1,10 +1,13 @@
 """Ratios of events: constant ones and those that depend on the level, against closed forms; coverage, with controls."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy import special, stats
 
 from fe_likelihoods.prediction.event_ratios import EventRatios, LevelRatios
+from fe_likelihoods.prediction.reliability import exceedance
 from tests.benchmarks.decisions import ratio_twin
 
 
@@ -123,3 +126,22 @@ def test_what_cannot_be_used_is_refused():
             ratios.quantile(p, level)
     with pytest.raises(ValueError, match="ratios of one quantity"):
         EventRatios([[1.0, 1.1], [0.9, 1.2]]).draw_populations(3, np.random.default_rng(1), np.zeros(1))
+
+
+def test_equal_ratios_are_said_and_have_no_nan():
+    with pytest.warns(UserWarning, match="EventRatios: the ratios of 2 events are equal.*prior_events=3"):
+        equal = EventRatios([1.0, 1.0])
+    with pytest.warns(UserWarning, match="LevelRatios: the ratios of 3 events are equal"):
+        levels = LevelRatios([1.0] * 3, [1.0, 2.0, 3.0])
+    with pytest.warns(UserWarning, match="are equal"):  # one of two quantities
+        EventRatios([[1.0, 1.1], [1.0, 1.2]])
+    for ratios in (equal, levels):
+        found = ratios.probability_above(np.array([0.9, 1.0, 1.1]), np.zeros(3))
+        assert found.tolist() == [1.0, 0.0, 0.0]  # strictly above, as without ratios
+        for limit, expected in ((0.9, 1.0), (1.0, 0.0), (1.1, 0.0)):
+            one = exceedance(np.ones(50), limit, ratios=ratios)
+            assert (one.lower, one.probability, one.upper) == (expected,) * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        EventRatios([1.0, 1.0], prior_sd=0.15, prior_events=3)
+        EventRatios([1.0, 1.001])

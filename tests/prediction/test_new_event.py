@@ -112,7 +112,11 @@ def test_peak_of_a_new_event_has_the_spread_of_the_population_and_of_the_ratios(
     logs = SPREAD * rng.standard_normal(40_000) + np.log(ratios.draw(40_000, rng))
     expected = median * np.exp(np.quantile(logs, [0.05, 0.5, 0.95]))
     np.testing.assert_allclose(corrected.quantiles, expected, rtol=0.04)
-    assert corrected.noise and corrected.mean == pytest.approx(corrected.values.mean())
+    assert corrected.noise and np.isfinite(plain.mean)
+    for none in (corrected.mean, corrected.variance, corrected.sd, corrected.standard_error):
+        assert none.shape == () and np.isnan(none)  # exp(t) has no mean
+    assert "has no mean: use the quantiles" in corrected._repr_html_()
+    assert "has no mean" not in plain._repr_html_()
     assert corrected.score(median).measured[0] == median
     again = predict_new_event(hierarchy, Amplified(), 2.0, ratios=ratios, **options)
     np.testing.assert_array_equal(again.values, corrected.values)
