@@ -622,8 +622,10 @@ def test_many_events_predict_new_ones(tmp_path):
         assert events[score] < 0.6 * usual[score]
     assert usual["upper / lower end"] < 1.2 < events["upper / lower end"]
     assert summary["evidence"]["by amplitude"] > summary["evidence"]["constant"] + 50.0
-    (axes,) = read_figure(tmp_path, "fragility").axes
-    assert len(texts(axes)) == 3 and axes.get_xlabel() == "Peak acceleration of the base [g]"
+    usual, events = summary["fragility"]["one event, as usual"], summary["fragility"]["population of events"]
+    assert events["wrong and certain"] <= usual["wrong and certain"] and 0.0 <= events["Brier score"] < 0.25
+    panels = read_figure(tmp_path, "fragility").axes
+    assert [panel.get_xlabel() for panel in panels] == ["Peak acceleration of the base [g]"] * 2
     for name in ("scores_as_usual", "scores_events", "events"):
         assert len(read_figure(tmp_path, name).axes) >= 2
 
