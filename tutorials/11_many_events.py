@@ -323,11 +323,11 @@ for name, column in zip(posterior.parameter_names, sampler.get_chain(flat=True).
 # Fragility
 # ---------
 #
-# The probability that the peak of the deck exceeds a limit, under several motions at each of some intensities: once from
-# the strongest event as usual, once with the spread between events and the ratio of peaks. The synthetic bridge has one
-# event under each motion, with parameters of its own. A motion is therefore exceeded or not, and the Brier score, the
-# mean square of (probability - outcome), judges the probabilities; 0 is best, 0.25 is that of a coin. The curve over many
-# motions hides what is wrong for a single one, because the motions differ more than the predictions.
+# The probability that the peak of the deck exceeds a limit, under several motions at each of some intensities: once
+# from the strongest event as usual, once with the spread between events and the ratio of peaks. The synthetic bridge
+# has one event under each motion, with parameters of its own: its peak exceeds the limit or not. The Brier score, the
+# mean square of (probability - outcome), judges the probabilities; 0 is best, 0.25 is that of a coin. The mean over
+# many motions hides what is wrong for a single one, because the motions differ more than the predictions.
 
 LIMIT = 0.5 * G
 GRID = np.exp(np.linspace(np.log(0.12), np.log(0.5), 4 if fast else 7))
