@@ -1,7 +1,7 @@
 """Predictions of events that the calibration has not seen: one bridge in eleven earthquakes, real measurements.
 
 Painter Street Overpass (CSMIP station 89324), transverse: a deck on its column and its two ends (`BridgeDeck`), whose
-middle (channel 7) is predicted. Three ways to predict an event:
+middle (channel 7) is predicted. Ways to predict an event:
 
 * "one event, as usual": the posterior of the 1992 main shock, white noise or effective samples, propagated under the
   other ten events;
@@ -10,7 +10,8 @@ middle (channel 7) is predicted. Three ways to predict an event:
 * "other events": each event from the ten others by `predict_new_event`;
 * "other events, amplitude-dependent": the same with `EquivalentLinear`, whose softening and growth of damping are
   common to all events. One event does not tell them from its frequency and damping, so its posterior follows from that
-  of the linear model without simulations of the other one (`_amplitude_dependent`).
+  of the linear model without simulations of the other one (`_amplitude_dependent`);
+* "..., by the median": peaks by `predict_from_median` with the same populations.
 
 The rows are medians over the events (RRMSE, CRPS, interval score and width as multiples of the root mean square of the
 measured channel; coverage of the 90 % band, and of its strong part), the share of measured peaks within their 50 and
@@ -23,6 +24,7 @@ The data are no part of this project: set FE_SHARED to a folder with the downloa
 """
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,6 +55,7 @@ from fe_likelihoods import (
     Varying,
     event_ratio,
     peak,
+    predict_from_median,
     predict_new_event,
     propagate,
     read_v2,
@@ -121,22 +124,27 @@ def transfer(repeats: int = 1) -> list[Row]:
         guess = EventRatios([ratios[_MAIN]], **_GUESS)
         scored = [_new_event(single, guess, relative[name].posterior, seed) for name in unseen]
         rows += _rows("one event, spread stated", seed, scored)
-        scored = []
-        for name in records:
-            others = {other: fit for other, fit in relative.items() if other != name}
-            measured = EventRatios([ratios[other] for other in others])
-            scored.append(_new_event(_hierarchies(others, seed), measured, relative[name].posterior, seed))
-        rows += _rows("other events", seed, scored)
+        rows += _held_out("other events", relative, ratios, seed)
         amplitude = {name: _amplitude_dependent(fit, seed) for name, fit in relative.items()}
-        scored = []
-        for name in records:
-            others = {other: fit for other, fit in amplitude.items() if other != name}
-            measured = EventRatios([ratios[other] for other in others])
-            hierarchies = _hierarchies(others, seed, _COMMON)
-            scored.append(_new_event(hierarchies, measured, amplitude[name].posterior, seed))
-        rows += _rows("other events, amplitude-dependent", seed, scored)
+        rows += _held_out("other events, amplitude-dependent", amplitude, ratios, seed, _COMMON)
         rows += _evidence(relative, amplitude, seed)
     return rows
+
+
+def _held_out(
+    case: str, fits: dict[str, _Fit], ratios: dict[str, float], seed: int, common: dict | None = None
+) -> list[Row]:
+    """Each event from the other ones: by the population and ratios, and the peaks by the median of the population."""
+    scored, by_median = [], []
+    for name, own in fits.items():
+        others = {other: fit for other, fit in fits.items() if other != name}
+        hierarchies = _hierarchies(others, seed, common)
+        measured = EventRatios([ratios[other] for other in others])
+        scored.append(_new_event(hierarchies, measured, own.posterior, seed))
+        posteriors = {other: fit.posterior for other, fit in others.items()}
+        found = predict_from_median(hierarchies[0], posteriors, own.posterior, None, quantity=_PEAK, n=2000, seed=seed)
+        by_median.append(found.score(own.posterior.likelihood.measurements))
+    return _rows(case, seed, scored) + _peak_rows(f"{case}, by the median", seed, by_median)
 
 
 def _records(path: Path) -> dict[int, Record]:
@@ -290,29 +298,36 @@ def _score(histories: Prediction, peaks: Prediction, other: Posterior) -> _Score
 
 def _rows(case: str, seed: int, scored: list[_Scored]) -> list[Row]:
     histories, peaks = zip(*scored, strict=True)
-    pit = [each.pit[0] for each in peaks]
-    case = f"{case}, {len(scored)} events, seed {seed}"
-
-    def median(values: list[float]) -> float:
-        return float(np.median(values))
-
-    rows = [Row("RRMSE", case, median([each.rrmse[0] for each in histories]), "")]
+    named = f"{case}, {len(scored)} events, seed {seed}"
+    rows = [Row("RRMSE", named, _median([each.rrmse[0] for each in histories]), "")]
     for name in ("crps", "interval_score", "width"):
         scaled = [getattr(each, name)[0] / each.rms[0] for each in histories]
-        rows.append(Row(f"{name} / RMS", case, median(scaled), "", f"{min(scaled):.2g} to {max(scaled):.2g}"))
+        rows.append(Row(f"{name} / RMS", named, _median(scaled), "", f"{min(scaled):.2g} to {max(scaled):.2g}"))
     for name in ("coverage", "coverage_strong"):
         shares = [getattr(each, name)[0] for each in histories]
-        rows.append(Row(name, case, median(shares), "", f"{min(shares):.2f} to {max(shares):.2f}"))
+        rows.append(Row(name, named, _median(shares), "", f"{min(shares):.2f} to {max(shares):.2f}"))
+    return rows + _peak_rows(case, seed, peaks)
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values))
+
+
+def _peak_rows(case: str, seed: int, peaks: Sequence[QuantityScores]) -> list[Row]:
+    pit, rows = [each.pit[0] for each in peaks], []
+    case = f"{case}, {len(peaks)} events, seed {seed}"
     for level in (0.5, 0.9):
         rows.append(Row(f"peaks within {level:.0%}", case, share_within(pit, level), ""))
     ends = [each.upper[0] / each.median[0] for each in peaks]
-    rows.append(Row("upper end / median of the peak", case, median(ends), "", f"{min(ends):.2f} to {max(ends):.2f}"))
+    rows.append(Row("upper end / median of the peak", case, _median(ends), "", f"{min(ends):.2f} to {max(ends):.2f}"))
     apart = [each.upper[0] / each.lower[0] for each in peaks]
-    rows.append(Row("upper / lower end of the peak", case, median(apart), "", f"{min(apart):.2f} to {max(apart):.2f}"))
+    rows.append(Row("upper / lower end of the peak", case, _median(apart), "", f"{min(apart):.2f} to {max(apart):.2f}"))
     errors = [np.log(each.measured[0] / each.median[0]) for each in peaks]
     stated = np.log(apart) / (2.0 * norm.ppf(0.95))  # standard deviation of a normal distribution with these ends
     ratio = float(np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(stated))))
     rows.append(Row("error / stated error of the log peak", case, ratio, "", "root mean squares; 1 is right"))
     score = [each.interval_score[0] / each.measured[0] for each in peaks]
-    rows.append(Row("interval score / measured peak", case, median(score), "", f"{min(score):.2g} to {max(score):.2g}"))
+    rows.append(
+        Row("interval score / measured peak", case, _median(score), "", f"{min(score):.2g} to {max(score):.2g}")
+    )
     return rows
