@@ -136,7 +136,9 @@ class HierarchicalPosterior:
     The result is exact up to the finite number of samples if no parameter is common. The exact value of a common
     parameter is not among the samples, so the density of common and varying parameters is that of the mixture which is
     fitted to the samples of each test: correlations between them are kept, and shapes that the mixture does not
-    describe are lost. `Hierarchy` states the errors.
+    describe are lost. `Hierarchy` states the errors. Where a common parameter is within 4 standard deviations of a
+    bound of its prior, its density is fitted on the scale of its normal score, so that a test that says nothing about
+    it adds a constant (docs/theory/hierarchy.rst).
 
     Examples
     --------
@@ -170,7 +172,9 @@ class HierarchicalPosterior:
         self.described = {}
         for name, test in self.tests.items():
             try:
-                self.described[name] = describe(test, [*varying, *common], self._logarithmic, max_samples)
+                self.described[name] = describe(
+                    test, [*varying, *common], self._logarithmic, max_samples, n_common=len(common)
+                )
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
         self._set_smallest_sd()
@@ -212,6 +216,8 @@ class HierarchicalPosterior:
             state.update(f"{name} {self.tests[name].log_evidence} {each.effective_sample_size}".encode())
             for array in (each.points, each.log_weights, each.log_prior, each.means, each.covariances):
                 state.update(np.ascontiguousarray(array).tobytes())
+            if each.common is not None:
+                state.update(complete_repr(each.common).encode())
         return state.hexdigest()
 
     def __call__(self, x: Any) -> np.ndarray | float:

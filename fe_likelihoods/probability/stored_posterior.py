@@ -26,6 +26,8 @@ __all__ = [
     "resampled_description",
 ]
 
+_NEAR = 4.0  # distance of a bound from the mean, in standard deviations, within which a normal density does not fit
+
 
 @dataclass(frozen=True, eq=False)
 class StoredPosterior:
@@ -139,6 +141,9 @@ class DescribedPosterior(NamedTuple):
         The mixture in standardised coordinates.
     effective_sample_size : float
         Effective number of independent samples.
+    common : MixtureDistribution, optional
+        Density of the common parameters alone, fitted on the scale of the normal scores of their priors, if a sample
+        of one of them is near a bound of its prior.
     """
 
     points: np.ndarray
@@ -151,6 +156,7 @@ class DescribedPosterior(NamedTuple):
     covariances: np.ndarray
     mixture: MixtureDistribution
     effective_sample_size: float
+    common: MixtureDistribution | None = None
 
     def log_prior_at(self, points: np.ndarray) -> np.ndarray:
         """Logarithm of the prior density (...) of points (..., dim) on the scale of the population."""
@@ -183,7 +189,12 @@ def log_density_on_scale(prior: Prior, logarithmic: np.ndarray, points: np.ndarr
 
 
 def describe(
-    stored: StoredPosterior, names: Sequence[str], logarithmic: np.ndarray, max_samples: int, seed: int = 0
+    stored: StoredPosterior,
+    names: Sequence[str],
+    logarithmic: np.ndarray,
+    max_samples: int,
+    seed: int = 0,
+    n_common: int = 0,
 ) -> DescribedPosterior:
     """Describe the stored samples of some parameters.
 
@@ -199,6 +210,8 @@ def describe(
         Largest number of samples. More samples are thinned: evenly, or by systematic resampling if they have weights.
     seed : int
         Seed of the resampling and of the fit.
+    n_common : int
+        The last `n_common` parameters have one value in all tests.
 
     Returns
     -------
@@ -216,6 +229,7 @@ def describe(
     equal = np.ptp(stored.log_weights) == 0.0
     rows = _systematic(weights, min(len(points), max_samples), rng)  # evenly spaced rows for equal weights
     mixture = _fit(points[rows], names, stored.effective_sample_size, seed)
+    common = _fit_common(points[rows], prior, n_common, stored.effective_sample_size, seed)
     if len(points) > max_samples:
         points, log_weights = points[rows], np.full(len(rows), -np.log(len(rows)))
     else:
@@ -224,7 +238,7 @@ def describe(
     if len(stored.samples) > max_samples and not equal:  # resampling adds the error of as many samples
         size = 1.0 / (1.0 / stored.effective_sample_size + 1.0 / max_samples)
     incomplete = DescribedPosterior(
-        points, log_weights, np.zeros(len(points)), prior, logarithmic, *_components(mixture), mixture, size
+        points, log_weights, np.zeros(len(points)), prior, logarithmic, *_components(mixture), mixture, size, common
     )
     return incomplete._replace(log_prior=incomplete.log_prior_at(points))
 
@@ -233,16 +247,24 @@ def resampled_description(described: DescribedPosterior, rng: np.random.Generato
     """A description of samples drawn with replacement from the described ones, to estimate statistical errors.
 
     As many samples are drawn as there are effective ones. The points stay the same; their weights are the counts of
-    the draws, and the mixture is fitted to the draws, starting from the given one.
+    the draws, and the mixtures are fitted to the draws, starting from the given ones.
     """
     size = max(round(described.effective_sample_size), 1)
     counts = rng.multinomial(size, np.exp(described.log_weights) / np.exp(described.log_weights).sum())
     with np.errstate(divide="ignore"):
         log_weights = np.log(counts / size)
-    mixture = described.mixture.refitted(np.repeat(described.points, counts, axis=0))
+    drawn, common = np.repeat(described.points, counts, axis=0), described.common
+    mixture = described.mixture.refitted(drawn)
+    if common is not None:
+        common = common.refitted(drawn[:, -common.dim :])
     shares, means, covariances = _components(mixture)
     return described._replace(
-        log_weights=log_weights, log_shares=shares, means=means, covariances=covariances, mixture=mixture
+        log_weights=log_weights,
+        log_shares=shares,
+        means=means,
+        covariances=covariances,
+        mixture=mixture,
+        common=common,
     )
 
 
@@ -258,6 +280,32 @@ def _fit(points: np.ndarray, names: Sequence[str], effective: float, seed: int) 
         }
     )
     return fit_mixture(points, coordinates, effective_sample_size=effective, seed=seed)
+
+
+def _fit_common(
+    points: np.ndarray, prior: Prior, n_common: int, effective: float, seed: int
+) -> MixtureDistribution | None:
+    """Density of the common parameters, the last columns of points (n, dim), if one of them is near a bound.
+
+    A mixture of normal distributions of the parameter itself cannot describe a density that ends at a bound. That of
+    its normal score under the prior can: where a test says nothing, the score is standard normal.
+    """
+    names = prior.names[len(prior.names) - n_common :]
+    if not n_common or any(name not in prior.distributions for name in names):  # a joint prior
+        return None
+    values, bounds = points[:, -n_common:], prior.bounds[-n_common:]
+    distances = np.abs(bounds - values.mean(axis=0)[:, None]) / values.std(axis=0)[:, None]
+    if (distances > _NEAR).all():
+        return None
+    # without near bounds, the coordinate is that of the joint mixture, which is accurate far from the prior too
+    far = (distances > _NEAR).all(axis=1)
+    scores = Prior(
+        {
+            name: TruncatedNormal(mean, sd, -np.inf, np.inf) if inside else prior.distributions[name]
+            for name, mean, sd, inside in zip(names, values.mean(axis=0), values.std(axis=0), far, strict=True)
+        }
+    )
+    return fit_mixture(values, scores, effective_sample_size=effective, seed=seed)
 
 
 def _components(mixture: MixtureDistribution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
