@@ -97,6 +97,9 @@ class Agreement(NamedTuple):
         Parameters that are compared on a logarithmic scale.
     messages : tuple of str
         What limits the comparison; empty if nothing was found.
+    left_out : dict of str to tuple of str
+        Tests with parameters that were not compared, because the test says too little about them or its prior cannot be
+        taken out.
     """
 
     pairs: tuple[PairAgreement, ...]
@@ -106,11 +109,14 @@ class Agreement(NamedTuple):
     level: float
     logarithmic: tuple[str, ...]
     messages: tuple[str, ...]
+    left_out: dict[str, tuple[str, ...]]
 
     @property
-    def agree(self) -> bool:
-        """Whether no disagreement was found, neither of a pair nor of all tests together."""
-        return self.smallest_p >= self.level
+    def agree(self) -> bool | None:
+        """False where a pair or all tests together disagree, else True; None (not known) if something was left out."""
+        if self.smallest_p < self.level:
+            return False
+        return None if self.left_out else True
 
     @property
     def smallest_p(self) -> float:
@@ -124,11 +130,15 @@ class Agreement(NamedTuple):
     def sentence(self) -> str:
         """The result in words, and what follows for predictions."""
         p = f"p < {2 * _SMALLEST_P:.0g}" if self.smallest_p <= 2.0 * _SMALLEST_P else f"p = {self.smallest_p:.1g}"
-        if self.agree:
+        if self.agree is not False:
             limits = ", ".join(self._difference(name, value) for name, value in self.detectable.items())
+            unknown = "; ".join(f"{', '.join(names)} of {test!r}" for test, names in self.left_out.items())
+            unknown = (
+                unknown and f"Whether all tests agree is not known: {unknown} could not be compared. In the rest: "
+            )
             return (
-                f"No disagreement was found ({p}). A true difference between two tests of {limits} is found in "
-                f"{_POWER:.0%} of such comparisons; smaller ones may be there."
+                f"{unknown}No disagreement was found ({p}). A true difference between two tests of {limits} is found "
+                f"in {_POWER:.0%} of such comparisons; smaller ones may be there."
             )
         found = [pair for pair in self.pairs if pair.adjusted < self.level]
         if len(self.pairs) == 1:
@@ -271,6 +281,11 @@ def compare_tests(
         level,
         tuple(name for name, log in zip(names, logarithmic, strict=True) if log),
         tuple(messages),
+        {
+            test: tuple(name for name in names if name not in each.names)
+            for test, each in found.items()
+            if len(each.names) < len(names)
+        },
     )
 
 

@@ -7,18 +7,24 @@ The posterior of the hyper-parameters without test k is that of all tests divide
    p(\varphi \mid D_{-k}) \propto \frac{p(\varphi \mid D)}{m_k(\varphi)}, \qquad
    p(D_k \mid D_{-k}) = \left(E\left[\frac{1}{m_k(\varphi)}\right]\right)^{-1},
 
-the expectation over :math:`p(\varphi \mid D)`. The hyper-samples are weighted with :math:`1 / m_k`. Where these weights
-are unusable, because the test has moved the population far, the population without it is sampled anew. No model is
-simulated in either case. See ``docs/theory/hierarchy.rst``.
+the expectation over :math:`p(\varphi \mid D)`. The hyper-samples are weighted with :math:`1 / m_k` where these weights
+are nearly even. Otherwise the population without the test may be where no hyper-sample is, which weights cannot show:
+it is sampled anew, through populations in which the test counts less and less, :math:`p(\varphi \mid D_{-k}) m_k^t`
+with t from 1 to 0. The predictive density is then the product of the ratios of neighbouring populations, each by bridge
+sampling. No model is simulated in either case. See ``docs/theory/hierarchy.rst``.
 
 References
 ----------
 A. Vehtari, A. Gelman, J. Gabry (2017), Practical Bayesian model evaluation using leave-one-out cross-validation and
 WAIC, Statistics and Computing 27, 1413-1432, doi:10.1007/s11222-016-9696-4.
+
+X.-L. Meng, W. H. Wong (1996), Simulating ratios of normalizing constants via a simple identity: a theoretical
+exploration, Statistica Sinica 6, 831-860.
 """
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,9 +36,9 @@ from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
 
 __all__ = ["LeftOut", "leave_one_out"]
 
-_FEWEST_EFFECTIVE = 50.0  # hyper-samples
-_WALKERS, _STEPS = 128, 400  # of a new run, half of the steps is left out
-_FEWEST_TIMES = 10.0  # autocorrelation times in the steps that are used
+_SMALLEST_SHARE = 0.5  # effective hyper-samples of all: fewer may hide a region without samples
+_WALKERS, _BLOCK, _MOST_STEPS = 128, 200, 4000
+_FEWEST_TIMES = 10.0  # autocorrelation times in the steps that are used, the second half
 
 
 class LeftOut(NamedTuple):
@@ -45,15 +51,16 @@ class LeftOut(NamedTuple):
     pareto_shape : float
         Shape of the tail of the weights 1 / m_k [-].
     effective_samples : float
-        Effective number of hyper-samples after weighting.
+        Effective number of hyper-samples after weighting, or of the new samples.
     sampled : bool
-        Whether the population was sampled anew, because the shape is above 0.7 or fewer than 50 effective samples are
-        left.
+        Whether the population was sampled anew, because the shape is 0.7 or more, or less than half of the
+        hyper-samples are effective.
     log_density : float
         Logarithm of the predictive density of all data of the test given the other tests, a proper score: larger is
         better. NaN if its `StoredPosterior` has no `log_evidence`.
     log_density_error : float
-        Standard error of it from the number of hyper-samples and the error of the evidence.
+        Standard error of it from the number of hyper-samples, which are taken as independent, that of the new samples,
+        and the error of the evidence.
     """
 
     hierarchy: Hierarchy
@@ -74,9 +81,10 @@ def leave_one_out(
     hierarchy : Hierarchy
         Population of two tests or more.
     sample : callable, optional
-        Function of a `HierarchicalPosterior` that returns samples (n, ndim) of its hyper-parameters, for tests that
-        weights cannot leave out. Default: emcee with differential evolution, 128 walkers that start from the weighted
-        hyper-samples, and 400 steps, of which the second half is used.
+        Function of a `HierarchicalPosterior` that returns independent samples (n, ndim) of its hyper-parameters, for
+        tests that weights cannot leave out. Default: emcee with differential evolution and 128 walkers, which start
+        from the population of all tests and lose the test in steps; each step takes 20 autocorrelation times, of which
+        the second half is used, and at most 4000 moves.
     seed : int
         Seed of resampling and of the default sampler.
 
@@ -93,7 +101,7 @@ def leave_one_out(
     Warns
     -----
     UserWarning
-        If tests are left out by new samples, which names them, and if such a run was too short.
+        If a new run of the default sampler was too short.
 
     Examples
     --------
@@ -104,23 +112,20 @@ def leave_one_out(
     if len(posterior.tests) < 2:
         raise ValueError(f"leave_one_out needs two tests or more; got {', '.join(map(repr, posterior.tests))}")
     log_marginals = posterior.log_marginals(hierarchy.samples)
-    rng, found, anew = np.random.default_rng(seed), {}, []
+    rng, found = np.random.default_rng(seed), {}
     for k, name in enumerate(posterior.tests):
         rest, own = posterior.without(name), log_marginals[:, k]
         weights, shape = smoothed_weights(own.min() - own)
         effective = float(1.0 / np.square(weights).sum())
-        sampled = bool(shape > LARGEST_SHAPE or effective < min(_FEWEST_EFFECTIVE, 0.5 * len(own)))
-        rows = _systematic(weights, len(own), rng)
-        samples = hierarchy.samples[rows]
-        if sampled:
-            anew.append(f"{name!r} (Pareto shape {shape:.2f}, {effective:.0f} effective samples)")
-            samples = (
-                _sample_anew(rest, samples, rng) if sample is None else as_points(sample(rest), rest.parameter_names)
-            )
-            own = posterior.log_marginals(samples)[:, k]
-            weights = np.full(len(own), 1.0 / len(own))
-            effective = float(len(np.unique(samples, axis=0)))
-        log_density, error = _log_mean(own, weights)
+        sampled = not (shape < LARGEST_SHAPE and effective >= _SMALLEST_SHARE * len(own))
+        if not sampled:
+            samples = hierarchy.samples[_systematic(weights, len(own), rng)]
+            log_density, error = _log_mean(own, weights)
+        elif sample is None:
+            samples, log_density, error = _sample_anew(posterior, k, hierarchy.samples, own, rng)
+        else:
+            samples = as_points(sample(rest), rest.parameter_names)
+            log_density, error = _bridge(own, posterior.log_marginals(samples)[:, k])
         stored = posterior.tests[name]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what limits the tests was said of all of them; checks have the rest
@@ -128,16 +133,10 @@ def leave_one_out(
         found[name] = LeftOut(
             population,
             shape,
-            effective,
+            float(len(np.unique(samples, axis=0))) if sampled else effective,
             sampled,
             np.nan if stored.log_evidence is None else log_density,
             float(np.hypot(error, stored.log_evidence_error)),
-        )
-    if anew:
-        warnings.warn(
-            f"these tests have moved the population so far that weights cannot leave them out: {', '.join(anew)}. The "
-            "population without them was sampled anew, without simulations",
-            stacklevel=2,
         )
     return found
 
@@ -158,28 +157,92 @@ def _log_mean(log_values: np.ndarray, weights: np.ndarray) -> tuple[float, float
     return float(largest + np.log(mean)), float(error)
 
 
-def _sample_anew(posterior: HierarchicalPosterior, start: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples of the hyper-parameters from an ensemble that starts at the weighted samples."""
+def _bridge(log_upper: np.ndarray, log_lower: np.ndarray) -> tuple[float, float]:
+    """Logarithm of the ratio of two normalising constants, and its standard error (Meng and Wong 1996, section 3).
+
+    The densities have the ratio r, up to the wanted constant. Given is log r at independent samples of the density with
+    r as a factor (upper), and of that without it (lower).
+    """
+    from scipy.optimize import brentq  # slow to import
+    from scipy.special import expit
+
+    shift = np.log(len(log_upper) / len(log_lower))
+
+    def shares(log_ratio: float) -> tuple[np.ndarray, np.ndarray]:
+        return expit(log_lower - log_ratio + shift), expit(log_ratio - shift - log_upper)
+
+    ends = [min(log_upper.min(), log_lower.min()) - 20.0, max(log_upper.max(), log_lower.max()) + 20.0]
+    log_ratio = brentq(lambda x: np.subtract(*(each.sum() for each in shares(x))), *(np.array(ends) + shift))
+    error = np.sqrt(sum(each.var() / (len(each) * each.mean() ** 2) for each in shares(log_ratio)))
+    return float(log_ratio), float(error)
+
+
+def _sample_anew(
+    posterior: HierarchicalPosterior, k: int, samples: np.ndarray, own: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, float, float]:
+    """Samples without test k, log-density of its data and its error, by a sequence in which the test counts less."""
+    power, log_density, variance = 1.0, 0.0, 0.0
+    while power > 0.0:
+        lower = _next_power(own, power)
+        weights = np.exp((lower - power) * (own - own.min()))
+        rows = _systematic(weights, len(own), rng)
+        new = _ensemble(partial(_log_prob, posterior, k, lower), samples[rows], rng)
+        new_own = posterior.log_marginals(new)[:, k]
+        ratio, error = _bridge((power - lower) * own, (power - lower) * new_own)
+        # neighbouring ratios share samples and depend on each other: at most twice the variance of independent ones
+        log_density, variance = log_density + ratio, variance + 2.0 * error**2
+        power, samples, own = lower, new, new_own
+    return samples, log_density, float(np.sqrt(variance))
+
+
+def _log_prob(posterior: HierarchicalPosterior, k: int, power: float, x: np.ndarray) -> np.ndarray:
+    """Log-density of the hyper-parameters in which the likelihood of test k has this power."""
+    log_density = posterior.log_prior(x)
+    inside = log_density > -np.inf
+    if inside.any():
+        marginals = posterior.log_marginals(x[inside])
+        log_density[inside] += marginals.sum(axis=1) - (1.0 - power) * marginals[:, k]
+    return log_density
+
+
+def _next_power(own: np.ndarray, power: float) -> float:
+    """The smallest power whose weights leave half of the samples effective; 0 if possible."""
+
+    def share(lower: float) -> float:
+        weights = np.exp((lower - power) * (own - own.min()))
+        return float(weights.sum() ** 2 / (np.square(weights).sum() * len(own)))
+
+    low, high = 0.0, power
+    if share(low) >= _SMALLEST_SHARE:
+        return low
+    while high - low > 1e-3 * power:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if share(middle) >= _SMALLEST_SHARE else (middle, high)
+    return high if high < power else 0.5 * power
+
+
+def _ensemble(log_prob: Callable[[np.ndarray], np.ndarray], start: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Samples of a density, about one autocorrelation time apart, from an ensemble with differential evolution."""
     import emcee
 
-    walkers = max(_WALKERS, 4 * posterior.ndim)
-    # different points: weighted samples, and pairs of them a little apart
+    ndim = start.shape[1]
+    walkers = max(_WALKERS, 4 * ndim)
     first = start[rng.integers(len(start), size=walkers)]
-    spread = np.maximum(start.std(axis=0), 1e-3 * np.abs(start).mean(axis=0))
-    proposals = first + 0.3 * spread * rng.standard_normal((20, walkers, posterior.ndim))
-    for proposed in proposals:
-        moved = np.isfinite(posterior.log_prior(proposed))
-        first = np.where(moved[:, None], proposed, first)
-    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(walkers, posterior.ndim, posterior.log_prob, moves=moves, vectorize=True)
+    # weighted samples are repeated: points a little apart, where they are possible
+    apart = first + 0.3 * start.std(axis=0) * rng.standard_normal(first.shape)
+    first = np.where(np.isfinite(log_prob(apart))[:, None], apart, first)
+    # not emcee's DESnookerMove, whose samples are too narrow (emcee 3.1.6): see tests/contract/test_emcee_moves.py
+    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DEMove(gamma0=1.0), 0.2)]
+    sampler = emcee.EnsembleSampler(walkers, ndim, log_prob, moves=moves, vectorize=True)
     sampler.random_state = np.random.RandomState(int(rng.integers(2**31))).get_state()
-    sampler.run_mcmc(first, _STEPS, skip_initial_state_check=True)
-    used = _STEPS // 2
-    time = float(np.max(sampler.get_autocorr_time(discard=_STEPS - used, quiet=True, tol=0)))
-    if not used > _FEWEST_TIMES * time:
+    state, time = first, np.inf
+    while sampler.iteration < 2.0 * _FEWEST_TIMES * time and sampler.iteration < _MOST_STEPS:
+        state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True)
+        time = float(np.max(sampler.get_autocorr_time(discard=sampler.iteration // 2, quiet=True, tol=0)))
+    if not sampler.iteration >= 2.0 * _FEWEST_TIMES * time:
         warnings.warn(
-            f"a population of {len(posterior.tests)} tests was sampled for {used / time:.1f} "
-            f"autocorrelation times, {_FEWEST_TIMES:.0f} are needed: give sample= with another sampler",
-            stacklevel=4,
+            f"a population was sampled for {sampler.iteration / 2.0 / time:.1f} autocorrelation times, "
+            f"{_FEWEST_TIMES:.0f} are needed: give sample= with another sampler",
+            stacklevel=5,
         )
-    return sampler.get_chain(discard=_STEPS - used, thin=max(int(time / 2.0), 1), flat=True)
+    return sampler.get_chain(discard=sampler.iteration // 2, thin=max(int(np.ceil(time)), 1), flat=True)

@@ -153,6 +153,11 @@ def test_what_limits_a_comparison_is_said(rng):
     limited = compare_tests(tests | {"W": wide}, ["a", "b"])
     assert len(limited.pairs) == 1 and np.isnan(limited.p_value)
     assert sum("'W' says too little about" in text for text in limited.messages) == 2
+    assert limited.agree is None and limited.left_out == {"W": ("a", "b")}
+    assert "not known: a, b of 'W' could not be compared" in limited.sentence
+    assert compare_tests(tests, ["a", "b"]).agree is True  # control: nothing was left out
+    apart = compare_tests(twin(rng, difference=30.0) | {"W": wide}, ["a", "b"])
+    assert apart.agree is False and apart.left_out == limited.left_out
     bounded = Prior({"a": Uniform(0.0, 1.0)})
     at_bound = StoredPosterior(1.0 - np.abs(0.05 * rng.standard_normal((500, 1))), bounded)
     inside = StoredPosterior(0.5 + 0.05 * rng.standard_normal((500, 1)), bounded)

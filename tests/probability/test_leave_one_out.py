@@ -42,9 +42,9 @@ def on_grid(posterior: HierarchicalPosterior) -> np.ndarray:
     return density / density.sum()
 
 
-def hierarchy_of(measured, n=2000, **options) -> Hierarchy:
+def hierarchy_of(measured, n=2000, seed=0, **options) -> Hierarchy:
     posterior = population(measured, **options)
-    rows = np.random.default_rng(0).choice(len(GRID), n, p=on_grid(posterior))
+    rows = np.random.default_rng(seed).choice(len(GRID), n, p=on_grid(posterior))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return Hierarchy(posterior, GRID[rows])
@@ -86,10 +86,12 @@ def test_weights_leave_tests_out_as_exactly_as_a_new_run(alike):
     assert abs(error) > 4.0 * np.sqrt(weights @ np.square(GRID[:, 0] - weights @ GRID[:, 0])) / np.sqrt(500.0)
 
 
+@pytest.mark.slow
 def test_a_test_that_moved_the_population_is_left_out_by_a_new_run(beside):
-    with pytest.warns(UserWarning, match=r"cannot leave them out: 'T5' \(Pareto shape 1\.\d+.*sampled anew") as caught:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         found = leave_one_out(beside)
-    assert len(caught) == 1 and [name for name, each in found.items() if each.sampled] == ["T5"]
+    assert [name for name, each in found.items() if each.sampled] == ["T5"]
     check(found["T5"], beside.posterior, "T5", ONE_BESIDE[5])
     check(found["T0"], beside.posterior, "T0", ONE_BESIDE[0])
     assert found["T5"].log_density < found["T0"].log_density - 4.0  # the others did not predict it
@@ -100,12 +102,25 @@ def test_a_test_that_moved_the_population_is_left_out_by_a_new_run(beside):
     assert abs(weights @ beside.samples[:, 1] - exact) > 4.0 * abs(found["T5"].hierarchy.samples[:, 1].mean() - exact)
 
 
+def test_even_tails_of_weights_do_not_hide_a_dominating_test():
+    """No hyper-sample is where the other tests agree, and the weights have a small Pareto shape all the same."""
+    measured = (1.0, 1.2, 0.9, 2.8)
+    hierarchy = hierarchy_of(measured, n=500, seed=7)
+    found = leave_one_out(hierarchy)["T3"]
+    assert found.sampled and found.pareto_shape < 0.5
+    check(found, hierarchy.posterior, "T3", measured[3])
+    assert found.log_density_error < 0.1
+    # control: the weights
+    own = hierarchy.posterior.log_marginals(hierarchy.samples)[:, 3]
+    weights, _ = smoothed_weights(own.min() - own)
+    assert np.log(weights @ np.exp(own)) > found.log_density + 1.0
+
+
 def test_another_sampler_can_be_given(beside):
     def sample(posterior):
         return GRID[np.random.default_rng(1).choice(len(GRID), 1000, p=on_grid(posterior))]
 
-    with pytest.warns(UserWarning, match="sampled anew"):
-        found = leave_one_out(beside, sample=sample)["T5"]
+    found = leave_one_out(beside, sample=sample)["T5"]
     check(found, beside.posterior, "T5", ONE_BESIDE[5])
     assert len(found.hierarchy.samples) == 1000
 
