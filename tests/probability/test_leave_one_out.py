@@ -78,8 +78,9 @@ def test_weights_leave_tests_out_as_exactly_as_a_new_run(alike):
         warnings.simplefilter("error")
         found = leave_one_out(alike)
     for (name, each), measured in zip(found.items(), ALIKE, strict=True):
-        assert not each.sampled and each.pareto_shape < 0.7 and each.effective_samples > 300
+        assert each.sampled or (each.pareto_shape < 0.7 and each.effective_samples >= 1000)  # half of the samples
         check(each, alike.posterior, name, measured)
+    assert {each.sampled for each in found.values()} == {False, True}  # T0 is sampled anew
     # control: the population of all tests is not that without T0
     weights = on_grid(alike.posterior.without("T0"))
     error = alike.samples[:, 0].mean() - weights @ GRID[:, 0]
