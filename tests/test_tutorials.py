@@ -626,7 +626,7 @@ def test_many_events_predict_new_ones(tmp_path):
     assert events["wrong and certain"] <= usual["wrong and certain"] and 0.0 <= events["Brier score"] < 0.25
     panels = read_figure(tmp_path, "fragility").axes
     assert [panel.get_xlabel() for panel in panels] == ["Peak acceleration of the base [g]"] * 2
-    for name in ("scores_as_usual", "scores_events", "events"):
+    for name in ("scores_as_usual", "scores_events", "scores_median", "events"):
         assert len(read_figure(tmp_path, name).axes) >= 2
 
 
