@@ -420,8 +420,9 @@ else:
         name: event_ratio(posterior, sampler.get_chain(flat=True)[::6], PEAK)
         for name, (posterior, sampler) in fitted.items()
     }
+    left_out = leave_one_out(population(real_stored), seed=args.seed)
     held_out = score_left_out(
-        leave_one_out(population(real_stored), seed=args.seed),
+        left_out,
         real_posteriors,
         quantity=PEAK,
         ratios=real_ratios,
@@ -431,6 +432,13 @@ else:
     real_scores = {name: each.scores for name, each in held_out.items()}
     summary["Painter Street, each from the others"] = show_scores("Painter Street, each from the others", real_scores)
     plot_scores(real_scores).savefig(args.out / "scores_painter_street.png", dpi=150)
+    by_median = {
+        name: predict_from_median(
+            each.hierarchy, real_posteriors, real_posteriors[name], None, quantity=PEAK, seed=args.seed
+        ).score(real_posteriors[name].likelihood.measurements)
+        for name, each in left_out.items()
+    }
+    summary["Painter Street, median"] = show_scores("the same, median and one ratio", by_median)
 
 summary |= {"evidence": {name: sampler.log_evidence for name, (_, sampler) in joints.items()}}
 (args.out / "summary.json").write_text(json.dumps(summary, indent=2))

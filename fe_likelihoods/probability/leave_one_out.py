@@ -96,7 +96,7 @@ def leave_one_out(
     Raises
     ------
     ValueError
-        For a hierarchy of a single test.
+        For a hierarchy of a single test, or with fewer different hyper-samples than twice the number of parameters.
 
     Warns
     -----
@@ -111,6 +111,12 @@ def leave_one_out(
     posterior = hierarchy.posterior
     if len(posterior.tests) < 2:
         raise ValueError(f"leave_one_out needs two tests or more; got {', '.join(map(repr, posterior.tests))}")
+    different = len(np.unique(hierarchy.samples, axis=0))
+    if different < 2 * posterior.ndim:
+        raise ValueError(
+            f"leave_one_out: expected {2 * posterior.ndim} different hyper-samples or more, twice the number of "
+            f"hyper-parameters; got {different}: sample the population with more walkers or steps"
+        )
     log_marginals = posterior.log_marginals(hierarchy.samples)
     rng, found = np.random.default_rng(seed), {}
     for k, name in enumerate(posterior.tests):
@@ -238,11 +244,14 @@ def _ensemble(log_prob: Callable[[np.ndarray], np.ndarray], start: np.ndarray, r
     state, time = first, np.inf
     while sampler.iteration < 2.0 * _FEWEST_TIMES * time and sampler.iteration < _MOST_STEPS:
         state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True)
-        time = float(np.max(sampler.get_autocorr_time(discard=sampler.iteration // 2, quiet=True, tol=0)))
+        times = sampler.get_autocorr_time(discard=sampler.iteration // 2, quiet=True, tol=0)
+        time = float(np.max(times)) if np.isfinite(times).all() else np.inf  # not known if a parameter never moved
     if not sampler.iteration >= 2.0 * _FEWEST_TIMES * time:
         warnings.warn(
             f"a population was sampled for {sampler.iteration / 2.0 / time:.1f} autocorrelation times, "
-            f"{_FEWEST_TIMES:.0f} are needed: give sample= with another sampler",
+            f"{_FEWEST_TIMES:.0f} are needed: give sample= with another sampler, or a Hierarchy with more different "
+            "hyper-samples",
             stacklevel=5,
         )
-    return sampler.get_chain(discard=sampler.iteration // 2, thin=max(int(np.ceil(time)), 1), flat=True)
+    thin = int(np.ceil(time)) if np.isfinite(time) else 1
+    return sampler.get_chain(discard=sampler.iteration // 2, thin=max(thin, 1), flat=True)

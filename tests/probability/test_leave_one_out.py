@@ -145,3 +145,12 @@ def test_a_single_test_cannot_be_left_out(alike):
     np.testing.assert_allclose(
         rest.log_likelihood(points), alike.posterior.log_marginals(points)[:, [0, 2, 3]].sum(axis=1)
     )
+
+
+def test_a_population_of_too_few_different_samples_is_refused():
+    posterior = population(ALIKE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        hierarchy = Hierarchy(posterior, np.repeat([[1.0, 0.4], [1.1, 0.3]], 50, axis=0))
+    with pytest.raises(ValueError, match="expected 4 different hyper-samples or more.*got 2"):
+        leave_one_out(hierarchy)
