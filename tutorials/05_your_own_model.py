@@ -51,7 +51,7 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Update your own model; write figures to a folder.")
     parser.add_argument("--pool", choices=("local", "dask", "none"), default="local")
     parser.add_argument("--workers", type=int, default=2, help="number of worker processes")
-    parser.add_argument("--walkers", type=int, default=12 if os.environ.get("FAST") else 200)
+    parser.add_argument("--walkers", type=int, default=24 if os.environ.get("FAST") else 200)
     parser.add_argument("--cache", type=Path, help="file of the simulation cache (default: in OUT)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the noise and of the sampler")
     parser.add_argument("--out", type=Path, default=Path("results-own-model"), help="folder of the results")

@@ -145,11 +145,13 @@ def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured:
     values = dict(job.model)
     if job.kind == "column":
         from ..models.rc_column import PARAMETERS, RCColumn
+        from ..models.rc_column_parts import BarBuckling, LowCycleFatigue
 
+        off = {"fatigue": LowCycleFatigue(), "buckling": BarBuckling()}  # a section switches them on
         usual = RCColumn.lhpost(record)
         for part in PARTS["column"]:
             if part in values:
-                values[part] = _changed(job, part, getattr(usual, part), values[part])
+                values[part] = _changed(job, part, getattr(usual, part) or off[part], values[part])
         if "units" in values:
             values["units"] = tuple((dict(usual.units) | values["units"]).items())
         _check_names(job, "parameters", values.get("parameters", ()), tuple(PARAMETERS))

@@ -81,6 +81,19 @@ _HOOPS = (
     Key("ultimate_strain", "number", "strain at fracture"),
     Key("spiral", "yes or no", "whether it is a spiral"),
 )
+_FATIGUE = (
+    Key("cf", "number", "plastic strain of a half cycle that breaks a bar (0.26)"),
+    Key("alpha", "number", "exponent of Coffin and Manson (0.506)"),
+    Key("cd", "number", "coefficient of the loss of strength (0.389)"),
+)
+_BUCKLING = (
+    Key(
+        "slenderness",
+        "number",
+        "unsupported length of a bar by its diameter; by default that of the spacing of the hoops",
+    ),
+    Key("alpha", "number", "1 for steel that hardens linearly (the default), 0.75 for steel that does not"),
+)
 _PIER = (
     Key("modulus", "stress", "modulus of elasticity"),
     Key("inertia", "number", "second moment of area [m⁴]"),
@@ -105,7 +118,14 @@ _DAMPER = (
     Key("count", "whole number", "number of dampers"),
 )
 PARTS: dict[str, dict[str, tuple[Key, ...]]] = {
-    "column": {"concrete": _CONCRETE, "steel": _STEEL, "bars": _BARS, "hoops": _HOOPS},
+    "column": {
+        "concrete": _CONCRETE,
+        "steel": _STEEL,
+        "bars": _BARS,
+        "hoops": _HOOPS,
+        "fatigue": _FATIGUE,
+        "buckling": _BUCKLING,
+    },
     "bridge": {
         **{f"pier_{i}": _PIER for i in (1, 2)},
         **{f"bearing_{i}": _BEARING for i in (1, 2)},
