@@ -93,19 +93,15 @@ def test_a_closed_queue_of_a_sampler_cancels_what_has_not_been_started(cluster, 
     client.wait_for_workers(1)
     pool = DaskExecutor(client)
     queue = PoolQueue(Gate(tmp_path), pool, list)
-    for item in range(6):  # tasks of their own
+    for item in range(20, 40):  # tasks of their own
         queue.submit([item])
     stop = time.monotonic() + 30.0
-    while not (tmp_path / "0").exists():
+    while not (tmp_path / "20").exists():
         assert time.monotonic() < stop
         time.sleep(0.01)
     queue.close()
-    # the scheduler hears of it in its own time; the worker has one that runs, and one or two that it has received
-    while sum(len(keys) for keys in client.processing().values()) > 3:
-        assert time.monotonic() < stop
-        time.sleep(0.01)
     (tmp_path / "go").touch()
     assert pool.map(Gate(tmp_path), [7]) == [7]
-    # a worker has received one or two before it starts them
+    # a worker has received a few before it starts them, more of them on a busy machine; without close, all 20 start
     begun = {path.name for path in tmp_path.iterdir()}
-    assert {"0", "7", "go"} <= begun and not {"3", "4", "5"} & begun
+    assert {"20", "7", "go"} <= begun and len(begun - {"7", "go"}) <= 8
