@@ -272,10 +272,10 @@ def test_the_amplitude_dependent_posterior_of_one_event_is_that_of_its_linear_mo
 def test_hyper_samples_of_the_synthetic_twins_are_those_of_the_posterior():
     """Many events of known spread determine median and spread; without events, they are those of the priors."""
     rng = np.random.default_rng(1)
-    data = 0.3 + np.hypot(0.2, new_event._ERROR) * rng.standard_normal(2000)
-    median, spread = new_event._hyper_samples(data, rng, 2000).T
+    data = 0.3 + np.hypot(0.2, new_event.ERROR) * rng.standard_normal(2000)
+    median, spread = new_event.hyper_samples(data, rng, 2000).T
     assert np.log(median).mean() == pytest.approx(data.mean(), abs=0.01)
-    assert spread.mean() == pytest.approx(np.sqrt(data.var() - new_event._ERROR**2), abs=0.01)
-    median, spread = new_event._hyper_samples(data[:0], rng, 2000).T
+    assert spread.mean() == pytest.approx(np.sqrt(data.var() - new_event.ERROR**2), abs=0.01)
+    median, spread = new_event.hyper_samples(data[:0], rng, 2000).T
     assert stats.kstest(np.log(median), stats.norm(0.0, 0.5).cdf).pvalue > 1e-3
     assert stats.kstest(spread, stats.halfnorm(scale=0.3).cdf).pvalue > 1e-3

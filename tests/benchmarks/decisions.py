@@ -38,6 +38,7 @@ from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.signals.records import Record
 
+from .new_event import ERROR, MEDIAN_SD, SPREAD_SD, hyper_samples
 from .rows import Row
 
 __all__ = ["fragility_bands", "fragility_twin", "level_ratios", "ratio_twin"]
@@ -49,8 +50,6 @@ _TRUTHS = {
     "slope 0.2": lambda x: 0.2 * x,
     "curve": lambda x: 0.25 * np.tanh(2.0 * x),
 }
-_MEDIAN_SD, _SPREAD_SD, _ERROR = 0.5, 0.3, 0.05
-_GRID = np.meshgrid(np.linspace(-2.0, 2.0, 161), np.linspace(0.0025, 1.2, 120), indexing="ij")
 _PROBABILITIES = np.linspace(0.05, 0.95, 9)  # of the true curve at the intensities
 
 
@@ -136,17 +135,17 @@ def fragility_bands(repeats: int = 1) -> list[Row]:
 def fragility_twin(events: int, seed: int, ratio_sd: float = 0.2, n: int = 400) -> tuple[bool, np.ndarray, np.ndarray]:
     """Whether the band holds the true curve, the intervals its points, and those of one posterior without error."""
     rng = np.random.default_rng([seed, events])
-    center, spread = _MEDIAN_SD * rng.standard_normal(), abs(_SPREAD_SD * rng.standard_normal())
+    center, spread = MEDIAN_SD * rng.standard_normal(), abs(SPREAD_SD * rng.standard_normal())
     logs = center + spread * rng.standard_normal(events)
     bias = 0.1
     ratios = EventRatios(np.exp(bias + ratio_sd * rng.standard_normal(events)))
-    data = logs + _ERROR * rng.standard_normal(events)
-    prior, sd = Prior({"gain": LogNormal(1.0, 1.0)}), _ERROR / np.sqrt(1.0 + _ERROR**2)
+    data = logs + ERROR * rng.standard_normal(events)
+    prior, sd = Prior({"gain": LogNormal(1.0, 1.0)}), ERROR / np.sqrt(1.0 + ERROR**2)
     stored = {
-        f"EQ{k}": StoredPosterior({"gain": np.exp(sd**2 / _ERROR**2 * each + sd * rng.standard_normal(200))}, prior)
+        f"EQ{k}": StoredPosterior({"gain": np.exp(sd**2 / ERROR**2 * each + sd * rng.standard_normal(200))}, prior)
         for k, each in enumerate(data)
     }
-    varying = {"gain": Varying(LogNormal(1.0, _MEDIAN_SD), HalfNormal(_SPREAD_SD))}
+    varying = {"gain": Varying(LogNormal(1.0, MEDIAN_SD), HalfNormal(SPREAD_SD))}
     total = np.hypot(spread, ratio_sd)
     intensities = np.exp(total * stats.norm.ppf(_PROBABILITIES) - center - bias)  # of the limit 1
     truth = special.ndtr((np.log(intensities) + center + bias) / total)
@@ -155,7 +154,7 @@ def fragility_twin(events: int, seed: int, ratio_sd: float = 0.2, n: int = 400) 
     options = {"level": 0.9, "seed": seed, "progress": False}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        hierarchy = Hierarchy(HierarchicalPosterior(stored, varying, max_samples=100), _hyper_samples(data, rng))
+        hierarchy = Hierarchy(HierarchicalPosterior(stored, varying, max_samples=100), hyper_samples(data, rng, 300))
     found = fragility(_Scaled(record), hierarchy, records, peak("top"), 1.0, ratios=ratios, n=n, **options)
     lower, upper = found.band(0.9)
     alone = fragility(_Scaled(record), stored["EQ0"].samples, records, peak("top"), 1.0, noise=False, **options)
@@ -164,18 +163,3 @@ def fragility_twin(events: int, seed: int, ratio_sd: float = 0.2, n: int = 400) 
         (found.lower <= truth) & (truth <= found.upper),
         (alone.lower <= truth) & (truth <= alone.upper),
     )
-
-
-def _hyper_samples(data: np.ndarray, rng: np.random.Generator, n: int = 300) -> np.ndarray:
-    """Samples of median and spread from their exact posterior density on a grid."""
-    center, spread = _GRID
-    variance = spread**2 + _ERROR**2
-    log_density = -0.5 * (center / _MEDIAN_SD) ** 2 - 0.5 * (spread / _SPREAD_SD) ** 2
-    for each in data:
-        log_density = log_density - 0.5 * np.log(variance) - 0.5 * (each - center) ** 2 / variance
-    density = np.exp(log_density - log_density.max()).ravel()
-    cells = rng.choice(density.size, n, p=density / density.sum())
-    width = center[1, 0] - center[0, 0], spread[0, 1] - spread[0, 0]
-    jitter = rng.random((2, n)) - 0.5
-    logs = center.ravel()[cells] + width[0] * jitter[0]
-    return np.stack([np.exp(logs), np.abs(spread.ravel()[cells] + width[1] * jitter[1])], axis=1)

@@ -32,10 +32,10 @@ from fe_likelihoods.prediction.scores import pit_samples
 
 from .rows import Row
 
-__all__ = ["new_event"]
+__all__ = ["ERROR", "MEDIAN_SD", "SPREAD_SD", "hyper_samples", "new_event"]
 
-_SETS, _NEW, _DRAWS, _ERROR, _RATIO = 200, 20, 400, 0.05, 0.1
-_MEDIAN_SD, _SPREAD_SD = 0.5, 0.3  # of the priors of the population's median and spread
+_SETS, _NEW, _DRAWS, ERROR, _RATIO = 200, 20, 400, 0.05, 0.1
+MEDIAN_SD, SPREAD_SD = 0.5, 0.3  # of the priors of the population's median and spread
 _CASES = {  # number of events, median and spread of the gains; None: drawn from the priors
     "5 events, truth from the priors": (5, None),
     "1 event, truth from the priors": (1, None),
@@ -77,22 +77,22 @@ def new_event(repeats: int = 1) -> list[Row]:
 def _data_set(events: int, truth: tuple[float, float] | None, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     """PIT of the peaks of new events, the same from the posterior of one event alone, and the relative upper end."""
     rng = np.random.default_rng([seed, events])
-    center, spread = rng.standard_normal(2) * [_MEDIAN_SD, _SPREAD_SD] if truth is None else np.array(truth)
+    center, spread = rng.standard_normal(2) * [MEDIAN_SD, SPREAD_SD] if truth is None else np.array(truth)
     center, spread, ratio_sd = (center, abs(spread), _RATIO) if truth is None else (np.log(center), spread, _RATIO)
     degrees = 3.0
     if events == 1:  # the guess of the spread of the ratios is right on average
         ratio_sd *= np.sqrt(degrees / rng.chisquare(degrees))
     logs, ratios = center + spread * rng.standard_normal(events), np.exp(ratio_sd * rng.standard_normal(events))
-    data = logs + _ERROR * rng.standard_normal(events)
-    prior, sd = Prior({"gain": LogNormal(1.0, 1.0)}), _ERROR / np.sqrt(1.0 + _ERROR**2)
+    data = logs + ERROR * rng.standard_normal(events)
+    prior, sd = Prior({"gain": LogNormal(1.0, 1.0)}), ERROR / np.sqrt(1.0 + ERROR**2)
     stored = {
-        f"EQ{k}": StoredPosterior({"gain": np.exp(sd**2 / _ERROR**2 * each + sd * rng.standard_normal(200))}, prior)
+        f"EQ{k}": StoredPosterior({"gain": np.exp(sd**2 / ERROR**2 * each + sd * rng.standard_normal(200))}, prior)
         for k, each in enumerate(data)
     }
-    varying = {"gain": Varying(LogNormal(1.0, _MEDIAN_SD), HalfNormal(_SPREAD_SD))}
+    varying = {"gain": Varying(LogNormal(1.0, MEDIAN_SD), HalfNormal(SPREAD_SD))}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        hierarchy = Hierarchy(HierarchicalPosterior(stored, varying, max_samples=100), _hyper_samples(data, rng))
+        hierarchy = Hierarchy(HierarchicalPosterior(stored, varying, max_samples=100), hyper_samples(data, rng))
     prior_of_ratio = {"prior_sd": _RATIO, "prior_events": degrees} if events == 1 else {}
     known = EventRatios(ratios, **prior_of_ratio)
     predicted = predict_new_event(hierarchy, _Twin(), None, quantity=peak("top"), ratios=known, n=_DRAWS, seed=seed)
@@ -102,11 +102,11 @@ def _data_set(events: int, truth: tuple[float, float] | None, seed: int) -> tupl
     return pit, single, float(predicted.quantile(0.95) / predicted.quantile(0.5))
 
 
-def _hyper_samples(data: np.ndarray, rng: np.random.Generator, n: int = 200) -> np.ndarray:
+def hyper_samples(data: np.ndarray, rng: np.random.Generator, n: int = 200) -> np.ndarray:
     """Samples of median and spread from their exact posterior density on a grid."""
     center, spread = _GRID
-    variance = spread**2 + _ERROR**2
-    log_density = -0.5 * (center / _MEDIAN_SD) ** 2 - 0.5 * (spread / _SPREAD_SD) ** 2
+    variance = spread**2 + ERROR**2
+    log_density = -0.5 * (center / MEDIAN_SD) ** 2 - 0.5 * (spread / SPREAD_SD) ** 2
     for each in data:
         log_density = log_density - 0.5 * np.log(variance) - 0.5 * (each - center) ** 2 / variance
     density = np.exp(log_density - log_density.max()).ravel()
