@@ -11,6 +11,7 @@ Proposals are fitted in units of the weighted standard deviations, so parameters
 The acceptance probabilities are derived in ``docs/theory/tempering``.
 """
 
+import copy
 import math
 from collections.abc import Callable
 
@@ -86,32 +87,34 @@ def calibrate_move(
         move.calibrate(coords, weights, inside)
 
 
-def _fit_to_ensemble(move: Move, coords: np.ndarray) -> None:
-    """Fit a move to the current walkers (n, ndim), for a plain EnsembleSampler, which does not call ``calibrate``."""
-    move.calibrate(coords, np.full(len(coords), 1.0 / len(coords)))
-
-
 class _FittedMove(MHMove):
-    """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points."""
+    """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points.
+
+    Where it was not calibrated (in a plain EnsembleSampler, or in a run that goes on from a chain without its journal),
+    two copies are fitted to one half of the walkers each, and move the other half. A proposal that was fitted to the
+    points that it moves would make their tails too light for many sweeps; this one is independent of them.
+    """
 
     def __init__(self):
-        super().__init__(self._draw)
-        self._mean = None
-        self._root = None
-
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit the proposal to points (n, ndim) with normalised weights (n,)."""
-        self._mean, self._root = location_and_root(coords, weights)
+        super().__init__(self._draw_all)
+        self._halves: tuple[_FittedMove, ...] = ()
 
     @property
-    def mean(self) -> np.ndarray | None:
-        """Weighted mean (ndim,) of the points that the proposal was fitted to; None before the first fit."""
-        return self._mean
+    def _is_fitted(self) -> bool:
+        raise NotImplementedError
 
-    @property
-    def root(self) -> np.ndarray | None:
-        """Lower-triangular root (ndim, ndim) of the fitted covariance or scale matrix; None before the first fit."""
-        return self._root
+    def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Proposed points and log-ratios of proposal densities for points (n, ndim)."""
+        raise NotImplementedError
+
+    def _draw_all(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        if not self._halves:
+            return self._draw(coords, random)
+        # not every second walker: resampled copies are neighbours, and would be in both halves
+        middle = len(coords) // 2
+        parts = coords[:middle], coords[middle:]
+        drawn = [half._draw(part, random) for half, part in zip(self._halves, parts, strict=True)]
+        return np.concatenate([points for points, _ in drawn]), np.concatenate([ratios for _, ratios in drawn])
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Propose a new point for each walker.
@@ -123,12 +126,48 @@ class _FittedMove(MHMove):
         accepted : ndarray of bool, shape (nwalkers,)
             Which proposals were accepted.
         """
-        if self._root is None:
-            _fit_to_ensemble(self, state.coords)
+        if not self._is_fitted and not self._halves:
+            middle, halves = len(state.coords) // 2, (copy.deepcopy(self), copy.deepcopy(self))
+            for half, others in zip(halves, (state.coords[middle:], state.coords[:middle]), strict=True):
+                half.calibrate(others, np.full(len(others), 1.0 / len(others)))
+            self._halves = halves
         return super().propose(model, state)
 
+    def tune(self, state: State, accepted: np.ndarray) -> None:
+        """Adapt the scale; nothing by default."""
+        for half in self._halves:
+            half.tune(state, accepted)
 
-class RandomWalkMove(_FittedMove):
+
+class _GaussianFit(_FittedMove):
+    """A move whose proposal has the mean and a root of the covariance of weighted points."""
+
+    def __init__(self):
+        super().__init__()
+        self._mean = None
+        self._root = None
+
+    @property
+    def _is_fitted(self) -> bool:
+        return self._root is not None
+
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
+        """Fit the proposal to points (n, ndim) with normalised weights (n,)."""
+        self._mean, self._root = location_and_root(coords, weights)
+        self._halves = ()
+
+    @property
+    def mean(self) -> np.ndarray | None:
+        """Weighted mean (ndim,) of the points that the proposal was fitted to; None before the first fit."""
+        return self._mean
+
+    @property
+    def root(self) -> np.ndarray | None:
+        """Lower-triangular root (ndim, ndim) of the fitted covariance or scale matrix; None before the first fit."""
+        return self._root
+
+
+class RandomWalkMove(_GaussianFit):
     """Gaussian random walk with the weighted covariance of the stage.
 
     Parameters
@@ -167,11 +206,12 @@ class RandomWalkMove(_FittedMove):
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """If `adapt`, increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
+        super().tune(state, accepted)
         if self.adapt:
             self._log_factor += float(np.mean(accepted)) - self.target
 
 
-class StudentTMove(_FittedMove):
+class StudentTMove(_GaussianFit):
     """Independent draws from a multivariate Student t with the weighted mean and covariance of the stage.
 
     When the posterior is nearly Gaussian, one sweep replaces most of the ensemble by new points. The tails are heavier
@@ -209,7 +249,7 @@ class StudentTMove(_FittedMove):
         return proposed, self._log_density(coords) - self._log_density(proposed)
 
 
-class MixtureMove(MHMove):
+class MixtureMove(_FittedMove):
     """Three kernels from one mixture of Student t fitted to the stage; each sweep chooses one of them at random.
 
     independence
@@ -249,7 +289,7 @@ class MixtureMove(MHMove):
     def __init__(self, max_components: int = 6, independence_threshold: float = 0.5, target: float = 0.25):
         if max_components < 1:
             raise ValueError(f"max_components must be at least 1; got {max_components}")
-        super().__init__(self._draw)
+        super().__init__()
         self.max_components = max_components
         self.independence_threshold = independence_threshold
         self.target = target
@@ -259,6 +299,10 @@ class MixtureMove(MHMove):
         self._log_factors = [0.0, 0.0, 0.0]
         self._current: int | None = None  # index of the kernel of the latest sweep; None right after a calibration
         self._independence_accepted = False
+
+    @property
+    def _is_fitted(self) -> bool:
+        return self._mixture is not None
 
     @property
     def mixture(self) -> Mixture | None:
@@ -281,7 +325,7 @@ class MixtureMove(MHMove):
         self._inside = inside
         self._archive = to_component_space(self._mixture, coords)
         self._cumulated = np.cumsum(weights)
-        self._current, self._independence_accepted = None, False
+        self._current, self._independence_accepted, self._halves = None, False, ()
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
         """Add components for parts of the target that the fitted mixture does not cover.
@@ -313,8 +357,6 @@ class MixtureMove(MHMove):
         accepted : ndarray of bool, shape (nwalkers,)
             Which proposals were accepted.
         """
-        if self._mixture is None:
-            _fit_to_ensemble(self, state.coords)
         # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
         shares = KERNEL_PROBABILITIES_IF_ACCEPTED if self._independence_accepted else KERNEL_PROBABILITIES
         self._current = 0 if self._current is None else model.random.choice(len(self._kernels), p=shares)
@@ -322,11 +364,17 @@ class MixtureMove(MHMove):
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """Adapt the scale of the kernel used last, or record whether independent draws have a high acceptance."""
+        super().tune(state, accepted)
         share = float(np.mean(accepted))
         if self._current == 0:
             self._independence_accepted = share > self.independence_threshold
         else:
             self._log_factors[self._current] += share - self.target
+
+    def _draw_all(self, coords, random):
+        for half in self._halves:
+            half._current = self._current
+        return super()._draw_all(coords, random)
 
     def _draw(self, coords, random):
         return self._kernels[self._current](coords, random)
