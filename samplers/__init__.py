@@ -68,6 +68,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .tempering.evidence_check import (
         EvidenceCheck,
     )
+    from .tempering.failed_region import (
+        NearFailures,
+    )
     from .tempering.guide import (
         Guide,
         GuideSession,
@@ -104,6 +107,7 @@ __all__ = [
     "MixtureMove",
     "Mode",
     "ModelComparison",
+    "NearFailures",
     "RAMANCHA_2022_CONSTANT",
     "RAMANCHA_2022_LITERAL",
     "RandomWalkMove",
@@ -174,6 +178,7 @@ _EXPORTS = {
     "tempered": ("TemperedSampler",),
     "tempering.diagnostics": ("SamplingWarning",),
     "tempering.evidence_check": ("EvidenceCheck",),
+    "tempering.failed_region": ("NearFailures",),
     "tempering.guide": (
         "Guide",
         "GuideSession",

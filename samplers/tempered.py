@@ -375,7 +375,7 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
             halted = True
         present.complete = store and not halted
         missing = 0 if iterations is None else iterations - new
-        self._judge(missing)
+        self._judge(missing, (stored if halted or advanced is None else advanced).coords)
         if halted:
             if advanced is not None:  # the move that exceeded the limit may have changed some of its walkers
                 for name in State.__slots__:
@@ -388,13 +388,15 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         elif present.runs_to_end and not store:
             self._checkpoint.pass_call(request, state if advanced is None else advanced)
 
-    def _judge(self, missing: int) -> None:
+    def _judge(self, missing: int, coords: np.ndarray) -> None:
         """Store the verdict on an annealing of this object, or keep that of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
             numbers = self.nwalkers, self.ndim, self.simulations
             searched = self._budget.of_guides
-            self._verdict = judge(self._result, self.settings.guided, *numbers, missing, failed, searched)
+            slow = self._budget.slow_columns(self.ndim)
+            self._near = self._evaluator.points.near(coords, slow, self._optional.counts_failures)
+            self._verdict = judge(self._result, self.settings.guided, *numbers, missing, failed, searched, self._near)
             self._checkpoint.store_verdict(self._verdict)
 
     def compute_log_prob(self, coords):

@@ -61,7 +61,7 @@ def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failu
     found = [
         *_of_the_verdict(run),
         *_of_the_chain(run, rows),
-        *_of_failures(failed, run.is_inconclusive),
+        *_of_failures(failed, run.is_inconclusive and not run.tempered),
         *_of_the_responses(fits),
         *_of_the_model(run),
         *_of_the_data(fits),
@@ -151,9 +151,9 @@ def _of_failures(failed: Failures, inconclusive: bool) -> list[Advice]:
     )
     largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
     found.append(Advice(CAUTION if largest > LARGE_FAILURE_SHARE else REMARK, "Simulations failed", text, action))
-    if failed.borders and not inconclusive:
+    if failed.near.borders and failed.near.known and not inconclusive:
         text = (
-            f"In the region of the samples, {failed.near_failed} of {failed.near} simulated points failed. The "
+            f"In the region of the samples, {failed.near.failed} of {failed.near.evaluated} simulated points failed. The "
             "failures, not the data, end the posterior there: its mean and its interval may be wrong."
         )
         action = (

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import ks_2samp
 
+from samplers.tempering.failed_region import NearFailures, failures_near
+
 from ..probability.likelihood import FELikelihood
 from .run import FinishedRun
 
@@ -18,9 +20,6 @@ __all__ = ["Failure", "Failures", "failures"]
 FEWEST_TO_COMPARE = 5  # failures, below which their place is not a pattern
 CLEAR_SEPARATION = 0.5  # Kolmogorov-Smirnov distance between the failed and the successful points
 UNLIKELY = 0.01  # probability of such a distance by chance
-FEWEST_NEAR = 3  # failures among the samples
-LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
-INSIDE = 0.99  # share of the samples that are closer to their mean than the region that counts as theirs
 
 
 class Failure(NamedTuple):
@@ -56,8 +55,9 @@ class Failures(NamedTuple):
     prior_failed, prior_draws : int
         Number of failures among the draws of the prior that the run began with, and of these draws; 0 of 0 if they are
         not known.
-    near_failed, near : int
-        Number of failures among the samples of the posterior, and of all evaluated points there.
+    near : NearFailures
+        Failures among the samples of the posterior, and all evaluated points there. Of a tempered sampler, those that
+        its verdict depends on.
     """
 
     rows: tuple[Failure, ...]
@@ -66,13 +66,7 @@ class Failures(NamedTuple):
     remark: str = ""
     prior_failed: int = 0
     prior_draws: int = 0
-    near_failed: int = 0
-    near: int = 0
-
-    @property
-    def borders(self) -> bool:
-        """Whether failures border on the samples, so that they may end the posterior."""
-        return self.near_failed >= FEWEST_NEAR and self.near_failed > LARGE_SHARE_NEAR * self.near
+    near: NearFailures = NearFailures(0, 0)
 
     @property
     def sentence(self) -> str:
@@ -144,14 +138,13 @@ def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str
     ]
     rows.sort(key=lambda row: -row.count)
     count = sum(row.count for row in rows) if count is None else count
-    near = [_near_the_samples(run, source) for source in sources]
     draws = getattr(run.sampler, "prior_draws", None)
     prior = (0, 0)
     # the first failures are recorded, and the draws of the prior are the first points
     if draws is not None and (count <= sum(len(source.failed) for source in sources)):
         bad = np.any([_are_among(draws[:, each.columns], each.failed) for each in sources], axis=0)
         prior = (int(bad.sum()), len(draws))
-    return Failures(tuple(rows), count, max(attempts, count), remark, *prior, *max(near, key=lambda each: each[0]))
+    return Failures(tuple(rows), count, max(attempts, count), remark, *prior, _near_the_samples(run, sources))
 
 
 def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -166,22 +159,13 @@ def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bo
     return likelihood.simulations >= len(distinct) or _are_among(distinct, source.succeeded).mean() >= 0.5
 
 
-def _near_the_samples(run: FinishedRun, source: _Source) -> tuple[int, int]:
-    """Number of failures in the region of the samples, and of all distinct evaluated points there.
-
-    The region is an ellipsoid about the mean of the samples with their covariance, which holds 99 % of them.
-    """
-    samples = run.samples[:, source.columns]
-    inverse = np.linalg.pinv(np.atleast_2d(np.cov(samples, rowvar=False)), hermitian=True)
-
-    def distances(points: np.ndarray) -> np.ndarray:
-        offsets = points - samples.mean(axis=0)
-        return np.einsum("ij,jk,ik->i", offsets, inverse, offsets)
-
-    limit = np.quantile(distances(samples), INSIDE)
-    failed = int(np.count_nonzero(distances(np.unique(source.failed, axis=0)) <= limit)) if len(source.failed) else 0
-    successes = np.unique(np.concatenate([source.succeeded, samples]), axis=0)
-    return failed, failed + int(np.count_nonzero(distances(successes) <= limit))
+def _near_the_samples(run: FinishedRun, sources: list[_Source]) -> NearFailures:
+    """Failures in the region of the samples: those that the sampler has judged, else those known here."""
+    judged = getattr(run.sampler, "failures_near", None)
+    if judged is not None:
+        return judged
+    found = [failures_near(run.samples[:, each.columns], each.failed, each.succeeded) for each in sources]
+    return max(found, key=lambda each: each.failed)
 
 
 def _where(run: FinishedRun, source: _Source, reason: str) -> str:

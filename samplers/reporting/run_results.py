@@ -8,6 +8,7 @@ from ..storage.checkpoint import Checkpoint
 from ..storage.evaluation import Evaluator
 from ..tempering.budget import Budget, as_limit
 from ..tempering.evidence_check import EvidenceCheck
+from ..tempering.failed_region import NearFailures
 from ..tempering.genealogy import standard_error_of_mean
 from ..tempering.guide import AdaptedGuide, Guide
 from ..tempering.population import GuidedRound, Stage
@@ -32,6 +33,7 @@ class RunResults:
     _result: AnnealingResult
     _verdict: Verdict | None
     _seed: list[int] | None
+    _near: NearFailures | None = None
     _prior_draws: np.ndarray | None = None
 
     @property
@@ -73,6 +75,14 @@ class RunResults:
     def failures(self) -> list[dict]:
         """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failures."""
         return list(self._evaluator.failures.kept)
+
+    @property
+    def failures_near(self) -> NearFailures | None:
+        """Failures in the region of the last walkers, which the verdict depends on; None for a chain of a file.
+
+        Values of -inf inside the support of the prior are failures if ``log_prob_fn.report()`` has a "failure_count".
+        """
+        return None if self._result.independent_points is None else self._near
 
     @property
     def ladder(self) -> tuple[Stage, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
 
 from ..tempering.budget import Budget, BudgetExhausted
+from ..tempering.failed_region import EvaluatedPoints
 from ..tempering.flights import Flight, submit_and_wait
 from .checkpoint import Checkpoint
 from .first_evaluations import POINTS
@@ -238,6 +239,8 @@ class Evaluator:
         Number of points evaluated so far, including those of the interrupted run that is continued.
     failures : Failures
         Those of them that failed.
+    points : EvaluatedPoints
+        The latest of them.
     new_evaluations : int
         Number of points that this object has evaluated itself.
     pool : object with a method map, optional
@@ -279,7 +282,7 @@ class Evaluator:
 
     def reset(self) -> None:
         """Forget evaluations and failures; `budget` keeps its points."""
-        self.evaluations, self.failures = 0, Failures()
+        self.evaluations, self.failures, self.points = 0, Failures(), EvaluatedPoints()
 
     @property
     def map(self) -> Callable:
@@ -461,6 +464,7 @@ class Evaluator:
         """Count the evaluations of a batch and its failures."""
         self.evaluations += len(batch.coords)
         self.failures.add(batch)
+        self.points.add(batch.coords, batch.log_prob, list(batch.reasons))
         self.budget.count(batch.coords)
 
     def pack(self, log_prob: np.ndarray, log_prior: np.ndarray, blobs: np.ndarray | None) -> np.ndarray:

@@ -51,6 +51,12 @@ class OptionalAttributes(NamedTuple):
             getattr(function, "parameter_names", ()),
         )
 
+    @property
+    def counts_failures(self) -> bool:
+        """Whether the function counts failed simulations by itself, so that -inf inside the prior is a failure."""
+        found = self.report() if callable(self.report) else None
+        return isinstance(found, Mapping) and "failure_count" in found
+
     def check_ndim(self, ndim: int, name: str) -> None:
         """Raise ValueError if the function states another number of parameters than `ndim`."""
         if isinstance(self.ndim, Integral) and self.ndim != ndim:

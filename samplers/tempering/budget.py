@@ -121,10 +121,14 @@ class Budget:
         self._earlier = self.of_guides
         self.guide, self.refused, self._granted = guide, False, 0.0
 
+    def slow_columns(self, ndim: int) -> np.ndarray:
+        """Indices of the parameters that a simulation depends on; all where none is slow."""
+        slow = np.setdiff1d(np.arange(ndim), np.asarray(self.fast, dtype=int))
+        return slow if len(slow) > 0 else np.arange(ndim)
+
     def _keys(self, coords: np.ndarray) -> list[int]:
         """A hash of the slow parameters of each point, the same in every process."""
-        slow = np.setdiff1d(np.arange(coords.shape[1]), np.asarray(self.fast, dtype=int))
-        bits = np.ascontiguousarray(coords[:, slow] if len(slow) > 0 else coords, dtype=float).view(np.uint64)
+        bits = np.ascontiguousarray(coords[:, self.slow_columns(coords.shape[1])], dtype=float).view(np.uint64)
         keys = np.zeros(len(bits), dtype=np.uint64)
         for column in bits.T:
             for value in (column, keys >> np.uint64(32)):

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .failed_region import NearFailures, check_failed_region
 from .genealogy import standard_error_of_mean
 from .population import Doubt, GuidedRound, Halt
 from .results import AnnealingResult
@@ -76,6 +77,7 @@ def judge(
     missing_steps: int = 0,
     failures: str = "",
     searched: float = 0.0,
+    near: NearFailures | None = None,
 ) -> Verdict:
     """Judge an annealing that has reached beta = 1.
 
@@ -95,13 +97,15 @@ def judge(
         How many evaluations failed, for the reasons; empty if none did.
     searched : float
         Simulations that the guide made by itself.
+    near : NearFailures, optional
+        Failures in the region of the final points; None where they are not known.
 
     Returns
     -------
     Verdict
     """
     stage = result.ladder[-1]
-    found = list(result.doubts)
+    found = [*result.doubts, *(() if near is None else check_failed_region(near))]
     reasons: list[str] = []
     if searched > 0.0:
         reasons.append(f"the guide used {searched:.0f} of the {simulations:.0f} simulations for its search")

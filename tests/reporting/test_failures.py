@@ -64,6 +64,9 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     assert contents.failures.count == posterior.report()["failure_count"]
     note = notes_of(contents)["Failures border on the samples"]
     assert note.level == "severe" and contents.status == "not usable"
+    # one place decides: the sampler
+    assert sampler.verdict.status == "not usable" and contents.failures.near is sampler.failures_near
+    assert f"{sampler.failures_near.failed} of {sampler.failures_near.evaluated} simulated points failed" in note.text
     assert "Do not use these numbers" in contents.summary[2]
     bad = int((sampler.prior_draws[:, 0] > 1.1).sum())
     assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].text
@@ -73,7 +76,7 @@ def test_control_failures_far_from_the_samples_are_no_severe_doubt():
     posterior = posterior_of([1.05, 0.8])
     sampler = run(posterior)
     contents = gather(read_run(sampler, posterior), {})
-    assert contents.failures.count > 10 and contents.failures.near_failed == 0
+    assert contents.failures.count > 10 and contents.failures.near.failed == 0
     assert "Failures border on the samples" not in notes_of(contents)
     assert contents.status == sampler.verdict.status
 

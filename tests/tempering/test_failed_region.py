@@ -1,0 +1,124 @@
+"""Failures among the final points end the posterior, not the data: the verdict says so, and only then."""
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SMCSampler, TMCMCSampler
+from samplers.tempering import failed_region
+from samplers.tempering.failed_region import EvaluatedPoints, failures_near
+from tests.contract.targets import Box, Gaussian
+
+N = 250
+
+
+class Cut(Gaussian):
+    """A Gaussian whose simulations fail above a limit of the first parameter, and return NaN or -inf then.
+
+    Without failures, the mean of the first parameter is 0.70 and its standard deviation 0.05.
+    """
+
+    def __init__(self, limit, way, ndim=2, sd=0.05):
+        super().__init__(ndim=ndim, sd=sd)
+        self.limit, self.way, self.failed = limit, way, 0
+
+    def __call__(self, x):
+        values, failed = np.array(super().__call__(x)), np.asarray(x)[..., 0] > self.limit
+        self.failed += int(np.sum(failed))
+        values[failed] = np.nan if self.way == "nan" else -np.inf
+        return values
+
+
+class Counting(Cut):
+    """As a posterior of finite-element models, it says how many simulations failed."""
+
+    def report(self):
+        return {"failure_count": self.failed}
+
+
+def run(posterior, Sampler=SMCSampler, nwalkers=N, steps=1, **options):
+    options = {"vectorize": True, "seed": 1} | options
+    sampler = Sampler(nwalkers, posterior.ndim, posterior, **options)
+    sampler.run_mcmc(None, steps)
+    return sampler
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize(
+    "options", [{}, {"recycle": False, "nwalkers": 80}, {"Sampler": TMCMCSampler, "nwalkers": 80}], ids=str
+)
+@pytest.mark.parametrize(("way", "status"), [("nan", "not usable"), ("inf", "usable"), ("counted", "not usable")])
+def test_a_run_that_is_piled_up_against_failures_says_so(way, status, options):
+    posterior = (Counting if way == "counted" else Cut)(0.7, way)
+    sampler = run(posterior, **options)
+    assert sampler.verdict.status == status
+    near = sampler.failures_near
+    (reason,) = (r for r in sampler.verdict.reasons if r.startswith("in the region of the final points"))
+    assert f"{near.failed} of {near.evaluated} evaluated points" in reason and near.borders
+    assert near.known == (status == "not usable")
+    # the points cannot tell: mean and standard deviation are those of half a Gaussian
+    samples = sampler.get_chain(flat=True)[:, 0]
+    assert samples.max() <= 0.7 and samples.mean() == pytest.approx(0.66, abs=0.01)
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("way", ["nan", "inf", "counted"])
+def test_control_failures_away_from_the_posterior_are_no_doubt(way):
+    posterior = (Counting if way == "counted" else Cut)(0.9, way)
+    sampler = run(posterior)
+    assert posterior.failed > 10 and not sampler.failures_near.borders
+    assert sampler.verdict.status == "converged"
+
+
+def test_control_a_bound_of_the_prior_is_no_failure():
+    """The posterior leans against a corner of the box, outside of which nothing is evaluated."""
+    sampler = run(Box([0.0, 0.0], [1.0, 1.0], lambda x: -20.0 * np.sum(x, axis=-1)))
+    assert sampler.failures_near == (0, 0, True) and sampler.verdict.status == "converged"
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_a_run_that_goes_on_from_its_file_says_the_same(tmp_path):
+    verdicts = []
+    for name, interrupted in (("whole", False), ("parts", True)):
+        path = str(tmp_path / f"{name}.h5")
+
+        def make(path=path):
+            posterior = Cut(0.7, "nan")
+            backend = emcee.backends.HDFBackend(path)
+            return SMCSampler(60, 2, posterior, vectorize=True, seed=3, backend=backend)
+
+        sampler = make()
+        if interrupted:
+            for count, _ in enumerate(sampler.sample(None, iterations=4)):
+                if count == 1:
+                    break
+            sampler.backend.close()
+            sampler = make()
+            for _ in sampler.sample(None, iterations=4):
+                pass
+        else:
+            for _ in sampler.sample(None, iterations=4):
+                pass
+        verdicts.append((sampler.verdict, sampler.failures_near))
+    assert verdicts[0] == verdicts[1] and verdicts[0][1].borders
+
+
+def test_the_latest_points_are_kept(monkeypatch, rng):
+    monkeypatch.setattr(failed_region, "KEPT_POINTS", 100)
+    points, samples = EvaluatedPoints(), rng.standard_normal((50, 2))
+    points.add(np.zeros((40, 2)) + 0.1 * rng.standard_normal((40, 2)), np.full(40, -np.inf), [])
+    columns = np.arange(2)
+    assert points.near(samples, columns, True).failed == 40
+    for _ in range(4):
+        points.add(0.1 * rng.standard_normal((25, 2)), np.zeros(25), [])
+    assert points.near(samples, columns, True).failed == 0
+
+
+def test_the_region_is_that_of_the_samples_in_any_units(rng):
+    samples = rng.standard_normal((400, 2))
+    failed, succeeded = rng.uniform(-4.0, 4.0, size=(100, 2)), rng.uniform(-4.0, 4.0, size=(300, 2))
+    found = failures_near(samples, failed, succeeded)
+    scale = np.array([2e-4, 3e10])
+    assert failures_near(samples * scale, failed * scale, succeeded * scale) == found
+    inside = np.sum(failed**2, axis=1) < np.quantile(np.sum(samples**2, axis=1), 0.99)
+    assert abs(found.failed - inside.sum()) <= 4 and found.evaluated > found.failed
