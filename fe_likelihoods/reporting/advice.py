@@ -153,8 +153,8 @@ def _of_failures(failed: Failures, inconclusive: bool) -> list[Advice]:
     found.append(Advice(CAUTION if largest > LARGE_FAILURE_SHARE else REMARK, "Simulations failed", text, action))
     if failed.near.borders and failed.near.known and not inconclusive:
         text = (
-            f"In the region of the samples, {failed.near.failed} of {failed.near.evaluated} simulated points failed. The "
-            "failures, not the data, end the posterior there: its mean and its interval may be wrong."
+            f"In the region of the samples, {failed.near.failed} of {failed.near.evaluated} simulated points failed. "
+            "The failures, not the data, end the posterior there: its mean and its interval may be wrong."
         )
         action = (
             "See in the table of failures where they happen. Mend the model or the settings of its solver there, and "
