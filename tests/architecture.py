@@ -50,7 +50,7 @@ ORDER = {
         ("signals",),
         ("plots",),
         ("kernels",),
-        ("units",),
+        ("text_tables", "units"),
     ),
     "samplers": (
         ("cost",),

@@ -1,23 +1,29 @@
 """Predictions of other events: base motions that a TOML file lists as ``[events.NAME]``."""
 
+import contextlib
+import logging
 import math
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..prediction.prediction import Prediction
-from ..prediction.score_tables import QuantityScores
 from ..probability.posterior import Posterior
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
-from ..units import from_si
+from ..simulation.model import SimulationFailed
 from .data import read_base_motion, read_measured
+from .hints import in_toml_terms
 from .job import Job
 from .models import Problem, reduce_data
 from .results import write_csv
 
-__all__ = ["Event", "predict_events", "prediction_options", "read_events"]
+__all__ = ["Event", "predict_events", "prediction_options", "read_events", "without_warnings", "write_events"]
+
+logger = logging.getLogger(__name__)
 
 _STATES = ("virgin", "end")
 _ENDS = (0.05, 0.5, 0.95)  # quantiles that tables and scores need
@@ -92,36 +98,48 @@ def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measur
         raise ValueError(str(error).replace("] file: ", "] measured: ", 1)) from error
 
 
+@contextlib.contextmanager
+def without_warnings() -> Iterator[None]:
+    """Without the warnings of `propagate`, which its result keeps as remarks: the command says and writes these."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
 def predict_events(
-    job: Job, events: tuple[Event, ...], posterior: Posterior, samples: np.ndarray, folder: Path, progress: bool
-) -> tuple[str, ...]:
-    """Predict the response to other base motions, one simulation per sample and event; write tables and pictures.
+    job: Job, events: tuple[Event, ...], problem: Problem, samples: np.ndarray, progress: bool
+) -> dict[str, dict[str, Prediction]]:
+    """Predict histories and peaks under other base motions, one simulation per sample and event.
+
+    Responses are stored in the cache of the likelihood, so that events whose prediction was interrupted go on there.
 
     Parameters
     ----------
     job : Job
     events : tuple of Event
-    posterior : Posterior
+    problem : Problem
     samples : (n, ndim) ndarray
         Samples of the posterior.
-    folder : Path
     progress : bool
         Whether to show progress bars.
 
     Returns
     -------
-    tuple of str
-        Names of the files: ``event-NAME.txt``, ``event-NAME.csv`` and ``event-NAME.png`` of each event.
+    dict of str to dict of str to Prediction
+        "histories" and "peaks" of each event by its name, but of those of which all simulations fail.
     """
-    if not len(samples):
-        return ()
-    return tuple(file for event in events for file in _predict_event(job, event, posterior, samples, folder, progress))
+    found = {}
+    for event in events if len(samples) else ():
+        try:
+            found[event.name] = _predict_event(job, event, problem.posterior, samples, progress)
+        except SimulationFailed as error:
+            logger.warning("event %s is left out: %s", event.name, error)
+    return found
 
 
 def _predict_event(
-    job: Job, event: Event, posterior: Posterior, samples: np.ndarray, folder: Path, progress: bool
-) -> tuple[str, ...]:
-    from ..plots.predictions import plot_bands
+    job: Job, event: Event, posterior: Posterior, samples: np.ndarray, progress: bool
+) -> dict[str, Prediction]:
     from ..prediction.propagation import propagate
     from ..prediction.quantities import peak
 
@@ -131,45 +149,62 @@ def _predict_event(
     if event.measured is not None:  # measurements contain noise
         options["noise"] = job.prediction.get("noise", True)
     try:
-        found = propagate(
-            posterior,
-            samples,
-            record=event.record,
-            quantity={"histories": None, "peaks": [peak(channel.name) for channel in channels]},
-            **options,
-            progress=progress,
-        )
+        with without_warnings():
+            return propagate(
+                posterior,
+                samples,
+                record=event.record,
+                quantity={"histories": None, "peaks": [peak(channel.name) for channel in channels]},
+                cache=posterior.likelihood.cache,
+                **options,
+                progress=progress,
+            )
     except ValueError as error:
         raise ValueError(f"{job.file.name}: [events.{event.name}] {error}") from error
-    histories, peaks = found["histories"], found["peaks"]
+
+
+def write_events(
+    folder: Path, events: tuple[Event, ...], predictions: Mapping[str, dict[str, Prediction]]
+) -> tuple[str, ...]:
+    """Write tables and pictures of predicted events.
+
+    Returns
+    -------
+    tuple of str
+        Names of the files: ``event-NAME.txt``, ``event-NAME.csv`` and ``event-NAME.png`` of each event.
+    """
+    files: list[str] = []
+    for event in events:
+        if event.name in predictions:
+            names = tuple(f"event-{event.name}.{ending}" for ending in ("txt", "csv", "png"))
+            _write_event([folder / name for name in names], event, predictions[event.name])
+            files += names
+    return tuple(files)
+
+
+def _write_event(paths: list[Path], event: Event, predictions: dict[str, Prediction]) -> None:
+    from ..plots.predictions import plot_bands
+    from ..reporting.other_events import describe_event
+    from ..text_tables import text_table
+
+    found = describe_event(event.name, predictions, event.measured)
     steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
-    lines = [f"Event {event.name}: {event.record.name}, {steps}", f"Prediction from {histories.n_samples} samples"]
-    lines[-1] += ", with the noise" if histories.noise else ", without the noise of measurements"
-    if histories.n_failed:
-        lines += [f"{count} samples left out: {reason}" for reason, count in histories.failure_reasons.items()]
-    scores = None if event.measured is None else peaks.score(event.measured)
-    rows = _peak_rows(peaks, scores)
-    lines += ["", "Peaks"]
-    for row in rows:
-        ends = f"{row['q05']:.3g} to {row['q95']:.3g}"
-        lines.append(f"  {row['channel']} [{row['unit']}]: median {row['median']:.3g}, 90 % between {ends}")
-    if scores is not None:
-        lines += ["", "Peaks against the measurements", str(scores)]
-        lines += ["", "Histories against the measurements", str(histories.score(event.measured))]
-    names = tuple(f"event-{event.name}.{ending}" for ending in ("txt", "csv", "png"))
-    (folder / names[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    write_csv(folder / names[1], rows)
-    plot_bands(histories, event.measured).savefig(folder / names[2], dpi=150)
-    return names
-
-
-def _peak_rows(peaks: Prediction, scores: QuantityScores | None) -> list[dict[str, Any]]:
-    """Predicted and measured peaks in display units, one row per channel."""
+    lines = [f"Event {event.name}: {event.record.name}, {steps}", found.sentence]
+    lines += [f"CAUTION: {remark}" for remark in found.remarks]
+    if found.values:
+        lines += ["", "Peaks against the measurements", *map(str, found.values)]
+    else:
+        rows = [(row.name, row.unit, *(f"{value:.3g}" for value in (row.median, *row.ends))) for row in found.numbers]
+        lines += ["", "Peaks", text_table([("quantity", "unit", "median", "5 %", "95 %"), *rows])]
+    if found.histories:
+        lines += ["", "Histories against the measurements", *map(str, found.histories)]
+    paths[0].write_text(in_toml_terms("\n".join(lines)) + "\n", encoding="utf-8")
     rows = []
-    for k, channel in enumerate(peaks.channels):
-        low, median, high = (from_si(peaks.quantile(p)[k], channel.unit).item() for p in _ENDS)
-        row = {"channel": channel.name, "unit": channel.unit, "q05": low, "median": median, "q95": high}
-        if scores is not None:
-            row |= {"measured": from_si(scores.measured[k], channel.unit).item(), "pit": float(scores.pit[k])}
-        rows.append(row)
-    return rows
+    for channel, row in zip(predictions["peaks"].channels, found.numbers, strict=True):
+        values = {"q05": row.ends[0], "q25": row.quartiles[0], "median": row.median}
+        values |= {"q75": row.quartiles[1], "q95": row.ends[1]}
+        if event.measured is not None:
+            values |= {"measured": row.measured, "pit": row.pit}
+        rows.append({"channel": channel.name, "unit": row.unit} | values)
+    write_csv(paths[1], rows)
+    plot_bands(predictions["histories"], event.measured).savefig(paths[2], dpi=150)

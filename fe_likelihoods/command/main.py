@@ -93,6 +93,8 @@ def _show(outcome: Any) -> None:
     if "CAUTION" in description:
         click.echo(f"Measurements: {description}")
     _say_assumed(outcome.problem)
+    for caution in outcome.cautions:
+        click.echo(f"CAUTION: {caution}")
     click.echo(f"Written to {outcome.folder}/: {', '.join(outcome.files)}")
 
 

@@ -1,9 +1,7 @@
 """Files of a finished run: tables as text and CSV, samples for arviz, the prediction, and the report."""
 
 import csv
-import json
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +10,11 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..probability.likelihood import FELikelihood
 from ..probability.posterior import Posterior
+from ..signals.channels import Measurements
 from ..signals.error_measures import rrmse
 from .hints import in_toml_terms
 
-__all__ = ["read_prediction", "write_csv", "write_prediction", "write_report", "write_samples", "write_tables"]
-
-_ARRAYS = ("mean", "variance", "standard_error", "quantiles", "quantile_error", "failed")
+__all__ = ["write_csv", "write_report", "write_samples", "write_tables"]
 
 
 def write_tables(folder: Path, sampler: Any, posterior: Posterior) -> tuple[str, ...]:
@@ -120,31 +117,11 @@ def write_report(
     prediction: Prediction | None,
     again: str,
     truth: Mapping[str, float] | None,
+    events: Mapping[str, Mapping[str, Prediction]],
+    measured: Mapping[str, Measurements],
 ) -> str:
     """Write the report in HTML, with the command that makes it again; return the name of the file."""
     from ..reporting.report import report
 
-    report(sampler, posterior, prediction, path, truth=truth, repeat=again)
+    report(sampler, posterior, prediction, path, truth=truth, events=events, measured=measured, repeat=again)
     return path.name
-
-
-def read_prediction(path: Path, posterior: Posterior) -> Prediction | None:
-    """The stored prediction of a run, or None if there is none."""
-    if not path.is_file():
-        return None
-    with np.load(path) as stored:
-        others = json.loads(str(stored["others"]))
-        arrays = {name: stored[name] for name in _ARRAYS}
-    others = {name: tuple(value) if isinstance(value, list) else value for name, value in others.items()}
-    return Prediction(**arrays, **others, channels=tuple(posterior.likelihood.model.channels), values=None)
-
-
-def write_prediction(path: Path, prediction: Prediction) -> None:
-    """Write a prediction of histories, compressed."""
-    others = {
-        field.name: getattr(prediction, field.name)
-        for field in fields(prediction)
-        if field.name not in (*_ARRAYS, "channels", "values", "quantity")
-    }
-    arrays = {name: getattr(prediction, name) for name in _ARRAYS}
-    np.savez_compressed(path, others=json.dumps(others), **arrays)

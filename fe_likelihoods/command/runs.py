@@ -18,10 +18,11 @@ import numpy as np
 
 from ..prediction.prediction import Prediction
 from ..simulation.disk_cache import SimulationCache
-from .events import predict_events, prediction_options, read_events
+from .events import Event, predict_events, prediction_options, read_events, without_warnings, write_events
+from .hints import in_toml_terms
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem
-from .results import read_prediction, write_prediction, write_report, write_samples, write_tables
+from .results import write_report, write_samples, write_tables
 
 __all__ = ["Outcome", "default_folder", "make_sampler", "report_run", "run_job"]
 
@@ -47,12 +48,15 @@ class Outcome(NamedTuple):
     problem : Problem
     files : tuple of str
         Names of the files of the results.
+    cautions : tuple of str
+        What speaks against the predictions.
     """
 
     folder: Path
     sampler: Any
     problem: Problem
     files: tuple[str, ...]
+    cautions: tuple[str, ...]
 
 
 def default_folder(file: Path) -> Path:
@@ -136,14 +140,7 @@ def run_job(
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
     sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
     sampler.run_mcmc(None, job.sampler.get("steps", STEPS), progress=progress)
-    prediction = _predict(job, problem, sampler, progress)
-    if prediction is not None:
-        write_prediction(folder / "prediction.npz", prediction)
-    draws = job.prediction.get("draws", DRAWS)
-    samples = write_samples(folder, sampler, problem.posterior, prediction, draws)
-    written = (*_write(folder, job.file, sampler, problem, prediction), samples)
-    predicted = predict_events(job, events, problem.posterior, _drawn(job, problem, sampler), folder, progress)
-    return Outcome(folder, sampler, problem, (*written, *predicted))
+    return Outcome(folder, sampler, problem, *_write(folder, job, job.file, sampler, problem, events, progress))
 
 
 def report_run(path: Path) -> Outcome:
@@ -186,8 +183,9 @@ def report_run(path: Path) -> Outcome:
         # the journal repeats the run without an evaluation; the chain alone has lost which walkers are copies
         with _without_messages("samplers.storage.resumption"):
             sampler.run_mcmc(None, steps, progress=False)
-    prediction = read_prediction(folder / "prediction.npz", problem.posterior)
-    return Outcome(folder, sampler, problem, _write(folder, Path(origin["file"]), sampler, problem, prediction))
+    events = read_events(job, problem)
+    file = Path(origin["file"])
+    return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
 
 
 @contextlib.contextmanager
@@ -202,11 +200,28 @@ def _without_messages(name: str) -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _write(folder: Path, file: Path, sampler: Any, problem: Problem, prediction: Prediction | None) -> tuple[str, ...]:
-    """Write the report and the tables; return the names of the files."""
+def _write(
+    folder: Path, job: Job, file: Path, sampler: Any, problem: Problem, events: tuple[Event, ...], progress: bool
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Write tables, predictions, samples and report; return the names of the files, and what is to be said.
+
+    Predictions are made here; their responses are in the cache if they were made before.
+    """
     posterior, again = problem.posterior, shlex.join(["fe-likelihoods", "run", str(file), "--out", str(folder)])
-    report = write_report(folder / "report.html", sampler, posterior, prediction, again, problem.truth)
-    return (report, *write_tables(folder, sampler, posterior))
+    tables = write_tables(folder, sampler, posterior)
+    drawn = _drawn(job, problem, sampler)
+    prediction = _predict(job, problem, drawn, progress)
+    samples = write_samples(folder, sampler, posterior, prediction, job.prediction.get("draws", DRAWS))
+    predicted = predict_events(job, events, problem, drawn, progress)
+    pictures = write_events(folder, events, predicted)
+    measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
+    page, truth = folder / "report.html", problem.truth
+    report = write_report(page, sampler, posterior, prediction, again, truth, predicted, measured)
+    cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
+    for name, each in predicted.items():
+        cautions += [f"event {name}: {remark}" for remark in each["histories"].remarks]
+    cautions += [f"event {event.name}: all simulations failed" for event in events if event.name not in predicted]
+    return (report, *tables, samples, *pictures), tuple(map(in_toml_terms, cautions))
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:
@@ -258,12 +273,14 @@ def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
     return problem.posterior.draw_noise(drawn, job.sampler.get("seed", 1)) if job.noise == "marginal" else drawn
 
 
-def _predict(job: Job, problem: Problem, sampler: Any, progress: bool) -> Prediction | None:
+def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:
     from ..prediction.propagation import propagate
 
-    if job.prediction.get("draws", DRAWS) < 1:
+    if not len(drawn):
         return None
+    cache = problem.posterior.likelihood.cache
     try:
-        return propagate(problem.posterior, _drawn(job, problem, sampler), **prediction_options(job), progress=progress)
+        with without_warnings():
+            return propagate(problem.posterior, drawn, cache=cache, **prediction_options(job), progress=progress)
     except ValueError as error:
         raise ValueError(f"{job.where('prediction')} {error}") from error

@@ -15,6 +15,7 @@ import numpy as np
 from ..signals.records import Record
 from ..simulation.kept_states import simulate_last_part
 from ..simulation.model import Model, SimulationBatch, simulate_batch
+from ..simulation.stored_responses import StoredResponses
 
 __all__ = ["STATES", "Excitation", "chosen_state", "excite", "under_record"]
 
@@ -41,8 +42,14 @@ class Excitation(NamedTuple):
     n_steps: int
     from_state: str
 
-    def simulate(self, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
-        """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters)."""
+    def simulate(self, thetas: np.ndarray, pool: Any = None, stored: StoredResponses | None = None) -> SimulationBatch:
+        """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters).
+
+        With `stored`, they are looked up and stored there, those of the whole excitation.
+        """
+        if stored is not None:
+            responses, reasons = stored.simulate(thetas)
+            return SimulationBatch(np.ascontiguousarray(responses[:, :, self.first :]), reasons)
         if self.first:
             return simulate_last_part(self.model, self.first, thetas, pool)
         return simulate_batch(self.model, thetas, pool)

@@ -79,6 +79,8 @@ class Prediction:
     spread : EventSpread or None
         What is unknown of the events, for the intervals of `fe_likelihoods.exceedance`; None unless the prediction is
         that of a new event (`fe_likelihoods.predict_new_event`).
+    remarks : tuple of str
+        What speaks against the prediction, as `fe_likelihoods.propagate` has warned.
     """
 
     mean: np.ndarray
@@ -100,6 +102,7 @@ class Prediction:
     shifted: tuple[str, ...] = ()
     quantity: object = None
     spread: EventSpread | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def sd(self) -> np.ndarray:

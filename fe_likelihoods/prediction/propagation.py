@@ -20,6 +20,7 @@ Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00
 """
 
 import logging
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -35,8 +36,10 @@ from ..probability.time_shift_noise import TimeShiftNoise
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
+from ..simulation.disk_cache import SimulationCache
 from ..simulation.kept_states import KEPT_STATES
 from ..simulation.model import SimulationFailed
+from ..simulation.stored_responses import StoredResponses
 from .accumulator import Accumulator
 from .excitation import chosen_state, excite, under_record
 from .inputs import (
@@ -51,7 +54,7 @@ from .inputs import (
 from .model_error import follows_response
 from .prediction import Prediction
 from .quantities import Quantity, evaluator, measured_quantity
-from .transfer_checks import Peaks, calibration_of, sample_to_check, warn_of_peaks, warn_of_residuals
+from .transfer_checks import Peaks, calibration_of, remark_on_peaks, remark_on_residuals, sample_to_check
 
 __all__ = ["check_effective_sample_size", "fit_measures", "propagate"]
 
@@ -79,6 +82,7 @@ def propagate(
     memory_bytes: int | None = 512 * 2**20,
     state_bytes: int | None = 256 * 2**20,
     pool: Any = None,
+    cache: SimulationCache | str | os.PathLike | None = None,
     calibrated: Sequence[Measurements] | None = None,
     check: bool = True,
     seed: int | None = None,
@@ -138,6 +142,10 @@ def propagate(
         None: no limit. Models without a method ``simulate_from`` run the whole excitation.
     pool : optional
         Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
+    cache : SimulationCache or path, optional
+        Where responses are looked up and stored as soon as they are simulated, so that a prediction which was
+        interrupted, or is made again, repeats none of them but one or two that are compared. Those of the whole
+        excitation are stored, also for "end". Default: responses are not stored.
     calibrated : sequence of Measurements, optional
         Measurements of the events with which the parameters were calibrated, whose amplitudes a prediction under
         another record is compared with. Default: those of the likelihood. An empty sequence for no comparison.
@@ -223,12 +231,16 @@ def propagate(
     if batch is None:
         together = source.executor is not None or simulates_in_batches(model)
         batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
+    stored = None
+    if cache is not None:
+        cache = cache if isinstance(cache, SimulationCache) else SimulationCache(cache)
+        stored = StoredResponses(model, source.executor, cache)
     peaks = Peaks() if record is not None and known else None
     checked = sample_to_check(source, samples) if check else None
     own_response = None  # of the checked sample to the excitation of the calibration
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
-            responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor)
+            responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor, stored)
             for accumulator in accumulators.values():
                 accumulator.add(start, responses, reasons)
             if checked is not None and record is None and 0 <= (row := row_of_sample[checked] - start) < len(responses):
@@ -243,14 +255,19 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
+    remarks = []
     if peaks is not None:
-        warn_of_peaks(peaks, model.channels, known)
+        remarks.append(remark_on_peaks(peaks, model.channels, known))
     if record is not None and noise:
         histories = [each for each in predictions.values() if each.dt is not None]
-        _warn_of_level((histories or list(predictions.values()))[0], source)
+        remarks.append(_remark_on_level((histories or list(predictions.values()))[0], source))
     if checked is not None and (record is not None or own_response is not None):
         point = as_points(samples, (*source.model.parameter_names, *source.noise.parameter_names))[checked]
-        warn_of_residuals(source, point, own_response)
+        remarks.append(remark_on_residuals(source, point, own_response))
+    remarks = tuple(remark for remark in remarks if remark)
+    for remark in remarks:
+        warnings.warn(remark, stacklevel=2)
+    predictions = {name: replace(each, remarks=remarks) for name, each in predictions.items()}
     return predictions if isinstance(quantity, Mapping) else predictions[""]
 
 
@@ -372,10 +389,13 @@ def _prediction(
     )
 
 
-def _warn_of_level(prediction: Prediction, source: PredictionSource) -> None:
-    """Warn if noise in SI units was calibrated with a much stronger or weaker response than the predicted one."""
+def _remark_on_level(prediction: Prediction, source: PredictionSource) -> str:
+    """What to say if noise in SI units was calibrated with a much stronger or weaker response than the predicted one.
+
+    An empty text otherwise.
+    """
     if follows_response(source.noise) or not prediction.channels:
-        return
+        return ""
     measurements, far = source.likelihood.measurements, []
     if prediction.dt is not None:
         levels = np.sqrt(np.mean(np.square(prediction.mean), axis=1))
@@ -385,18 +405,18 @@ def _warn_of_level(prediction: Prediction, source: PredictionSource) -> None:
         try:
             measured = np.atleast_1d(measured_quantity(prediction.quantity, measurements))
         except ValueError:  # samples are missing, so that the level of the calibration is not known
-            return
+            return ""
     for channel, level, reference in zip(prediction.channels, levels, measured, strict=True):
         ratio = abs(level / reference) if reference else 1.0
         if not 1.0 / _LARGEST_LEVEL_RATIO <= ratio <= _LARGEST_LEVEL_RATIO:
             far.append(f"{channel.name} ({ratio:.2g} times)")
-    if far:
-        warnings.warn(
-            "the predicted response has another level than the measurements of the calibration: "
-            f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
-            "too narrow for a stronger motion; ModulatedNoise, BandNoise and RelativeNoise scale with the response",
-            stacklevel=3,
-        )
+    if not far:
+        return ""
+    return (
+        "the predicted response has another level than the measurements of the calibration: "
+        f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
+        "too narrow for a stronger motion; ModulatedNoise, BandNoise and RelativeNoise scale with the response"
+    )
 
 
 def _probabilities(quantiles: Sequence[float]) -> tuple[float, ...]:

@@ -11,10 +11,20 @@ from numpy.typing import ArrayLike
 from ..probability.residuals import effective_samples
 from ..signals.channels import Channel
 from ..signals.error_measures import rrmse
+from ..text_tables import text_table
 from ..units import from_si
 from .scores import crps_normal, crps_samples, interval_score, log_score_normal, pit_normal, pit_samples
 
-__all__ = ["LEVELS", "HistoryScores", "QuantityScores", "envelope", "score_histories", "score_values", "strong_part"]
+__all__ = [
+    "LEVELS",
+    "HistoryScores",
+    "QuantityScores",
+    "central_interval",
+    "envelope",
+    "score_histories",
+    "score_values",
+    "strong_part",
+]
 
 LEVELS = (0.1, 0.5)
 """Shares of the largest predicted envelope that separate weak, moderate and strong response."""
@@ -97,9 +107,9 @@ class HistoryScores(NamedTuple):
             shares = [self.coverage[k], self.coverage_strong[k], *self.coverage_by_level[k]]
             rows.append(row + ["-" if np.isnan(share) else f"{share:.1%}" for share in shares])
         if not self.without_spread.any():
-            return _table(rows)
+            return text_table(rows)
         left_out = ", ".join(f"{n} of {c.name}" for c, n in zip(self.channels, self.without_spread, strict=True) if n)
-        return f"{_table(rows)}\nlog score without samples whose predicted standard deviation is zero: {left_out}"
+        return f"{text_table(rows)}\nlog score without samples whose predicted standard deviation is zero: {left_out}"
 
 
 class QuantityScores(NamedTuple):
@@ -169,7 +179,7 @@ class QuantityScores(NamedTuple):
             within = "yes" if self.within[k] else "no"
             row = [name, unit, measured, median, f"{lower} to {upper}", within, crps, score, f"{self.pit[k]:.3f}"]
             rows.append(row)
-        return _table(rows)
+        return text_table(rows)
 
 
 def score_histories(
@@ -273,7 +283,7 @@ def score_values(
     QuantityScores
     """
     measured, ascending = np.asarray(measured, dtype=float), np.sort(values, axis=0)
-    (lower, upper), quartiles = _interval(ascending, level), _interval(ascending, 0.5)
+    (lower, upper), quartiles = central_interval(ascending, level), central_interval(ascending, 0.5)
     return QuantityScores(
         names=tuple(names),
         units=tuple(units),
@@ -291,8 +301,8 @@ def score_values(
     )
 
 
-def _interval(ascending: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the central interval of sorted samples (n, n_quantities)."""
+def central_interval(ascending: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """Ends (n_quantities,) of the central interval of sorted samples (n, n_quantities), see `QuantityScores.lower`."""
     n = len(ascending)
     rank = max(1, math.ceil(0.5 * (1.0 - level) * (n + 1) - 0.5))  # as `share_within` of the PIT (rank + 0.5) / (n + 1)
     return ascending[rank - 1], ascending[n - rank]
@@ -367,16 +377,3 @@ def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
     """Mean of each row over the samples `where`, NaN without any."""
     count = where.sum(axis=1)
     return np.where(count > 0, np.where(where, values, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    """Cells as aligned text; the first column to the left, the others to the right."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        first, *others = (
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        lines.append("  ".join([first, *others]).rstrip())
-    return "\n".join(lines)

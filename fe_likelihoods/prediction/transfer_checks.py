@@ -1,11 +1,10 @@
 """Whether a prediction goes beyond its calibration: other amplitudes than those measured, or a noise that is wrong.
 
 Parameters of structures depend on the amplitude of the response, and noise in SI units does not scale with it. A
-posterior under white noise is too narrow where the residuals are correlated. Both are said as warnings.
+posterior under white noise is too narrow where the residuals are correlated. A prediction warns of both.
 """
 
 import logging
-import warnings
 import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -30,8 +29,8 @@ __all__ = [
     "Peaks",
     "calibration_of",
     "sample_to_check",
-    "warn_of_peaks",
-    "warn_of_residuals",
+    "remark_on_peaks",
+    "remark_on_residuals",
 ]
 
 logger = logging.getLogger(__name__)
@@ -86,11 +85,14 @@ def _names(measured: Measurements) -> list[str]:
     return [channel.name for channel in measured.channels]
 
 
-def warn_of_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibrated) -> None:
-    """Warn if the median of the peak of a channel is beyond the peaks of the calibration, by a factor of two."""
+def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibrated) -> str:
+    """What to say where the median of the peak of a channel is beyond the peaks of the calibration by a factor of two.
+
+    An empty text otherwise.
+    """
     predicted, far = peaks.median(), []
     if predicted is None:
-        return
+        return ""
     for channel, value in zip(channels, predicted, strict=True):
         measured = [np.abs(history[~np.isnan(history)]).max() for history in _histories(calibrated, channel.name)]
         if not measured or not max(measured) > 0.0:
@@ -99,16 +101,16 @@ def warn_of_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibra
             far.append(f"{channel.name} ({value / max(measured):.2g} times the largest calibrated one)")
         elif value < min(measured) / _LARGEST_PEAK_RATIO:
             far.append(f"{channel.name} ({value / min(measured):.2g} times the smallest calibrated one)")
-    if far:
-        # Several events show how parameters vary between them, but not at amplitudes that none of them had.
-        other = "" if len(calibrated) > 1 else ", or let parameters vary between events (Hierarchy)"
-        warnings.warn(
-            f"the predicted peaks are outside of the range of the calibration by more than a factor of "
-            f"{_LARGEST_PEAK_RATIO:g}: {', '.join(far)}. The parameters were calibrated at other amplitudes; where "
-            "stiffness and damping depend on the amplitude, the prediction is beside the truth, and its spread does "
-            f"not show it. Calibrate with events of this amplitude{other}",
-            stacklevel=3,
-        )
+    if not far:
+        return ""
+    # Several events show how parameters vary between them, but not at amplitudes that none of them had.
+    other = "" if len(calibrated) > 1 else ", or let parameters vary between events (Hierarchy)"
+    return (
+        f"the predicted peaks are outside of the range of the calibration by more than a factor of "
+        f"{_LARGEST_PEAK_RATIO:g}: {', '.join(far)}. The parameters were calibrated at other amplitudes; where "
+        "stiffness and damping depend on the amplitude, the prediction is beside the truth, and its spread does "
+        f"not show it. Calibrate with events of this amplitude{other}"
+    )
 
 
 def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
@@ -129,8 +131,8 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
     return int(np.argmin(np.square(scaled).sum(axis=1)))
 
 
-def warn_of_residuals(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> None:
-    """Warn, once for a likelihood, if its residuals contradict the noise with which it was sampled.
+def remark_on_residuals(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> str:
+    """What to say, once for a likelihood, if its residuals contradict the noise with which it was sampled.
 
     Samples that do not fit, such as draws of the prior, are not judged.
 
@@ -143,21 +145,26 @@ def warn_of_residuals(source: PredictionSource, point: np.ndarray, response: np.
     response : (n_channels, n_steps) ndarray, or None
         Its response to the excitation of the calibration [SI]. None: it is taken from the responses that the likelihood
         has stored, or simulated.
+
+    Returns
+    -------
+    str
+        Empty if there is nothing to say.
     """
     likelihood, noise = source.likelihood, source.noise
     n_structural = len(source.model.parameter_names)
     if response is None:
         response = _response(likelihood, point[:n_structural])
     if response is None:
-        return
+        return ""
     residuals, parameters = likelihood.residuals_of(response, point), point[None, n_structural:]
     channels = source.model.channels
     if not (np.isfinite(residuals).sum(axis=1) > 1).all() or not np.nanmax(np.abs(residuals), axis=1).all():
-        return
+        return ""
     stated = noise.standard_deviations(parameters)[0]
     found = np.sqrt(np.nanmean(np.square(residuals), axis=1))
     if (np.maximum(found / stated, stated / found) > _OTHER_LEVEL).any():
-        return
+        return ""
     _CHECKED.add(likelihood)
     autoregressive = isinstance(noise, AutoregressiveNoise)
     if autoregressive:
@@ -165,14 +172,14 @@ def warn_of_residuals(source: PredictionSource, point: np.ndarray, response: np.
     try:
         checks = residual_checks(residuals)
     except ValueError:  # no two successive samples of a channel: nothing to check
-        return
+        return ""
     independent = effective_samples(residuals)
     assumed = getattr(noise, "effective_samples", None)
     assumed = checks.n_samples if assumed is None else np.minimum(assumed, checks.n_samples)
     wrong = (checks.white < _UNLIKELY / len(channels)) & (np.abs(checks.lag_one) > _WEAK)
     wrong &= np.asarray(assumed) > _LARGEST_COUNT_RATIO * independent
     if not wrong.any():
-        return
+        return ""
     names = ", ".join(
         f"{channel.name} (correlation {lag:.2f} from sample to sample, {count:.0f} samples are worth {worth:.0f})"
         for channel, lag, count, worth, is_wrong in zip(
@@ -182,11 +189,10 @@ def warn_of_residuals(source: PredictionSource, point: np.ndarray, response: np.
     )
     what = "innovations of the calibration are" if autoregressive else "residuals of the calibration are"
     other = "fewer samples, BandNoise" if autoregressive else "AutoregressiveNoise"
-    warnings.warn(
+    return (
         f"the {what} not independent, as the noise says they are: {names}. The posterior is too narrow, and so is the "
         f"spread of the predictions between its samples. Calibrate with {other} or effective_samples=, see "
-        "residual_checks, or predict with the spread between events (predict_new_event). This is said once",
-        stacklevel=3,
+        "residual_checks, or predict with the spread between events (predict_new_event). This is said once"
     )
 
 

@@ -18,6 +18,7 @@ __all__ = [
     "cost",
     "data_sets",
     "evidence",
+    "names_of_values",
     "predicted_values",
     "residual_sentences",
     "summary_sentences",
@@ -240,11 +241,17 @@ def predicted_values(prediction: Prediction) -> list[PredictedValue]:
         return []
     mean, sd = np.ravel(prediction.mean), np.ravel(prediction.sd)
     quantiles = np.reshape(prediction.quantiles, (len(prediction.probabilities), -1))
-    named = len(prediction.channels) == len(mean)  # quantities of channels, such as peak("top")
-    given = prediction.quantity if isinstance(prediction.quantity, list | tuple) else [prediction.quantity]
-    names = [str(each) for each in given] if named and len(given) == len(mean) else None
-    names = names or [f"quantity {i + 1}" for i in range(len(mean))]
     return [
         PredictedValue(name, float(mean[i]), float(sd[i]), tuple(quantiles[:, i].tolist()))
-        for i, name in enumerate(names[:20])
+        for i, name in enumerate(names_of_values(prediction)[:20])
     ]
+
+
+def names_of_values(prediction: Prediction) -> list[str]:
+    """Names of the numbers of a prediction that is no history, such as "peak of top", or "quantity 1"."""
+    n = prediction.mean.size
+    named = len(prediction.channels) == n  # quantities of channels, such as peak("top")
+    given = prediction.quantity if isinstance(prediction.quantity, list | tuple) else [prediction.quantity]
+    if named and len(given) == n:
+        return [str(each) for each in given]
+    return [f"quantity {i + 1}" for i in range(n)]

@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,12 +13,23 @@ from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.fits import plot_fit
 from .fits import Fit
+from .other_events import OtherEvent
 from .run import FinishedRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Picture", "draw_fit", "draw_posterior", "draw_prediction", "draw_residuals", "draw_run", "draw_scores"]
+__all__ = [
+    "Picture",
+    "draw_event",
+    "draw_fit",
+    "draw_posterior",
+    "draw_prediction",
+    "draw_residuals",
+    "draw_run",
+    "draw_scores",
+    "draw_scores_of_events",
+]
 
 LEGIBLE = 80  # pixels per inch at which the smallest labels can be read
 WIDEST = 1100  # pixels: fits on a page of 1200
@@ -157,6 +168,62 @@ def draw_prediction(prediction: Prediction, measurements: Any) -> list[Picture]:
             lambda: prediction.plot(measurements),
         )
     ]
+
+
+def draw_event(event: OtherEvent) -> list[Picture]:
+    """Predicted histories of another event with their band and its measurements."""
+    pictures = []
+    for each in event.predictions.values():
+        if each.dt is None:
+            continue
+        names = [channel.name for channel in each.channels]
+        measured = event.measured
+        if measured is not None and not {channel.name for channel in measured.channels} & set(names):
+            measured = None
+        pictures.append(
+            _picture(
+                event.name,
+                "Mean and band of the prediction, and the measurements where there are any. The band contains the "
+                "uncertainty of the parameters, and the noise only if the legend says so.",
+                f"Predicted histories of {', '.join(names)} in the event {event.name}.",
+                lambda each=each, measured=measured: each.plot(measured),
+            )
+        )
+    return pictures
+
+
+def draw_scores_of_events(events: Sequence[OtherEvent]) -> list[Picture]:
+    """Calibration, coverage and sharpness of the predictions of all events with measurements: numbers, histories."""
+    from ..plots.scores import plot_scores
+
+    numbers = {event.name: event.values[0] for event in events if event.values and event.values[0].measured.all()}
+    histories = {event.name: event.histories[0] for event in events if event.histories}
+    about = (
+        "Left: bars outside of the grey band show predictions that are too narrow (high at both ends), too wide (high "
+        "in the middle) or biased (high at one end). "
+    )
+    pictures = []
+    if numbers:
+        pictures.append(
+            _picture(
+                "Predicted and measured numbers of all events",
+                about + "Middle: intervals divided by the measured value; those that cross the line contain it. "
+                "Right: shares of measured values in the intervals, which should be in the grey bars.",
+                f"Predicted intervals by measured values of {', '.join(numbers)}.",
+                lambda: plot_scores(numbers),
+            )
+        )
+    if histories:
+        pictures.append(
+            _picture(
+                "Scores of the histories of all events",
+                about + "Coverage is right near the grey line; of two predictions, the one with the smaller interval "
+                "score is better.",
+                f"Calibration, coverage and interval scores of the histories of {', '.join(histories)}.",
+                lambda: plot_scores(histories),
+            )
+        )
+    return pictures
 
 
 def draw_scores(scores: HistoryScores | QuantityScores) -> list[Picture]:

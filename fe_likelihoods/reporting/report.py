@@ -12,6 +12,7 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
+from ..units import from_si
 from .advice import Advice, advise
 from .contents import (
     DataSet,
@@ -27,7 +28,18 @@ from .contents import (
 from .failures import Failures, failures
 from .fits import Fits, fit_data_sets
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
-from .pictures import Picture, draw_fit, draw_posterior, draw_prediction, draw_residuals, draw_run, draw_scores
+from .other_events import EventPredictions, OtherEvent, as_events, describe_event
+from .pictures import (
+    Picture,
+    draw_event,
+    draw_fit,
+    draw_posterior,
+    draw_prediction,
+    draw_residuals,
+    draw_run,
+    draw_scores,
+    draw_scores_of_events,
+)
 from .run import FinishedRun, read_run
 from .table import ParameterRow, parameter_rows
 
@@ -44,6 +56,7 @@ class Predicted(NamedTuple):
     n_samples: int
     n_failed: int
     scores: str
+    remarks: tuple[str, ...]
 
 
 class Contents(NamedTuple):
@@ -63,6 +76,9 @@ class Contents(NamedTuple):
     fit_pictures: list[tuple[str, list[Picture]]]
     run_pictures: list[Picture]
     predictions: list[Predicted]
+    events: list[OtherEvent]
+    event_pictures: list[list[Picture]]
+    score_pictures: list[Picture]
     residuals: list[str]
     verdict: list[str]
     unknown: list[str]
@@ -85,6 +101,7 @@ def report(
     names: Sequence[str] | None = None,
     truth: Mapping[str, float] | Sequence[float] | None = None,
     measured: Measurements | Mapping[str, Measurements] | None = None,
+    events: Mapping[str, Prediction | EventPredictions] | None = None,
     discard: int = 0,
     thin: int = 1,
     repeat: str = "",
@@ -114,7 +131,12 @@ def report(
     truth : mapping of str to float, or sequence of float, optional
         True values of synthetic data, in the units of the samples.
     measured : Measurements, or mapping of str to Measurements, optional
-        Measurements to draw with the predictions, by the title of the prediction.
+        Measurements to draw with the predictions, by the title of the prediction or the name of the event.
+    events : mapping of str to Prediction, or to mapping of str to Prediction, optional
+        Predictions of other events than that of the calibration, by the name of the event: results of
+        `fe_likelihoods.propagate` with ``record=`` or of `fe_likelihoods.predict_new_event`, of one quantity or of
+        several by name, such as ``{"histories": None, "peaks": [peak("top")]}``. They are scored where `measured` has
+        the event.
     discard, thin : int
         Iterations of the chain to leave out at its beginning (burn-in), and of which to keep one in `thin`.
     repeat : str
@@ -134,12 +156,23 @@ def report(
     Examples
     --------
     >>> report(sampler, posterior, propagate(posterior, samples), out="results/report.html")
+    >>> several = {"histories": None, "peaks": [peak("top")]}
+    >>> second = propagate(posterior, samples, record=record, quantity=several, noise=True)
+    >>> report(sampler, posterior, events={"second shaking": second}, measured={"second shaking": measurements})
     """
     run = read_run(sampler, posterior, names=names, truth=truth, discard=discard, thin=thin)
-    predictions = _predictions(prediction, measured)
+    of_events = as_events({} if events is None else events)
+    known = measured
+    if isinstance(measured, Mapping):
+        known = {name: each for name, each in measured.items() if name not in of_events}
+    elif measured is not None and prediction is None and of_events:
+        raise ValueError("measured must be a mapping of the names of events to their measurements")
+    predictions = _predictions(prediction, known)
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
-    page = render(gather(run, predictions, title, repeat))
+    measurements = measured if isinstance(measured, Mapping) else {}
+    described = [describe_event(name, each, measurements.get(name)) for name, each in of_events.items()]
+    page = render(gather(run, predictions, described, title, repeat))
     path.write_text(page, encoding="utf-8")
     return path
 
@@ -147,6 +180,7 @@ def report(
 def gather(
     run: FinishedRun,
     predictions: Mapping[str, tuple[Prediction, Measurements | None]],
+    events: Sequence[OtherEvent] = (),
     title: str = "",
     repeat: str = "",
 ) -> Contents:
@@ -172,6 +206,9 @@ def gather(
         fit_pictures=[(fit.title, [*draw_fit(fit), *draw_residuals(fit)]) for fit in fits.fits],
         run_pictures=draw_run(run),
         predictions=[_predicted(name, *each) for name, each in predictions.items()],
+        events=list(events),
+        event_pictures=[draw_event(each) for each in events],
+        score_pictures=draw_scores_of_events(events),
         residuals=[] if run.is_inconclusive else residual_sentences(fits),
         verdict=verdict_sentences(run, rows),
         unknown=[] if run.diagnostics is None else list(run.diagnostics.unknown),
@@ -191,7 +228,13 @@ def render(contents: Contents) -> str:
 
     template = resources.files(__package__).joinpath("templates/report.html").read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"number": _number, "like": _like, "error": lambda x: _number(x, 2), "percent": _percent}
+    environment.filters |= {
+        "shown": _shown,
+        "number": _number,
+        "like": _like,
+        "error": lambda x: _number(x, 2),
+        "percent": _percent,
+    }
     return environment.from_string(template).render(contents._asdict())
 
 
@@ -207,6 +250,11 @@ def _like(value: float, sd: float) -> str:
     return f"{value:#.{max(digits, 4)}g}".rstrip(".").replace("-", "−")
 
 
+def _shown(value: float, unit: str) -> str:
+    """A value in SI units as a number in a display unit."""
+    return _number(from_si(value, unit).item(), 3)
+
+
 def _percent(value: float) -> str:
     return f"{100.0 * value:.3g} %" if np.isfinite(value) else "–"
 
@@ -219,7 +267,10 @@ def _predictions(prediction: Any, measured: Any) -> dict[str, tuple[Prediction, 
         if not isinstance(each, Prediction):
             raise ValueError(f"prediction must be the result of propagate, or a mapping of such; {name!r} is {each!r}")
     if unknown := [name for name in known if name not in named]:
-        raise ValueError(f"measured has {', '.join(unknown)}, but the predictions are {', '.join(named) or 'none'}")
+        raise ValueError(
+            f"measured has {', '.join(unknown)}, but the predictions are {', '.join(named) or 'none'}, and no "
+            "event has this name"
+        )
     return {name: (each, known.get(name)) for name, each in named.items()}
 
 
@@ -228,7 +279,7 @@ def _predicted(name: str, prediction: Prediction, measurements: Measurements | N
     pictures = draw_prediction(prediction, measurements) if prediction.dt is not None else []
     pictures += draw_scores(scores) if not isinstance(scores, str) else []
     values, counts = tuple(predicted_values(prediction)), (prediction.n_samples, prediction.n_failed)
-    return Predicted(name, tuple(pictures), values, prediction.probabilities, *counts, str(scores))
+    return Predicted(name, tuple(pictures), values, prediction.probabilities, *counts, str(scores), prediction.remarks)
 
 
 def _scores(prediction: Prediction, measurements: Measurements | None) -> HistoryScores | QuantityScores | str:

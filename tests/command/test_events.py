@@ -9,6 +9,7 @@ from fe_likelihoods import LinearOscillator, SimulationCache, from_si, propagate
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
+from tests.reporting.report_page import read_page
 
 SETTINGS = OSCILLATOR.replace("draws = 10", "draws = 20")
 EVENTS = """
@@ -51,6 +52,33 @@ def test_events_are_predicted_and_scored(events):
     assert "measurements" not in (events / "r" / "event-after.txt").read_text().splitlines()[-1]
     assert (events / "r" / "event-after.png").stat().st_size > 10_000
 
+    report = read_page(events / "r" / "report.html")
+    numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
+    assert [row[:2] for row in numbers] == [
+        [name, f"peak of {row['channel']} [{row['unit']}]"] for name in ("weaker", "after") for row in rows.values()
+    ]
+    for cells, row in zip(numbers, rows.values(), strict=False):
+        shown = [float(row[key]) for key in ("median", "measured")]
+        assert [float(cells[2]), float(cells[5])] == pytest.approx(shown, rel=6e-3)
+        assert cells[6].startswith("within") == (0.05 <= float(row["pit"]) <= 0.95)
+    assert all(row[5:7] == ["–", "not known"] for row in numbers[2:])
+    histories = next(table for table in report.tables if table[0][-1] == "In its strong part")[1:]
+    assert [row[0] for row in histories] == ["weaker", "weaker"]
+    assert sum(alt.startswith("Predicted histories") and "in the event" in alt for _, alt in report.images) == 2
+    assert "predicted peaks are outside" not in report.text or "weaker" in report.notes
+    assert "The motion meets the structure before any other event" in text
+
+
+def test_report_makes_events_again_without_simulations(events, monkeypatch):
+    call("run", "oscillator.toml", "--out", "r", "--quiet")
+    first = (events / "r" / "event-after.csv").read_text()
+    simulated, one = [], LinearOscillator.simulate
+    monkeypatch.setattr(LinearOscillator, "simulate", lambda self, theta: simulated.append(theta) or one(self, theta))
+    (events / "r" / "event-after.csv").unlink()
+    said = call("report", "r")
+    assert "event-after.csv" in said and (events / "r" / "event-after.csv").read_text() == first
+    assert 0 < len(simulated) <= 8  # verification of a few responses of each excitation, not 20 of each
+
 
 def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
     (events / "oscillator.toml").write_text(SETTINGS)
@@ -63,7 +91,7 @@ def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
 
 
 def test_the_prediction_is_that_of_propagate(events):
-    from fe_likelihoods.command.events import predict_events, read_events
+    from fe_likelihoods.command.events import predict_events, read_events, write_events
     from fe_likelihoods.prediction.quantities import peak
 
     job = read_job("oscillator.toml")
@@ -71,7 +99,7 @@ def test_the_prediction_is_that_of_propagate(events):
     samples = problem.posterior.sample_prior(12, 1)
     found = read_events(job, problem)
     assert [event.name for event in found] == ["weaker", "after"]
-    predict_events(job, found, problem.posterior, samples, events, False)
+    write_events(events, found, predict_events(job, found, problem, samples, False))
     for event in found:
         noise = event.measured is not None
         options = {"record": event.record, "seed": 1, "noise": noise, "progress": False} | event.options

@@ -197,3 +197,16 @@ def test_missed_alarms_of_100_runs_that_are_wrong():
         found = " ".join(said(propagate, posterior, samples, record=excitation(rng, 3.0), noise=True, seed=seed))
         missed += [each not in found for each in ("predicted peaks are outside", "not independent")]
     assert missed[0] <= 10 and missed[1] <= 5
+
+
+def test_the_prediction_keeps_what_was_said(rng):
+    posterior, samples = calibrated(rng, rho=0.9)
+    weak = excitation(rng, 0.1)
+    options = {"record": weak, "quantity": {"a": None, "b": peak("top")}, "noise": True, "progress": False}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = propagate(posterior, samples, **options)
+    texts = tuple(str(each.message) for each in caught)
+    assert len(texts) == 3 and all(each.filename == __file__ for each in caught)
+    assert found["a"].remarks == found["b"].remarks == texts
+    assert propagate(posterior, samples, progress=False).remarks == ()

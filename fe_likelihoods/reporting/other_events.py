@@ -1,0 +1,213 @@
+"""Predictions of other events than that of the calibration: numbers, scores and sentences about each of them."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..prediction.prediction import Prediction
+from ..prediction.score_tables import HistoryScores, QuantityScores, central_interval
+from ..signals.channels import Measurements
+from ..units import from_si
+from .contents import names_of_values
+
+__all__ = ["EventPredictions", "NumberRow", "OtherEvent", "as_events", "describe_event"]
+
+EventPredictions = Mapping[str, Prediction]
+"""Predictions of one event by quantity, such as the result of `fe_likelihoods.propagate` for several quantities."""
+
+LEVEL = 0.9  # of the intervals
+SMALL_COVERAGE = 0.5  # of the strong part, below which a prediction is said to be wrong
+
+
+class NumberRow(NamedTuple):
+    """A predicted number of an event, such as a peak, in the unit of its channel.
+
+    Attributes
+    ----------
+    name, unit : str
+        Name of the quantity, such as "peak of deck", and its display unit.
+    median : float
+        Predicted median.
+    quartiles, ends : (float, float)
+        Ends of the central intervals with probabilities 0.5 and 0.9.
+    measured, pit : float
+        Measured value, and predicted probability of a smaller one; NaN without measurements.
+    """
+
+    name: str
+    unit: str
+    median: float
+    quartiles: tuple[float, float]
+    ends: tuple[float, float]
+    measured: float
+    pit: float
+
+    @property
+    def place(self) -> str:
+        """Where the measured value is, in words; empty without one."""
+        if not np.isfinite(self.pit):
+            return ""
+        if abs(self.pit - 0.5) <= 0.25:
+            return "within 50 %"
+        if abs(self.pit - 0.5) <= 0.5 * LEVEL:
+            return f"within {_percent(LEVEL)}"
+        return "above" if self.pit > 0.5 else "below"
+
+
+class OtherEvent(NamedTuple):
+    """The prediction of one event.
+
+    Attributes
+    ----------
+    name : str
+    predictions : mapping of str to Prediction
+        By quantity.
+    measured : Measurements or None
+    numbers : tuple of NumberRow
+        Of all predictions that are not histories.
+    histories : tuple of HistoryScores
+        Of all predictions of histories, where there are measurements.
+    values : tuple of QuantityScores
+        Of all predictions of numbers, where there are measurements.
+    sentence : str
+        How it was predicted, and how the measurements compare with it.
+    remarks : tuple of str
+        What speaks against it: warnings, failed samples, scores that could not be computed.
+    """
+
+    name: str
+    predictions: EventPredictions
+    measured: Measurements | None
+    numbers: tuple[NumberRow, ...]
+    histories: tuple[HistoryScores, ...]
+    values: tuple[QuantityScores, ...]
+    sentence: str
+    remarks: tuple[str, ...]
+
+
+def as_events(events: Any) -> dict[str, EventPredictions]:
+    """Predictions of each event by quantity; ValueError for other objects.
+
+    Parameters
+    ----------
+    events : mapping of str to Prediction, or to mapping of str to Prediction
+        By the name of the event.
+    """
+    if not isinstance(events, Mapping):
+        raise ValueError(f"events must be a mapping of names to predictions of these events; got {events!r}")
+    found = {}
+    for name, given in events.items():
+        of_event = {"": given} if isinstance(given, Prediction) else given
+        if not isinstance(of_event, Mapping) or not all(isinstance(each, Prediction) for each in of_event.values()):
+            raise ValueError(
+                f"events: expected the result of propagate for each event, of one quantity or of several by name; "
+                f"{name!r} is {given!r}"
+            )
+        found[str(name)] = dict(of_event)
+    return found
+
+
+def describe_event(name: str, predictions: EventPredictions, measured: Measurements | None) -> OtherEvent:
+    """Score the predictions of an event, and say how it compares with the measurements.
+
+    Parameters
+    ----------
+    name : str
+    predictions : mapping of str to Prediction
+        By quantity.
+    measured : Measurements or None
+
+    Returns
+    -------
+    OtherEvent
+    """
+    remarks = list(dict.fromkeys(remark for each in predictions.values() for remark in each.remarks))
+    first = next(iter(predictions.values()))
+    if first.n_failed:
+        reasons = "; ".join(f"{count}: {reason}" for reason, count in first.failure_reasons.items())
+        remarks.append(f"{first.n_failed} samples failed and are left out ({reasons})")
+    histories, values, numbers = [], [], []
+    for each in predictions.values():
+        scores = None
+        if measured is not None:
+            scores, told = _scores(each, measured)
+            remarks += [text for text in told if text not in remarks]
+        if scores is not None:
+            (histories if each.dt is not None else values).append(scores)
+        if each.dt is None and each.values is not None:
+            numbers += _number_rows(each, scores)
+    missed = [
+        channel.name
+        for scores in histories
+        for channel, share in zip(scores.channels, scores.coverage_strong, strict=True)
+        if share < SMALL_COVERAGE
+    ]
+    if missed:
+        remarks.append(
+            f"the {_percent(LEVEL)} band contains less than half of the strong part of {', '.join(missed)}: its spread "
+            "is not that of a new event. Calibrate with several events (predict_new_event), or with a noise that "
+            "follows the response; and look for what the model lacks"
+        )
+    sentence = _sentence(first, measured, histories, numbers)
+    return OtherEvent(
+        name, predictions, measured, tuple(numbers), tuple(histories), tuple(values), sentence, tuple(remarks)
+    )
+
+
+def _scores(prediction: Prediction, measured: Measurements) -> tuple[HistoryScores | QuantityScores | None, list[str]]:
+    """Scores, None where they cannot be computed, and what is to be said about them."""
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            scores = prediction.score(measured, LEVEL)
+    except ValueError as error:
+        return None, [f"no scores: {error}"]
+    return scores, [str(each.message) for each in caught]
+
+
+def _number_rows(prediction: Prediction, scores: QuantityScores | None) -> list[NumberRow]:
+    """The numbers of a prediction, in the units of their channels where these are known."""
+    values = np.sort(prediction.values.reshape(len(prediction.values), -1), axis=0)
+    ends, quartiles = central_interval(values, LEVEL), central_interval(values, 0.5)
+    known, names = len(prediction.channels) == values.shape[1], names_of_values(prediction)
+    rows = []
+    for k, name in enumerate(names):
+        unit = prediction.channels[k].unit if known else "SI"
+        found = [np.median(values[:, k]), *(end[k] for end in (*quartiles, *ends))]
+        found.append(np.nan if scores is None else scores.measured[k])
+        shown = [float(each if unit == "SI" else from_si(each, unit)) for each in found]
+        pit = np.nan if scores is None else float(scores.pit[k])
+        rows.append(NumberRow(name, unit, shown[0], tuple(shown[1:3]), tuple(shown[3:5]), shown[5], pit))
+    return rows
+
+
+def _sentence(
+    first: Prediction, measured: Measurements | None, histories: list[HistoryScores], numbers: list[NumberRow]
+) -> str:
+    """How an event was predicted, and how the measurements compare with it."""
+    noise = "with the noise of measurements" if first.noise else "without the noise of measurements"
+    state = "as the event of the calibration has left it" if first.from_state == "end" else "before any other event"
+    text = f"Predicted from {first.n_samples} samples, {noise}. The motion meets the structure {state}."
+    if measured is None:
+        return f"{text} There are no measurements to compare with."
+    known = [row for row in numbers if np.isfinite(row.pit)]
+    if known:
+        inside = sum(row.place.startswith("within") for row in known)
+        text += f" {inside} of {len(known)} measured numbers are within their {_percent(LEVEL)} intervals"
+        outside = [f"{row.name} {row.place}" for row in known if not row.place.startswith("within")]
+        text += f" ({', '.join(outside)})." if outside else "."
+    for scores in histories:
+        shares = ", ".join(
+            f"{_percent(share)} of {channel.name}"
+            for channel, share in zip(scores.channels, scores.coverage_strong, strict=True)
+        )
+        text += f" In the strong part, the {_percent(LEVEL)} band contains {shares}."
+    if not first.noise:
+        text += " A band without noise is that of the response, and contains fewer measurements."
+    return text
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"

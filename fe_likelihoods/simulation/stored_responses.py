@@ -1,0 +1,96 @@
+"""Responses of a model that are stored in a cache on disk as soon as they are simulated, without measurements.
+
+A prediction that was interrupted finds them when it is made again. Likelihoods store their responses themselves
+(`fe_likelihoods.probability.new_simulations`), under the same keys.
+"""
+
+import os
+import time
+from typing import Any
+
+import numpy as np
+
+from .disk_cache import SimulationCache
+from .fingerprint import read_attributes_again, simulation_fingerprint
+from .model import Model, SimulationBatch, simulate_batch
+from .verification import VerifiedCache, VerifyingRun
+
+__all__ = ["StoredResponses"]
+
+_SECONDS = 0.1  # of simulations between two writes, if one simulation is shorter
+
+
+class StoredResponses:
+    """Simulations of a model, each of which is run once for all processes that use a cache.
+
+    Parameters
+    ----------
+    model : Model
+    pool : object with ``map(function, items)``, or None
+        As for `simulate_batch`.
+    cache : SimulationCache
+        One or two stored responses per process are simulated again and compared (`SimulationCache`).
+
+    Attributes
+    ----------
+    simulations : int
+        Number of simulations that were not stored.
+    """
+
+    def __init__(self, model: Model, pool: Any, cache: SimulationCache) -> None:
+        read_attributes_again(model)
+        self.model, self.pool, self.cache = model, pool, cache
+        self.simulations = 0
+        self._verified = VerifiedCache(cache, model, pool)
+        shape = len(model.channels), model.n_steps
+        self._run = VerifyingRun(model, pool, np.zeros(shape), None, len(model.channels))
+        self._least = 1
+        if pool is not None:
+            self._least = getattr(pool, "n_workers", None) or os.cpu_count() or 1
+        elif hasattr(model, "simulate_batch"):
+            self._least = os.cpu_count() or 1
+        self._size = self._least
+
+    def simulate(self, thetas: np.ndarray) -> SimulationBatch:
+        """Responses (n, n_channels, n_steps) [SI], stored or new, and the reasons of failures.
+
+        Parameters
+        ----------
+        thetas : (n, n_parameters) float
+            Distinct parameter sets.
+
+        Raises
+        ------
+        StaleCache
+            If a stored response and a new simulation differ.
+        """
+        responses = np.full((len(thetas), len(self.model.channels), self.model.n_steps), np.nan)
+        left = []
+        for row, response in enumerate(self._verified.look_up_responses(thetas, self._run)):
+            if response is None:
+                left.append(row)
+            else:
+                responses[row] = response
+        reasons = [""] * len(thetas)
+        if left:
+            for row, reason in zip(left, self._verified.look_up_failures(thetas[left], self._run), strict=True):
+                reasons[row] = reason
+            left = [row for row in left if not reasons[row]]
+        while left:
+            rows, left = left[: self._size], left[self._size :]
+            start = time.perf_counter()
+            batch = simulate_batch(self.model, thetas[rows], self.pool)
+            seconds = time.perf_counter() - start
+            self._store(thetas[rows], batch)
+            responses[rows] = batch.response
+            for row, reason in zip(rows, batch.reasons, strict=True):
+                reasons[row] = reason
+            wanted = int(_SECONDS * len(rows) / max(seconds, 1e-9))
+            self._size = max(self._least, min(4 * self._size, wanted))
+        return SimulationBatch(responses, reasons)
+
+    def _store(self, thetas: np.ndarray, batch: SimulationBatch) -> None:
+        self.simulations += len(thetas)
+        self.cache.store_responses(self.model, thetas, batch.response)
+        self.cache.store_failures(self.model, thetas, batch.reasons)
+        self._verified.add_own(thetas, simulation_fingerprint(self.model))

@@ -1,0 +1,87 @@
+"""Other events in a report: tables, sentences, figures, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Measurements, peak, propagate, report
+from fe_likelihoods.reporting.other_events import describe_event
+from tests.reporting.report_page import read_page
+from tests.reporting.test_report import vibrating
+
+__all__ = ["vibrating"]  # the fixture
+
+SEVERAL = {"histories": None, "peaks": [peak("top")]}
+
+
+def predicted(vibrating, n=40, **options):
+    sampler, posterior = vibrating
+    samples = sampler.get_chain(flat=True)[:: len(sampler.get_chain(flat=True)) // n]
+    return propagate(posterior, samples, quantity=SEVERAL, progress=False, seed=1, **options)
+
+
+def scaled(posterior, factor):
+    measured = posterior.likelihood.measurements
+    return Measurements(measured.channels, measured.dt, factor * measured.values)
+
+
+@pytest.mark.filterwarnings("ignore:the residuals")
+def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
+    sampler, posterior = vibrating
+    events = {"same": predicted(vibrating, noise=True), "larger": predicted(vibrating, noise=True)}
+    events["unmeasured"] = predicted(vibrating)["histories"]
+    measured = {"same": posterior.likelihood.measurements, "larger": scaled(posterior, 1.5)}
+    path = report(sampler, posterior, out=tmp_path / "report.html", events=events, measured=measured)
+    page = read_page(path)
+    numbers = next(table for table in page.tables if table[0][1] == "Quantity")[1:]
+    assert [row[0] for row in numbers] == ["same", "larger"] and numbers[0][1] == "peak of top [mm]"
+    peaks = events["same"]["peaks"]
+    for row, factor in zip(numbers, (1.0, 1.5), strict=True):
+        largest = 1e3 * factor * np.abs(posterior.likelihood.measurements.values).max()
+        assert float(row[5]) == pytest.approx(largest, rel=5e-3)
+        assert float(row[2]) == pytest.approx(1e3 * np.median(peaks.values), rel=5e-3)
+        values = np.sort(1e3 * peaks.values.ravel())
+        assert [float(end) for end in row[4].split(" to ")] == pytest.approx([values[2], values[-3]], rel=0.05)
+    assert numbers[0][6].startswith("within") and numbers[1][6:] == ["above", "0.99"]
+    assert "0 of 1 measured numbers are within their 90 % intervals (peak of top above)" in page.text
+    assert "There are no measurements to compare with" in page.text
+    assert "less than half of the strong part of top" in page.notes["larger"] and "same" not in page.notes
+    histories = next(table for table in page.tables if table[0][-1] == "In its strong part")[1:]
+    scores = events["larger"]["histories"].score(measured["larger"])
+    assert [row[0] for row in histories] == ["same", "larger"]
+    assert float(histories[1][5]) == pytest.approx(1e3 * scores.interval_score[0], rel=5e-3)
+    assert histories[1][8] == f"{100 * scores.coverage_strong[0]:.3g} %"
+    drawn = [alt for _, alt in page.images]
+    assert sum("in the event" in alt for alt in drawn) == 3
+    assert "Predicted intervals by measured values of same, larger." in drawn
+    assert any(alt.startswith("Calibration, coverage and interval scores of the histories of same") for alt in drawn)
+
+
+@pytest.mark.filterwarnings("ignore:the residuals")
+def test_what_speaks_against_an_event_is_said(vibrating, tmp_path):
+    sampler, posterior = vibrating
+    few = predicted(vibrating, n=8, noise=True)
+    told = describe_event("few", few, posterior.likelihood.measurements).remarks
+    assert any("do not have their level" in remark for remark in told)
+    remarked = {name: replace(each, remarks=("the peaks are far away",)) for name, each in few.items()}
+    assert describe_event("far", remarked, None).remarks == ("the peaks are far away",)  # once for all quantities
+    silent = describe_event("silent", predicted(vibrating), posterior.likelihood.measurements)
+    assert "A band without noise is that of the response" in silent.sentence
+    other = describe_event("other", few, Measurements(posterior.likelihood.measurements.channels, 0.02, [[0.0] * 9]))
+    assert any(remark.startswith("no scores: ") for remark in other.remarks)
+
+
+def test_what_are_no_predictions_of_events_is_refused(vibrating, tmp_path):
+    sampler, posterior = vibrating
+    path = tmp_path / "report.html"
+    measured = posterior.likelihood.measurements
+    with pytest.raises(ValueError, match="events must be a mapping of names"):
+        report(sampler, posterior, out=path, events=predicted(vibrating)["peaks"])
+    with pytest.raises(ValueError, match="expected the result of propagate for each event.*'second' is 3.0"):
+        report(sampler, posterior, out=path, events={"second": 3.0})
+    with pytest.raises(ValueError, match="measured has third, .* no event has this name"):
+        report(sampler, posterior, out=path, events={"second": predicted(vibrating)}, measured={"third": measured})
+    with pytest.raises(ValueError, match="measured must be a mapping of the names of events"):
+        report(sampler, posterior, out=path, events={"second": predicted(vibrating)}, measured=measured)
+    assert not path.exists()
