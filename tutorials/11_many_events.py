@@ -370,7 +370,7 @@ for ax, (label, curve) in zip(axes, curves.items(), strict=True):
     ax.set_title(f"{label}: Brier score {brier:.3f}")
     ax.set_xlabel("Peak acceleration of the base [g]")
 axes[0].set_ylabel(f"P(peak of the deck > {from_si(LIMIT, 'g'):.2g} g)")
-axes[0].legend(loc="center right")
+fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
 fig.savefig(args.out / "fragility.png", dpi=150)
 
 # %%

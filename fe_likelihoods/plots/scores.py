@@ -26,7 +26,9 @@ __all__ = ["plot_scores"]
 _LEVELS = ("weak", "moderate", "strong")
 _BAND = 0.9  # probability of the bands of chance
 _BINS = 10
-_MOST_NAMES = 12  # points with names in the last axes
+_MOST_NAMES = 16  # points with names beside the last axes
+_LINE = 0.062  # height of such a name, as a share of that of the axes
+_SPAN = 0.1  # of coverages below the level that is shown at least
 _FEWEST = 3  # events whose scatter is drawn as standard errors
 
 
@@ -68,13 +70,17 @@ def plot_scores(
             f"got {[(name, type(each).__name__, getattr(each, 'level', None)) for name, each in events.items()]}"
         )
     if histories == {True}:
-        figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.6), layout="constrained")
+        figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.8), layout="constrained")
         _history_axes(axes, events)
         return figure
     rows = sum(len(each.names) for each in events.values())
-    size = (11.0, max(3.4, 1.2 + 0.24 * rows))
+    size = (11.0, max(3.6, 1.3 + (0.24 if rows <= 30 else 0.15) * rows))
     figure, axes = plt.subplots(1, 3, figsize=size, layout="constrained", width_ratios=(1.0, 1.6, 0.8))
     _number_axes(axes, events)
+    for each, ratio in ((axes[0], 0.9), (axes[2], 1.2)):  # as tall as they are for few events
+        if rows > 12:
+            each.set_box_aspect(ratio)
+            each.set_anchor("N")
     return figure
 
 
@@ -88,7 +94,7 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScoresLike]) -> 
         error = known.std(axis=0, ddof=1) / np.sqrt(len(known))
         at = (np.arange(shares.shape[1]) + 0.5) / shares.shape[1]
         axes[0].errorbar(at, known.mean(axis=0), error, fmt="none", color=ORANGE, linewidth=1.2, label="between events")
-        axes[0].legend(frameon=False, fontsize="small")
+    _add_room_for_legend(axes[0])
 
     names = list(dict.fromkeys(channel.name for each in events.values() for channel in each.channels))
     for k, name in enumerate(names):
@@ -100,29 +106,65 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScoresLike]) -> 
     axes[1].set_xlabel("response")
     axes[1].set_ylabel(f"share in the {level:.0%} band [-]")
     axes[1].set_title("coverage by level of the response", fontsize="medium")
-    axes[1].set_ylim(top=1.03)
+    axes[1].set_ylim(min(level - _SPAN, axes[1].dataLim.ymin - 0.02), 1.03)
+    if len(names) > 1:
+        axes[1].legend(
+            frameon=False, fontsize="small", ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.2), columnspacing=1.0
+        )
 
     points = [(event, each, k) for event, each in events.items() for k in range(len(each.channels))]
-    for event, each, k in points:
+    for _event, each, k in points:
         name = each.channels[k].name
         ends = each.width[k] / each.rms[k], each.interval_score[k] / each.rms[k]
         colour = _colour(names.index(name))
         axes[2].plot(ends, [each.coverage[k]] * 2, color=colour, linewidth=0.8)
         axes[2].plot(ends[0], each.coverage[k], "o", color=colour, fillstyle="none", markersize=5)
         axes[2].plot(ends[1], each.coverage[k], "o", color=colour, markersize=5)
-        if len(points) <= _MOST_NAMES:
-            text = f"{event}: {name}" if event and len(names) > 1 else event or name
-            axes[2].annotate(text, (ends[1], each.coverage[k]), (4, 3), textcoords="offset points", fontsize="x-small")
     axes[2].axhline(level, color=GREY, linewidth=0.8)
     axes[2].set_xlabel("width (open), interval score (full) / RMS [-]")
     axes[2].set_ylabel(f"share in the {level:.0%} band [-]")
     axes[2].set_title("sharpness beside coverage", fontsize="medium")
-    axes[2].margins(x=0.3, y=0.1)
+    axes[2].margins(x=0.08)
     axes[2].set_xlim(left=0.0)
-    if len(names) > 1:
-        axes[1].legend(frameon=False, fontsize="small")
+    axes[2].set_ylim(min(level - _SPAN, axes[2].dataLim.ymin - 0.03), 1.03)
+    if len(points) <= _MOST_NAMES:
+        texts = [
+            f"{event}: {each.channels[k].name}" if event and len(names) > 1 else event or each.channels[k].name
+            for event, each, k in points
+        ]
+        ends = [(each.interval_score[k] / each.rms[k], each.coverage[k]) for _, each, k in points]
+        _name_points(axes[2], texts, ends)
     for each in axes:
         each.grid(alpha=0.25)
+
+
+def _name_points(axes: Axes, texts: Sequence[str], points: Sequence[tuple[float, float]]) -> None:
+    """Write names at the right of the axes, in the order of the heights of their points, with a line to each point."""
+    low, high = axes.get_ylim()
+    heights = np.array([(y - low) / (high - low) for _, y in points])
+    order = np.argsort(heights, kind="stable")
+    places = _spread(heights[order], _LINE)
+    for k, place in zip(order, places, strict=True):
+        axes.annotate(
+            texts[k],
+            points[k],
+            (1.04, place),
+            textcoords="axes fraction",
+            fontsize="x-small",
+            verticalalignment="center",
+            arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.5, "shrinkA": 0.0, "shrinkB": 3.0},
+        )
+
+
+def _spread(heights: np.ndarray, gap: float) -> np.ndarray:
+    """Ascending heights with the least sum of squared shifts that makes them `gap` or more apart."""
+    groups: list[list[float]] = []  # number of heights, and their mean without the gaps
+    for k, height in enumerate(heights):
+        groups.append([1.0, height - k * gap])
+        while len(groups) > 1 and groups[-2][1] > groups[-1][1]:  # pool adjacent violators
+            (n, mean), (m, other) = groups.pop(), groups.pop()
+            groups.append([n + m, (n * mean + m * other) / (n + m)])
+    return np.repeat([mean for _, mean in groups], [int(n) for n, _ in groups]) + gap * np.arange(len(heights))
 
 
 def _coverage_of(name: str, events: Sequence[HistoryScoresLike]) -> tuple[np.ndarray, np.ndarray]:
@@ -207,9 +249,15 @@ def _draw_histogram(axes: Axes, shares: np.ndarray, independent: float) -> None:
     axes.bar(at, shares, 0.94 * probability, color=BLUE, alpha=0.75)
     axes.fill_between([0.0, 1.0], low, high, color=GREY, alpha=0.35, linewidth=0.0, label=f"{_BAND:.0%} by chance")
     axes.axhline(probability, color=GREY, linewidth=0.8)
-    axes.set(xlim=(0.0, 1.0), xlabel="predicted probability below measured (PIT)", ylabel="share [-]")
-    axes.set_title(f"calibration: worth {n} values", fontsize="medium")
-    axes.legend(frameon=False, fontsize="small")
+    axes.set(xlim=(0.0, 1.0), xlabel="predicted probability\nbelow measured (PIT)", ylabel="share [-]")
+    axes.set_title(f"calibration: worth {n} value{'s' if n > 1 else ''}", fontsize="medium")
+    _add_room_for_legend(axes)
+
+
+def _add_room_for_legend(axes: Axes) -> None:
+    """A legend of one row above the bars."""
+    axes.set_ylim(0.0, 1.18 * max(axes.dataLim.ymax, 1e-9))
+    axes.legend(frameon=False, fontsize="small", ncols=2, loc="upper center", columnspacing=1.0, borderaxespad=0.1)
 
 
 def _chance(n: int, probability: float) -> tuple[float, float]:

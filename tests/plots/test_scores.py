@@ -3,6 +3,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from scipy import stats
 
 from fe_likelihoods.plots.scores import plot_scores
@@ -124,3 +125,52 @@ def test_scores_that_do_not_belong_together_are_refused(rng):
         plot_scores({})
     with pytest.raises(ValueError, match=r"divided by the measured values.*drift"):
         plot_scores(numbers(np.array([1.0, 0.0]), rng))
+
+
+def boxes(figure, artists):
+    figure.canvas.draw()
+    return [Text.get_window_extent(each) for each in artists if each.get_text()]  # of an annotation without its line
+
+
+def overlaps(found):
+    return [(i, j) for i, a in enumerate(found) for j, b in enumerate(found[:i]) if a.overlaps(b)]
+
+
+@pytest.mark.parametrize("n", [1, 3, 8])
+def test_names_of_points_do_not_overlap_and_are_beside_the_axes(rng, n):
+    events = {f"event {k}": histories(rng, 1.0 + 0.001 * k) for k in range(n)}  # coverages that are nearly the same
+    figure = plot_scores(events)
+    names = boxes(figure, figure.axes[2].texts)
+    assert len(names) == 2 * n and not overlaps(names)
+    right, whole = figure.axes[2].get_window_extent().x1, figure.bbox
+    assert all(right < each.x0 and each.x1 <= whole.x1 and whole.y0 <= each.y0 for each in names)
+    heights = [point.xy[1] for point in figure.axes[2].texts]
+    places = [text.get_position()[1] for text in figure.axes[2].texts]
+    assert np.all(np.diff(np.array(places)[np.argsort(heights, kind="stable")]) > 0.0)  # lines do not cross in height
+    plt.close("all")
+
+
+def test_control_names_at_their_points_would_overlap(rng):
+    figure = plot_scores({f"event {k}": histories(rng, 1.0 + 0.001 * k) for k in range(8)})
+    for text in figure.axes[2].texts:
+        text.set_position((1.04, 0.5))
+    assert overlaps(boxes(figure, figure.axes[2].texts))
+    plt.close("all")
+
+
+@pytest.mark.parametrize("n", [1, 3, 11, 40])
+def test_legends_cover_no_bar_and_labels_of_axes_do_not_overlap(rng, n):
+    for events in (
+        {f"EQ{k}": histories(rng, np.exp(0.3 * rng.normal())) for k in range(n)},
+        {f"EQ{k}": numbers(np.exp(rng.normal(size=2)), rng) for k in range(n)},
+    ):
+        figure = plot_scores(events)
+        figure.canvas.draw()
+        legend = figure.axes[0].get_legend().get_window_extent()
+        assert not any(legend.overlaps(bar.get_window_extent()) for bar in figure.axes[0].patches)
+        labels = [axes.xaxis.label for axes in figure.axes] + [axes.yaxis.label for axes in figure.axes]
+        labels += figure.axes[1].get_yticklabels() + figure.axes[1].get_xticklabels()
+        labels += [axes.title for axes in figure.axes]
+        assert not overlaps(boxes(figure, labels))
+        assert figure.get_figheight() < 15.0 and figure.axes[0].get_window_extent().height > 100.0
+        plt.close(figure)
