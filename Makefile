@@ -36,7 +36,7 @@ clients:         ## run every client on one posterior and compare with quadratur
 	PYTHON=$(PYTHON) .ci/clients
 
 tutorials: $(READY) ## run every tutorial that needs no other data than the bundled ones
-	for t in tutorials/0[1-5]*.py; do $(BIN)/python $$t || exit 1; done
+	for t in tutorials/0[1-5]*.py tutorials/1[01]*.py; do $(BIN)/python $$t || exit 1; done
 
 bench: $(READY)  ## measure speed against OpenSees, scipy and other samplers; prints one table
 	$(BIN)/python -m tests.benchmarks

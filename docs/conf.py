@@ -1,8 +1,8 @@
 """Settings of Sphinx. `make docs` builds the pages of this folder, the API reference and the tutorials.
 
 The API reference has one page per folder of the two packages, generated from the docstrings (``building.py``).
-Tutorials 01 to 05 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must fetch, and are
-shown without output. Both are written into folders that git ignores: ``docs/api`` and ``docs/tutorials``.
+Tutorials 01 to 05, 10 and 11 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must
+fetch, and are shown without output. Both are written into folders that git ignores: ``docs/api`` and ``docs/tutorials``.
 """
 
 import os
@@ -44,7 +44,7 @@ autodoc_default_options = {"members": True, "show-inheritance": True}
 sphinx_gallery_conf = {
     "examples_dirs": "../tutorials",
     "gallery_dirs": "tutorials",
-    "filename_pattern": r"/0[1-5]_",  # executed
+    "filename_pattern": r"/(0[1-5]|1[01])_",  # executed
     "ignore_pattern": r"^[a-z_]+\.py$",  # modules that tutorials share
     "within_subsection_order": "FileNameSortKey",
     "reset_argv": "building.tutorial_arguments",
