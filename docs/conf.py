@@ -2,7 +2,8 @@
 
 The API reference has one page per folder of the two packages, generated from the docstrings (``building.py``).
 Tutorials 01 to 05, 10 and 11 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must
-fetch, and are shown without output. Both are written into folders that git ignores: ``docs/api`` and ``docs/tutorials``.
+fetch, and are shown without output. Pages and tutorials are written into folders that git ignores: ``docs/api`` and
+``docs/tutorials``.
 """
 
 import os

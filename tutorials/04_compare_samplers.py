@@ -110,8 +110,8 @@ SAMPLERS = {
 EMCEE_WALKERS = 24 if FAST else 64
 GUIDED_WALKERS = 24 if FAST else 100
 GUIDED = "SMC with a guide"
-COLOURS = {"SMC": "#1f5a8c", "TMCMC": "#d9822b", "TMCMC as published": "#b03a48", GUIDED: "#d4007a"}
-COLOURS |= {"emcee": "#5b8c5a", "emcee from the prior": "#7b5ea7"}
+COLOURS = {"SMC": "#1f5a8c", "TMCMC": "#d9822b", GUIDED: "#5b8c5a", "emcee": "#7b5ea7"}  # those of plot_corner
+COLOURS |= {"TMCMC as published": "#b03a48", "emcee from the prior": "#6b4a2f"}
 
 
 # %%

@@ -205,7 +205,8 @@ for axes, (title, key) in zip(panels, shown.items(), strict=True):
     axes.fill_between(instants, low, high, color="#1f5a8c", alpha=0.35, linewidth=0, label="90 % band")
     values = from_si(measured["EQ4"].channel("displacement"), "in")
     axes.plot(instants, values, color="#d9822b", linewidth=0.9, label="measured")
-    axes.set_title(f"{title}: {100 * marks.coverage[1]:.0f} % of the samples in the band", fontsize=10)
+    relative = marks.interval_score[1] / marks.rms[1]
+    axes.set_title(f"{title}: {100 * marks.coverage[1]:.0f} % inside, interval score {relative:.2f} RMS", fontsize=10)
     axes.set_ylabel("displacement [in]")
 panels[0].legend(loc="upper right", ncols=2)
 panels[-1].set_xlabel("time in EQ4 [s]")

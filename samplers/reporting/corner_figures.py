@@ -99,7 +99,8 @@ def plot_corner(
     )
     k = len(drawn.labels)
     limits = panel_limits(drawn.samples, drawn.truths)
-    figure, axes, panel = _corner_grid(k, bool(title))
+    lines = 0.17 * title.count("\n")  # height of the title below its first line [in]
+    figure, axes, panel = _corner_grid(k, 0.6 + lines if title else 0.3)
     small, contours = 7.0 if k > 6 else 8.0, 0
     for i in range(k):
         _draw_diagonal(axes[i, i], drawn, i, limits[i], limits[i], small)
@@ -123,19 +124,19 @@ def plot_corner(
         if i:
             axes[i, 0].set_ylabel(text, fontsize=size)
             axes[i, 0].yaxis.set_label_coords(-0.54 / panel, 0.5)
-    _add_legend(figure, drawn, k, contours)
+    _add_legend(figure, drawn, k, contours, 0.35 + lines)
     if title:
         figure.suptitle(title, fontsize=11, y=1.0 - 0.12 / figure.get_figheight(), va="top")
     return figure
 
 
-def _corner_grid(k: int, titled: bool) -> tuple["Figure", np.ndarray, float]:
-    """A figure with square panels, its axes (k, k), and the size of a panel [in]."""
+def _corner_grid(k: int, top: float) -> tuple["Figure", np.ndarray, float]:
+    """A figure with square panels below a margin [in], its axes (k, k), and the size of a panel [in]."""
     import matplotlib.pyplot as plt
 
     panel = float(np.clip(9.0 / k, 1.05, 2.0))
     gap = 0.24 if k < 7 else 0.2
-    left, bottom, right, top = 0.95, 0.95, 0.15, 0.6 if titled else 0.3
+    left, bottom, right = 0.95, 0.95, 0.15
     inner = k * panel + (k - 1) * gap
     legend = max(0.0, 3.0 - (inner - panel))  # room for the legend, beside the only panel of the first row
     width, height = left + inner + right + legend, bottom + inner + top
@@ -260,8 +261,8 @@ def _are_few(x: np.ndarray) -> bool:
     return len(np.unique(x, axis=0)) < FEW_POINTS
 
 
-def _add_legend(figure: "Figure", drawn: Drawn, k: int, contours: int) -> None:
-    """Explain the lines in the upper right corner, which has no panels."""
+def _add_legend(figure: "Figure", drawn: Drawn, k: int, contours: int, below: float) -> None:
+    """Explain the lines in the upper right corner, which has no panels, `below` the top [in]."""
     notes = ["contours hold 50 and 90 % of the samples"] if contours else []
     if any(_are_few(x) for x in drawn.samples.values()):
         notes.append(f"points: fewer than {FEW_POINTS} distinct samples")
@@ -276,7 +277,7 @@ def _add_legend(figure: "Figure", drawn: Drawn, k: int, contours: int) -> None:
         title="\n".join(notes),
         title_fontsize=size - 1.0,
         frameon=False,
-        bbox_to_anchor=(1.0 - 0.1 / figure.get_figwidth(), 1.0 - 0.35 / figure.get_figheight()),
+        bbox_to_anchor=(1.0 - 0.1 / figure.get_figwidth(), 1.0 - below / figure.get_figheight()),
     )
     legend.get_title().set_multialignment("left")
     legend._legend_box.align = "left"

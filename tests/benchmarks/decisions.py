@@ -11,8 +11,8 @@ sets.
 of gains and ratios are normal between events. The hyper-parameters of the gain are drawn from the priors that the
 hierarchical model states, those of the ratio are fixed. Each data set has K events, from which `fragility` with a
 `Hierarchy` and `EventRatios` finds the curve at nine intensities. The rows are the shares of the data sets whose band
-holds the whole true curve (`Fragility.band`) and those whose intervals hold it at single intensities. The control is
-`fragility` with the posterior of one event and ``noise=False``.
+holds the whole true curve (`Fragility.band`) and those whose intervals hold it at single intensities, with the interval
+score of these. The control is `fragility` with the posterior of one event and ``noise=False``.
 """
 
 import logging
@@ -32,6 +32,7 @@ from fe_likelihoods import (
     StoredPosterior,
     Varying,
     fragility,
+    interval_score,
     peak,
 )
 from fe_likelihoods.models.function import FunctionModel
@@ -117,7 +118,7 @@ def fragility_bands(repeats: int = 1) -> list[Row]:
     rows = []
     for events in (3, 5, 10):
         found = [fragility_twin(events, seed) for seed in range(repeats * _SETS)]
-        whole, points, control = (np.array(each) for each in zip(*found, strict=True))
+        whole, points, control, scores = (np.array(each) for each in zip(*found, strict=True))
         case = f"{events} events"
         for what, inside in (
             ("90 % band holds the whole curve", whole),
@@ -127,13 +128,18 @@ def fragility_bands(repeats: int = 1) -> list[Row]:
         ):
             error = 100.0 * np.std(inside) / np.sqrt(len(inside))
             rows.append(Row(what, case, 100.0 * float(np.mean(inside)), "%", f"+- {error:.1f}"))
+        for what, score in zip(("intervals", "control"), scores.T, strict=True):
+            error = score.std() / np.sqrt(len(score))
+            rows.append(Row(f"{what}: interval score of the probability", case, score.mean(), "", f"+- {error:.3f}"))
         each = ", ".join(f"{share:.0f}" for share in 100.0 * points.mean(axis=0))
         rows.append(Row("intervals, by the true probability 5 to 95 %", case, None, "%", each))
     return rows
 
 
-def fragility_twin(events: int, seed: int, ratio_sd: float = 0.2, n: int = 400) -> tuple[bool, np.ndarray, np.ndarray]:
-    """Whether the band holds the true curve, the intervals its points, and those of one posterior without error."""
+def fragility_twin(
+    events: int, seed: int, ratio_sd: float = 0.2, n: int = 400
+) -> tuple[bool, np.ndarray, np.ndarray, list[float]]:
+    """Whether the band holds the curve, and the intervals its points; those of one posterior without error; scores."""
     rng = np.random.default_rng([seed, events])
     center, spread = MEDIAN_SD * rng.standard_normal(), abs(SPREAD_SD * rng.standard_normal())
     logs = center + spread * rng.standard_normal(events)
@@ -162,4 +168,5 @@ def fragility_twin(events: int, seed: int, ratio_sd: float = 0.2, n: int = 400) 
         bool(((lower <= truth) & (truth <= upper)).all()),
         (found.lower <= truth) & (truth <= found.upper),
         (alone.lower <= truth) & (truth <= alone.upper),
+        [float(interval_score(each.lower, each.upper, truth, 0.9).mean()) for each in (found, alone)],
     )

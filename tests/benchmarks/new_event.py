@@ -7,7 +7,8 @@ the hierarchical model states, so that its intervals must have their level, or t
 the spread between events: the posterior of one event, as without `Hierarchy`.
 
 The rows are the shares of the measured peaks within their intervals over 200 data sets per repeat, with the standard
-error from the scatter between data sets, and the median ratio of the upper end to the median.
+error from the scatter between data sets, the interval score of the logarithms, and the median ratio of the upper end to
+the median.
 """
 
 import warnings
@@ -25,6 +26,7 @@ from fe_likelihoods import (
     Prior,
     StoredPosterior,
     Varying,
+    interval_score,
     peak,
     predict_new_event,
 )
@@ -60,22 +62,26 @@ def _respond(theta: np.ndarray) -> list[np.ndarray]:
 
 
 def new_event(repeats: int = 1) -> list[Row]:
-    """Two rows of coverage per case, one of sharpness, and one of the control."""
+    """Rows of coverage and of the interval score per case and for the control, and one of sharpness."""
     rows = []
     for case, (events, truth) in _CASES.items():
         results = [_data_set(events, truth, seed) for seed in range(repeats * _SETS)]
-        pit, single, ends = (np.array(each) for each in zip(*results, strict=True))
-        for what, values in (("coverage", pit), ("control: one posterior", single)):
+        pit, single, scores, ends = (np.array(each) for each in zip(*results, strict=True))
+        for k, (what, values) in enumerate((("coverage", pit), ("control: one posterior", single))):
             for level in (0.5, 0.9):
                 inside = (np.abs(values - 0.5) <= 0.5 * level).mean(axis=1)
                 error = inside.std() / np.sqrt(len(inside))
                 rows.append(Row(f"{what}, {level:.0%}", case, 100.0 * inside.mean(), "%", f"+- {100.0 * error:.1f}"))
+            score, error = scores[:, k].mean(), scores[:, k].std() / np.sqrt(len(scores))
+            rows.append(Row(f"{what}, interval score of the log peak", case, float(score), "", f"+- {error:.2f}"))
         rows.append(Row("upper end / median", case, float(np.median(ends)), ""))
     return rows
 
 
-def _data_set(events: int, truth: tuple[float, float] | None, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """PIT of the peaks of new events, the same from the posterior of one event alone, and the relative upper end."""
+def _data_set(
+    events: int, truth: tuple[float, float] | None, seed: int
+) -> tuple[np.ndarray, np.ndarray, list[float], float]:
+    """PIT of new peaks, the same from the posterior of one event alone, both scores, and the relative upper end."""
     rng = np.random.default_rng([seed, events])
     center, spread = rng.standard_normal(2) * [MEDIAN_SD, SPREAD_SD] if truth is None else np.array(truth)
     center, spread, ratio_sd = (center, abs(spread), _RATIO) if truth is None else (np.log(center), spread, _RATIO)
@@ -98,8 +104,11 @@ def _data_set(events: int, truth: tuple[float, float] | None, seed: int) -> tupl
     predicted = predict_new_event(hierarchy, _Twin(), None, quantity=peak("top"), ratios=known, n=_DRAWS, seed=seed)
     new = np.exp(center + spread * rng.standard_normal(_NEW) + ratio_sd * rng.standard_normal(_NEW))
     alone = stored["EQ0"].samples[:, 0] * ratios[0]
-    pit, single = (pit_samples(np.repeat(values[:, None], _NEW, axis=1), new) for values in (predicted.values, alone))
-    return pit, single, float(predicted.quantile(0.95) / predicted.quantile(0.5))
+    both = predicted.values, alone
+    pit, single = (pit_samples(np.repeat(values[:, None], _NEW, axis=1), new) for values in both)
+    ends = [np.quantile(np.log(values), (0.05, 0.95)) for values in both]
+    scores = [float(interval_score(low, high, np.log(new), 0.9).mean()) for low, high in ends]
+    return pit, single, scores, float(predicted.quantile(0.95) / predicted.quantile(0.5))
 
 
 def hyper_samples(data: np.ndarray, rng: np.random.Generator, n: int = 200) -> np.ndarray:

@@ -106,6 +106,13 @@ def test_corner_shows_units_prior_truth_and_nominal_values(updated):
             assert axes[i, j].get_xlim() == axes[j, j].get_xlim() and axes[i, j].get_ylim() == axes[i, i].get_xlim()
 
 
+def test_a_title_of_two_lines_is_above_the_legend(updated):
+    figure = plot_corner(updated, Posterior(), title="synthetic data\nfew points, not converged")
+    figure.canvas.draw()
+    title, explained = (each.get_window_extent() for each in (figure._suptitle, figure.legends[0]))
+    assert title.y0 >= explained.y1 and title.y0 >= grid(figure)[0, 0].get_window_extent().y1
+
+
 def test_arrows_point_to_values_outside_of_the_panels(updated):
     axes = grid(plot_corner(updated, Posterior(), truths=[9.0, 0.9, 0.002], nominal={"k": -3.0, "sigma": 0.5}))
     assert arrows(axes[0, 0]) == [("-3", 0.005), ("9", 0.995)]
