@@ -1,8 +1,9 @@
 """Results as text: aligned tables for ``print``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-__all__ = ["text_table"]
+__all__ = ["NamedResults", "number", "text_table"]
 
 
 def text_table(rows: Sequence[Sequence[str]]) -> str:
@@ -29,3 +30,29 @@ def text_table(rows: Sequence[Sequence[str]]) -> str:
         )
         lines.append("  ".join([first, *others]).rstrip())
     return "\n".join(lines)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with some significant digits; "-" for NaN."""
+    return "-" if value != value else f"{value:.{digits}g}"  # noqa: PLR0124 - NaN differs from itself
+
+
+class NamedResults(dict[str, Any]):
+    """Results by name, a dict; ``print`` gives one table with a row per name.
+
+    Each value has a property `cells`: texts by the headings of their columns, the same for all values.
+
+    Examples
+    --------
+    >>> class Peak:
+    ...     cells = {"peak [g]": "0.31"}
+    >>> print(NamedResults(first=Peak()))
+    event  peak [g]
+    first      0.31
+    """
+
+    def __str__(self) -> str:
+        rows: list[Mapping[str, str]] = [value.cells for value in self.values()]
+        head = list(dict.fromkeys(heading for row in rows for heading in row))
+        named = zip(self, rows, strict=True)
+        return text_table([["event", *head], *([name, *(row.get(h, "-") for h in head)] for name, row in named)])

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..signals.channels import Channel
+from ..text_tables import number, text_table
+from ..units import from_si
 from .prediction import Prediction
 
 __all__ = ["AveragedPrediction", "average_predictions"]
@@ -52,6 +54,21 @@ class AveragedPrediction(NamedTuple):
     probabilities: dict[str, float]
     channels: tuple[Channel, ...]
     dt: float | None
+
+    def __str__(self) -> str:
+        shares = ", ".join(f"{name} {share:.2f}" for name, share in self.probabilities.items())
+        what = "values" if self.dt is None else "histories, the sample with the largest mean"
+        known = len(self.channels) == (self.mean.size if self.dt is None else len(self.mean))
+        arrays = [np.atleast_1d(each) for each in (self.mean, self.sd, self.within, self.between)]
+        if self.dt is not None:
+            at = np.abs(self.mean).argmax(axis=1)[:, None]
+            arrays = [np.take_along_axis(each, at, axis=1) for each in arrays]
+        rows = [("value", "unit", "mean", "sd", "within models", "between models")]
+        for k, (mean, sd, within, between) in enumerate(zip(*map(np.ravel, arrays), strict=True)):
+            name, unit = (self.channels[k].name, self.channels[k].unit) if known else (f"{k}", "SI")
+            shown = [x if unit == "SI" else from_si(x, unit) for x in (mean, sd, np.sqrt(within), np.sqrt(between))]
+            rows.append((name, unit, *map(number, shown)))
+        return f"Average of the models {shares}; {what}; sd within and between models\n{text_table(rows)}"
 
     @property
     def sd(self) -> np.ndarray:

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..text_tables import number
 from .damage_measures import SIDES, STRAIN_MEASURES, DamageMeasures
 from .event_ratios import EventRatios, LevelRatios
 from .event_spread import EventSpread
@@ -67,6 +68,11 @@ class LimitState(NamedTuple):
     measure: str
     limit: ArrayLike
     source: str = ""
+
+    def __str__(self) -> str:
+        limits = np.ravel(self.limit)
+        value = number(limits[0]) if len(limits) == 1 else f"{number(limits.min())} to {number(limits.max())}"
+        return f"{self.name}: {self.measure} beyond {value} [SI]" + (f" ({self.source})" if self.source else "")
 
 
 _ASSUMED = (
@@ -147,6 +153,9 @@ class Damage(NamedTuple):
             return ""
         total = self.n_samples + self.n_failed
         return f"{self.n_failed} of {total} samples failed and are not counted: probabilities may be too low"
+
+    def __str__(self) -> str:
+        return self.table()
 
     def table(self) -> str:
         """Return the probabilities of the limit states and the quantiles of the measures after each event as text.

@@ -24,6 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
+from ..text_tables import number, text_table
+
 __all__ = ["EventRatios", "LevelRatios", "RatioPopulations", "standardised"]
 
 FORMS = ("constant", "linear", "smooth")
@@ -31,6 +33,7 @@ _LEAST_EVENTS = {"constant": 1, "linear": 4, "smooth": 10}  # for a form to be a
 _AMPLITUDES = (0.25, 1.0, 4.0, 16.0)  # of f over its range, as multiples of s
 _LENGTHS = (0.7, 1.5, 3.0)  # of a smooth f, as multiples of the standard deviation of the log levels
 _GRID = 48  # levels at which a drawn function is known
+_SHOWN = 0.9  # probability of printed intervals
 _REACH = 1e-9
 
 
@@ -146,6 +149,14 @@ class EventRatios:
     def __post_init__(self) -> None:
         values = _checked_ratios("EventRatios", self.values, self.prior_sd, self.prior_events, (1, 2))
         object.__setattr__(self, "values", values)
+
+    def __str__(self) -> str:
+        factors, medians = np.atleast_1d(self.factor(_SHOWN)), np.atleast_1d(self.median)
+        rows = [("number", "median of the ratio", f"{_SHOWN:.0%} interval of a new event")]
+        for k, (median, factor) in enumerate(zip(medians, factors, strict=True)):
+            rows.append((f"{k + 1}", number(median), f"{number(median / factor)} to {number(median * factor)}"))
+        guess = f"; guess {self.prior_sd:g} worth {self.prior_events:g} events" if self.prior_events else ""
+        return f"Ratios of measured to fitted values in {len(self.values)} events{guess}\n{text_table(rows)}"
 
     @property
     def degrees_of_freedom(self) -> float:
@@ -341,6 +352,17 @@ class LevelRatios:
         fields = {"values": values, "levels": levels, "_center": center, "_width": width}
         for name, value in (fields | {"_parts": parts, "_weights": weights / weights.sum()}).items():
             object.__setattr__(self, name, value)
+
+    def __str__(self) -> str:
+        levels = np.unique(np.array(self.levels, dtype=float)[[np.argmin(self.levels), np.argmax(self.levels)]])
+        rows = [("predicted value [SI]", "median of the ratio", f"{_SHOWN:.0%} interval of a new event")]
+        for level in levels:
+            low, median, high = (
+                number(float(self.quantile(p, level))) for p in (0.5 - 0.5 * _SHOWN, 0.5, 0.5 + 0.5 * _SHOWN)
+            )
+            rows.append((number(level), median, f"{low} to {high}"))
+        forms = ", ".join(f"{name} {share:.2f}" for name, share in self.forms.items())
+        return f"Ratios by level in {len(self.values)} events; probabilities of the forms: {forms}\n{text_table(rows)}"
 
     @property
     def degrees_of_freedom(self) -> float:

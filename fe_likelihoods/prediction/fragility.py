@@ -18,6 +18,7 @@ from scipy import stats
 from ..probability.hierarchy import Hierarchy
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
+from ..text_tables import number, text_table
 from .event_ratios import EventRatios, LevelRatios
 from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .excitation import chosen_state, excite, under_record
@@ -84,6 +85,19 @@ class Fragility(NamedTuple):
     from_state: str = "virgin"
     draws: np.ndarray | None = None
     uncertainty: str = ""
+
+    def __str__(self) -> str:
+        rows = [("record", "intensity [SI]", "P(exceed)", "MC error", "interval", "failed")]
+        for k, name in enumerate(self.names):
+            numbers = number(self.intensity[k]), number(self.probability[k]), number(self.standard_error[k], 2)
+            ends = f"{number(self.lower[k])} to {number(self.upper[k])}"
+            rows.append((name, *numbers, ends, f"{self.n_failed[k]}"))
+        lines = [f"Probability to exceed {number(self.threshold)} [SI], from the state {self.from_state!r}"]
+        lines += [
+            text_table(rows),
+            "no curve: the points do not determine one" if self.curve is None else f"{self.curve}",
+        ]
+        return "\n".join([*lines, *([f"The probabilities contain {self.uncertainty}."] if self.uncertainty else [])])
 
     def band(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
         """Band that contains the probabilities under all records together.

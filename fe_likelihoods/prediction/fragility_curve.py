@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import optimize, special
 
+from ..text_tables import number
+
 __all__ = ["FragilityCurve", "curve_with_errors", "fit_fragility"]
 
 _REPLICATES = 100  # resamplings for the errors of the curve
@@ -42,6 +44,13 @@ class FragilityCurve(NamedTuple):
     dispersion: float
     median_error: float = np.inf
     dispersion_error: float = np.inf
+
+    def __str__(self) -> str:
+        median, dispersion = number(self.median), number(self.dispersion)
+        if np.isfinite(self.median_error) and np.isfinite(self.dispersion_error):
+            median += f" +- {number(self.median_error, 2)}"
+            dispersion += f" +- {number(self.dispersion_error, 2)}"
+        return f"lognormal fragility curve: median {median} [SI], dispersion {dispersion}"
 
     def probability(self, intensity: ArrayLike) -> np.ndarray:
         """Return the probability of an exceedance at positive intensities."""

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 
 from ..probability.leave_one_out import LeftOut
 from ..probability.posterior import Posterior
+from ..text_tables import NamedResults, number
+from ..units import from_si
 from .event_ratios import EventRatios
 from .new_event import predict_new_event
 from .prediction import Prediction
@@ -34,6 +36,29 @@ class HeldOutScore(NamedTuple):
     log_density: float
     prediction: Prediction
 
+    @property
+    def cells(self) -> dict[str, str]:
+        """The scores as texts by headings, for `score_left_out`: of each number, or of each channel of histories."""
+        scores, found = self.scores, {}
+        if isinstance(scores, QuantityScores):
+            for k, (name, unit) in enumerate(zip(scores.names, scores.units, strict=True)):
+                ends = scores.lower[k], scores.upper[k]
+                shown = [each if unit == "SI" else from_si(each, unit) for each in (scores.measured[k], *ends)]
+                measured, lower, upper = map(number, shown)
+                found |= {f"{name} [{unit}]": measured, f"{scores.level:.0%} interval of {name}": f"{lower} to {upper}"}
+                found[f"PIT of {name}"] = number(scores.pit[k], 2)
+        else:
+            for k, channel in enumerate(scores.channels):
+                found |= {f"RRMSE of {channel.name}": f"{scores.rrmse[k]:.1%}"}
+                found[f"interval score of {channel.name} [{channel.unit}]"] = number(
+                    from_si(scores.interval_score[k], channel.unit)
+                )
+                found[f"strong part of {channel.name} in band"] = f"{scores.coverage_strong[k]:.1%}"
+        return found | {"log density": number(self.log_density, 5)}
+
+    def __str__(self) -> str:
+        return f"{self.scores}\nlog density of the data of the event: {number(self.log_density, 5)}"
+
 
 def score_left_out(
     left_out: Mapping[str, LeftOut],
@@ -45,7 +70,7 @@ def score_left_out(
     n: int = 500,
     seed: int = 0,
     **options: Any,
-) -> dict[str, HeldOutScore]:
+) -> NamedResults:
     """Predict each event from the others, under its own excitation, and score it with its measurements.
 
     Parameters
@@ -67,6 +92,7 @@ def score_left_out(
     Returns
     -------
     dict of str to HeldOutScore
+        ``print`` gives a table with a row per event.
 
     Raises
     ------
@@ -77,7 +103,7 @@ def score_left_out(
         if missing := [name for name in left_out if name not in given]:
             raise ValueError(f"score_left_out: {what} of {', '.join(map(repr, missing))} are missing")
     seeds = np.random.SeedSequence(seed).spawn(len(left_out))
-    found = {}
+    found = NamedResults()
     for (name, each), own_seed in zip(left_out.items(), seeds, strict=True):
         others = None
         if ratios is not None:

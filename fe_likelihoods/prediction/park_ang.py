@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..signals.records import DisplacementHistory
+from ..text_tables import number
 
 if TYPE_CHECKING:
     from ..models.rc_column import RCColumn
@@ -55,6 +56,13 @@ class ParkAng(NamedTuple):
     yield_force: float
     beta: float = 0.05
     source: str = ""
+
+    def __str__(self) -> str:
+        said = f" ({self.source})" if self.source else ""
+        return (
+            f"Park-Ang index: ultimate displacement {number(1e3 * self.ultimate_displacement)} mm, yield force "
+            f"{number(1e-3 * self.yield_force)} kN, beta {number(self.beta)}{said}"
+        )
 
     def check(self) -> None:
         """Raise ValueError if a constant is no positive and finite number; `beta` may be zero."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_shifted, compare_with
 from ..signals.error_measures import rrmse
+from ..text_tables import number, text_table
 from ..units import find_unit
 from .event_spread import EventSpread
 from .quantities import measured_quantity
@@ -327,16 +328,28 @@ class Prediction:
         """The quantile of a probability that is known up to round-off."""
         return self.quantile(next((p for p in self.probabilities if abs(p - probability) < 1e-9), probability))
 
+    def __str__(self) -> str:
+        title, lines, header, rows = self._table()
+        cells = [[each if isinstance(each, str) else number(each) for each in row] for row in rows]
+        table = [text_table([header, *cells])] if rows else []
+        return "\n".join([f"{title}: {lines[0]}", *lines[1:], *table])
+
     def _repr_html_(self) -> str:
         """In notebooks: the largest values of histories, or the moments of a few numbers, in the units of channels."""
         from ..plots.html import html_object, html_table
 
+        title, lines, header, rows = self._table()
+        return html_object(title, lines, *([html_table(header, rows)] if rows else []))
+
+    def _table(self) -> tuple[str, list[str], tuple[str, ...], list[tuple]]:
+        """Title, lines of text, header and rows: the largest values of histories, or the moments of a few numbers."""
         noise = "with measurement noise" if self.noise else "without measurement noise"
         lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
         if self.spread is not None and self.spread.ratios is not None:
             lines.append("the ratio of a new event has no mean: use the quantiles")
         if self.n_failed:
             lines.append(f"{self.n_failed} samples failed and are left out")
+        lines += [f"CAUTION: {remark}" for remark in self.remarks]
         units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
         if self.dt is not None:
             header = ("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")
@@ -345,10 +358,10 @@ class Prediction:
                 at = int(np.argmax(np.abs(mean)))
                 numbers = mean[at] / factor, at * self.dt, sd[at] / factor, sd.mean() / factor
                 rows.append((channel.name, unit, *map(float, numbers)))
-            return html_object("Prediction of histories", lines, html_table(header, rows))
+            return "Prediction of histories", lines, header, rows
         if self.mean.size > _MOST_ROWS:
             lines.append(f"{self.mean.size} values of shape {self.mean.shape}: mean, sd and quantiles are attributes")
-            return html_object("Prediction", lines)
+            return "Prediction", lines, (), []
         of_channels = len(self.channels) == self.mean.size
         names = [channel.name for channel in self.channels] if of_channels else [f"{i}" for i in range(self.mean.size)]
         header = ("value", "unit", "mean", "MC error", "sd", *(f"{100 * p:g} %" for p in self.probabilities))
@@ -359,7 +372,7 @@ class Prediction:
                 names, units if of_channels else [("SI", 1.0)] * self.mean.size, table.T, strict=True
             )
         ]
-        return html_object("Prediction", lines, html_table(header, rows))
+        return "Prediction", lines, header, rows
 
     def _need_histories(self) -> None:
         if self.dt is None:

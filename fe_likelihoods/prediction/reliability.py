@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from ..signals.channels import Channel
+from ..text_tables import number, text_table
 from ..units import to_si
 from .event_ratios import EventRatios, LevelRatios
 from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
@@ -78,6 +79,14 @@ class Exceedance(NamedTuple):
     upper: np.ndarray
     effective_sample_size: float
     uncertainty: str = ""
+
+    def __str__(self) -> str:
+        arrays = (self.threshold, self.probability, self.standard_error, self.lower, self.upper)
+        rows = [("threshold [SI]", "probability", "MC error", "interval")]
+        for limit, share, error, lower, upper in zip(*map(np.ravel, np.broadcast_arrays(*arrays)), strict=True):
+            rows.append((number(limit), number(share), number(error, 2), f"{number(lower)} to {number(upper)}"))
+        said = f"\nThe probability contains {self.uncertainty}." if self.uncertainty else ""
+        return text_table(rows) + said
 
 
 def exceedance(

@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..text_tables import number, text_table
 from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
 from .stored_posterior import StoredPosterior, log_density_on_scale, on_scale
 
@@ -73,6 +74,15 @@ class PairAgreement(NamedTuple):
     distance: float
     p_value: float
     adjusted: float
+
+    def __str__(self) -> str:
+        rows = [("parameter", "difference [sd]")]
+        rows += [(name, f"{value:+.1f}") for name, value in self.differences.items()]
+        table = text_table(rows)
+        numbers = (
+            f"distance {number(self.distance)}, p = {number(self.p_value, 2)}, corrected {number(self.adjusted, 2)}"
+        )
+        return f"{self.tests[0]!r} and {self.tests[1]!r}: {numbers}\n{table}"
 
 
 class Agreement(NamedTuple):
@@ -170,20 +180,12 @@ class Agreement(NamedTuple):
 
     def __str__(self) -> str:
         names = list(self.detectable)
-        first, second = (max(len(pair.tests[i]) for pair in self.pairs) for i in (0, 1))
-        widths = [max(len(name), 8) for name in names]
-        head = [
-            f"{'difference [sd]':<{first + second + 1}}",
-            *(f"{n:>{w}}" for n, w in zip(names, widths, strict=True)),
-        ]
-        lines = [" ".join([*head, "distance  p of pair  corrected"])]
+        rows = [["difference [sd]", *names, "distance", "p of pair", "corrected"]]
         for pair in self.pairs:
-            values = [
-                f"{pair.differences[name]:>+{width}.1f}" if name in pair.differences else " " * (width - 1) + "-"
-                for name, width in zip(names, widths, strict=True)
-            ]
-            label = f"{pair.tests[0]:<{first}} {pair.tests[1]:<{second}}".ljust(len(head[0]))
-            lines.append(" ".join([label, *values, f"{pair.distance:8.1f} {pair.p_value:10.2g} {pair.adjusted:10.2g}"]))
+            values = [f"{pair.differences[name]:+.1f}" if name in pair.differences else "-" for name in names]
+            chances = f"{pair.distance:.1f}", number(pair.p_value, 2), number(pair.adjusted, 2)
+            rows.append([", ".join(pair.tests), *values, *chances])
+        lines = [text_table(rows)]
         lines.append(f"all together: p = {self.p_value:.2g}, scatter {self.scatter:.1f} times the errors")
         return "\n".join([*lines, self.sentence, *self.messages])
 

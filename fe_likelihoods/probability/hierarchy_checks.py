@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..text_tables import number, text_table
 from .pareto_smoothing import LARGEST_SHAPE, pareto_shape
 from .population_marginal import draw_products, inverse_prior, population_marginal, sample_weights
 from .stored_posterior import resampled_description
@@ -84,12 +85,12 @@ class HierarchyChecks(NamedTuple):
     messages: tuple[str, ...]
 
     def __str__(self) -> str:
-        lines = ["test                 effective  of samples  Pareto  outside   error   shift"]
+        rows = [("test", "effective", "of samples", "Pareto", "outside", "error", "shift")]
         for name, each in self.tests.items():
-            lines.append(
-                f"{name:20s} {each.effective_samples:9.0f} {each.sample_share:10.0%} {each.pareto_shape:8.2f} "
-                f"{each.outside:8.1%} {each.error:7.2f} {each.shift:7.2f}"
-            )
+            effective, share = number(each.effective_samples, 4), f"{each.sample_share:.0%}"
+            others = f"{each.pareto_shape:.2f}", f"{each.outside:.1%}", f"{each.error:.2f}", f"{each.shift:.2f}"
+            rows.append((name, effective, share, *others))
+        lines = [text_table(rows)]
         worst = max(self.mean_errors, key=lambda name: self.mean_errors[name])
         lines.append(f"largest error of a mean: {self.mean_errors[worst]:.2f} posterior sd ({worst})")
         lines.append(f"error of the log-evidence: {self.log_evidence_error:.2f}")

@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..text_tables import NamedResults, number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy import Hierarchy
 from .inputs import as_points
@@ -70,10 +71,24 @@ class LeftOut(NamedTuple):
     log_density: float
     log_density_error: float
 
+    @property
+    def cells(self) -> dict[str, str]:
+        """The numbers as texts by headings, for `leave_one_out`."""
+        return {
+            "log density": number(self.log_density, 5),
+            "its error": number(self.log_density_error, 2),
+            "effective samples": f"{self.effective_samples:.0f}",
+            "Pareto shape": number(self.pareto_shape, 2),
+            "sampled anew": "yes" if self.sampled else "no",
+        }
+
+    def __str__(self) -> str:
+        return text_table([list(self.cells), list(self.cells.values())])
+
 
 def leave_one_out(
     hierarchy: Hierarchy, *, sample: Callable[[HierarchicalPosterior], Any] | None = None, seed: int = 0
-) -> dict[str, LeftOut]:
+) -> NamedResults:
     """Leave each test out of a hierarchical model in turn. No simulation is run.
 
     Parameters
@@ -91,7 +106,7 @@ def leave_one_out(
     Returns
     -------
     dict of str to LeftOut
-        For each test.
+        For each test; ``print`` gives a table.
 
     Raises
     ------
@@ -118,7 +133,7 @@ def leave_one_out(
             f"hyper-parameters; got {different}: sample the population with more walkers or steps"
         )
     log_marginals = posterior.log_marginals(hierarchy.samples)
-    rng, found = np.random.default_rng(seed), {}
+    rng, found = np.random.default_rng(seed), NamedResults()
     for k, name in enumerate(posterior.tests):
         rest, own = posterior.without(name), log_marginals[:, k]
         weights, shape = smoothed_weights(own.min() - own)

@@ -1,0 +1,153 @@
+"""What `print` shows of results: short tables and sentences with units, not arrays."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    EventRatios,
+    LevelRatios,
+    LimitState,
+    ParkAng,
+    Record,
+    average_predictions,
+    compare_tests,
+    exceedance,
+    fit_fragility,
+    fragility,
+    leave_one_out,
+    peak,
+    propagate,
+)
+from fe_likelihoods.prediction.held_out import HeldOutScore
+from fe_likelihoods.prediction.score_tables import score_values
+from fe_likelihoods.text_tables import NamedResults, text_table
+from tests.prediction.flexible import Flexible
+from tests.probability.test_leave_one_out import ALIKE, hierarchy_of
+
+RECORD = Record("base", 0.1, np.sin(np.arange(40.0)))
+RATIOS = EventRatios([0.8, 1.0, 1.25])
+
+
+def cells(text, row):
+    """Cells of a row of a printed table."""
+    return [cell.strip() for cell in text.splitlines()[row].split("  ") if cell.strip()]
+
+
+@pytest.fixture
+def predicted():
+    options = {"quantity": {"histories": None, "peak": peak("displacement")}, "progress": False}
+    return propagate(Flexible(RECORD), np.linspace(-0.5, 0.5, 41)[:, None], **options)
+
+
+def test_predictions(predicted):
+    text = str(predicted["peak"])
+    assert text.startswith("Prediction: 41 samples, without measurement noise; effective sample size 41\n")
+    assert cells(text, 1) == ["value", "unit", "mean", "MC error", "sd", "5 %", "50 %", "95 %"]
+    name, unit, mean, *_, median, _ = cells(text, 2)
+    assert (name, unit) == ("displacement", "cm")
+    assert float(mean) == pytest.approx(1e2 * predicted["peak"].mean, rel=5e-3)
+    assert float(median) == pytest.approx(1e2 * predicted["peak"].quantile(0.5), rel=5e-3)
+    text = str(predicted["histories"])
+    assert cells(text, 1)[2:4] == ["largest mean", "at [s]"] and "array" not in text
+    largest = np.abs(predicted["histories"].mean).max()
+    assert abs(float(cells(text, 2)[2])) == pytest.approx(1e2 * largest, rel=5e-3)
+
+
+def test_averages_of_models(predicted):
+    for each in predicted.values():
+        text = str(average_predictions({"a": each, "b": each}, {"a": 0.25, "b": 0.75}))
+        assert text.startswith("Average of the models a 0.25, b 0.75") and "array" not in text
+        assert cells(text, 2)[:2] == ["displacement", "cm"] and float(cells(text, 2)[-1]) < 1e-9
+    assert float(cells(text, 2)[3]) == pytest.approx(1e2 * predicted["peak"].sd, rel=5e-3)
+
+
+def test_exceedance_and_fragility(predicted):
+    found = exceedance(predicted["peak"], [10.0, 12.0], unit="cm", ratios=RATIOS)
+    text = str(found)
+    assert [cells(text, row)[0] for row in (1, 2)] == ["0.1", "0.12"]
+    assert float(cells(text, 1)[1]) == pytest.approx(found.probability[0], rel=5e-3)
+    assert text.endswith("The probability contains " + found.uncertainty + ".")
+    records = [RECORD.scale(factor) for factor in (0.5, 1.0, 2.0)]
+    curve = fragility(
+        Flexible(RECORD),
+        np.linspace(-0.5, 0.5, 41)[:, None],
+        records,
+        peak("displacement"),
+        2.0,
+        unit="cm",
+        ratios=RATIOS,
+        seed=1,
+        progress=False,
+    )
+    text = str(curve)
+    assert text.startswith("Probability to exceed 0.02 [SI], from the state 'virgin'")
+    assert [float(cells(text, row)[2]) for row in (2, 3, 4)] == pytest.approx(list(curve.probability), rel=5e-3)
+    assert f"lognormal fragility curve: median {curve.curve.median:.3g}" in text and "array" not in text
+    assert str(fit_fragility([1.0, 2.0, 3.0], [1, 5, 9], [10, 10, 10])).count("+-") == 0
+
+
+def test_ratios():
+    text = str(RATIOS)
+    assert text.startswith("Ratios of measured to fitted values in 3 events")
+    factor = RATIOS.factor(0.9)
+    assert cells(text, 2) == ["1", "1", f"{1 / factor:.3g} to {factor:.3g}"]
+    levels = LevelRatios([1.3, 1.2, 1.1, 0.98, 0.9], levels=[0.1, 0.3, 0.5, 1.0, 2.0])
+    text = str(levels)
+    assert [cells(text, row)[0] for row in (2, 3)] == ["0.1", "2"] and "linear" in text
+    assert float(cells(text, 2)[1]) == pytest.approx(levels.quantile(0.5, 0.1), rel=5e-3)
+
+
+def test_events_that_were_left_out():
+    found = leave_one_out(hierarchy_of(ALIKE, n=500))
+    text = str(found)
+    assert cells(text, 0)[:2] == ["event", "log density"]
+    assert [line.split()[0] for line in text.splitlines()[1:]] == list(found)
+    first = next(iter(found.values()))
+    assert float(cells(text, 1)[1]) == pytest.approx(first.log_density, rel=1e-4)
+    assert str(first).splitlines()[0].startswith("log density") and isinstance(found, dict)
+
+
+def test_held_out_scores(predicted, rng):
+    values = 0.01 * np.exp(0.2 * rng.normal(size=(100, 2)))
+    scores = {
+        name: HeldOutScore(
+            score_values(["a", "b"], ["cm", "cm"], values, factor * np.array([0.01, 0.011]), 0.9), 12.5, 0
+        )
+        for name, factor in {"first": 1.0, "second": 1.5}.items()
+    }
+    text = str(NamedResults(scores))
+    assert cells(text, 0)[:3] == ["event", "a [cm]", "90% interval of a"]
+    assert cells(text, 2)[:2] == ["second", "1.5"] and cells(text, 2)[-1] == "12.5"
+    assert len({len(cells(text, row)) for row in range(3)}) == 1
+    assert str(scores["first"]).endswith("log density of the data of the event: 12.5")
+
+
+def test_agreement_of_a_pair():
+    posterior = hierarchy_of(ALIKE, n=500).posterior
+    found = compare_tests(posterior.tests, ["a"])
+    pair = found.pairs[0]
+    row = cells(str(found), 1)
+    assert row[0] == ", ".join(pair.tests) and float(row[1]) == pytest.approx(pair.differences["a"], abs=0.051)
+    assert str(pair).startswith(f"{pair.tests[0]!r} and {pair.tests[1]!r}: distance {pair.distance:.3g}, p = ")
+    assert len(str(pair).splitlines()) == 2 + len(pair.differences)
+
+
+def test_constants_and_limits():
+    text = str(ParkAng(0.25, 4.0e5, 0.05, "pushed to failure"))
+    assert text == "Park-Ang index: ultimate displacement 250 mm, yield force 400 kN, beta 0.05 (pushed to failure)"
+    assert str(LimitState("wide cracks", "bar tension", 0.015, "Kowalsky")) == (
+        "wide cracks: bar tension beyond 0.015 [SI] (Kowalsky)"
+    )
+    assert str(LimitState("yield", "bar tension", np.array([0.002, 0.003]))) == (
+        "yield: bar tension beyond 0.002 to 0.003 [SI]"
+    )
+
+
+def test_tables_are_aligned_and_missing_cells_are_dashes():
+    assert text_table([("a", "bb"), ("ccc", "d")]) == "a    bb\nccc   d"
+
+    class Value:
+        def __init__(self, **found):
+            self.cells = found
+
+    assert str(NamedResults(x=Value(p="1"), y=Value(q="22"))) == "event  p   q\nx      1   -\ny      -  22"
