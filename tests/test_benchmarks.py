@@ -1,6 +1,7 @@
 """Tables of the benchmarks: runs without a result have a row, and weighted samples are scored correctly."""
 
 import json
+import zipfile
 
 import emcee
 import numpy as np
@@ -217,12 +218,27 @@ def test_run_of_the_truth_benchmark_is_compared_with_the_truth():
 
 def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, monkeypatch):
     monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
-    (row,) = transfer.transfer()
-    assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+    for benchmark in (transfer.transfer, transfer.transfer_median):
+        (row,) = benchmark()
+        assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
     monkeypatch.setattr(noises, "_FOLDER", tmp_path)
     for part in (noises._painter_street, noises._meloland):
         (row,) = part(1)
         assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+
+
+def test_files_that_cannot_be_used_are_named_and_left_out(tmp_path, monkeypatch):
+    """A record without one of the channels, and a page that was stored in the place of a file."""
+    monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
+    (tmp_path / "page_ce89324p.zip").write_text("<html>log in first</html>")
+    with zipfile.ZipFile(tmp_path / "channels_ce89324p.zip", "w") as archive:
+        archive.writestr("CHAN003.V2", "no record")
+    left_out = transfer.read_events()[1]
+    assert [row.case for row in left_out] == ["LEFT OUT"] * 2
+    assert left_out[0].note.startswith("channels_ce89324p.zip: no channel 3: ")
+    assert left_out[1].note.startswith("page_ce89324p.zip: no channel 3: ")
+    *first, last = transfer.transfer()
+    assert first == left_out and last.case == "SKIPPED"
 
 
 def test_the_amplitude_dependent_posterior_of_one_event_is_that_of_its_linear_model(rng):

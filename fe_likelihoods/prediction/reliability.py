@@ -70,6 +70,11 @@ class Exceedance(NamedTuple):
         Effective number of independent samples.
     uncertainty : str
         What the probability contains.
+    upper_by_events : ndarray or None
+        With ratios, the upper end of the Clopper-Pearson interval of the share of the events whose ratio exceeds, mean
+        over the samples: what the events tell without the normal form of the logarithms of their ratios. Where it is
+        far above `upper`, no event was near the threshold, and the probability is that of the assumed tail. None
+        without ratios.
     """
 
     threshold: np.ndarray
@@ -79,6 +84,7 @@ class Exceedance(NamedTuple):
     upper: np.ndarray
     effective_sample_size: float
     uncertainty: str = ""
+    upper_by_events: np.ndarray | None = None
 
     def __str__(self) -> str:
         arrays = (self.threshold, self.probability, self.standard_error, self.lower, self.upper)
@@ -207,7 +213,7 @@ def exceedance(
             for k in range(len(rows))
         ]
         numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
-        return Exceedance(limits, *numbers, effective, said)
+        return Exceedance(limits, *numbers, effective, said, np.array([each.upper_by_events for each in columns]))
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
     found = exceedance_probability(values, limits, spread, effective, level, seed)
@@ -247,7 +253,16 @@ def exceedance_probability(
     draws = exceedance_draws(values, limits, spread, np.random.default_rng(seed), below)
     share, error = single.mean(axis=0), single.std(axis=0) / np.sqrt(effective)
     lower, upper = interval_of_draws(draws, share, effective, spread, level)
-    return Exceedance(limits[0], share, error, lower, upper, effective, contents(False, spread))
+    by_events = None if spread.ratios is None else _upper_by_events(values, limits, spread.ratios, level, below)
+    return Exceedance(limits[0], share, error, lower, upper, effective, contents(False, spread), by_events)
+
+
+def _upper_by_events(
+    values: np.ndarray, limits: np.ndarray, ratios: EventRatios | LevelRatios, level: float, below: bool
+) -> np.ndarray:
+    """Upper end of the interval of the share of the events that exceed, of as many trials as there are events."""
+    exceeded = [(values * each < limits if below else values * each > limits).mean(axis=0) for each in ratios.values]
+    return binomial_interval(np.mean(exceeded, axis=0), len(ratios.values), level)[1]
 
 
 def interval_of_draws(

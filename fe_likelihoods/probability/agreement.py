@@ -32,6 +32,7 @@ import numpy as np
 
 from ..text_tables import number, text_table
 from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
+from .scales import Scales, scales_of
 from .stored_posterior import StoredPosterior, log_density_on_scale, on_scale
 
 __all__ = ["Agreement", "PairAgreement", "compare_tests"]
@@ -327,7 +328,8 @@ def _likelihood(
     stored: StoredPosterior, names: list[str], logarithmic: np.ndarray, what: str, messages: list[str]
 ) -> _Test:
     """The posterior of a test without its prior, of the parameters that it has information about."""
-    prior, points = on_scale(stored, names, logarithmic)
+    scales = scales_of(["log" if each else "linear" for each in logarithmic])
+    prior, points = on_scale(stored, names, scales)
     draws = prior.rvs(_PRIOR_DRAWS, 0)
     draws = np.where(logarithmic, np.log(np.where(logarithmic, np.maximum(draws, 1e-300), 1.0)), draws)
     own = np.exp(stored.log_weights)
@@ -360,8 +362,8 @@ def _likelihood(
         )
     if not kept.size:
         return nothing
-    names, points, logarithmic = [names[i] for i in kept], points[:, kept], logarithmic[kept]
-    log_prior = log_density_on_scale(stored.prior.subset(names), logarithmic, points)
+    names, points = [names[i] for i in kept], points[:, kept]
+    log_prior = log_density_on_scale(stored.prior.subset(names), Scales(*(each[kept] for each in scales)), points)
     possible = own > 0.0
     weights = np.zeros(len(own))
     weights[possible], shape = smoothed_weights(stored.log_weights[possible] - log_prior[possible])

@@ -34,11 +34,12 @@ from .inputs import as_points, complete_repr
 from .multivariate import as_distribution
 from .population_marginal import population_marginal
 from .priors import Prior
+from .scales import SCALES, scales_of
 from .stored_posterior import StoredPosterior, describe
 
 __all__ = ["HierarchicalPosterior", "Varying"]
 
-_SCALES = ("log", "linear")
+_HYPER_NAMES = {"log": ("median", "sd_log"), "logit": ("median", "sd_logit"), "linear": ("mean", "sd")}
 _LARGEST = 1e100  # of a mean or a standard deviation, so that squares do not overflow
 _SMALLEST_SD = 1e-12  # of the posterior's, below which the population is a point
 
@@ -50,30 +51,40 @@ class Varying:
     Parameters
     ----------
     location : Distribution
-        Prior of the median (scale "log") or the mean (scale "linear") of the population, in the unit of the parameter.
+        Prior of the median (scales "log" and "logit") or the mean (scale "linear") of the population, in the unit of
+        the parameter.
     sd : Distribution
-        Prior of the standard deviation of the population: of the natural logarithm of the parameter (scale "log"), or
-        of the parameter, in its unit (scale "linear").
-    scale : {"log", "linear"}
-        Whether the logarithm of the parameter or the parameter itself has a normal distribution.
+        Prior of the standard deviation of the population: of the natural logarithm of the parameter (scale "log"), of
+        ln((x - a) / (b - x)) (scale "logit"), or of the parameter, in its unit (scale "linear").
+    scale : {"log", "linear", "logit"}
+        Whether the logarithm of the parameter, the parameter itself, or its logit has a normal distribution. The scale
+        "logit" is for parameters between two bounds a and b that are physical, such as shares, which no test can
+        exceed. Near a, a change of the logit is a relative change of x - a; in the middle it is 4 / (b - a) times the
+        change of x.
+    bounds : (float, float), optional
+        Bounds (a, b) of the scale "logit". Default: those of the prior of this parameter, which must then be the same
+        in all tests.
 
     Raises
     ------
     ValueError
-        If a standard deviation or a median could be negative, or the scale is unknown.
+        If a standard deviation or a median could be negative, the scale is unknown, or a median could be beyond the
+        bounds.
 
     Examples
     --------
     >>> Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))
+    >>> Varying(Uniform(0.0, 1.0), HalfNormal(1.0), "logit")  # a share
     """
 
     location: Distribution
     sd: Distribution
     scale: str = "log"
+    bounds: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.scale not in _SCALES:
-            raise ValueError(f"Varying: scale must be one of {', '.join(map(repr, _SCALES))}; got {self.scale!r}")
+        if self.scale not in SCALES:
+            raise ValueError(f"Varying: scale must be one of {', '.join(map(repr, SCALES))}; got {self.scale!r}")
         for name in ("location", "sd"):
             object.__setattr__(self, name, as_distribution(name, getattr(self, name)))
         if self.sd.bounds[0] < 0.0:
@@ -85,6 +96,10 @@ class Varying:
                 "Varying: with scale='log' the location is a median, which needs a prior of positive values such as "
                 f"LogNormal(1.0, 0.5); got {self.location}"
             )
+        if self.bounds is not None:
+            if self.scale != "logit":
+                raise ValueError(f"Varying: bounds are those of scale='logit'; the scale is {self.scale!r}")
+            object.__setattr__(self, "bounds", _checked_bounds(self, self.bounds))
 
 
 class HierarchicalPosterior:
@@ -115,6 +130,8 @@ class HierarchicalPosterior:
         As given.
     prior : Prior
         Prior of the hyper-parameters.
+    scales : Scales
+        Scales of the varying and the common parameters.
     described : dict of str to DescribedPosterior
         The samples of each test as they are used.
 
@@ -126,10 +143,10 @@ class HierarchicalPosterior:
 
     Notes
     -----
-    The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log") or ``mean_NAME`` and ``sd_NAME`` (scale
-    "linear"), then ``correlation_A_B``, then the names of the common parameters. With three varying parameters or more,
-    the correlations after those with the first parameter are partial: ``partial_correlation_B_C`` is that of B and C
-    given the parameters before B.
+    The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log"), ``median_NAME`` and ``sd_logit_NAME``
+    (scale "logit"), or ``mean_NAME`` and ``sd_NAME`` (scale "linear"), then ``correlation_A_B``, then the names of the
+    common parameters. With three varying parameters or more, the correlations after those with the first parameter are
+    partial: ``partial_correlation_B_C`` is that of B and C given the parameters before B.
 
     The likelihood is taken as zero outside the bounds of the prior of a test.
 
@@ -160,20 +177,20 @@ class HierarchicalPosterior:
         _check(tests, varying, common, correlation, max_samples)
         self.tests, self.varying, self.common = dict(tests), dict(varying), tuple(common)
         self._correlated = correlation is not None and len(varying) > 1
-        self._logarithmic = np.array([each.scale == "log" for each in varying.values()] + [False] * len(common))
         distributions: dict[str, Any] = {}
         for name, each in varying.items():
-            is_log = each.scale == "log"
-            distributions[f"median_{name}" if is_log else f"mean_{name}"] = each.location
-            distributions[f"sd_log_{name}" if is_log else f"sd_{name}"] = each.sd
+            location, sd = _HYPER_NAMES[each.scale]
+            distributions |= {f"{location}_{name}": each.location, f"{sd}_{name}": each.sd}
         if self._correlated:
             distributions |= _lkj_prior(list(varying), float(correlation))
         self.prior = Prior(distributions | dict(common))
-        self.described = {}
+        kinds = [each.scale for each in varying.values()] + ["linear"] * len(common)
+        bounds = [_bounds_of(name, each, tests) for name, each in varying.items()] + [None] * len(common)
+        self.scales, self.described = scales_of(kinds, bounds), {}
         for name, test in self.tests.items():
             try:
                 self.described[name] = describe(
-                    test, [*varying, *common], self._logarithmic, max_samples, n_common=len(common)
+                    test, [*varying, *common], self.scales, max_samples, n_common=len(common)
                 )
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
@@ -181,7 +198,7 @@ class HierarchicalPosterior:
 
     def _set_smallest_sd(self) -> None:
         deviations = [
-            np.sqrt(np.cov(each.points.T, ddof=0).reshape(len(self._logarithmic), -1).diagonal())
+            np.sqrt(np.cov(each.points.T, ddof=0).reshape(len(self.scales.low), -1).diagonal())
             for each in self.described.values()
         ]
         self._smallest_sd = _SMALLEST_SD * np.min(deviations, axis=0)[: len(self.varying)]
@@ -280,23 +297,57 @@ class HierarchicalPosterior:
         Returns
         -------
         center : (n, n_varying + n_common) float
-            Means of the varying parameters (of their logarithms for the scale "log"), then the common parameters.
+            Means of the varying parameters on their scales, then the common parameters.
         factor : (n, n_varying, n_varying) float
             Cholesky factors of the covariances of the varying parameters.
         """
         points, n = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying)
         end = points.shape[1] - len(self.common)
         center = np.concatenate([points[:, 0 : 2 * n : 2], points[:, end:]], axis=1)
-        with np.errstate(divide="ignore"):
-            center = np.where(self._logarithmic, np.log(np.where(self._logarithmic, center, 1.0)), center)
+        center = self.scales.to_scale(center)
         factor = _correlation_factor(points[:, 2 * n : end], n)
         deviations = np.clip(points[:, 1 : 2 * n : 2], self._smallest_sd, _LARGEST)
         return np.clip(center, -_LARGEST, _LARGEST), deviations[:, :, None] * factor
 
     def from_scale(self, values: np.ndarray) -> np.ndarray:
         """Parameters (..., n_varying + n_common) from their values on the scales of the populations."""
-        with np.errstate(over="ignore"):
-            return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, values, 0.0)), values)
+        return self.scales.from_scale(values)
+
+
+def _checked_bounds(varying: Varying, bounds: Any) -> tuple[float, float]:
+    """Bounds of the scale "logit"; ValueError if they are not finite and ordered, or a median could be beyond them."""
+    low, high = (float(each) for each in bounds)
+    if not -np.inf < low < high < np.inf:
+        raise ValueError(f"Varying: scale='logit' needs two finite bounds (a, b), a < b; got {bounds!r}")
+    first, last = varying.location.bounds
+    if first < low or last > high:
+        raise ValueError(
+            f"Varying: with scale='logit' the location is a median between the bounds {low:g} and {high:g}, which "
+            f"needs a prior between them, such as Uniform({low:g}, {high:g}); got {varying.location}"
+        )
+    return low, high
+
+
+def _bounds_of(name: str, varying: Varying, tests: Mapping[str, StoredPosterior]) -> tuple[float, float] | None:
+    """Bounds of a varying parameter with the scale "logit": as stated, or those of its prior in all tests."""
+    if varying.scale != "logit" or varying.bounds is not None:
+        return varying.bounds
+    found = {
+        tuple(test.prior.bounds[test.prior.names.index(name)].tolist())
+        for test in tests.values()
+        if name in test.prior.names
+    }
+    if not found:
+        raise ValueError(f"HierarchicalPosterior: no test has a parameter {name}")
+    if len(found) > 1:
+        raise ValueError(
+            f"HierarchicalPosterior: the bounds of the prior of {name} differ between the tests ({sorted(found)}); "
+            "state those of scale='logit', Varying(..., bounds=(a, b))"
+        )
+    try:
+        return _checked_bounds(varying, next(iter(found)))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def _check(tests: Any, varying: Any, common: Any, correlation: Any, max_samples: Any) -> None:

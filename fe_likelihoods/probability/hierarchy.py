@@ -101,7 +101,7 @@ class Hierarchy:
         Warns
         -----
         UserWarning
-            If more than 1 % of the draws are outside the bounds of the priors of the tests.
+            If more than 1 % of the draws are outside the bounds of the priors of the tests, with the parameters.
         """
         if not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")
@@ -112,14 +112,16 @@ class Hierarchy:
         center[:, :varying] += np.einsum("nij,nj->ni", factor, generator.standard_normal((n, varying)))
         draws = posterior.from_scale(center)
         own = [*posterior.varying, *posterior.common]
-        outside = np.zeros(n, dtype=bool)
+        outside = np.zeros(draws.shape, dtype=bool)
         for each in posterior.described.values():
             low, high = each.prior.bounds.T
-            outside |= ((draws < low) | (draws > high)).any(axis=1)
-        if outside.mean() > _LARGEST_OUTSIDE:
+            outside |= (draws < low) | (draws > high)
+        if outside.any(axis=1).mean() > _LARGEST_OUTSIDE:
+            named = ", ".join(f"{own[i]} {outside[:, i].mean():.1%}" for i in np.flatnonzero(outside.any(axis=0)))
             warnings.warn(
-                f"{outside.mean():.0%} of the draws of a new test are outside the bounds of the priors of the tests: "
-                "use scale='log' for positive parameters, or a narrower prior of the spread",
+                f"{outside.any(axis=1).mean():.0%} of the draws of a new test are outside the bounds of the priors of "
+                f"the tests ({named}): use Varying(..., scale='logit') for a parameter between two physical bounds "
+                "such as a share, scale='log' for a positive one, or a narrower prior of the spread",
                 stacklevel=2,
             )
         found = dict(zip(own, draws.T, strict=True))
@@ -134,7 +136,7 @@ class Hierarchy:
         -------
         dict of str to float
             Means over the hyper-samples of the centers on the scales of the populations: the geometric mean of the
-            medians for the scale "log".
+            medians for the scale "log", the mean of the logits for the scale "logit".
         """
         center, _ = self.posterior.population(self.samples)
         names = [*self.posterior.varying, *self.posterior.common]
@@ -176,8 +178,7 @@ class Hierarchy:
         used = np.linspace(0, len(self.samples) - 1, min(len(self.samples), n)).astype(int)
         center, factor = self.posterior.population(self.samples[used])
         values = np.stack([np.asarray(draws[name], dtype=float) for name in names], axis=1)
-        logarithmic = np.array([self.posterior.varying[name].scale == "log" for name in names])
-        points = np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+        points = self.posterior.scales.first(len(names)).to_scale(values)
         log_densities = np.empty((len(used), len(points)))
         for row, (mean, root) in enumerate(zip(center[:, : len(names)], factor, strict=True)):
             z = np.linalg.solve(root, (points - mean).T)
@@ -219,8 +220,7 @@ class Hierarchy:
         stored, described = self.posterior.tests[test], self.posterior.described[test]
         if len(described.points) < len(stored.samples):  # described with fewer samples
             columns = [stored.prior.names.index(name) for name in self.posterior.varying]
-            values, logarithmic = stored.samples[:, columns], described.logarithmic
-            points = np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+            points = described.scales.to_scale(stored.samples[:, columns])
             described = described._replace(
                 points=points, log_weights=stored.log_weights, log_prior=described.log_prior_at(points)
             )

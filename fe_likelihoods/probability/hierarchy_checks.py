@@ -25,6 +25,7 @@ _LARGEST_SHARE = 0.1  # of the hyper-samples at which weights may be unusable
 _LARGEST_OUTSIDE = 0.05  # of a population beyond bounds that the samples of a test reach
 _LARGEST_OUTSIDE_SUM = 0.06  # sum over the tests, without bounds at zero, which are those of positive parameters
 _OUTER = 0.02  # probability of the prior next to a bound
+_NORMAL = 0.5  # largest skewness and excess kurtosis of a prior that a normal density describes
 
 
 class ReweightingCheck(NamedTuple):
@@ -171,23 +172,42 @@ def _outside(
     described, varying = posterior.described[name], len(posterior.varying)
     if not np.isfinite(described.prior.bounds[:varying]).any():
         return 0.0, 0.0
+    reached = _reached(posterior, name)
     z = rng.standard_normal((len(center), 20, varying))
     draws = center[:, None, :varying] + np.einsum("nij,nkj->nki", factor, z)
     values = posterior.from_scale(np.concatenate([draws, np.zeros((*draws.shape[:2], len(posterior.common)))], axis=-1))
-    samples = posterior.from_scale(described.points)
     beyond, cut_off = np.zeros((2, *draws.shape[:2]), dtype=bool)
-    prior = posterior.tests[name].prior.rvs(20_000, 0)
-    for i, parameter in enumerate(posterior.varying):
-        column = prior[:, posterior.tests[name].prior.names.index(parameter)]
-        low, high = described.prior.bounds[i]
-        weights = np.exp(described.log_weights)
-        if weights[samples[:, i] < np.quantile(column, _OUTER)].sum() > 0.5 * _OUTER:
-            beyond |= values[..., i] < low
-            cut_off |= (values[..., i] < low) & (low != 0.0)
-        if weights[samples[:, i] > np.quantile(column, 1.0 - _OUTER)].sum() > 0.5 * _OUTER:
-            beyond |= values[..., i] > high
-            cut_off |= (values[..., i] > high) & (high != 0.0)
+    for i, (low, high) in enumerate(described.prior.bounds[:varying]):
+        outside = (values[..., i] < low) & reached[i, 0], (values[..., i] > high) & reached[i, 1]
+        beyond |= outside[0] | outside[1]
+        cut_off |= (outside[0] & (low != 0.0)) | (outside[1] & (high != 0.0))
     return float(beyond.mean()), float(cut_off.mean())
+
+
+def _reached(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
+    """Whether the samples of a test reach the lower and the upper end of the prior of each varying parameter."""
+    samples = posterior.from_scale(posterior.described[name].points)[:, : len(posterior.varying)]
+    weights, prior = np.exp(posterior.described[name].log_weights), _prior_draws(posterior, name)
+    low, high = np.quantile(prior, [_OUTER, 1.0 - _OUTER], axis=0)
+    return np.stack([weights @ (samples < low), weights @ (samples > high)], axis=1) > 0.5 * _OUTER
+
+
+def _flat(posterior: "HierarchicalPosterior", name: str) -> list[str]:
+    """Varying parameters that a test leaves between two bounds of its prior, which is not normal on their scale."""
+    bounds = posterior.described[name].prior.bounds[: len(posterior.varying)]
+    flat = (_reached(posterior, name) & np.isfinite(bounds)).all(axis=1)
+    draws = posterior.scales.first(len(posterior.varying)).to_scale(_prior_draws(posterior, name))
+    z = (draws - draws.mean(axis=0)) / draws.std(axis=0)
+    moments = np.abs([(z**3).mean(axis=0), (z**4).mean(axis=0) - 3.0]).max(axis=0)
+    return [
+        each for each, is_flat, far in zip(posterior.varying, flat, moments > _NORMAL, strict=True) if is_flat & far
+    ]
+
+
+def _prior_draws(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
+    """Draws (n, n_varying) of the prior of the varying parameters in a test."""
+    prior = posterior.tests[name].prior
+    return prior.rvs(20_000, 0)[:, [prior.names.index(each) for each in posterior.varying]]
 
 
 def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCheck], errors: np.ndarray) -> list[str]:
@@ -217,6 +237,15 @@ def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCh
                 f"{1.0 - each.sample_share:.0%} of its marginal likelihood is from the fitted mixture. Give more "
                 "samples of this test, or draw fresh samples with the population as its prior"
             )
+    # the mixture, which alone serves common parameters, does not describe a density that ends at two bounds
+    flat = {name: _flat(posterior, name) for name in found} if posterior.common else {}
+    if named := ", ".join(f"{each} in {test!r}" for test, names in flat.items() for each in names):
+        messages.append(
+            f"{named}: the samples reach both bounds of the prior, so that the test says little about this varying "
+            f"parameter, and with common parameters ({', '.join(posterior.common)}) the fitted mixture makes values "
+            "between the bounds unequally likely. Leave these tests out, or sample them again with a prior that is "
+            "normal on the scale of the population, such as LogNormal for scale='log'"
+        )
     if error > _LARGEST_ERROR:
         worst = max(found, key=lambda name: found[name].shift)
         messages.append(

@@ -16,6 +16,7 @@ from .distributions import TruncatedNormal
 from .inputs import as_points
 from .mixture_prior import MixtureDistribution, fit_mixture
 from .priors import Prior
+from .scales import Scales
 
 __all__ = [
     "DescribedPosterior",
@@ -122,15 +123,15 @@ class DescribedPosterior(NamedTuple):
     Attributes
     ----------
     points : ndarray[n, dim]
-        Samples: logarithms of parameters with a logarithmic scale, the other parameters as they are.
+        Samples on the scales of the population.
     log_weights : ndarray[n]
         Logarithms of their weights, which sum to one.
     log_prior : ndarray[n]
         Logarithm of the prior density of the points.
     prior : Prior
         Prior of these parameters, before the change of scale.
-    logarithmic : ndarray[dim] of bool
-        Which parameters have a logarithmic scale.
+    scales : Scales
+        Scales of the parameters.
     log_shares : ndarray[n_components]
         Logarithms of the shares of the components of the mixture.
     means : ndarray[n_components, dim]
@@ -150,7 +151,7 @@ class DescribedPosterior(NamedTuple):
     log_weights: np.ndarray
     log_prior: np.ndarray
     prior: Prior
-    logarithmic: np.ndarray
+    scales: Scales
     log_shares: np.ndarray
     means: np.ndarray
     covariances: np.ndarray
@@ -160,11 +161,11 @@ class DescribedPosterior(NamedTuple):
 
     def log_prior_at(self, points: np.ndarray) -> np.ndarray:
         """Logarithm of the prior density (...) of points (..., dim) on the scale of the population."""
-        return log_density_on_scale(self.prior, self.logarithmic, points)
+        return log_density_on_scale(self.prior, self.scales, points)
 
 
-def on_scale(stored: StoredPosterior, names: Sequence[str], logarithmic: np.ndarray) -> tuple[Prior, np.ndarray]:
-    """Prior of some parameters, and their samples (n, dim), as logarithms where `logarithmic` (dim,) says so.
+def on_scale(stored: StoredPosterior, names: Sequence[str], scales: Scales) -> tuple[Prior, np.ndarray]:
+    """Prior of some parameters, and their samples (n, dim) on their scales.
 
     Raises ValueError as `describe`.
     """
@@ -174,24 +175,30 @@ def on_scale(stored: StoredPosterior, names: Sequence[str], logarithmic: np.ndar
         )
     prior = stored.prior.subset(names)
     values = stored.samples[:, [stored.prior.names.index(name) for name in names]]
-    if (values[:, logarithmic] <= 0.0).any():
-        positive = ", ".join(name for name, log in zip(names, logarithmic, strict=True) if log)
-        raise ValueError(f"a logarithmic scale needs positive samples of {positive}; use scale='linear'")
-    return prior, np.where(logarithmic, np.log(np.where(logarithmic, values, 1.0)), values)
+    outside = ((values <= scales.low) | (values >= scales.high)).any(axis=0)
+    for name, low, high in (
+        each for each, is_out in zip(zip(names, *scales, strict=True), outside, strict=True) if is_out
+    ):
+        if high == np.inf:
+            raise ValueError(f"a logarithmic scale needs positive samples of {name}; use scale='linear'")
+        raise ValueError(
+            f"a logit scale needs samples of {name} between its bounds {low:g} and {high:g}, and not at them; state "
+            "wider ones, bounds=(low, high)"
+        )
+    return prior, scales.to_scale(values)
 
 
-def log_density_on_scale(prior: Prior, logarithmic: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Logarithm of the density (...) of a prior at points (..., dim) on the scale of `on_scale`."""
+def log_density_on_scale(prior: Prior, scales: Scales, points: np.ndarray) -> np.ndarray:
+    """Logarithm of the density (...) of a prior at points (..., dim) on the scales of `on_scale`."""
     rows = points.reshape(-1, points.shape[-1])
-    with np.errstate(over="ignore"):
-        values = np.where(logarithmic, np.exp(np.where(logarithmic, rows, 0.0)), rows)
-    return (prior.logpdf(values) + (rows * logarithmic).sum(axis=1)).reshape(points.shape[:-1])
+    log_density = prior.logpdf(scales.from_scale(rows)) + scales.log_jacobian(rows).sum(axis=1)
+    return log_density.reshape(points.shape[:-1])
 
 
 def describe(
     stored: StoredPosterior,
     names: Sequence[str],
-    logarithmic: np.ndarray,
+    scales: Scales,
     max_samples: int,
     seed: int = 0,
     n_common: int = 0,
@@ -204,8 +211,8 @@ def describe(
         Samples of all parameters.
     names : sequence of str
         The parameters to describe.
-    logarithmic : (dim,) array_like of bool
-        Which of them have a logarithmic scale.
+    scales : Scales
+        Their scales.
     max_samples : int
         Largest number of samples. More samples are thinned: evenly, or by systematic resampling if they have weights.
     seed : int
@@ -220,11 +227,10 @@ def describe(
     Raises
     ------
     ValueError
-        If a parameter is unknown, has a joint prior with parameters that are not described, or is not positive on a
-        logarithmic scale; and as `fit_mixture`.
+        If a parameter is unknown, has a joint prior with parameters that are not described, or has samples that its
+        scale does not permit; and as `fit_mixture`.
     """
-    logarithmic = np.asarray(logarithmic, dtype=bool)
-    prior, points = on_scale(stored, names, logarithmic)
+    prior, points = on_scale(stored, names, scales)
     rng, weights = np.random.default_rng(seed), np.exp(stored.log_weights)
     equal = np.ptp(stored.log_weights) == 0.0
     rows = _systematic(weights, min(len(points), max_samples), rng)  # evenly spaced rows for equal weights
@@ -238,7 +244,7 @@ def describe(
     if len(stored.samples) > max_samples and not equal:  # resampling adds the error of as many samples
         size = 1.0 / (1.0 / stored.effective_sample_size + 1.0 / max_samples)
     incomplete = DescribedPosterior(
-        points, log_weights, np.zeros(len(points)), prior, logarithmic, *_components(mixture), mixture, size, common
+        points, log_weights, np.zeros(len(points)), prior, scales, *_components(mixture), mixture, size, common
     )
     return incomplete._replace(log_prior=incomplete.log_prior_at(points))
 

@@ -60,6 +60,7 @@ BENCHMARKS = {
     "busy_workers": busy_workers.busy_workers,
     "hierarchy_warnings": hierarchy_warnings.alarms,
     "transfer": transfer.transfer,
+    "transfer_median": transfer.transfer_median,
     "noises": noises.noises,
     "transfer_columns": measured_columns.columns,
     "transfer_frame": measured_tests.frame,

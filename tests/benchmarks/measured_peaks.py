@@ -29,12 +29,11 @@ __all__ = ["measured_peaks"]
 
 def measured_peaks(repeats: int = 1) -> list[Row]:
     """Shares of measured peaks within their intervals, widths and interval scores; one seed per repeat."""
-    files = sorted(transfer._FOLDER.rglob("*ce89324p.zip")) if transfer._FOLDER.is_dir() else []
-    if len(files) < 4:
-        return [Row("measured_peaks", "SKIPPED", None, "", f"no files *ce89324p.zip in {transfer._FOLDER}")]
-    rows = []
+    records, rows = transfer.read_events()
+    if len(records) < 4:
+        return [*rows, Row("measured_peaks", "SKIPPED", None, "", f"no files *ce89324p.zip in {transfer._FOLDER}")]
     for seed in range(1, repeats + 1):
-        fits = {path.stem: transfer._calibrate(transfer._records(path), "relative", seed) for path in files}
+        fits = {name: transfer._calibrate(each, "relative", seed) for name, each in records.items()}
         for name, kind in (("parameters alone", False), ("white noise", True), ('noise="model"', "model")):
             own = [_own_peak(fit, kind, seed) for fit in fits.values()]
             rows += _peak_rows(f"own event, {name}, seed {seed}", own)

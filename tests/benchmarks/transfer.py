@@ -19,8 +19,13 @@ measured channel; coverage of the 90 % band, and of its strong part), the share 
 and the root mean square error of the logarithm of the peak as a multiple of the stated one. The last rows are the
 evidence of the amplitude-dependent model of all events relative to the linear one, and its common parameters.
 
+`transfer_median` has the rows "..., by the median" alone, with the share of the ends on the scale "logit"
+instead of "log", and a summary of all seeds. Its other rows compare the two scales of the share, with all events: the
+draws of a new event that have a share above 1, and the evidence of "logit" relative to "log".
+
 The data are no part of this project: set FE_SHARED to a folder with the downloads from https://www.strongmotioncenter.org
-(``*ce89324p.zip``) in ``measured/painter_street_bridge``. Without them one row says so.
+(``*ce89324p.zip``) in ``measured/painter_street_bridge``. Without them one row says so. Files that cannot be used, such
+as those without one of the channels, are left out, each with a row that says why.
 """
 
 import warnings
@@ -69,7 +74,7 @@ from samplers import SMCSampler
 from .rows import Row
 from .targets import SHARED
 
-__all__ = ["transfer"]
+__all__ = ["read_events", "transfer", "transfer_median"]
 
 _FOLDER = SHARED / "measured" / "painter_street_bridge"
 _MAIN = "petrolia_25apr1992_ce89324p"
@@ -78,12 +83,13 @@ _MEMBERS = ("CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2")
 _PRIOR = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share": Uniform(0.0, 1.0)}
 _SENSOR = 0.002  # of the accelerations [m/s²], the floor of the noise (assumed)
 _WINDOW = 1.0  # [s]
-_VARYING = {  # priors of the population: medians, and standard deviations of the logarithms (assumed)
+_VARYING = {  # priors of the population: medians, and standard deviations of logarithms and logits (assumed)
     "frequency": Varying(LogNormal(5.0, 0.5), HalfNormal(0.3)),
     "damping": Varying(LogNormal(0.1, 1.0), HalfNormal(0.7)),
     "share": Varying(LogNormal(0.8, 0.3), HalfNormal(0.3)),
     "share_ch7": Varying(LogNormal(0.3, 0.7), HalfNormal(0.5)),
 }
+_BOUNDED = _VARYING | {"share": Varying(Uniform(0.0, 1.0), HalfNormal(1.5), "logit")}
 _NOISE = "share_ch7"
 _REFERENCE = 0.0005  # [m], near the geometric mean of the levels of the events
 _POWERS = {"softening": norm(0.15, 0.2), "damping_growth": norm(0.2, 0.3)}  # priors of one event
@@ -107,28 +113,103 @@ class _Scored(NamedTuple):
 
 def transfer(repeats: int = 1) -> list[Row]:
     """Scores of predicted events, medians over the events, for each way to predict; one seed per repeat."""
-    files = sorted(_FOLDER.rglob("*ce89324p.zip")) if _FOLDER.is_dir() else []
-    if len(files) < 2:
-        return [Row("transfer", "SKIPPED", None, "", f"no two files *ce89324p.zip in {_FOLDER}: set FE_SHARED")]
-    records = {path.stem: _records(path) for path in files}
-    rows = []
+    records, rows = read_events()
+    if len(records) < 3:
+        return [
+            *rows,
+            Row("transfer", "SKIPPED", None, "", f"no three files *ce89324p.zip in {_FOLDER}: set FE_SHARED"),
+        ]
     for seed in range(1, repeats + 1):
         relative = {name: _calibrate(each, "relative", seed) for name, each in records.items()}
         ratios = {name: event_ratio(fit.posterior, fit.samples[::6], _PEAK) for name, fit in relative.items()}
-        unseen = [name for name in records if name != _MAIN]
-        for noise in ("white", "effective samples"):
-            fit = _calibrate(records[_MAIN], noise, seed)
-            scored = [_as_usual(fit, relative[name].posterior, seed) for name in unseen]
-            rows += _rows(f"one event, as usual, {noise}", seed, scored)
-        single = _hierarchies({_MAIN: relative[_MAIN]}, seed)
-        guess = EventRatios([ratios[_MAIN]], **_GUESS)
-        scored = [_new_event(single, guess, relative[name].posterior, seed) for name in unseen]
-        rows += _rows("one event, spread stated", seed, scored)
+        rows += _from_one(records, relative, ratios, seed)
         rows += _held_out("other events", relative, ratios, seed)
         amplitude = {name: _amplitude_dependent(fit, seed) for name, fit in relative.items()}
         rows += _held_out("other events, amplitude-dependent", amplitude, ratios, seed, _COMMON)
         rows += _evidence(relative, amplitude, seed)
     return rows
+
+
+def transfer_median(repeats: int = 1) -> list[Row]:
+    """Peaks of each event from the others by the median of their population, and a summary of all seeds."""
+    records, rows = read_events()
+    if len(records) < 3:
+        return [
+            *rows,
+            Row("transfer", "SKIPPED", None, "", f"no three files *ce89324p.zip in {_FOLDER}: set FE_SHARED"),
+        ]
+    per_seed: dict[tuple[str, str], list[float]] = {}
+    for seed in range(1, repeats + 1):
+        linear = {name: _calibrate(each, "relative", seed) for name, each in records.items()}
+        amplitude = {name: _amplitude_dependent(fit, seed) for name, fit in linear.items()}
+        for case, fits, common in (("linear", linear, None), ("amplitude-dependent", amplitude, _COMMON)):
+            found = []
+            for name in fits:
+                others = {other: fit for other, fit in fits.items() if other != name}
+                hierarchy = _hierarchy(others, seed, common, noise=False, varying=_BOUNDED)
+                found.append(_by_median(hierarchy, fits, name, seed))
+            new = _peak_rows(f"other events, {case}, by the median", seed, found)
+            for row in new:
+                per_seed.setdefault((row.what, case), []).append(row.value)
+            rows += new
+        rows += _scales_of_share(linear, seed)
+    for (what, case), values in per_seed.items():
+        note = f"{min(values):.3g} to {max(values):.3g}"
+        rows.append(Row(what, f"{case}, by the median, mean of {repeats} seeds", float(np.mean(values)), "", note))
+    return rows
+
+
+def _scales_of_share(fits: dict[str, _Fit], seed: int) -> list[Row]:
+    """Draws of a new event with a share above 1, for both scales of the share, and the evidence of the bounded one."""
+    rows, samplers = [], []
+    for scale, varying in (("log", _VARYING), ("logit", _BOUNDED)):
+        posterior, sampler = _population(fits, seed, None, noise=False, varying=varying)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is counted here
+            draws = Hierarchy(posterior, sampler.get_chain(flat=True)).new_test(20_000, rng=seed)
+        case = f"share on the scale {scale}, seed {seed}"
+        rows.append(Row("draws with a share above 1", case, 100.0 * float((draws["share"] > 1.0).mean()), "%"))
+        samplers.append(sampler)
+    log, logit = samplers
+    error = np.hypot(log.log_evidence_error, logit.log_evidence_error)
+    gain = logit.log_evidence - log.log_evidence
+    return [
+        *rows,
+        Row("log-evidence of logit over log", f"{len(fits)} events, seed {seed}", gain, "", f"+- {error:.2f}"),
+    ]
+
+
+def read_events() -> tuple[dict[str, dict[int, Record]], list[Row]]:
+    """Channels of the events that can be used, by name, and a row for each file that cannot."""
+    found, rows = {}, []
+    for path in sorted(_FOLDER.rglob("*ce89324p.zip")) if _FOLDER.is_dir() else []:
+        try:
+            if path.stem in found:
+                raise ValueError("another file has the same name")
+            records = _records(path)
+            FELikelihood(*_model_and_measurements(records))
+        except (ValueError, OSError) as error:
+            rows.append(Row("transfer", "LEFT OUT", None, "", f"{path.name}: {error}"))
+        else:
+            found[path.stem] = records
+    return found, rows
+
+
+def _from_one(
+    records: dict[str, dict[int, Record]], relative: dict[str, _Fit], ratios: dict[str, float], seed: int
+) -> list[Row]:
+    """All other events from the main shock alone: as usual, and with a stated spread."""
+    if _MAIN not in records:
+        return [Row("transfer", "SKIPPED", None, "", f"predictions from one event need {_MAIN}.zip")]
+    rows, unseen = [], [name for name in records if name != _MAIN]
+    for noise in ("white", "effective samples"):
+        fit = _calibrate(records[_MAIN], noise, seed)
+        scored = [_as_usual(fit, relative[name].posterior, seed) for name in unseen]
+        rows += _rows(f"one event, as usual, {noise}", seed, scored)
+    single = _hierarchies({_MAIN: relative[_MAIN]}, seed)
+    guess = EventRatios([ratios[_MAIN]], **_GUESS)
+    scored = [_new_event(single, guess, relative[name].posterior, seed) for name in unseen]
+    return rows + _rows("one event, spread stated", seed, scored)
 
 
 def _held_out(
@@ -141,10 +222,15 @@ def _held_out(
         hierarchies = _hierarchies(others, seed, common)
         measured = EventRatios([ratios[other] for other in others])
         scored.append(_new_event(hierarchies, measured, own.posterior, seed))
-        posteriors = {other: fit.posterior for other, fit in others.items()}
-        found = predict_from_median(hierarchies[0], posteriors, own.posterior, None, quantity=_PEAK, n=2000, seed=seed)
-        by_median.append(found.score(own.posterior.likelihood.measurements))
+        by_median.append(_by_median(hierarchies[0], fits, name, seed))
     return _rows(case, seed, scored) + _peak_rows(f"{case}, by the median", seed, by_median)
+
+
+def _by_median(hierarchy: Hierarchy, fits: dict[str, _Fit], name: str, seed: int) -> QuantityScores:
+    """Scores of the peak of one event by the median of the population of the others."""
+    posteriors, own = {other: fit.posterior for other, fit in fits.items()}, fits[name].posterior
+    found = predict_from_median(hierarchy, posteriors, own, None, quantity=_PEAK, n=2000, seed=seed)
+    return found.score(own.likelihood.measurements)
 
 
 def _records(path: Path) -> dict[int, Record]:
@@ -158,15 +244,19 @@ def _records(path: Path) -> dict[int, Record]:
             except ValueError as error:
                 reason = error
         else:
-            raise ValueError(f"{path.name}: no channel {number}: {reason}")
+            raise ValueError(f"no channel {number}: {reason}")
     end = min((each.n_steps - 1) * each.dt for each in found.values())
     return {number: each.trim(0.0, end) for number, each in found.items()}
 
 
+def _model_and_measurements(records: dict[int, Record]) -> tuple[LinearStructure, Measurements]:
+    model = LinearStructure(BridgeDeck("ch7"), [records[number] for number in _INPUTS])
+    return model, Measurements(model.channels, records[_OUTPUT].dt, [records[_OUTPUT].acceleration])
+
+
 def _calibrate(records: dict[int, Record], noise: str, seed: int) -> _Fit:
     """Posterior of one event, with noise in SI units ("white", "effective samples") or as a share of the response."""
-    model = LinearStructure(BridgeDeck("ch7"), [records[number] for number in _INPUTS])
-    measured = Measurements(model.channels, model.dt, [records[_OUTPUT].acceleration])
+    model, measured = _model_and_measurements(records)
     if noise == "relative":
         kind = RelativeNoise.of(measured, window=_WINDOW, sensor=(_SENSOR,))
         prior = _PRIOR | {"share_ch7": HalfNormal(1.0)}
@@ -221,7 +311,7 @@ def _amplitude_dependent(fit: _Fit, seed: int) -> _Fit:
 
 
 def _population(
-    fits: dict[str, _Fit], seed: int, common: dict | None = None, noise: bool = True
+    fits: dict[str, _Fit], seed: int, common: dict | None = None, noise: bool = True, varying: dict = _VARYING
 ) -> tuple[HierarchicalPosterior, SMCSampler]:
     """Samples of the population of some events, with parameters that they have in common, with or without the noise."""
     tests = {
@@ -235,7 +325,7 @@ def _population(
         )
         for name, fit in fits.items()
     }
-    varying = {name: each for name, each in _VARYING.items() if noise or name != _NOISE}
+    varying = {name: each for name, each in varying.items() if noise or name != _NOISE}
     correlation = 1.0 if len(fits) > 1 else None  # one event does not show correlations
     posterior = HierarchicalPosterior(tests, varying, common=common, correlation=correlation, max_samples=200)
     sampler = SMCSampler(300, posterior.ndim, posterior, vectorize=True, seed=seed)
@@ -251,13 +341,16 @@ def _hierarchies(fits: dict[str, _Fit], seed: int, common: dict | None = None) -
     The peak has no noise but the ratio. Ten events tell the correlations of three parameters better than those of four,
     so that the population without the noise is narrower in the direction that changes the peak.
     """
-    found = []
-    for noise in (False, True):
-        posterior, sampler = _population(fits, seed, common, noise)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the share of the ends is at its bound in one event
-            found.append(Hierarchy(posterior, sampler.get_chain(flat=True)))
-    return found[0], found[1]
+    return _hierarchy(fits, seed, common, noise=False), _hierarchy(fits, seed, common, noise=True)
+
+
+def _hierarchy(
+    fits: dict[str, _Fit], seed: int, common: dict | None, noise: bool, varying: dict = _VARYING
+) -> Hierarchy:
+    posterior, sampler = _population(fits, seed, common, noise, varying)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the share of the ends is at its bound in one event
+        return Hierarchy(posterior, sampler.get_chain(flat=True))
 
 
 def _evidence(linear: dict[str, _Fit], amplitude: dict[str, _Fit], seed: int) -> list[Row]:

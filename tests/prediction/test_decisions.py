@@ -120,6 +120,33 @@ def test_intervals_contain_their_own_probability(hierarchy, record, rng):  # noq
     assert np.all(lower <= curve.probability) and np.all(curve.probability <= upper)
 
 
+def test_what_the_events_tell_of_a_probability_without_the_form_of_their_ratios(rng):
+    """Clopper-Pearson for the events themselves: far in the tail it is far above the interval, which ends at P."""
+    few = EventRatios([0.9887505, 1.00023499, 1.00460618])
+    limits = np.array([0.5, 1.002, 100.0])
+    found = exceedance(np.ones(200), limits, ratios=few)
+    expected = [1.0, stats.beta.ppf(0.975, 2.0, 2.0), 1.0 - 0.025 ** (1.0 / 3.0)]  # 3, 1 and 0 of 3 events
+    np.testing.assert_allclose(found.upper_by_events, expected)
+    assert found.upper[2] == found.probability[2] < 1e-5 < 0.7 < found.upper_by_events[2]
+    assert exceedance(np.ones(200), limits, noise=False).upper_by_events is None
+    both = exceedance(np.ones((200, 2)), 1.002, ratios=EventRatios(np.column_stack([few.values, 1.0 / few.values])))
+    np.testing.assert_allclose(both.upper_by_events, stats.beta.ppf(0.975, [2.0, 2.0], [2.0, 2.0]))
+
+
+@pytest.mark.parametrize("degrees", [2.0, 50.0])
+def test_what_the_events_tell_holds_for_any_tail_of_the_ratios(degrees):
+    """Ratios with heavy tails: the upper end by the events contains the truth at its level, that of the normal not."""
+    truth, by_events, normal = 0.002, [], []
+    limit = np.exp(0.1 * stats.t.isf(truth, degrees))
+    for seed in range(300):
+        values = np.exp(0.1 * np.random.default_rng(seed).standard_t(degrees, 30))
+        found = exceedance(np.ones(5), limit, ratios=EventRatios(values), level=0.9)
+        by_events.append(truth <= found.upper_by_events)
+        normal.append(truth <= found.upper)
+    assert np.mean(by_events) > 0.95 - 4.0 * np.sqrt(0.05 * 0.95 / 300)
+    assert np.mean(normal) > 0.9 if degrees == 50.0 else np.mean(normal) < 0.9
+
+
 def test_fragility_of_a_hierarchy_is_compared_with_all_its_events(wave, rng):
     events, prior = {"weak": 0.2, "strong": 2.0}, Prior({"gain": LogNormal(1.0, 0.5)})
     posteriors = {name: with_noise(wave.with_record(wave.record.scale(k)), GaussianNoise) for name, k in events.items()}

@@ -105,3 +105,44 @@ def test_the_stated_error_includes_the_fit_of_the_common_parameter(rng):
         samples[:, :2] += 1e-6 * rng.standard_normal((200, 2))
         stated.append(check_hierarchy(posterior, samples).mean_errors["c"])
     assert 0.5 < np.mean(stated) / np.std(found, ddof=1) < 2.0
+
+
+PRIORS = {  # of a share: flat, and normal on the logit scale
+    "uniform": Uniform(0.0, 1.0),
+    "logit-normal": stats.johnsonsb(0.0, 0.6),
+}
+
+
+def shares(n_flat: int, prior: str, rng: np.random.Generator) -> dict[str, StoredPosterior]:
+    """Two tests that measured a share, and some that say nothing about it; all know the common parameter."""
+    columns = [stats.truncnorm.rvs(-6.0, 14.0, loc=0.3, scale=0.05, size=1000, random_state=rng) for _ in range(2)]
+    columns += [PRIORS[prior].rvs(1000, random_state=rng) for _ in range(n_flat)]
+    joint = Prior({"share": PRIORS[prior], "c": WIDE})
+    return {
+        f"T{i}": StoredPosterior(np.column_stack([each, 0.1 * rng.standard_normal(1000)]), joint, log_evidence=0.0)
+        for i, each in enumerate(columns)
+    }
+
+
+@pytest.mark.parametrize(
+    ("prior", "scale", "is_right"),
+    [("uniform", "linear", False), ("uniform", "logit", False), ("logit-normal", "logit", True)],
+)
+def test_a_varying_parameter_that_tests_say_nothing_about(prior, scale, is_right):
+    """Such tests should add a constant. Where the mixture makes something else of them, an alarm says so."""
+    varying, common = {"share": Varying(Uniform(0.0, 1.0), HalfNormal(0.5), scale)}, {"c": LINEAR.location}
+    means = np.linspace(0.1, 0.9, 9)
+    sd = 0.1 if scale == "linear" else 0.4
+    points = np.column_stack([means, np.full(9, sd), np.zeros(9)])
+    mass = stats.norm.cdf((1.0 - means) / sd) - stats.norm.cdf(-means / sd) if scale == "linear" else np.ones(9)
+    posterior = HierarchicalPosterior(shares(5, prior, np.random.default_rng(3)), varying, common=common)
+    error = np.ptp(posterior.log_marginals(points)[:, 2:].sum(axis=1) - 5.0 * np.log(mass))
+    if scale == "logit":  # 0.1 to 0.3 and 0.9 to 1.4 with six seeds; 0.2 to 1.0 on the linear scale
+        assert error < 0.4 if is_right else error > 0.6
+    near = np.array([0.3, sd, 0.0]) + 0.02 * np.random.default_rng(1).random((50, 3))
+    said = [each for each in check_hierarchy(posterior, near).messages if "unequally likely" in each]
+    assert len(said) == (not is_right)
+    if not is_right:
+        assert all(f"share in 'T{k}'" in said[0] for k in (2, 3, 4, 5)) and "'T1'" not in said[0]
+        alone = HierarchicalPosterior(posterior.tests, varying)
+        assert not [each for each in check_hierarchy(alone, near[:, :2]).messages if "unequally" in each]

@@ -25,6 +25,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.probability.hierarchical_posterior import _correlation_factor
 from fe_likelihoods.probability.pareto_smoothing import pareto_shape
+from fe_likelihoods.probability.scales import scales_of
 from fe_likelihoods.probability.stored_posterior import describe
 from tests.benchmarks.hierarchy_warnings import RIGHT, WRONG, problem, solve
 
@@ -161,7 +162,7 @@ def test_extreme_hyper_parameters_have_a_density(two):
 
 def test_thinned_samples_give_nearly_the_same():
     test = stored(DATA[0], ERRORS, 1500, 1)
-    few, all_of_them = (describe(test, ["a", "b"], [False, False], size) for size in (500, 1500))
+    few, all_of_them = (describe(test, ["a", "b"], scales_of(["linear", "linear"]), size) for size in (500, 1500))
     assert len(few.points) == 500 and few.effective_sample_size == 500
     np.testing.assert_allclose(few.points.mean(axis=0), all_of_them.points.mean(axis=0), atol=0.05)
 
