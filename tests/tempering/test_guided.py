@@ -236,6 +236,34 @@ def test_weights_grow_towards_tails_that_are_too_light(variance, noise, rng):
     assert tail_growth([Round(x[:15], records[:15], log_weights[:15])]) == (0.0, np.inf)
 
 
+@pytest.mark.parametrize(("dof", "light"), [(None, True), (6.0, False)])
+def test_growth_among_the_outermost_draws_is_seen(dof, light, rng):
+    """A normal proposal with half the variance of a t3: the weights fall in the bulk, and grow in the tails only."""
+    reported = 0
+    for _ in range(40):
+        x = np.sqrt(1.5) * rng.standard_normal((80, 2))
+        if dof is not None:  # heavy enough: the weights fall, or grow slowly, to the end
+            x = np.sqrt(2.0) * rng.standard_normal((80, 2)) * np.sqrt(dof / rng.chisquare(dof, size=(80, 1)))
+        squares = np.sum(x**2, axis=1)
+        records = np.zeros(80, dtype=[("log_prob", float), ("log_prior", float)])
+        records["log_prob"] = -2.5 * np.log1p(squares / 3.0)
+        log_density = -squares / 3.0 if dof is None else -0.5 * (dof + 2.0) * np.log1p(squares / 2.0 / dof)
+        reported += tails_are_light([Round(x, records, records["log_prob"] - log_density)])
+    assert reported >= 36 if light else reported <= 1
+
+
+def test_few_draws_need_a_larger_growth(rng):
+    """Without a trend, the share of slopes above two errors is that of a normal law, however few draws there are."""
+    records = np.zeros(40, dtype=[("log_prob", float), ("log_prior", float)])
+    found = []
+    for _ in range(4000):
+        records["log_prob"] = -rng.exponential(size=40)
+        found.append(tail_growth([Round(np.zeros((40, 1)), records, rng.standard_normal(40))], 0.25))
+    ratios = np.array([slope / error for slope, error in found])
+    assert np.mean(np.abs(ratios) > 4.0) < 2e-3  # 0.004 without the factor, by Student's t with 8 degrees of freedom
+    assert np.mean(np.abs(ratios) > 2.0) < 0.05
+
+
 @pytest.mark.parametrize("spread", [0.3, 0.7, 1.0])
 def test_the_evidence_of_rounds_is_unbiased_and_its_error_covers(spread, rng):
     """Lognormal weights with mean 1: the evidence is 1."""
