@@ -93,7 +93,8 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
         Largest number of simulations (`simulations`). Where it is reached, the posterior is estimated from the points
         that are known, the state is stored once if the call has stored no step, and a `SamplingWarning` says so; see
         `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the same
-        file, and call `run_mcmc` again: the result is that of a run with the larger number from the start.
+        file, and call `run_mcmc` again: the result is that of a run with the larger number from the start. (A new
+        sampler first evaluates a `log_prob_fn` without a `fingerprint` again at `nwalkers` points; these do not count.)
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
         the run, and two samplers never share a stream. A file that contains a run keeps its seed: another one has no

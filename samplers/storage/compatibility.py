@@ -81,8 +81,8 @@ def differences(
 
     Settings are compared, then the log-prior of the starting points, then, for a posterior without a fingerprint, the
     log-probabilities of the first points of the annealing, as many as there are walkers, and of the best point. Half of
-    the space may have changed, so one point is not enough. This costs an evaluation per point, which a fingerprint
-    saves.
+    the space may have changed, so one point is not enough. This costs an evaluation per point, beyond any limit of
+    simulations, which a fingerprint saves; the log says so.
 
     Parameters
     ----------
@@ -113,7 +113,11 @@ def differences(
 def _compare_points(
     coords: np.ndarray, log_prob: np.ndarray, compute: Callable[[np.ndarray], EvaluatedBatch]
 ) -> list[str]:
-    logger.info("log_prob_fn has no fingerprint: it is compared with the stored run at %d points", len(coords))
+    logger.warning(  # these are simulations that the user has not asked for
+        "log_prob_fn has no fingerprint: it is evaluated again at %d points of the stored run, to compare. These "
+        "evaluations are not part of max_simulations; an attribute fingerprint saves them",
+        len(coords),
+    )
     now = compute(coords).log_prob
     different = np.flatnonzero(~np.isclose(log_prob, now, **CLOSE, equal_nan=True))
     if len(different) == 0:

@@ -13,6 +13,7 @@ import emcee
 import numpy as np
 import pytest
 
+from samplers import SamplingWarning
 from samplers.storage.journal_contents import read_journal
 from tests.contract.targets import Gaussian
 from tests.faults.resumable_run import NDIM, SAMPLERS, N, make
@@ -127,6 +128,32 @@ def cut(path, share):
     data = journal_of(path).read_bytes()
     journal_of(path).write_bytes(data[: int(share * len(data))])
     path.unlink()
+
+
+@pytest.mark.parametrize("fingerprint", [None, "the posterior of this test"])
+def test_a_comparison_beyond_the_limit_is_said(fingerprint, tmp_path, caplog):
+    """A posterior without a fingerprint is evaluated again, which max_simulations does not contain."""
+    path = tmp_path / "run.h5"
+    sampler = make(path, "smc", max_simulations=100)
+    with pytest.warns(SamplingWarning, match="max_simulations"):
+        set_fingerprint(sampler, fingerprint).run_mcmc(None, 2)
+    contents = read_journal(journal_of(path))
+    caplog.clear()
+    again = set_fingerprint(make(path, "smc", max_simulations=150), fingerprint)
+    with pytest.warns(SamplingWarning, match="max_simulations"):
+        again.run_mcmc(None, 2)
+    # Ten of the first points are evaluated again to look for values that depend on the batch, whatever the limit is.
+    beyond = again.log_prob_fn.f.calls - 50
+    if fingerprint is None:
+        assert f"evaluated again at {compared(contents)} points" in caplog.text and beyond >= compared(contents)
+    else:
+        assert "evaluated again" not in caplog.text and beyond <= 0
+
+
+def set_fingerprint(sampler, fingerprint):
+    if fingerprint is not None:
+        sampler.log_prob_fn.f.fingerprint = fingerprint
+    return sampler
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.97, 0.999])
