@@ -11,7 +11,8 @@ from ..units import from_si
 from .events import read_events
 from .job import read_job
 from .models import USER_MODELS, Problem, make_problem, noise_channels_of
-from .runs import default_folder, make_sampler
+from .runs import default_folder
+from .sampling import is_emcee, make_sampler
 
 __all__ = ["check_job"]
 
@@ -50,7 +51,11 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
         compared = "without measurements" if event.measured is None else "compared with measurements"
         say(f"Event {event.name}: {event.record.name}, {steps}, {compared}")
     guided = job.sampler.get("guide", False)
-    _say_cost(problem, sampler, guided, job.budget, say)
+    if is_emcee(job):
+        simulations = sampler.nwalkers * (job.sampler["steps"] + 1)
+        say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler['steps']} steps")
+    else:
+        _say_cost(problem, sampler, guided, job.budget, say)
     _draw(problem, seconds, picture)
     say(f"{picture}: the measurements should lie within the band of the simulations at draws of the prior")
     say(f"Next: fe-likelihoods run {file} (writes to {default_folder(file)}/)")

@@ -18,6 +18,8 @@ _TERMS = (
         r"see the failures that log_prob_fn reports \(posterior\.report\(\) for a posterior of fe_likelihoods\)",
         "see the first failure in the messages above",
     ),
+    (r"ModulatedNoise, BandNoise and RelativeNoise scale", '"modulated", "bands" and "relative" of [noise] scale'),
+    (r"Calibrate with AutoregressiveNoise or effective_samples=", 'Set kind = "autoregressive" or "bands" in [noise]'),
     (r"with guide=posterior\.guide\(\)", "with guide = true           "),  # a table: of the same width
 )
 

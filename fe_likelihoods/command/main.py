@@ -84,7 +84,7 @@ def run(ctx: click.Context, file: Path, out: Path | None, resume: bool, overwrit
     ctx.obj["interrupted"] = f"Interrupted. What was computed is kept in {folder}/; go on with: {again}"
     outcome = run_job(file, out, resume, overwrite, progress=not quiet)
     _show(outcome)
-    ctx.exit(NOT_USABLE if outcome.sampler.verdict.status == "not usable" else 0)
+    ctx.exit(0 if outcome.usable else NOT_USABLE)
 
 
 def _show(outcome: Any) -> None:

@@ -10,10 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..probability.autoregressive_noise import AutoregressiveNoise
 from ..probability.distributions import Distribution, HalfNormal, Uniform
 from ..probability.likelihood import FELikelihood
-from ..probability.noise import GaussianNoise, SharedGaussianNoise
+from ..probability.noise import SharedGaussianNoise
 from ..probability.parameters import channels_of_deviations
 from ..probability.posterior import Posterior
 from ..signals.channels import Channel, Measurements
@@ -22,6 +21,7 @@ from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model
 from .data import is_dataset, read_base_motion, read_bundled, read_measured
 from .job import Job
+from .noises import make_noise
 from .priors import parse_prior
 from .schema import PARTS, did_you_mean
 
@@ -79,7 +79,7 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
         raise ValueError(
             f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
         )
-    law = _located(job, "noise", lambda: _make_noise(job, model, measured))
+    law = _located(job, "noise", lambda: make_noise(job, model, measured))
     likelihood = _located(job, "measurements", lambda: FELikelihood(model, measured, law, pool=workers, cache=cache))
     priors, assumed = _make_priors(job, likelihood)
     posterior = Posterior(likelihood, priors)
@@ -263,14 +263,6 @@ def load_function(job: Job, text: str) -> Callable:
         names = tuple(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
         raise ValueError(f"{where} {path.name} has no function {name!r}; {did_you_mean(name, names)}")
     return function
-
-
-def _make_noise(job: Job, model: Model, measured: Measurements) -> Any:
-    if job.noise == "per event":
-        return "per event"
-    if job.noise == "shared":
-        return SharedGaussianNoise.of(measured.select([channel.name for channel in model.channels]))
-    return (AutoregressiveNoise if job.noise == "autoregressive" else GaussianNoise)(model.channels)
 
 
 def _make_priors(job: Job, likelihood: FELikelihood) -> tuple[dict[str, Distribution], dict[str, Distribution]]:

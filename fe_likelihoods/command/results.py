@@ -10,6 +10,7 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..probability.likelihood import FELikelihood
 from ..probability.posterior import Posterior
+from ..reporting.run import FinishedRun
 from ..signals.channels import Measurements
 from ..signals.error_measures import rrmse
 from .hints import in_toml_terms
@@ -17,51 +18,68 @@ from .hints import in_toml_terms
 __all__ = ["write_csv", "write_report", "write_samples", "write_tables"]
 
 
-def write_tables(folder: Path, sampler: Any, posterior: Posterior) -> tuple[str, ...]:
+def write_tables(folder: Path, run: FinishedRun) -> tuple[str, ...]:
     """Write the moments of the parameters, the stages and the errors of the fit.
 
     Parameters
     ----------
     folder : Path
-    sampler : object
-        Sampler that has run.
-    posterior : Posterior
+    run : FinishedRun
 
     Returns
     -------
     tuple of str
-        Names of the files.
+        Names of the files; a run without tempering has no ``stages.txt``.
     """
     from samplers import ladder_table, summary
 
-    samples = sampler.get_chain(flat=True)
-    shown = np.stack([p.shown(column) for p, column in zip(posterior.parameters, samples.T, strict=True)], axis=1)
-    errors = sampler.mean_error() / np.array([p.factor for p in posterior.parameters])
-    labels = [parameter.label for parameter in posterior.parameters]
+    posterior = run.posterior
+    shown = np.stack([p.shown(column) for p, column in zip(run.parameters, run.samples.T, strict=True)], axis=1)
+    errors = run.mean_error / np.array([p.factor for p in run.parameters])
+    labels = [parameter.label for parameter in run.parameters]
     moments = summary(shown, labels, mean_error=errors)
     low, median, high = np.quantile(shown, [0.05, 0.5, 0.95], axis=0)
-    evidence = f"log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}"
-    fit = _fit_rows(posterior, samples)
-    runs = _model_runs(posterior.likelihood, sampler.simulations)
+    fit = _fit_rows(posterior, run.samples)
+    simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [
         str(moments),
         "",
-        evidence,
-        in_toml_terms(str(sampler.verdict)),
-        *runs,
+        *_of_the_sampler(run),
+        *_model_runs(posterior.likelihood, simulations),
         "",
         "Relative RMS error of the response (RRMSE):",
     ]
     lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     columns = ("parameter", "mean", "mean_error", "sd", "cv", "q05", "median", "q95", "nominal")
-    nominal = [parameter.shown(parameter.nominal) for parameter in posterior.parameters]
+    nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
     values = (labels, moments.mean, errors, moments.sd, moments.cv, low, median, high, nominal)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     write_csv(folder / "summary.csv", rows)
     write_csv(folder / "fit.csv", fit)
-    (folder / "stages.txt").write_text(ladder_table(sampler) + "\n", encoding="utf-8")
+    if not run.tempered:
+        return ("summary.txt", "summary.csv", "fit.csv")
+    (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
     return ("summary.txt", "summary.csv", "fit.csv", "stages.txt")
+
+
+def _of_the_sampler(run: FinishedRun) -> list[str]:
+    """Evidence and verdict, or the length of a Markov chain, as lines of text."""
+    if run.tempered:
+        evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2f}"
+        return [evidence, in_toml_terms(str(run.verdict))]
+    used = run.sampler.iteration - run.discard
+    lines = [
+        f"{len(run.samples)} samples of {run.sampler.nwalkers} walkers in {used} iterations, after {run.discard} that "
+        f"are left out; worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
+        f"{run.autocorrelation_time:.0f} iterations). emcee gives neither an evidence nor a verdict."
+    ]
+    if run.is_inconclusive:
+        lines.append(
+            "Not usable: the chain is shorter than 50 autocorrelation times. Give more `steps` in [sampler] and give "
+            'the same command again, or use kind = "smc".'
+        )
+    return lines
 
 
 def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
@@ -101,19 +119,19 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def write_samples(folder: Path, sampler: Any, posterior: Posterior, prediction: Prediction | None, draws: int) -> str:
+def write_samples(folder: Path, run: FinishedRun, prediction: Prediction | None, draws: int) -> str:
     """Write the samples in netCDF, with the responses of `draws` of them; return the name of the file."""
     from samplers import to_arviz
 
-    data = to_arviz(sampler, posterior if draws else None, prediction, **({"draws": draws} if draws else {}))
+    options = {"draws": draws} if draws else {}
+    data = to_arviz(run.sampler, run.posterior if draws else None, prediction, discard=run.discard, **options)
     data.to_netcdf(str(folder / "posterior.nc"))
     return "posterior.nc"
 
 
 def write_report(
     path: Path,
-    sampler: Any,
-    posterior: Posterior,
+    run: FinishedRun,
     prediction: Prediction | None,
     again: str,
     truth: Mapping[str, float] | None,
@@ -123,5 +141,6 @@ def write_report(
     """Write the report in HTML, with the command that makes it again; return the name of the file."""
     from ..reporting.report import report
 
-    report(sampler, posterior, prediction, path, truth=truth, events=events, measured=measured, repeat=again)
+    options = {"truth": truth, "events": events, "measured": measured, "discard": run.discard, "repeat": again}
+    report(run.sampler, run.posterior, prediction, path, **options)
     return path.name

@@ -17,23 +17,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..prediction.prediction import Prediction
+from ..reporting.run import read_run
 from ..simulation.disk_cache import SimulationCache
 from .events import Event, predict_events, prediction_options, read_events, without_warnings, write_events
 from .hints import in_toml_terms
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem
 from .results import write_report, write_samples, write_tables
+from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
 
-__all__ = ["Outcome", "default_folder", "make_sampler", "report_run", "run_job"]
+__all__ = ["Outcome", "default_folder", "report_run", "run_job"]
 
 SETTINGS, ORIGIN, CHAIN, CACHE = "settings.toml", "origin.json", "run.h5", "simulations.sqlite"
 CHANGEABLE = ("budget", "events", "prediction")  # sections that do not change what a run has computed so far
-DRAWS, STEPS = 100, 4  # of predictions, of the chain
-PRESETS = {
-    "ramancha2022": "RAMANCHA_2022_LITERAL",
-    "ramancha2022-constant": "RAMANCHA_2022_CONSTANT",
-    "ching-chen-2007": "CHING_CHEN_2007",
-}
+DRAWS = 100  # of predictions
 
 
 class Outcome(NamedTuple):
@@ -50,6 +47,8 @@ class Outcome(NamedTuple):
         Names of the files of the results.
     cautions : tuple of str
         What speaks against the predictions.
+    usable : bool
+        Whether the samples can be used at all.
     """
 
     folder: Path
@@ -57,49 +56,12 @@ class Outcome(NamedTuple):
     problem: Problem
     files: tuple[str, ...]
     cautions: tuple[str, ...]
+    usable: bool
 
 
 def default_folder(file: Path) -> Path:
     """Folder of the results of a TOML file, in the current folder: ``results-column`` for ``column.toml``."""
     return Path(f"results-{file.stem}")
-
-
-def make_sampler(job: Job, problem: Problem, backend: Any = None) -> Any:
-    """Make the sampler of a TOML file, with a backend or in memory.
-
-    Raises
-    ------
-    ValueError
-        If a setting is impossible; the message names the section.
-    """
-    import samplers
-
-    given = dict(job.sampler)
-    kind, preset = given.pop("kind", "smc"), given.pop("preset", None)
-    kinds = {"smc": samplers.SMCSampler, "tmcmc": samplers.TMCMCSampler}
-    where = job.where("sampler")
-    if kind not in kinds:
-        raise ValueError(f"{where} kind: expected one of {', '.join(kinds)}; got {kind!r}")
-    if preset is not None and preset not in PRESETS:
-        raise ValueError(f"{where} preset: expected one of {', '.join(PRESETS)}; got {preset!r}")
-    settings = {} if preset is None else dict(getattr(samplers.presets, PRESETS[preset]))
-    walkers, seed, guided = given.pop("walkers", 500), given.pop("seed", 1), given.pop("guide", False)
-    given.pop("steps", None)
-    posterior = problem.posterior
-    try:
-        return kinds[kind](
-            walkers,
-            posterior.ndim,
-            posterior,
-            backend=backend,
-            vectorize=True,
-            seed=seed,
-            guide=posterior.guide() if guided else None,
-            max_simulations=job.budget.get("max_simulations"),
-            **(settings | given),
-        )
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{where} {error}") from error
 
 
 def run_job(
@@ -139,7 +101,7 @@ def run_job(
     _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
     sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
-    sampler.run_mcmc(None, job.sampler.get("steps", STEPS), progress=progress)
+    run_sampler(job, problem, sampler, progress)
     return Outcome(folder, sampler, problem, *_write(folder, job, job.file, sampler, problem, events, progress))
 
 
@@ -173,13 +135,13 @@ def report_run(path: Path) -> Outcome:
     cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
     problem = make_problem(job, cache)
     sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
-    if sampler.iteration == 0:
+    if sampler.iteration <= discarded(job):
         raise ValueError(
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
     steps = job.sampler.get("steps", STEPS)
-    if sampler.iteration >= steps:
+    if not is_emcee(job) and sampler.iteration >= steps:
         # the journal repeats the run without an evaluation; the chain alone has lost which walkers are copies
         with _without_messages("samplers.storage.resumption"):
             sampler.run_mcmc(None, steps, progress=False)
@@ -202,26 +164,27 @@ def _without_messages(name: str) -> Iterator[None]:
 
 def _write(
     folder: Path, job: Job, file: Path, sampler: Any, problem: Problem, events: tuple[Event, ...], progress: bool
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Write tables, predictions, samples and report; return the names of the files, and what is to be said.
+) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Write tables, predictions, samples and report; return the last members of the `Outcome`.
 
     Predictions are made here; their responses are in the cache if they were made before.
     """
     posterior, again = problem.posterior, shlex.join(["fe-likelihoods", "run", str(file), "--out", str(folder)])
-    tables = write_tables(folder, sampler, posterior)
+    run = read_run(sampler, posterior, discard=discarded(job))
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
-    samples = write_samples(folder, sampler, posterior, prediction, job.prediction.get("draws", DRAWS))
+    samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS))
     predicted = predict_events(job, events, problem, drawn, progress)
     pictures = write_events(folder, events, predicted)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     page, truth = folder / "report.html", problem.truth
-    report = write_report(page, sampler, posterior, prediction, again, truth, predicted, measured)
+    report = write_report(page, run, prediction, again, truth, predicted, measured)
+    tables = write_tables(folder, run)  # last: they say how many simulations there are
     cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
     for name, each in predicted.items():
         cautions += [f"event {name}: {remark}" for remark in each["histories"].remarks]
     cautions += [f"event {event.name}: all simulations failed" for event in events if event.name not in predicted]
-    return (report, *tables, samples, *pictures), tuple(map(in_toml_terms, cautions))
+    return (report, *tables, samples, *pictures), tuple(map(in_toml_terms, cautions)), not run.is_inconclusive
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:
@@ -261,13 +224,15 @@ def _changes(old: str, new: str) -> list[str]:
     found = []
     for section in sorted({*before, *after} - {*CHANGEABLE}):
         ours, theirs = before.get(section, {}), after.get(section, {})
+        if section == "sampler" and ours.get("kind") == "emcee":  # a chain may be continued, and more of it left out
+            ours, theirs = ({k: v for k, v in each.items() if k not in ("steps", "discard")} for each in (ours, theirs))
         found += [f"[{section}] {key}" for key in sorted({*ours, *theirs}) if ours.get(key) != theirs.get(key)]
     return found
 
 
 def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
     """Draws of the posterior to predict with, evenly from the chain."""
-    samples, n = sampler.get_chain(flat=True), job.prediction.get("draws", DRAWS)
+    samples, n = sampler.get_chain(flat=True, discard=discarded(job)), job.prediction.get("draws", DRAWS)
     rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
     drawn = samples[rows]
     return problem.posterior.draw_noise(drawn, job.sampler.get("seed", 1)) if job.noise == "marginal" else drawn

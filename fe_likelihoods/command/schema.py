@@ -16,9 +16,11 @@ __all__ = [
     "EVENT",
     "FREE_SECTIONS",
     "MODELS",
+    "NOISES",
     "PARTS",
     "SECTIONS",
     "Key",
+    "NoiseKind",
     "did_you_mean",
     "read_keys",
     "read_quantity",
@@ -236,14 +238,19 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("missing", "numbers", "numbers that stand for missing samples"),
     ),
     "noise": (
-        Key(
-            "kind", "text", '"per channel" (white, the default), "autoregressive", "shared", "per event" or "marginal"'
-        ),
+        Key("kind", "text", "see the table of kinds; per channel (white) by default"),
+        Key("sensor", "table of quantities", "channel = known standard deviation of the noise of its sensor"),
+        Key("window", "time", "modulated, relative: length of the window in which the level of the response is taken"),
+        Key("edges", "numbers", "bands: frequencies between the bands [Hz], ascending"),
+        Key("shares", "yes or no", "bands: levels as shares of the simulated response (yes), or in SI units"),
     ),
     "sampler": (
-        Key("kind", "text", '"smc" (the default) or "tmcmc"'),
-        Key("walkers", "whole number >= 1", "number of walkers (500)"),
-        Key("steps", "whole number >= 1", "sweeps at beta = 1, each of which stores all walkers (4)"),
+        Key("kind", "text", '"smc" (the default), "tmcmc" or "emcee"'),
+        Key("walkers", "whole number >= 1", "number of walkers (500; emcee: 4 per parameter, 32 or more)"),
+        Key(
+            "steps", "whole number >= 1", "sweeps at beta = 1, each of which stores all walkers (4); emcee: iterations"
+        ),
+        Key("discard", "whole number >= 0", "emcee: iterations that are left out as burn-in (half of steps)"),
         Key("seed", "whole number >= 0", "seed (1)"),
         Key("guide", "yes or no", "find the posterior from the responses, with hundreds of simulations (no)"),
         Key("preset", "text", '"ramancha2022", "ramancha2022-constant" or "ching-chen-2007": settings of papers'),
@@ -266,6 +273,39 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
     ),
 }
 """Keys of the sections besides ``[model]`` and ``[priors]``."""
+
+
+class NoiseKind(NamedTuple):
+    """A kind of the noise: what it is, and the keys of ``[noise]`` that it takes and needs."""
+
+    meaning: str
+    keys: tuple[str, ...] = ()
+    required: tuple[str, ...] = ()
+
+
+NOISES = {
+    "per channel": NoiseKind("white, one level per channel in its unit (the default)", ("sensor",)),
+    "autoregressive": NoiseKind("each error depends on the one before, with a correlation per channel", ("sensor",)),
+    "shared": NoiseKind("white, one level for all channels as a share of their root mean squares", ("sensor",)),
+    "per event": NoiseKind("white, a level per channel and event of a data set with several"),
+    "marginal": NoiseKind("white, the levels integrated out"),
+    "relative": NoiseKind(
+        "white, one level per channel as a share of that of the measurements; a prediction has the share of the "
+        "predicted response, of its window if one is given",
+        ("sensor", "window"),
+    ),
+    "modulated": NoiseKind(
+        "white, a share of the level of the simulated response, which follows it in time",
+        ("sensor", "window"),
+        ("sensor", "window"),
+    ),
+    "bands": NoiseKind(
+        "a level per channel and band of frequency, so that errors are correlated in time; shares need the sensor",
+        ("sensor", "edges", "shares"),
+        ("edges",),
+    ),
+}
+"""Kinds of the noise."""
 
 EVENT: tuple[Key, ...] = (
     *(key for key in SECTIONS["record"] if key.name != "every"),
@@ -318,6 +358,10 @@ _KINDS = {
     "numbers": (_all(_is_number, list), "a list of numbers, such as [1.0, 2.0]"),
     "whole numbers": (_all(_is_whole, list), "a list of whole numbers, such as [1, 2]"),
     "table of texts": (_all(_is_text, dict), 'texts by name, such as {top = "abc"}'),
+    "table of quantities": (
+        _all(lambda value: _is_number(value) or _is_text(value), dict),
+        'numbers with units by name, such as {top = "0.01 g"}',
+    ),
     "table of whole numbers": (_all(_is_whole, dict), "whole numbers by name, such as {top = 2}"),
 }
 

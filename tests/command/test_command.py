@@ -273,7 +273,11 @@ def test_a_damaged_cache_is_told_and_not_changed(folder):
         ("half-normal(5 mm)", "halfnormal(5)", "[priors] sigma_displacement: expected a distribution in quotes"),
         ("damping =", "dampng =", "[priors] dampng: the model has no such parameter; did you mean damping?"),
         ('damping = "normal(1, 0.3)"', "", '[priors] damping: this prior is missing; write for example damping = "n'),
-        ("guide = true", 'guide = true\nkind = "mcmc"', "[sampler] kind: expected one of smc, tmcmc; got 'mcmc'"),
+        (
+            "guide = true",
+            'guide = true\nkind = "mcmc"',
+            "[sampler] kind: expected one of smc, tmcmc, emcee; got 'mcmc'",
+        ),
         ("[prediction]", "[budget]\nworkers = 2\n[prediction]", "[budget] workers: a built-in model uses all cores"),
         ("[prediction]", '[noise]\nkind = "pink"\n[prediction]', "[noise] kind: unknown noise 'pink'"),
     ],

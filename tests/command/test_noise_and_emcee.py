@@ -1,0 +1,194 @@
+"""Kinds of the noise and emcee's sampler in the TOML file."""
+
+import csv
+
+import emcee
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    BandNoise,
+    GaussianNoise,
+    ModulatedNoise,
+    RelativeNoise,
+    SharedGaussianNoise,
+)
+from fe_likelihoods.command.hints import in_toml_terms
+from fe_likelihoods.command.job import read_job
+from fe_likelihoods.command.models import make_problem
+from tests.command.test_command import OSCILLATOR, ROOT, call, folder  # noqa: F401
+from tests.reporting.report_page import read_page
+
+SIGMAS = 'sigma_acceleration = "half-normal(0.1 g)"\nsigma_displacement = "half-normal(5 mm)"\n'
+PLAIN = OSCILLATOR.replace(SIGMAS, "")
+SENSOR = 'sensor = {acceleration = "0.01 g", displacement = 0.001}\n'
+SI = {"acceleration": 0.0980665, "displacement": 0.001}
+EMCEE = OSCILLATOR.replace("walkers = 20\nsteps = 2\nguide = true", 'kind = "emcee"\nwalkers = 16\nsteps = 60')
+
+
+def problem_of(folder, noise):  # noqa: F811
+    (folder / "oscillator.toml").write_text(f"{PLAIN}[noise]\n{noise}")
+    return make_problem(read_job("oscillator.toml"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "cls", "values", "parameters"),
+    [
+        (
+            'kind = "per channel"\n' + SENSOR,
+            GaussianNoise,
+            {"sensor": SI},
+            ["sigma_acceleration", "sigma_displacement"],
+        ),
+        ('kind = "autoregressive"\n' + SENSOR, AutoregressiveNoise, {"sensor": SI}, None),
+        ('kind = "shared"\n' + SENSOR, SharedGaussianNoise, {"sensor": SI}, None),
+        ('kind = "relative"\n', RelativeNoise, {"sensor": None, "window": None}, None),
+        ('kind = "relative"\nwindow = "1.5 s"\n' + SENSOR, RelativeNoise, {"sensor": SI, "window": 1.5}, None),
+        (
+            'kind = "modulated"\nwindow = 1.0\n' + SENSOR,
+            ModulatedNoise,
+            {"sensor": SI, "window": 1.0},
+            ["share_acceleration", "share_displacement"],
+        ),
+        (
+            'kind = "bands"\nedges = [1.0, 5.0]\n' + SENSOR,
+            BandNoise,
+            {"sensor": SI, "edges": (1.0, 5.0), "relative": True},
+            [f"share_{name}_band{k}" for name in ("acceleration", "displacement") for k in (1, 2, 3)],
+        ),
+        (
+            'kind = "bands"\nedges = [2.0]\nshares = false\n',
+            BandNoise,
+            {"sensor": None, "edges": (2.0,), "relative": False},
+            [f"sigma_{name}_band{k}" for name in ("acceleration", "displacement") for k in (1, 2)],
+        ),
+    ],
+)
+def test_noises_are_those_of_python(folder, keys, cls, values, parameters):  # noqa: F811
+    problem = problem_of(folder, keys)
+    noise, likelihood = problem.posterior.likelihood.noise, problem.posterior.likelihood
+    assert type(noise) is cls
+    for name, value in values.items():
+        expected = tuple(value[channel.name] for channel in noise.channels) if isinstance(value, dict) else value
+        assert getattr(noise, name) == (pytest.approx(expected) if isinstance(expected, tuple) else expected)
+    if parameters is not None:
+        assert list(noise.parameter_names) == parameters
+    assert set(problem.assumed) == set(noise.parameter_names)
+    point = problem.posterior.prior.mean()
+    assert np.isfinite(likelihood.log_likelihood(point)) and np.isfinite(problem.posterior(point[None])).all()
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ('kind = "modulatd"', "[noise] kind: unknown noise 'modulatd'; did you mean modulated?"),
+        ('kind = "modulated"\nwindow = "1 s"', '[noise] sensor: the kind "modulated" needs this key'),
+        ('kind = "modulated"\n' + SENSOR, '[noise] window: the kind "modulated" needs this key'),
+        ('kind = "modulated"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
+        ('kind = "modulated"\nwindow = "0 s"\n' + SENSOR, "[noise] ModulatedNoise: window must be a positive length"),
+        ('kind = "modulated"\nwindow = "0.01 s"\n' + SENSOR, "must be at least three steps"),
+        ('kind = "bands"\n' + SENSOR, '[noise] edges: the kind "bands" needs this key'),
+        ('kind = "bands"\nedges = [1.0]', '[noise] sensor: the kind "bands" needs this key'),
+        ('kind = "bands"\nedges = [5.0, 1.0]\n' + SENSOR, "expects ascending positive frequencies"),
+        ('kind = "bands"\nedges = [1.0, 500.0]\n' + SENSOR, "contains frequencies below"),
+        ('kind = "bands"\nedges = "1 Hz"\n' + SENSOR, "[noise] edges: expected a list of numbers"),
+        ('kind = "relative"\nedges = [1.0]', '[noise] edges: the kind "relative" has no such key; it is for "bands"'),
+        ('window = "1 s"', '[noise] window: the kind "per channel" has no such key; it is for "relative", "modulated"'),
+        ('sensor = {acceleration = "1 mm"}', "[noise] sensor: acceleration: expected a number in m/s"),
+        ('sensor = {accelaration = "1 g"}', "sensor: unknown channel 'accelaration'; did you mean acceleration?"),
+        ('sensor = {acceleration = "-1 g"}', "[noise] sensor: acceleration: expected a standard deviation"),
+        ('sensor = "1 g"', '[noise] sensor: expected numbers with units by name, such as {top = "0.01 g"}'),
+    ],
+)
+def test_wrong_keys_of_the_noise_are_named(folder, keys, message):  # noqa: F811
+    (folder / "oscillator.toml").write_text(f"{PLAIN}[noise]\n{keys}\n")
+    output = call("run", "oscillator.toml", "--quiet", code=1)
+    assert output.startswith("Error: oscillator.toml: ") and message in output
+    assert not (folder / "results-oscillator").exists()
+
+
+def test_a_noise_without_a_guide_is_told_before_the_run(folder):  # noqa: F811
+    (folder / "oscillator.toml").write_text(f'{PLAIN}[noise]\nkind = "modulated"\nwindow = "1 s"\n{SENSOR}')
+    output = call("run", "oscillator.toml", "--quiet", code=1)
+    assert "[sampler]" in output and "guide" in output and not (folder / "results-oscillator").exists()
+
+
+def test_messages_about_noises_are_in_the_words_of_the_file():
+    for words, told in (
+        ("ModulatedNoise, BandNoise and RelativeNoise scale", '"modulated", "bands" and "relative" of [noise] scale'),
+        (
+            "Calibrate with AutoregressiveNoise or effective_samples=",
+            'Set kind = "autoregressive" or "bands" in [noise]',
+        ),
+    ):
+        assert in_toml_terms(f"the bands. {words} x") == f"the bands. {told} x"
+    source = (ROOT / "fe_likelihoods" / "prediction" / "propagation.py").read_text()
+    assert "ModulatedNoise, BandNoise and RelativeNoise scale" in source
+
+
+def test_emcee_runs_and_goes_on_with_more_steps(folder):  # noqa: F811
+    (folder / "oscillator.toml").write_text(EMCEE)
+    assert "emcee makes 976 simulations" in call("check", "oscillator.toml")
+    said = call("run", "oscillator.toml", "--quiet", "--out", "parts", code=3)
+    assert "emcee gives neither an evidence nor a verdict" in said and "Not usable: the chain is shorter" in said
+    assert "stages.txt" not in said and "report.html" in said and (folder / "parts" / "posterior.nc").is_file()
+    assert "The chain is short" in read_page(folder / "parts" / "report.html").notes
+    with open("parts/summary.csv", newline="") as file:
+        rows = {row["parameter"]: row for row in csv.DictReader(file)}
+    chain = emcee.backends.HDFBackend("parts/run.h5").get_chain(flat=True, discard=30)
+    assert float(rows["stiffness [x nominal]"]["mean"]) == pytest.approx(chain[:, 0].mean(), rel=1e-9)
+    (folder / "oscillator.toml").write_text(EMCEE.replace("steps = 60", "steps = 90\ndiscard = 50"))
+    call("run", "oscillator.toml", "--quiet", "--out", "parts", code=3)
+    call("run", "oscillator.toml", "--quiet", "--out", "whole", code=3)
+    chains = [emcee.backends.HDFBackend(f"{name}/run.h5").get_chain() for name in ("parts", "whole")]
+    assert chains[0].shape == (90, 16, 4)
+    np.testing.assert_array_equal(*chains)
+    assert (folder / "parts" / "summary.csv").read_text() == (folder / "whole" / "summary.csv").read_text()
+    call("report", "parts", code=0)
+    (folder / "oscillator.toml").write_text(EMCEE.replace("walkers = 16", "walkers = 18"))
+    assert "[sampler] walkers differ" in call("run", "oscillator.toml", "--out", "parts", code=1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("steps = 60", "", "[sampler] steps: this key is missing; emcee needs the number of its iterations"),
+        ("walkers = 16", "walkers = 15", "emcee needs an even number of 8 walkers or more, two per parameter; got 15"),
+        ("steps = 60", "steps = 60\nguide = true", "[sampler] guide: emcee has no such setting"),
+        ("steps = 60", "steps = 60\ndiscard = 60", "[sampler] discard: expected fewer than steps = 60; got 60"),
+        ('kind = "emcee"', 'kind = "smc"\ndiscard = 3', "[sampler] discard: smc has no burn-in"),
+        ('kind = "emcee"', 'kind = "mcmc"', "[sampler] kind: expected one of smc, tmcmc, emcee"),
+        (
+            "[prediction]",
+            "[budget]\nmax_simulations = 90\n[prediction]",
+            "[budget] max_simulations: emcee makes walkers",
+        ),
+    ],
+)
+def test_wrong_settings_of_emcee_are_named(folder, old, new, message):  # noqa: F811
+    assert old in EMCEE
+    (folder / "oscillator.toml").write_text(EMCEE.replace(old, new, 1))
+    assert message in call("run", "oscillator.toml", "--quiet", code=1)
+    assert not (folder / "results-oscillator").exists()
+
+
+@pytest.mark.slow  # 64 000 simulations
+def test_emcee_and_smc_find_the_same_posterior(folder):  # noqa: F811
+    near = (
+        'stiffness = "normal(1, 0.3)"',
+        'stiffness = "normal(1.1, 0.01)"',
+    )  # one mode: emcee leaves walkers in others
+    (folder / "oscillator.toml").write_text(EMCEE.replace(*near).replace("steps = 60", "steps = 4000\ndiscard = 1000"))
+    call("run", "oscillator.toml", "--quiet", "--out", "emcee")
+    (folder / "oscillator.toml").write_text(OSCILLATOR.replace(*near).replace("walkers = 20", "walkers = 200"))
+    call("run", "oscillator.toml", "--quiet", "--out", "smc")
+    found = []
+    for name in ("emcee", "smc"):
+        with open(f"{name}/summary.csv", newline="") as file:
+            rows = list(csv.DictReader(file))
+        found.append({key: np.array([float(row[key]) for row in rows]) for key in ("mean", "mean_error", "sd")})
+    ours, theirs = found
+    error = np.hypot(ours["mean_error"], theirs["mean_error"])
+    assert (np.abs(ours["mean"] - theirs["mean"]) < 4.0 * error).all()
+    assert (np.abs(np.log(ours["sd"] / theirs["sd"])) < 0.25).all()
