@@ -31,7 +31,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..probability.inputs import as_points
-from ..probability.noise import noise_time_shifts
+from ..probability.noise import noise_time_shifts, noise_under
 from ..probability.time_shift_noise import TimeShiftNoise
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
@@ -200,6 +200,9 @@ def propagate(
     state = chosen_state(source.model, record, from_state)
     excitation = excite(source.model, record, state, rest)
     model, n_steps = excitation.model, excitation.n_steps
+    if record is not None and noise and hasattr(source.noise, "under"):
+        source = source._replace(noise=noise_under(source.noise, model, excitation.first))
+        _, sample_noise = split_samples(source, samples, noise, True)
     wanted = quantity if isinstance(quantity, Mapping) else {"": quantity}
     if not wanted:
         raise ValueError("quantity: expected at least one quantity by name; got none")

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..signals.channels import Channel, Measurements
 from .grouped_errors import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
-from .noise import HALF_LOG_TWO_PI, PerChannel, options_repr, set_channels
+from .noise import HALF_LOG_TWO_PI, PerChannel, numbers, options_repr, set_channels
 from .sample_counts import SampleCounts
 
 __all__ = ["BandNoise", "BandSums"]
@@ -168,7 +168,7 @@ class BandNoise:
         sensor: PerChannel = None,
         layout: MeasuredLayout | None = None,
     ) -> None:
-        object.__setattr__(self, "edges", tuple(float(edge) for edge in np.ravel(edges)))
+        object.__setattr__(self, "edges", numbers(self, "edges", edges, "[Hz]"))
         ascending = all(low < high for low, high in zip((0.0, *self.edges), self.edges, strict=False))
         if not self.edges or not ascending or not self.edges[-1] < math.inf:
             raise ValueError(

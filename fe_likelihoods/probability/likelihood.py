@@ -25,7 +25,7 @@ from .distributions import Distribution, RandomState
 from .event_noise import join_measurements, named_noise
 from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
 from .marginal_noise import MarginalNoise
-from .noise import Noise, noise_of_part, noise_statistic, noise_time_shifts
+from .noise import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under
 from .parameters import Parameter, describe_parameters
 from .report import simulation_report
 
@@ -120,7 +120,7 @@ class FELikelihood(CachedSimulations):
         measurements = match_measurements(model, join_measurements(model, measurements))
         noise = named_noise(model, measurements, noise)
         check_noise_channels(model, noise)
-        self.noise = noise_of_part(noise, measurements)
+        self.noise = noise_under(noise_of_part(noise, measurements), model)
         structural, others = tuple(model.parameter_names), tuple(self.noise.parameter_names)
         self.parameter_names = structural + others
         if len(set(self.parameter_names)) != len(self.parameter_names):

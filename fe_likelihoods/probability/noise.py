@@ -14,8 +14,8 @@ Which noise to take:
 ``GaussianNoise(channels, effective_samples=n_eff)``      Correlated errors without more parameters; `n_eff` is
                                                           estimated from residuals.
 ``SharedGaussianNoise.of(measurements)``                  One unknown standard deviation for all channels.
-``ModulatedNoise(channels, window=1.0, sensor=...)``      Standard deviations that follow the envelope of the simulated
-                                                          response, for predictions of weaker or stronger motions.
+``ModulatedNoise(channels, window=1.0, sensor=...)``      Shares of the level of the simulated response in time, for
+                                                          predictions of weaker or stronger motions and of other tests.
 ``BandNoise(channels, (1.0, 5.0), sensor=...)``           Errors that are correlated in time: shares of the response in
                                                           bands of frequency, for predictions of other motions.
 ``RelativeNoise.of(measurements)``                        Standard deviations that are shares of the response levels.
@@ -44,10 +44,13 @@ __all__ = [
     "GaussianNoise",
     "Noise",
     "SharedGaussianNoise",
+    "as_number",
     "noise_channels",
     "noise_of_part",
     "noise_statistic",
     "noise_time_shifts",
+    "noise_under",
+    "numbers",
     "options_repr",
     "set_channels",
     "set_effective",
@@ -83,6 +86,8 @@ class Noise(Protocol):
       measured samples, for checks of residuals and for the log-likelihood in blocks of time.
     * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed where it
       depends on their number or times. A likelihood calls it with its own measurements.
+    * ``under(model, first)``, which returns the noise under the excitation of a model whose response begins at the step
+      ``first``; called by a likelihood with its model, and by a prediction with the model under the predicted record.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
       predictions with autoregressive noise.
     """
@@ -119,6 +124,22 @@ def noise_time_shifts(noise: Noise) -> Mapping[str, float] | None:
 def noise_of_part(noise: Noise, measurements: Measurements) -> Noise:
     """Noise of a part of the measurements: the same, unless it has a method ``with_measurements``."""
     return noise.with_measurements(measurements) if hasattr(noise, "with_measurements") else noise
+
+
+def noise_under(noise: Noise, model: Any, first: int = 0) -> Noise:
+    """Noise under the excitation of a model: the same, unless it has a method ``under``."""
+    return noise.under(model, first) if hasattr(noise, "under") else noise
+
+
+def as_number(noise: Any, what: str, value: Any, unit: str) -> float:
+    """A number that a user gave for a noise; ValueError in words for anything else, such as a text with a unit."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{type(noise).__name__}: {what} must be a number {unit}; got {value!r}: give the number alone; "
+            'to_si(0.02, "g") converts other units'
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -259,8 +280,8 @@ class SharedGaussianNoise:
         sensor: PerChannel = None,
         effective_samples: PerChannel = None,
     ) -> None:
-        object.__setattr__(self, "scales", tuple(float(scale) for scale in scales))
         channels = tuple(channels)
+        object.__setattr__(self, "scales", numbers(self, "scales", scales, "[SI unit of the channel]"))
         if not channels or len(self.scales) != len(channels):
             raise ValueError(
                 f"SharedGaussianNoise expects one scale per channel; got {len(channels)} channels and "
@@ -370,12 +391,18 @@ def _per_channel(noise: Any, what: str, given: PerChannel, default: float) -> tu
                 f"{', '.join(names)}"
             )
         given = [given.get(name, default) for name in names]
-    values = tuple(float(value) for value in np.ravel(given))
+    values = numbers(noise, what, given, "per channel" if what == "effective_samples" else "[SI unit of the channel]")
     if len(values) != len(names):
         raise ValueError(
             f"{type(noise).__name__}: {what} must be one number for each of {', '.join(names)}; got {len(values)}"
         )
     return values
+
+
+def numbers(noise: Any, what: str, given: Any, unit: str) -> tuple[float, ...]:
+    """Numbers that a user gave for a noise, in any sequence; see `as_number`."""
+    listed = [given] if isinstance(given, str) else np.ravel(np.asarray(given, dtype=object))
+    return tuple(as_number(noise, what, value, unit) for value in listed)
 
 
 def options_repr(sensor: tuple[float, ...] | None, effective_samples: tuple[float, ...] | None = None) -> list[str]:

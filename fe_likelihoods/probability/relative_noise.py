@@ -23,7 +23,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from .noise import PerChannel, options_repr, set_channels, set_effective, total_deviations, white_log_likelihood
+from .noise import (
+    PerChannel,
+    as_number,
+    numbers,
+    options_repr,
+    set_channels,
+    set_effective,
+    total_deviations,
+    white_log_likelihood,
+)
 from .sample_counts import SampleCounts
 
 __all__ = ["RelativeNoise", "local_level"]
@@ -88,15 +97,16 @@ class RelativeNoise:
         effective_samples: PerChannel = None,
     ) -> None:
         channels = tuple(channels)
-        object.__setattr__(self, "levels", tuple(float(level) for level in levels))
+        object.__setattr__(self, "levels", numbers(self, "levels", levels, "[SI unit of the channel]"))
         if len(self.levels) != len(channels) or not all(0.0 < level < math.inf for level in self.levels):
             raise ValueError(
                 f"RelativeNoise expects one positive response level for each of {len(channels)} channels; got "
                 f"{self.levels}: leave out channels without a signal"
             )
+        window = None if window is None else as_number(self, "window", window, "[s], or None")
         if window is not None and not 0.0 < window < math.inf:
             raise ValueError(f"RelativeNoise: window must be a positive length [s], or None; got {window!r}")
-        object.__setattr__(self, "window", None if window is None else float(window))
+        object.__setattr__(self, "window", window)
         set_channels(self, channels, sensor)
         set_effective(self, effective_samples)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.interpolation import POINTS
-from .noise import GaussianNoise, SharedGaussianNoise
+from .noise import GaussianNoise, SharedGaussianNoise, as_number
 from .sample_counts import SampleCounts
 
 __all__ = ["TimeShiftNoise"]
@@ -69,13 +69,21 @@ class TimeShiftNoise:
                 "TimeShiftNoise"
             )
         names = [channel.name for channel in noise.channels]
+        if not isinstance(time_shifts, Mapping):
+            raise ValueError(
+                f"TimeShiftNoise expects the largest shifts [s] by the names of channels, such as {{{names[0]!r}: "
+                f"0.05}}; got {time_shifts!r}"
+            )
         unknown = sorted(set(time_shifts) - set(names))
         if unknown or not time_shifts:
             raise ValueError(
                 f"TimeShiftNoise expects the largest shifts of some of the channels {', '.join(names)}; got "
                 f"{dict(time_shifts)!r}"
             )
-        shifts = tuple((name, float(time_shifts[name])) for name in names if name in time_shifts)
+        shifts = tuple(
+            (name, as_number(self, "time_shifts", time_shifts[name], "[s]")) for name in names if name in time_shifts
+        )
+        dt = as_number(self, "dt", dt, "[s]")
         if not all(0.0 < shift < math.inf for _, shift in shifts) or not 0.0 < dt < math.inf:
             raise ValueError(
                 f"TimeShiftNoise expects positive largest shifts and a positive step, in seconds; got {dict(shifts)!r} "
@@ -83,7 +91,7 @@ class TimeShiftNoise:
             )
         object.__setattr__(self, "noise", noise)
         object.__setattr__(self, "shifts", shifts)
-        object.__setattr__(self, "dt", float(dt))
+        object.__setattr__(self, "dt", dt)
 
     @property
     def channels(self) -> Sequence[Channel]:

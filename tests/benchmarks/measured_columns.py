@@ -8,10 +8,12 @@ are those of the first column. The rows are explained in `tests.benchmarks.measu
 
 from dataclasses import replace
 
-from fe_likelihoods import dissipated_energy, peak
+import numpy as np
+
+from fe_likelihoods import ModulatedNoise, dissipated_energy, peak, propagate
 
 from . import tested_column
-from .measured_transfer import Case, calibrate, ratios_of, score_case, skipped, within
+from .measured_transfer import CachedResponses, Case, Fit, calibrate, ratios_of, score_case, skipped, within
 from .rows import Row
 from .tested_column import PRIOR, PROPERTIES, SENSOR, SIGMA, Specimen, first_half, specimen
 
@@ -34,22 +36,47 @@ def columns(repeats: int = 1) -> list[Row]:
         return rows
     tests = [specimen(name, file) for name, file in _TESTS.items()]
     tests = [each._replace(model=replace(each.model, geometry="linear")) for each in tests]
-    model, measured = first_half(tests[0])
+    calibrated, measured = first_half(tests[0])
     rows, scored = [], []
     for seed in range(1, repeats + 1):
-        fit = calibrate(model, measured, PRIOR, SIGMA, seed, walkers=_WALKERS, draws=_DRAWS)
-        rows.append(Row("simulations of the calibration", f"seed {seed}", fit.simulations, ""))
+        fit, modulated = (
+            calibrate(calibrated, measured, PRIOR, SIGMA, seed, noise=noise, walkers=_WALKERS, draws=_DRAWS)
+            for noise in (None, _noise(tests[0]))
+        )
+        for kind, each in (("white", fit), ("modulated", modulated)):
+            rows.append(Row("simulations of the calibration", f"{kind}, seed {seed}", each.simulations, ""))
         half = tests[0].parts["first half"]
-        ratios = ratios_of(fit, model, _numbers(tests[0], half, half))
+        ratios = ratios_of(fit, calibrated, _numbers(tests[0], half, half))
         for test in tests:
+            model = CachedResponses(test.model)
+            growth = _growth(test, model, fit)
+            rows.append(Row("growth of the error, power of the drift", f"{test.name}, seed {seed}", growth, ""))
             for label, part in test.parts.items():
                 if test is not tests[0] or label != "first half":
                     numbers = _numbers(test, part, slice(None))
-                    case = Case(f"{test.name}, {label}", test.model, test.measured, part, numbers)
-                    found, each = score_case(case, fit, _WINDOW, ratios, SENSOR, seed)
+                    name = f"{test.name}, {label}"
+                    case = Case(name, model, test.measured, part, numbers, _noise(test))
+                    found, each = score_case(case, fit, modulated, ratios, seed)
                     rows += found
                     scored.append(each)
     return rows + within(scored)
+
+
+def _growth(test: Specimen, model: CachedResponses, fit: Fit) -> float:
+    """Power of the drift with which the error of the mean response grows, by least squares over twelfths of a test."""
+    kept = slice(0, test.parts["second half"].stop)
+    mean = propagate(model, fit.structure, quantiles=(), progress=False).mean[0, kept]
+    error = np.square(test.measured.values[0, kept] - mean)
+    reached = np.maximum.accumulate(np.abs(test.model.loading.displacement[kept]))
+    parts = np.array_split(np.arange(len(error)), 12)
+    sizes = [[np.log(reached[part].mean()), 0.5 * np.log(error[part].mean())] for part in parts]
+    return float(np.polyfit(*np.transpose(sizes), 1)[0])
+
+
+def _noise(test: Specimen) -> ModulatedNoise:
+    """Shares of the level of the force at a drift of 1 %."""
+    model = test.model
+    return ModulatedNoise(model.channels, window=_WINDOW, sensor=[SENSOR], deformation=0.01 * model.height)
 
 
 def _numbers(test: Specimen, part: slice, kept: slice) -> dict:

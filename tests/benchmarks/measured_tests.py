@@ -16,6 +16,7 @@ from fe_likelihoods import (
     LinearStructure,
     LogNormal,
     Measurements,
+    ModulatedNoise,
     Record,
     ShearFrame,
     Steel,
@@ -62,18 +63,20 @@ def coupon(repeats: int = 1) -> list[Row]:
     prior = {name: TruncatedNormal(1.0, each) for name, each in sd.items()}
     (name,) = (channel.name for channel in model.channels)
     later = slice(half, None)
+    noise = ModulatedNoise(whole.channels, window=20 * model.dt, sensor=[1.5 * _MPA], deformation=0.01)
     case = Case(
         "coupon, second half",
         whole,
         Measurements(whole.channels, whole.dt, stress[None]),
         later,
         {"peak": peak(name, later), "energy": dissipated_energy(name, strain, later)},
+        noise,
     )
     rows, scored = [], []
     for seed in range(1, repeats + 1):
-        fit = calibrate(model, measured, prior, 50 * _MPA, seed)
+        fit, modulated = (calibrate(model, measured, prior, 50 * _MPA, seed, noise=each) for each in (None, noise))
         ratios = ratios_of(fit, model, {"peak": peak(name), "energy": dissipated_energy(name, strain[:half])})
-        found, numbers = score_case(case, fit, 20 * model.dt, ratios, 1.5 * _MPA, seed)
+        found, numbers = score_case(case, fit, modulated, ratios, seed)
         rows += found
         scored.append(numbers)
     return rows + within(scored)
@@ -90,6 +93,9 @@ def frame(repeats: int = 1) -> list[Row]:
     data = Measurements(raw.channels, raw.dt, raw.values - rest.mean(axis=1, keepdims=True))
     sensor = float(rest[1:].std(axis=1).mean())
 
+    def noise(floors: tuple[str, ...]) -> ModulatedNoise:
+        return ModulatedNoise(data.select(floors).channels, window=0.5, sensor=[sensor] * len(floors))
+
     def structure(floors: tuple[str, ...], shaking: str) -> LinearStructure:
         start, stop = _SHAKINGS[shaking]
         table = Record("table", data.dt, data.channel("table")).trim(_REST, stop)
@@ -102,15 +108,16 @@ def frame(repeats: int = 1) -> list[Row]:
     prior |= {f"damping_{i}": LogNormal(0.01, 1.0) for i in (1, 2, 3)}
     rows, scored = [], []
     for seed in range(1, repeats + 1):
-        fit = calibrate(model, measured, prior, 3.0, seed)
+        fit, modulated = (calibrate(model, measured, prior, 3.0, seed, noise=each) for each in (None, noise(used)))
         known = ratios_of(fit, model, _of_accelerations(used))
         for what in ("peak", "energy"):  # of the floor that was not measured: between the two others
             known[f"{what} floor2"] = np.sqrt(known[f"{what} floor1"] * known[f"{what} floor3"])
         for shaking in ("shaking 2", "shaking 3"):
             floors = tuple(_FLOORS)
             later = data.select(floors).trim(*_SHAKINGS[shaking])
-            case = Case(f"frame, {shaking}", structure(floors, shaking), later, slice(None), _of_accelerations(floors))
-            found, numbers = score_case(case, fit, 0.5, known, sensor, seed)
+            predicted, numbers = structure(floors, shaking), _of_accelerations(floors)
+            case = Case(f"frame, {shaking}", predicted, later, slice(None), numbers, noise(floors))
+            found, numbers = score_case(case, fit, modulated, known, seed)
             rows += found
             scored.append(numbers)
     return rows + within(scored)
@@ -131,11 +138,12 @@ def meloland(repeats: int = 1) -> list[Row]:
 
     weak, strong = structure(*_MELOLAND_PARTS["weak"]), structure(*_MELOLAND_PARTS["strong"])
     prior = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share": Uniform(0.0, 1.0)}
+    noise = ModulatedNoise([channel], window=1.0, sensor=[0.002])
     rows, scored = [], []
     for seed in range(1, repeats + 1):
-        fit = calibrate(*weak, prior, 1.0, seed)
-        case = Case("Meloland, strong part", *strong, slice(None), _of_accelerations(("ch7",)))
-        found, numbers = score_case(case, fit, 1.0, ratios_of(fit, weak[0], case.numbers), 0.002, seed)
+        fit, modulated = (calibrate(*weak, prior, 1.0, seed, noise=each) for each in (None, noise))
+        case = Case("Meloland, strong part", *strong, slice(None), _of_accelerations(("ch7",)), noise)
+        found, numbers = score_case(case, fit, modulated, ratios_of(fit, weak[0], case.numbers), seed)
         rows += found
         scored.append(numbers)
     return rows + within(scored)

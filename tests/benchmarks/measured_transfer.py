@@ -8,6 +8,8 @@ made in several ways:
   for the whole motion; "window": the level within a window around each sample. All three have the same posterior of
   the structure, because a share is a standard deviation divided by a constant, and the
   prior of the share is that of the standard deviation divided by the same constant;
+* "modulated": shares of the level of the simulated response (`ModulatedNoise` with its default settings, and with the
+  imposed deformation of a test that has one), calibrated with this noise: another posterior of the structure;
 * "ratios", for numbers such as peaks: the response without noise, times the ratio of measured to fitted value in the
   calibration, with a stated guess of its spread between events (`EventRatios`).
 
@@ -27,6 +29,7 @@ from fe_likelihoods import (
     GaussianNoise,
     HalfNormal,
     Measurements,
+    ModulatedNoise,
     Posterior,
     QuantityScores,
     RelativeNoise,
@@ -35,12 +38,13 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.prediction.quantities import ChannelQuantity, measured_quantity
 from fe_likelihoods.prediction.score_tables import score_values
+from fe_likelihoods.probability.response_levels import imposed_deformation
 from samplers import SMCSampler
 
 from .rows import Row
 from .targets import SHARED
 
-__all__ = ["GUESS", "Case", "Fit", "calibrate", "ratios_of", "score_case", "skipped", "within"]
+__all__ = ["GUESS", "CachedResponses", "Case", "Fit", "calibrate", "ratios_of", "score_case", "skipped", "within"]
 
 GUESS = {"prior_sd": 0.1, "prior_events": 3.0}
 """Stated spread between events of the logarithm of measured / fitted, worth three events (assumed)."""
@@ -61,6 +65,8 @@ class Case(NamedTuple):
         The samples that are scored.
     numbers : mapping of str to ChannelQuantity
         Numbers that are scored, such as the peak in this part.
+    noise : ModulatedNoise
+        Noise of its channels; the calibration with this kind of noise has the same settings.
     """
 
     name: str
@@ -68,17 +74,18 @@ class Case(NamedTuple):
     measured: Measurements
     part: slice
     numbers: Mapping[str, ChannelQuantity]
+    noise: ModulatedNoise
 
 
 class Fit(NamedTuple):
-    """Samples of a calibration: parameters of the structure, and the standard deviation of each channel [SI].
+    """Samples of a calibration: parameters of the structure, and the standard deviation of each channel.
 
     Attributes
     ----------
     structure : ndarray, shape (n, n_parameters)
         Parameters of the structure.
     sigma : ndarray, shape (n, n_channels)
-        Standard deviations of the errors.
+        Standard deviations of the errors [SI]; with `ModulatedNoise` their shares of the level [-].
     measured : Measurements
         The measurements of the calibration, whose root mean squares are the levels of the shares.
     simulations : int
@@ -97,6 +104,7 @@ class CachedResponses:
     def __init__(self, model: Any) -> None:
         self.parameter_names, self.channels = model.parameter_names, model.channels
         self.dt, self.n_steps, self.fingerprint = model.dt, model.n_steps, model.fingerprint
+        self.deformation = imposed_deformation(model)
         self._model, self._responses = model, {}
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
@@ -121,15 +129,21 @@ def calibrate(
     scale: float,
     seed: int,
     *,
+    noise: ModulatedNoise | None = None,
     walkers: int = 300,
     draws: int = 200,
 ) -> Fit:
-    """Sample the posterior with SMC, white noise; `scale` is that of the prior of all standard deviations [SI].
+    """Sample the posterior with SMC, white noise or `noise`.
 
-    `draws` of the samples are kept for predictions.
+    The prior of all standard deviations has the scale `scale` [SI], that of shares this scale divided by the root mean
+    square of the measured channel. `draws` of the samples are kept for predictions.
     """
-    noise = GaussianNoise(model.channels)
-    whole = dict(prior) | {name: HalfNormal(scale) for name in noise.parameter_names}
+    levels = (
+        np.sqrt(np.nanmean(np.square(measured.values), axis=1)) if noise is not None else np.ones(measured.n_channels)
+    )
+    noise = GaussianNoise(model.channels) if noise is None else noise
+    scales = dict(zip(noise.parameter_names, scale / levels, strict=True))
+    whole = dict(prior) | {name: HalfNormal(float(each)) for name, each in scales.items()}
     posterior = Posterior(FELikelihood(model, measured, noise), whole)
     sampler = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=seed)
     sampler.run_mcmc(None, 2, progress=False)
@@ -146,7 +160,7 @@ def ratios_of(fit: Fit, model: Any, quantities: Mapping[str, ChannelQuantity]) -
 
 
 def score_case(
-    case: Case, fit: Fit, window: float, ratios: Mapping[str, float], sensor: float | None, seed: int
+    case: Case, fit: Fit, modulated: Fit, ratios: Mapping[str, float], seed: int
 ) -> tuple[list[Row], dict[str, QuantityScores]]:
     """Rows of a case, and the scores of its numbers by way to predict.
 
@@ -154,14 +168,10 @@ def score_case(
     ----------
     case : Case
         What is predicted. Channels that were not calibrated have the mean noise of those that were.
-    fit : Fit
-        The calibration.
-    window : float
-        Window of the relative noise [s].
+    fit, modulated : Fit
+        The calibrations with white noise and with `ModulatedNoise`.
     ratios : mapping of str to float
         Ratios of measured to fitted numbers in the calibration.
-    sensor : float, optional
-        Known noise of the sensors [SI], the floor of the relative noise.
     seed : int
         Seed of the noise and of the ratios.
     """
@@ -169,21 +179,23 @@ def score_case(
     levels = np.sqrt(np.nanmean(np.square(fit.measured.values), axis=1))
     channels = case.model.channels
     columns = [calibrated.index(c.name) if c.name in calibrated else None for c in channels]
-    sigma = np.stack([fit.sigma.mean(axis=1) if k is None else fit.sigma[:, k] for k in columns], axis=1)
-    shares = fit.sigma / levels
-    shares = np.stack([shares.mean(axis=1) if k is None else shares[:, k] for k in columns], axis=1)
-    floor = None if sensor is None else (sensor,) * len(channels)
-    unused = np.ones(len(channels))  # levels act in a likelihood only
+
+    def of_channels(values: np.ndarray) -> np.ndarray:
+        return np.stack([values.mean(axis=1) if k is None else values[:, k] for k in columns], axis=1)
+
+    shares, unused = np.minimum(of_channels(fit.sigma / levels), 0.99), np.ones(len(channels))
+    options = {"sensor": case.noise.sensor}  # and levels of one, which act in a likelihood only
     kinds = {
-        "SI": (GaussianNoise(channels), sigma),
-        "relative": (RelativeNoise(channels, unused, sensor=floor), np.minimum(shares, 0.99)),
-        "window": (RelativeNoise(channels, unused, window=window, sensor=floor), np.minimum(shares, 0.99)),
+        "SI": (GaussianNoise(channels), fit.structure, of_channels(fit.sigma)),
+        "relative": (RelativeNoise(channels, unused, **options), fit.structure, shares),
+        "window": (RelativeNoise(channels, unused, window=case.noise.window, **options), fit.structure, shares),
+        "modulated": (case.noise, modulated.structure, of_channels(modulated.sigma)),
     }
     model, rows, scored = CachedResponses(case.model), [], {}
     quantities = list(case.numbers.values())
-    for way, (noise, parameters) in kinds.items():
+    for way, (noise, structure, parameters) in kinds.items():
         likelihood = FELikelihood(model, case.measured, noise)
-        samples = np.hstack([fit.structure, parameters])
+        samples = np.hstack([structure, parameters])
         histories = propagate(likelihood, samples, noise=True, seed=seed, progress=False)
         scores = histories.score(case.measured, part=case.part)
         for k, channel in enumerate(channels):

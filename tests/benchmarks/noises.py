@@ -60,7 +60,9 @@ NOISES: dict[str, Callable[[Measurements], Noise]] = {
     "white": lambda measured: GaussianNoise(measured.channels, sensor=_floor(measured)),
     "autoregressive": lambda measured: AutoregressiveNoise(measured.channels, sensor=_floor(measured)),
     "relative": lambda measured: RelativeNoise.of(measured, window=_WINDOW, sensor=_floor(measured)),
-    "modulated": lambda measured: ModulatedNoise(measured.channels, window=_WINDOW, sensor=_floor(measured)),
+    "modulated": lambda measured: _modulated(measured, 0.25),
+    "modulated, half": lambda measured: _modulated(measured, 0.5),
+    "modulated, envelope": lambda measured: _modulated(measured, 1.0),
     "bands, shares": lambda measured: BandNoise(measured.channels, _EDGES, sensor=_floor(measured)),
     "bands, SI": lambda measured: BandNoise(measured.channels, _EDGES, relative=False, sensor=_floor(measured)),
 }
@@ -84,6 +86,10 @@ def noises(repeats: int = 1) -> list[Row]:
 
 def _floor(measured: Measurements) -> list[float]:
     return [_SENSOR] * measured.n_channels
+
+
+def _modulated(measured: Measurements, local: float) -> ModulatedNoise:
+    return ModulatedNoise(measured.channels, window=_WINDOW, sensor=_floor(measured), local=local)
 
 
 def _prior_of(name: str) -> Uniform | HalfNormal:

@@ -8,6 +8,7 @@ from scipy import stats
 from scipy.fft import dct
 
 from fe_likelihoods import (
+    AutoregressiveNoise,
     BandNoise,
     Channel,
     Events,
@@ -22,7 +23,9 @@ from fe_likelihoods import (
     Posterior,
     Record,
     RelativeNoise,
+    SharedGaussianNoise,
     SimulationCache,
+    TimeShiftNoise,
     TruncatedNormal,
     find_modes,
     propagate,
@@ -70,8 +73,9 @@ def covariance(kind, history, parameters, channel, dt=DT):
     n, sensor = len(history), SENSOR[channel]
     if kind == "modulated":
         parts = np.floor(dt * np.arange(n) / (WINDOW / 3.0) + 1e-9)
-        envelope = [np.sqrt(np.mean(history[np.abs(parts - part) <= 1] ** 2)) for part in parts]
-        return np.diag(sensor**2 + (parameters[channel] * np.array(envelope)) ** 2)
+        envelope = [np.mean(history[np.abs(parts - part) <= 1] ** 2) for part in parts]
+        level = 0.75 * np.mean(history**2) + 0.25 * np.array(envelope)
+        return np.diag(sensor**2 + parameters[channel] ** 2 * level)
     time = np.arange(n)
     basis = np.sqrt(2.0 / n) * np.cos(np.pi * np.outer(time, time + 0.5) / n)
     basis[0] /= np.sqrt(2.0)
@@ -161,7 +165,7 @@ def test_draws_have_the_covariance_of_the_density(kind, rng):
         quantiles = prediction.quantile(0.95)[c] - prediction.quantile(0.05)[c]
         assert np.mean(quantiles / (2.0 * 1.6449 * sd)) == pytest.approx(1.0, abs=0.04)
         if kind == "modulated":
-            assert sd.max() > 5.0 * sd.min() and np.abs(lag_one).max() == 0.0
+            assert sd.max() > 1.5 * sd.min() and np.abs(lag_one).max() == 0.0
         elif channel.name == "top":
             assert np.abs(lag_one).mean() > 0.2
 
@@ -383,6 +387,9 @@ def test_what_is_wrong_is_refused():
         ModulatedNoise(CHANNELS, window=1.0, sensor={"top": 0.1})
     with pytest.raises(ValueError, match="window must be a positive length"):
         ModulatedNoise(CHANNELS, window=0.0, sensor=SENSOR)
+    for local in (-0.1, 1.1):
+        with pytest.raises(ValueError, match="local must be from 0"):
+            ModulatedNoise(CHANNELS, window=1.0, sensor=SENSOR, local=local)
     with pytest.raises(ValueError, match="at least three steps"):
         FELikelihood(MODEL, measured(response([1.0])), ModulatedNoise(CHANNELS, window=0.05, sensor=SENSOR))
     for edges in ((), (2.0, 1.0), (0.0, 1.0), (np.inf,)):
@@ -404,6 +411,32 @@ def test_what_is_wrong_is_refused():
         fitted.log_likelihood(np.zeros((1, len(fitted.statistic(gaps, gaps)))), 100, np.ones((1, 2)))
 
 
+@pytest.mark.parametrize(
+    ("make", "what"),
+    [
+        (lambda: GaussianNoise(CHANNELS, sensor="0.02 g"), "GaussianNoise: sensor"),
+        (lambda: GaussianNoise(CHANNELS, sensor={"top": "0.02 g"}), "GaussianNoise: sensor"),
+        (lambda: GaussianNoise(CHANNELS, sensor={"top": None}), "GaussianNoise: sensor"),
+        (lambda: GaussianNoise(CHANNELS, effective_samples="few"), "GaussianNoise: effective_samples"),
+        (lambda: SharedGaussianNoise(CHANNELS, ["1 g", "2 mm"]), "SharedGaussianNoise: scales"),
+        (lambda: AutoregressiveNoise(CHANNELS, sensor="0.02 g"), "AutoregressiveNoise: sensor"),
+        (lambda: ModulatedNoise(CHANNELS, window="1 s", sensor=SENSOR), "ModulatedNoise: window"),
+        (lambda: ModulatedNoise(CHANNELS, window=1.0, sensor="0.02 g"), "ModulatedNoise: sensor"),
+        (lambda: ModulatedNoise(CHANNELS, window=1.0, sensor=SENSOR, local="half"), "ModulatedNoise: local"),
+        (lambda: ModulatedNoise(CHANNELS, window=1.0, sensor=SENSOR, deformation="1 %"), "ModulatedNoise: deformation"),
+        (lambda: RelativeNoise(CHANNELS, "1 g"), "RelativeNoise: levels"),
+        (lambda: RelativeNoise(CHANNELS, (1.0, 1.0), window="1 s"), "RelativeNoise: window"),
+        (lambda: BandNoise(CHANNELS, "1 Hz", sensor=SENSOR), "BandNoise: edges"),
+        (lambda: BandNoise(CHANNELS, None, sensor=SENSOR), "BandNoise: edges"),
+        (lambda: TimeShiftNoise(GaussianNoise(CHANNELS), {"top": "0.1 s"}, DT), "TimeShiftNoise: time_shifts"),
+        (lambda: TimeShiftNoise(GaussianNoise(CHANNELS), {"top": 0.1}, "0.02 s"), "TimeShiftNoise: dt"),
+    ],
+)
+def test_what_is_no_number_is_refused_in_words(make, what):
+    with pytest.raises(ValueError, match=rf"^{what} must be a number .*; got .*to_si"):
+        make()
+
+
 @pytest.mark.parametrize("kind", ["modulated", "shares in bands"])
 def test_events_have_levels_of_their_own_response(kind, rng):
     """Two events with a pause, of which the second is ten times weaker: the shares are those of both."""
@@ -423,6 +456,15 @@ def test_events_have_levels_of_their_own_response(kind, rng):
         own = noise.with_measurements(Measurements(model.channels, DT, part))
         single[window.name] = Measurements(model.channels, DT, part + draw(own, parameters, part, rng))
     likelihood = FELikelihood(model, single, noise)
+    if kind == "modulated":  # in the likelihood and in a prediction of both, the level of each event is its own
+        both = likelihood.noise.response_deviations(parameters, simulated, DT)
+        for window in events.windows:
+            part = simulated[:, window.samples]
+            own = noise.with_measurements(Measurements(model.channels, DT, part))
+            alone = own.response_deviations(parameters, part)
+            # apart from the parts of the window at both ends, which contain samples of the pause
+            np.testing.assert_allclose(both[:, window.samples][:, 30:-30], alone[:, 30:-30], rtol=0.02)
+        assert likelihood.noise.under(LinearOscillator(strong)).excited.events == ()
     if kind == "shares in bands":  # each event is a stretch, and its density that of its own
         expected = 0.0
         for window in events.windows:

@@ -1,0 +1,127 @@
+r"""Level of a response in time, of which the error of a model is a share.
+
+The squared level in part p of the time is a mean of the squared envelope and of the mean square of the whole response,
+
+.. math:: l_p^2 = \left(\frac{d_p}{d_0}\right)^{2 \gamma} \left[ (1 - w)\, R^2 + w\, e_p^2 \right],
+
+because errors of a model last longer than the strong response that causes them. The first factor is for tests with an
+imposed deformation: the error grows with the largest deformation :math:`d_p` reached so far. See
+``docs/theory/noise.rst``.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .event_noise import find_events
+
+__all__ = ["Excited", "excited_parts", "imposed_deformation", "squared_levels"]
+
+_ROUND_OFF = 1e-6  # of a part
+
+
+class Excited(NamedTuple):
+    """What the level needs of the excitation of a model, for equal parts of the time from the time zero on.
+
+    Attributes
+    ----------
+    events : tuple of int
+        Number of the event, or of the pause, of each part: each has a mean square of its own. Empty for one event.
+    reached : tuple of float
+        Largest deformation up to the middle of each part [m, or - for a strain]. Empty for no imposed deformation.
+    """
+
+    events: tuple[int, ...] = ()
+    reached: tuple[float, ...] = ()
+
+
+def imposed_deformation(model: Any) -> np.ndarray | None:
+    """Deformation (n_steps,) [m, or - for a strain] that a test imposes on a model; None for other excitations.
+
+    That of the attribute ``deformation``, else of ``loading.displacement`` or ``record.displacement``
+    (`fe_likelihoods.DisplacementHistory`), else of ``strain`` (`fe_likelihoods.SteelCoupon`).
+    """
+    histories = (getattr(getattr(model, name, None), "displacement", None) for name in ("loading", "record"))
+    for found in (getattr(model, "deformation", None), *histories, getattr(model, "strain", None)):
+        if found is not None and np.shape(found) == (model.n_steps,):
+            return np.asarray(found, dtype=float)
+    return None
+
+
+def excited_parts(model: Any, part: float, first: int = 0) -> Excited:
+    """Events and deformations of a model in parts of the time.
+
+    Parameters
+    ----------
+    model : Model
+        The model under its excitation.
+    part : float
+        Length of a part [s].
+    first : int
+        Step of the response that is the time zero.
+
+    Returns
+    -------
+    Excited
+    """
+    time = model.dt * (np.arange(model.n_steps) - first)
+    middle = part * (np.arange(int(np.floor(time[-1] / part + _ROUND_OFF)) + 1) + 0.5)
+    events, deformation, numbers, reached = find_events(model), imposed_deformation(model), (), ()
+    if events is not None:
+        edges = np.ravel([(each.start, each.end) for each in events.windows]) - first * model.dt
+        numbers = tuple(np.searchsorted(edges, middle).tolist())
+    if deformation is not None:
+        reached = tuple(np.interp(middle, time, np.maximum.accumulate(np.abs(deformation))).tolist())
+    return Excited(numbers, reached)
+
+
+def squared_levels(
+    sums: np.ndarray, counts: np.ndarray, local: float, excited: Excited, reference: float | None, growth: float
+) -> np.ndarray:
+    """Squared levels of responses in each part of the time.
+
+    Parameters
+    ----------
+    sums : (n, n_parts, n_channels) float
+        Sums of squares of n responses [SI unit of the channel, squared].
+    counts : (n_parts, n_channels) int
+        Number of samples.
+    local : float
+        Weight w of the envelope, the mean square of a part and its two neighbours; 1 - w is that of the mean square of
+        the event.
+    excited : Excited
+        Events and deformations of the parts.
+    reference : float or None
+        Deformation at which the factor of the growth is one; None for no growth.
+    growth : float
+        Exponent of the deformation reached.
+
+    Returns
+    -------
+    (n, n_parts, n_channels) float
+        [SI unit of the channel, squared].
+    """
+    n_parts, whole = len(counts), np.empty(sums.shape)
+    numbers = _of_parts(excited.events or (0,), n_parts)
+    for number in np.unique(numbers):
+        inside = numbers == number
+        total = np.maximum(counts[inside].sum(axis=0), 1)
+        whole[:, inside] = sums[:, inside].sum(axis=1, keepdims=True) / total
+    near = _with_neighbours(sums) / np.maximum(_with_neighbours(counts), 1)
+    levels = (1.0 - local) * whole + local * near
+    if reference is None:
+        return levels
+    return levels * (_of_parts(excited.reached, n_parts)[:, None] / reference) ** (2.0 * growth)
+
+
+def _of_parts(values: tuple[float, ...], n_parts: int) -> np.ndarray:
+    """Values (n_parts,) of the parts; the last one also for later parts, in which nothing is measured."""
+    return np.array(values)[np.minimum(np.arange(n_parts), len(values) - 1)]
+
+
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
+    """Sums over each part and its two neighbours, in the last axis but one."""
+    total = values.copy()
+    total[..., 1:, :] += values[..., :-1, :]
+    total[..., :-1, :] += values[..., 1:, :]
+    return total
