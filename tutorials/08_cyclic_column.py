@@ -480,8 +480,8 @@ def plot_failure(path: Path) -> None:
         axis.plot(sample, from_si(column.force[part], "kip"), color="k", linewidth=0.9, label="measured")
         for name, colour in (("no failure", GREY), ("literature", ORANGE), ("0.15 and 8", BLUE)):
             axis.plot(sample, from_si(forces[name][part], "kip"), color=colour, linewidth=0.9, label=name)
-        axis.axvline(peak, color=GREY, linestyle=":", linewidth=0.8)
-        axis.set(ylabel="lateral force [kip]", title=f"{column.name}: from the largest force (dotted) to the end")
+        axis.axvline(peak, color="k", linestyle=":", linewidth=1.5)
+        axis.set(ylabel="lateral force [kip]", title=f"{column.name}: before and after the largest force (dotted)")
         axis.grid(alpha=0.25)
     axes[-1].set_xlabel("kept sample")
     figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, ncols=5, loc="outside upper center")
