@@ -82,10 +82,11 @@ class ResponseGuide:
 
     def __init__(self, posterior: Any, starts: int = 8) -> None:
         starts = check_starts(starts)
-        if posterior.likelihood.memory_cache.rows < _FEWEST_CACHED:
+        fewest = min(part.memory_cache.rows for part, _ in posterior.likelihood.parts())
+        if fewest < _FEWEST_CACHED:
             raise ValueError(
                 f"a guide needs a likelihood with memory_rows of {_FEWEST_CACHED} or more, so that no simulation is "
-                f"run twice; got {posterior.likelihood.memory_cache.rows}"
+                f"run twice; got {fewest}"
             )
         self._target = ResponseTarget(posterior)
         self._posterior, self._starts = posterior, starts
@@ -216,6 +217,8 @@ class ResponseGuide:
 
     def _check_memory(self) -> None:
         """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
+        if len(self._posterior.likelihood.parts()) > 1:
+            raise ValueError("asynchronous=True is not possible with a guide of a JointLikelihood: leave it out")
         target, memory = self._target, self._posterior.likelihood.response_memory
         most = self._starts * max(target.n_structural, POINTS_PER_STEP)
         needed = 8 * most * len(target.model.channels) * target.model.n_steps

@@ -20,6 +20,7 @@ from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
 from ..simulation.residual_statistics import needs_response
 from .quadratic import check_quadratic, sums_of_squares
+from .stacked import stack
 
 __all__ = ["Archive", "NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
 
@@ -188,7 +189,7 @@ class ResponseTarget:
 
     def __init__(self, posterior: _Posterior) -> None:
         self.posterior = posterior
-        self._likelihood: _Likelihood = posterior.likelihood
+        self._likelihood: _Likelihood = stack(posterior.likelihood)
         self._prior = posterior.prior
         self.model, self.noise = self._likelihood.model, self._likelihood.noise
         self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)

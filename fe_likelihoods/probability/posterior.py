@@ -265,19 +265,15 @@ class Posterior:
         Raises
         ------
         ValueError
-            If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory or is
-            a `JointLikelihood`, or the noise uses statistics that are not quadratic in the residuals.
+            If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory, the
+            noise uses statistics that are not quadratic in the residuals, or a data set of a `JointLikelihood` has
+            missing samples or times of its own.
 
         Notes
         -----
         The likelihood caches the responses that the guide requests, in memory and in the file of its cache, so another
         sampler with a guide repeats no simulation of them.
         """
-        if isinstance(self.likelihood, JointLikelihood):
-            raise ValueError(
-                "a guide emulates the responses of one model, and this posterior has a JointLikelihood of several: use "
-                "a sampler without a guide"
-            )
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
         return ResponseGuide(self, starts)

@@ -180,8 +180,6 @@ def test_predictions_are_of_one_part(pieces, rng):
     for message, (target, settings) in cases.items():
         with pytest.raises(ValueError, match=message):
             propagate(target, samples, progress=False, **settings)
-    with pytest.raises(ValueError, match="use a sampler without a guide"):
-        posterior.guide()
 
 
 def test_fragility_of_a_part(rng):

@@ -1,0 +1,173 @@
+"""Several likelihoods with parameters in common, as one whose channels are those of all.
+
+Data sets are independent given the parameters, so their log-likelihoods are added. The responses of all models at the
+same parameters are one response with the channels of all, and a statistic that is quadratic in the residuals of each
+data set is quadratic in all residuals. Modes and emulators therefore need to know nothing of several data sets. Data
+sets of fewer steps are filled up with residuals of zero, which no statistic counts.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..signals.comparison import Comparison
+from ..simulation.model import SimulationBatch
+from ..simulation.residual_statistics import needs_response
+from .quadratic import sums_of_squares
+
+__all__ = ["StackedLikelihood", "stack"]
+
+
+def stack(likelihood: Any) -> Any:
+    """The likelihood itself if it has one data set, else a `StackedLikelihood`."""
+    parts = likelihood.parts() if hasattr(likelihood, "parts") else ()
+    return StackedLikelihood(likelihood, parts) if len(parts) > 1 else likelihood
+
+
+class _StackedModel(NamedTuple):
+    """What modes and emulators read of a model."""
+
+    parameter_names: tuple[str, ...]
+    channels: tuple[Any, ...]
+    dt: float
+    n_steps: int
+    fingerprint: str
+
+
+class _Part(NamedTuple):
+    """One data set.
+
+    Attributes
+    ----------
+    likelihood : FELikelihood
+    structural, noise : list of int
+        Places of its parameters among all structural parameters, and among all noise parameters.
+    channels, numbers : slice
+        Its rows among all channels, and among all statistics.
+    statistic : callable
+        Statistic of its residuals.
+    """
+
+    likelihood: Any
+    structural: list[int]
+    noise: list[int]
+    channels: slice
+    numbers: slice
+    statistic: Callable[[np.ndarray], np.ndarray]
+
+
+class _StackedNoise:
+    """The noises of all data sets."""
+
+    def __init__(self, parts: Sequence[_Part]) -> None:
+        self._parts = parts
+        # white noise keeps its fast way: zeros add nothing to a sum of squares
+        white = all(part.statistic is sums_of_squares for part in parts)
+        self.statistic = sums_of_squares if white else self._statistic
+
+    def _statistic(self, residuals: np.ndarray) -> np.ndarray:
+        own = (residuals[part.channels, : part.likelihood.model.n_steps] for part in self._parts)
+        return np.concatenate([part.statistic(each) for part, each in zip(self._parts, own, strict=True)])
+
+    def log_likelihood(self, statistics: np.ndarray, n_samples: Sequence[Any], parameters: np.ndarray) -> np.ndarray:
+        """Sum (n,) of the log-likelihoods of statistics (n, n_numbers) at noise parameters (n, n_noise)."""
+        return sum(
+            part.likelihood.noise.log_likelihood(statistics[:, part.numbers], samples, parameters[:, part.noise])
+            for part, samples in zip(self._parts, n_samples, strict=True)
+        )
+
+
+class StackedLikelihood:
+    """What a guide needs of a likelihood, for several data sets.
+
+    Parameters
+    ----------
+    joint : JointLikelihood
+        The likelihoods.
+    parts : sequence of (FELikelihood, list of int)
+        They, and the places of their parameters.
+
+    Raises
+    ------
+    ValueError
+        If a data set has missing samples, times of its own or time shifts, or a noise whose level depends on the
+        response.
+    """
+
+    def __init__(self, joint: Any, parts: Sequence[tuple[Any, Sequence[int]]]) -> None:
+        names = joint.parameter_names[: joint.ndim - len(joint.fast_parameters)]
+        found, channels, numbers = [], 0, 0
+        for likelihood, columns in parts:
+            if isinstance(likelihood.measured, Comparison):
+                raise ValueError(
+                    "a guide of a JointLikelihood needs data sets that have all samples at the steps of their models: "
+                    "resample the measurements, or sample without a guide"
+                )
+            if needs_response(statistic := getattr(likelihood.noise, "statistic", None) or sums_of_squares):
+                raise ValueError(
+                    f"the level of {type(likelihood.noise).__name__} depends on the response, so the posterior cannot "
+                    "be emulated from residuals: sample without a guide, or use GaussianNoise"
+                )
+            own, width = len(likelihood.model.parameter_names), len(statistic(likelihood.measured))
+            rows, sums = channels + len(likelihood.measured), numbers + width
+            noise = [place - len(names) for place in columns[own:]]
+            found.append(
+                _Part(likelihood, list(columns[:own]), noise, slice(channels, rows), slice(numbers, sums), statistic)
+            )
+            channels, numbers = rows, sums
+        self._parts, self._n_numbers = found, numbers
+        self._first = parts[0][0]
+        n_steps = max(part.likelihood.model.n_steps for part in found)
+        fingerprint = hashlib.blake2b(
+            json.dumps([[part.likelihood.model.fingerprint, part.structural] for part in found]).encode(),
+            digest_size=16,
+        ).hexdigest()
+        all_channels = tuple(channel for part in found for channel in part.likelihood.model.channels)
+        self.model = _StackedModel(tuple(names), all_channels, self._first.model.dt, n_steps, fingerprint)
+        self.noise, self.n_samples = _StackedNoise(found), tuple(part.likelihood.n_samples for part in found)
+        self.measured = self._filled([part.likelihood.measured[None] for part in found], 1)[0]
+
+    def _filled(self, arrays: Sequence[np.ndarray], n: int) -> np.ndarray:
+        """Histories (n, n_channels, n_steps) of all data sets, zero after the end of each."""
+        filled = np.zeros((n, len(self.model.channels), self.model.n_steps))
+        for part, array in zip(self._parts, arrays, strict=True):
+            filled[:, part.channels, : array.shape[-1]] = array
+        return filled
+
+    def simulate(self, thetas: np.ndarray) -> SimulationBatch:
+        """Responses of all models; a point that fails in one is not simulated by the later ones."""
+        reasons = [""] * len(thetas)
+        arrays = []
+        for part in self._parts:
+            left = np.flatnonzero([not reason for reason in reasons])
+            response = np.full((len(thetas), *part.likelihood.measured.shape), np.nan)
+            if len(left) > 0:
+                batch = part.likelihood.simulate(thetas[np.ix_(left, part.structural)])
+                response[left] = batch.response
+                for row, reason in zip(left, batch.reasons, strict=True):
+                    reasons[row] = reason
+            arrays.append(response)
+        return SimulationBatch(self._filled(arrays, len(thetas)), reasons)
+
+    def statistics(self, thetas: np.ndarray) -> np.ndarray:
+        """Statistics (n, n_numbers) of all data sets; NaN where a simulation failed."""
+        result = np.full((len(thetas), self._n_numbers), np.nan)
+        left = np.arange(len(thetas))
+        for part in self._parts:
+            if len(left) > 0:
+                result[left, part.numbers] = part.likelihood.statistics(thetas[np.ix_(left, part.structural)])
+                left = left[np.isfinite(result[left, part.numbers]).all(axis=1)]
+        return result
+
+    def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
+        """Cache what an earlier run has found, as `FELikelihood.recall`."""
+        left = np.arange(len(thetas))
+        for part in self._parts:
+            own = statistics[left, part.numbers]
+            good = np.isfinite(own).all(axis=1)
+            known = ["" if fine else reasons[row] for row, fine in zip(left, good, strict=True)]
+            part.likelihood.recall(thetas[np.ix_(left, part.structural)], own, known)
+            left = left[good]

@@ -1,0 +1,204 @@
+"""Guides of several data sets with parameters in common."""
+
+import warnings
+
+import emcee
+import numpy as np
+import pytest
+from scipy import stats
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    JointLikelihood,
+    Measurements,
+    Posterior,
+    SimulationFailed,
+    TruncatedNormal,
+    Uniform,
+)
+from fe_likelihoods.emulation.target import ResponseTarget
+from samplers import SMCSampler
+
+DT, N = 0.02, 100
+CHANNEL = (Channel("top", "displacement", "mm"),)
+EVENTS = {"first": (0.05, 200, 0.0), "second": (0.02, 300, 1.0)}  # amplitude [m], steps, phase
+TRUTH, SD = np.array([1.2, 0.8]), 2e-3
+
+
+class Vibration:
+    """A mass that vibrates freely after an event; its simulations may fail above a stiffness."""
+
+    def __init__(self, amplitude, n_steps, phase, limit=np.inf):
+        self.amplitude, self.time, self.phase, self.limit = amplitude, DT * np.arange(n_steps), phase, limit
+
+    def __call__(self, theta):
+        if theta[0] > self.limit:
+            raise SimulationFailed("no convergence")
+        omega = 2.0 * np.pi * 1.5 * np.sqrt(theta[0])
+        return [self.amplitude * np.exp(-0.05 * theta[1] * omega * self.time) * np.cos(omega * self.time + self.phase)]
+
+
+def likelihoods(truth=TRUTH, sd=(SD, SD), seed=1, limits=(np.inf, np.inf), noises=(None, None)):
+    """One likelihood per event, with synthetic measurements."""
+    random, found = np.random.default_rng(seed), {}
+    for (name, event), own, limit, noise in zip(EVENTS.items(), sd, limits, noises, strict=True):
+        function = Vibration(*event, limit)
+        n = event[1]
+        model = FunctionModel(function, ["stiffness", "damping"], CHANNEL, DT, n, version=f"{name} {limit}")
+        exact = np.array(Vibration(*event)(truth))
+        measured = Measurements(CHANNEL, DT, exact + own * random.standard_normal((1, n)))
+        found[name] = FELikelihood(model, measured) if noise is None else FELikelihood(model, measured, noise)
+    return found
+
+
+def joint(marginal=True, **options):
+    """Posterior of both events: stiffness and damping in common, a standard deviation of the noise for each."""
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
+    prior |= {f"sigma_top_{name}": HalfNormal(0.01) for name in EVENTS}
+    posterior = Posterior(JointLikelihood(likelihoods(**options), separate=["sigma_top"]), prior)
+    return posterior.marginal() if marginal else posterior
+
+
+def with_other_parameters():
+    """The second event has its own first parameter, the common one second, and correlated noise."""
+    first, second = likelihoods(noises=(None, AutoregressiveNoise(CHANNEL))).values()
+    model = FunctionModel(
+        lambda theta: [theta[0] * np.array(Vibration(*EVENTS["second"])([theta[1], 1.0]))[0]],
+        ["scale", "stiffness"],
+        CHANNEL,
+        DT,
+        EVENTS["second"][1],
+        version="scaled",
+    )
+    second = FELikelihood(model, second.measurements, AutoregressiveNoise(CHANNEL))
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping", "scale")}
+    prior |= {"sigma_top": HalfNormal(0.01), "rho_top": Uniform(-0.5, 0.9)}
+    return Posterior(JointLikelihood({"first": first, "second": second}), prior)
+
+
+@pytest.mark.parametrize("make", [joint, lambda: joint(marginal=False), with_other_parameters])
+def test_the_stacked_likelihood_is_that_of_all_data_sets(make):
+    posterior = make()
+    target = ResponseTarget(posterior)
+    points = posterior.sample_prior(6, 1)
+    coords = target.coordinates(points)
+    runs = target.run_parameters(points[:, : target.n_structural], coords[:, : target.n_structural])
+    found = target.log_likelihood(runs.statistics, coords[:, target.n_structural :])
+    assert found == pytest.approx(posterior.log_likelihood(points), rel=1e-9)
+    for residuals, statistics in zip(runs.residuals, runs.statistics, strict=True):
+        assert target.statistic(residuals) == pytest.approx(statistics, rel=1e-4)  # residuals are single precision
+
+
+def test_a_point_that_fails_in_one_model_is_not_simulated_by_the_later_ones():
+    posterior = joint(limits=(1.1, np.inf))
+    first, second = posterior.likelihood.likelihoods.values()
+    target = ResponseTarget(posterior)
+    thetas = np.array([[1.0, 0.8], [1.15, 0.8], [0.9, 0.8]])
+    stored = []
+
+    def remember(_, compute):
+        stored.append(compute())
+        return stored[-1]
+
+    runs = target.run_parameters(thetas, target.coordinates(thetas), remember)
+    assert list(runs.failed) == [False, True, False]
+    assert (first.simulations, second.simulations) == (3, 2)
+    # a run that goes on knows all of it without a simulation
+    again = joint(limits=(1.1, np.inf))
+    target = ResponseTarget(again)
+    repeated = target.run_parameters(thetas, target.coordinates(thetas), lambda *_: stored[0])
+    assert np.array_equal(repeated.statistics, runs.statistics, equal_nan=True)
+    assert np.array_equal(again(thetas), posterior(thetas)) and again.likelihood.simulations == 0
+    assert again.report()["failure_count"] == 1
+
+
+def exact(posterior):
+    """Log-evidence, mean and standard deviation of two parameters by quadrature around the mode."""
+    axes = np.linspace(1.19, 1.212, 45), np.linspace(0.735, 0.885, 45)
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    values = posterior(grid)
+    weights = np.exp(values - values.max())
+    cell = np.prod([axis[1] - axis[0] for axis in axes])
+    log_evidence = values.max() + np.log(weights.sum() * cell)
+    mean = weights @ grid / weights.sum()
+    return log_evidence, mean, np.sqrt(weights @ (grid - mean) ** 2 / weights.sum())
+
+
+def guided(posterior, limit=700, seed=1, **options):
+    sampler = SMCSampler(
+        N,
+        posterior.ndim,
+        posterior,
+        vectorize=True,
+        seed=seed,
+        guide=posterior.guide(),
+        max_simulations=limit,
+        **options,
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the limit ends the steps at beta = 1
+        sampler.run_mcmc(None, 1)
+    return sampler
+
+
+def test_two_events_take_hundreds_of_simulations():
+    """The result is that of quadrature; every simulation is one run of each model."""
+    posterior = joint()
+    log_evidence, mean, sd = exact(joint())
+    sampler = guided(posterior)
+    assert sampler.verdict.status == "converged" and sampler.simulations <= 700
+    assert posterior.likelihood.simulations <= 2 * sampler.simulations
+    assert abs(sampler.log_evidence - log_evidence) < 4.0 * sampler.log_evidence_error < 0.4
+    samples = sampler.get_chain(flat=True)
+    assert np.all(np.abs(samples.mean(axis=0) - mean) < 4.0 * sd / np.sqrt(sampler.verdict.effective_sample_size))
+    assert samples.std(axis=0) == pytest.approx(sd, rel=0.3)
+
+
+def test_control_one_event_alone_has_another_posterior():
+    """The second event has a part in the result: without it, the standard deviations are larger."""
+    _, _, sd = exact(joint())
+    names = ("stiffness", "damping")
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in names} | {"sigma_top": HalfNormal(0.01)}
+    _, _, alone = exact(Posterior(likelihoods()["first"], prior).marginal())
+    assert np.all(alone > 1.05 * sd)
+
+
+def test_a_run_that_goes_on_is_the_long_run(tmp_path):
+    whole = guided(joint())
+    path = str(tmp_path / "run.h5")
+    guided(joint(), limit=420, backend=emcee.backends.HDFBackend(path)).backend.close()
+    again = joint()
+    sampler = guided(again, backend=emcee.backends.HDFBackend(path))
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+    assert sampler.log_evidence == whole.log_evidence and sampler.simulations == whole.simulations
+    assert again.likelihood.simulations < 2 * whole.simulations - 600
+
+
+def test_data_sets_that_cannot_be_stacked():
+    found = likelihoods()
+    first, second = found.values()
+    values = second.measurements.values.copy()
+    values[0, 5] = np.nan
+    gaps = FELikelihood(second.model, Measurements(CHANNEL, DT, values))
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")} | {"sigma_top": HalfNormal(0.01)}
+    with pytest.raises(ValueError, match="data sets that have all samples"):
+        Posterior(JointLikelihood({"first": first, "second": gaps}), prior).guide()
+
+
+@pytest.mark.slow
+def test_ranks_of_the_truth_are_uniform(seed):
+    """Simulation-based calibration: the truth is a draw of the prior, and so is the noise of each event."""
+    ranks, simulations = [], []
+    for number in range(40):
+        truth = joint(marginal=False).sample_prior(1, np.random.default_rng(1000 * seed + number))[0]
+        posterior = joint(marginal=False, truth=truth[:2], sd=truth[2:], seed=1000 * seed + number)
+        sampler = guided(posterior, limit=1500, seed=number)
+        ranks.append(np.mean(sampler.get_chain(flat=True) < truth, axis=0))
+        simulations.append(sampler.simulations)
+    print(np.mean(simulations), np.mean(ranks, axis=0))
+    for rank in np.transpose(ranks):
+        assert stats.kstest(rank, "uniform").pvalue > 0.001
