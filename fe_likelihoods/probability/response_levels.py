@@ -39,7 +39,8 @@ def imposed_deformation(model: Any) -> np.ndarray | None:
     """Deformation (n_steps,) [m, or - for a strain] that a test imposes on a model; None for other excitations.
 
     That of the attribute ``deformation``, else of ``loading.displacement`` or ``record.displacement``
-    (`fe_likelihoods.DisplacementHistory`), else of ``strain`` (`fe_likelihoods.SteelCoupon`).
+    (`fe_likelihoods.DisplacementHistory`), else of ``strain`` (`fe_likelihoods.SteelCoupon`). It must be part of the
+    fingerprint of the model, as the excitation is.
     """
     histories = (getattr(getattr(model, name, None), "displacement", None) for name in ("loading", "record"))
     for found in (getattr(model, "deformation", None), *histories, getattr(model, "strain", None)):
