@@ -12,6 +12,7 @@ import numpy as np
 
 from ..prediction.prediction import Prediction
 from ..probability.posterior import Posterior
+from ..reporting.other_events import OtherEvent, describe_event
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
@@ -21,7 +22,15 @@ from .job import Job
 from .models import Problem, reduce_data
 from .results import write_csv
 
-__all__ = ["Event", "predict_events", "prediction_options", "read_events", "without_warnings", "write_events"]
+__all__ = [
+    "Event",
+    "describe_events",
+    "predict_events",
+    "prediction_options",
+    "read_events",
+    "without_warnings",
+    "write_events",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -163,10 +172,24 @@ def _predict_event(
         raise ValueError(f"{job.file.name}: [events.{event.name}] {error}") from error
 
 
+def describe_events(
+    events: tuple[Event, ...], predictions: Mapping[str, dict[str, Prediction]]
+) -> tuple[OtherEvent, ...]:
+    """Numbers, scores and sentences of the events that were predicted."""
+    return tuple(
+        describe_event(event.name, predictions[event.name], event.measured)
+        for event in events
+        if event.name in predictions
+    )
+
+
 def write_events(
-    folder: Path, events: tuple[Event, ...], predictions: Mapping[str, dict[str, Prediction]]
+    folder: Path,
+    events: tuple[Event, ...],
+    predictions: Mapping[str, dict[str, Prediction]],
+    described: tuple[OtherEvent, ...],
 ) -> tuple[str, ...]:
-    """Write tables and pictures of predicted events.
+    """Write tables and pictures of predicted events, which `describe_events` has described.
 
     Returns
     -------
@@ -174,15 +197,15 @@ def write_events(
         Names of the files: ``event-NAME.txt``, ``event-NAME.csv`` and ``event-NAME.png`` of each event.
     """
     files: list[str] = []
-    for event in events:
-        if event.name in predictions:
-            names = tuple(f"event-{event.name}.{ending}" for ending in ("txt", "csv", "png"))
-            _write_event([folder / name for name in names], event, predictions[event.name])
-            files += names
+    by_name = {event.name: event for event in events}
+    for found in described:
+        names = tuple(f"event-{found.name}.{ending}" for ending in ("txt", "csv", "png"))
+        _write_event([folder / name for name in names], by_name[found.name], predictions[found.name], found)
+        files += names
     return tuple(files)
 
 
-def _write_event(paths: list[Path], event: Event, predictions: dict[str, Prediction]) -> None:
+def _write_event(paths: list[Path], event: Event, predictions: dict[str, Prediction], found: OtherEvent) -> None:
     from ..plots.predictions import plot_bands
     from ..reporting.other_events import describe_event
     from ..text_tables import text_table

@@ -19,7 +19,15 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..reporting.run import read_run
 from ..simulation.disk_cache import SimulationCache
-from .events import Event, predict_events, prediction_options, read_events, without_warnings, write_events
+from .events import (
+    Event,
+    describe_events,
+    predict_events,
+    prediction_options,
+    read_events,
+    without_warnings,
+    write_events,
+)
 from .hints import in_toml_terms
 from .job import Job, parse_job, read_job
 from .models import Problem, make_problem
@@ -175,14 +183,14 @@ def _write(
     prediction = _predict(job, problem, drawn, progress)
     samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS))
     predicted = predict_events(job, events, problem, drawn, progress)
-    pictures = write_events(folder, events, predicted)
+    described = describe_events(events, predicted)
+    pictures = write_events(folder, events, predicted, described)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     page, truth = folder / "report.html", problem.truth
     report = write_report(page, run, prediction, again, truth, predicted, measured)
     tables = write_tables(folder, run)  # last: they say how many simulations there are
     cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
-    for name, each in predicted.items():
-        cautions += [f"event {name}: {remark}" for remark in each["histories"].remarks]
+    cautions += [f"event {each.name}: {remark}" for each in described for remark in each.remarks]
     cautions += [f"event {event.name}: all simulations failed" for event in events if event.name not in predicted]
     return (report, *tables, samples, *pictures), tuple(map(in_toml_terms, cautions)), not run.is_inconclusive
 

@@ -241,6 +241,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("kind", "text", "see the table of kinds; per channel (white) by default"),
         Key("sensor", "table of quantities", "channel = known standard deviation of the noise of its sensor"),
         Key("window", "time", "modulated, relative: length of the window in which the level of the response is taken"),
+        Key("local", "number", "modulated: part of the variance that follows the response in time, 0 to 1 (0.25)"),
         Key("edges", "numbers", "bands: frequencies between the bands [Hz], ascending"),
         Key("shares", "yes or no", "bands: levels as shares of the simulated response (yes), or in SI units"),
     ),
@@ -296,7 +297,7 @@ NOISES = {
     ),
     "modulated": NoiseKind(
         "white, a share of the level of the simulated response, which follows it in time",
-        ("sensor", "window"),
+        ("sensor", "window", "local"),
         ("sensor", "window"),
     ),
     "bands": NoiseKind(

@@ -47,6 +47,8 @@ def test_events_are_predicted_and_scored(events):
         assert float(row["median"]) == pytest.approx(peak, rel=0.1)
         assert float(row["q05"]) <= float(row["median"]) <= float(row["q95"])
     text = (events / "r" / "event-weaker.txt").read_text()
+    told = [line for line in text.splitlines() if line.startswith("CAUTION: ")]
+    assert told and all(f"CAUTION: event weaker: {line.removeprefix('CAUTION: ')}" in said for line in told)
     assert "interval score" in text and "CRPS" in text and "with the noise" in text
     assert "without the noise" in (events / "r" / "event-after.txt").read_text()
     assert "measurements" not in (events / "r" / "event-after.txt").read_text().splitlines()[-1]
@@ -91,7 +93,7 @@ def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
 
 
 def test_the_prediction_is_that_of_propagate(events):
-    from fe_likelihoods.command.events import predict_events, read_events, write_events
+    from fe_likelihoods.command.events import describe_events, predict_events, read_events, write_events
     from fe_likelihoods.prediction.quantities import peak
 
     job = read_job("oscillator.toml")
@@ -99,7 +101,8 @@ def test_the_prediction_is_that_of_propagate(events):
     samples = problem.posterior.sample_prior(12, 1)
     found = read_events(job, problem)
     assert [event.name for event in found] == ["weaker", "after"]
-    write_events(events, found, predict_events(job, found, problem, samples, False))
+    predicted = predict_events(job, found, problem, samples, False)
+    write_events(events, found, predicted, describe_events(found, predicted))
     for event in found:
         noise = event.measured is not None
         options = {"record": event.record, "seed": 1, "noise": noise, "progress": False} | event.options

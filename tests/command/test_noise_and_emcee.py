@@ -46,9 +46,9 @@ def problem_of(folder, noise):  # noqa: F811
         ('kind = "relative"\n', RelativeNoise, {"sensor": None, "window": None}, None),
         ('kind = "relative"\nwindow = "1.5 s"\n' + SENSOR, RelativeNoise, {"sensor": SI, "window": 1.5}, None),
         (
-            'kind = "modulated"\nwindow = 1.0\n' + SENSOR,
+            'kind = "modulated"\nwindow = 1.0\nlocal = 0.5\n' + SENSOR,
             ModulatedNoise,
-            {"sensor": SI, "window": 1.0},
+            {"sensor": SI, "window": 1.0, "local": 0.5},
             ["share_acceleration", "share_displacement"],
         ),
         (
@@ -88,6 +88,7 @@ def test_noises_are_those_of_python(folder, keys, cls, values, parameters):  # n
         ('kind = "modulated"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
         ('kind = "modulated"\nwindow = "0 s"\n' + SENSOR, "[noise] ModulatedNoise: window must be a positive length"),
         ('kind = "modulated"\nwindow = "0.01 s"\n' + SENSOR, "must be at least three steps"),
+        ('kind = "modulated"\nwindow = 1.0\nlocal = 2.0\n' + SENSOR, "local must be from 0"),
         ('kind = "bands"\n' + SENSOR, '[noise] edges: the kind "bands" needs this key'),
         ('kind = "bands"\nedges = [1.0]', '[noise] sensor: the kind "bands" needs this key'),
         ('kind = "bands"\nedges = [5.0, 1.0]\n' + SENSOR, "expects ascending positive frequencies"),
