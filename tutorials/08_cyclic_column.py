@@ -16,9 +16,10 @@ of four columns fracture and buckle::
     python tutorials/08_cyclic_column.py --data FOLDER --every 12      # thinned until the residuals are nearly white
 
 FOLDER contains ``2017_Lehman_415.csv``, ``2013_Hose_SRPH1.csv``, ``2020_Lehman_407.csv``, ``2019_Lehman_1015.csv`` and
-``properties_circular_columns.csv`` from the repository kuanshi/ductile-fracture on GitHub
-(https://github.com/kuanshi/ductile-fracture, MIT licence; the tests are from the PEER structural performance database).
-The numbers in the text are those of the default options.
+``properties_circular_columns.csv``. They are made from the repository kuanshi/ductile-fracture on GitHub
+(https://github.com/kuanshi/ductile-fracture, MIT licence; the tests are from the PEER structural performance database):
+the histories are ``example/TestData/2017.txt`` and so on, in inches and kips, below a line ``disp_in,force_kip``. The
+numbers in the text are those of the default options.
 """
 
 import argparse
@@ -226,9 +227,11 @@ for column in columns:
 # The lateral force of a test is either the reading of the actuator, or, after the contribution of the vertical load is
 # removed, the base moment divided by the height. The table of properties does not say which. The model gives the second
 # with "linear" geometry and the first with "corotational" geometry. For the second column the difference is 40 % of the
-# force at the largest drift, and the measured force does not decrease with drift. It is therefore **assumed**, for both
-# columns, that the contribution was removed (``--geometry linear``; ``--geometry corotational`` is for readings of the
-# actuator). The first halves of the other two columns of the last section agree: 9.9 and 14.1 % with "linear", 12.2 and
+# force at the largest drift, and the measured force does not decrease with drift. The script of the source,
+# ``example/FiberElementBarFractureTest_Spiral.m``, subtracts the axial load times the drift from the forces of these
+# tests before it compares them with simulations with P-Delta. It is therefore **assumed**, for both columns, that the
+# contribution was removed (``--geometry linear``; ``--geometry corotational`` is for readings of the actuator). The
+# first halves of the other two columns of the last section agree: 9.9 and 14.1 % with "linear", 12.2 and
 # 16.5 % with "corotational" geometry.
 
 nominal = np.ones(len(parameters))

@@ -46,7 +46,7 @@ from .reinforcing_steel import (
 __all__ = ["Sections", "reset", "forces", "commit", "cross_jumps"]
 
 NEAR_JUMP = 0.995
-"""Share of the strain of a stress jump of concrete from which on `cross_jumps` takes a fiber across it."""
+"""Share of the strain of a jump of concrete, or of the damage at fracture, from which on it is taken across it."""
 
 _EC = concrete04.EC
 
@@ -311,8 +311,9 @@ def cross_jumps(e0, kappa, j, sections):
 
     The laws have jumps. Concrete loses its stress at once at eps_cu and at eps_tu, and a bar whose two backbones have
     different origins changes from one to the other at zero stress (`reinforcing_steel.switch_backbone`). Where the
-    jump itself drives the fiber back, there is equilibrium neither before nor after it, however small the step is. None
-    of the three jumps can be undone, so a fiber next to one is taken across it.
+    jump itself drives the fiber back, there is equilibrium neither before nor after it, however small the step is. A
+    bar that fractures (`bar_failure`) loses its stress over a small strain, which is as sudden where the column springs
+    back by more than that. None of the four jumps can be undone, so a fiber next to one is taken across it.
 
     Returns
     -------
@@ -340,5 +341,10 @@ def cross_jumps(e0, kappa, j, sections):
         count += 1
     if sections.virgin[j] == 0.0:
         for i in range(sections.steel_memory.shape[1]):
-            count += switch_backbone(sections.steel_memory[j, i], sections.steel)
+            bar = sections.steel_memory[j, i]
+            count += switch_backbone(bar, sections.steel)
+            if sections.failure.shape[0] > 0:
+                if bar[bar_failure.DAMAGE] >= NEAR_JUMP and bar[bar_failure.FRACTURED] == 0.0:
+                    bar[bar_failure.FRACTURED] = 1.0
+                    count += 1
     return count

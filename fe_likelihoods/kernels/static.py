@@ -3,7 +3,9 @@
 Newton's method on the equilibrium of forces, K du = load - force(u), with the tangent K. Where a displacement is
 imposed, its increment replaces the row of that degree of freedom, and the force that it takes is the restoring force
 there. A step that does not converge is repeated with a tolerance that is a hundred times larger, then halved. At the
-smallest part of a step, fibers next to a jump of their stress are taken across it (`fiber_section.cross_jumps`).
+smallest part of a step, fibers next to a jump of their stress are taken across it (`fiber_section.cross_jumps`). Where
+this does not help, the column may have lost the axial load: after many bars have fractured, the others yield in
+compression while the cracks are open. The top is then lowered until the cracks close and the load is carried again.
 
 ``docs/theory/time_integration.rst`` describes the steps and the retries.
 """
@@ -23,12 +25,15 @@ from .linear_solve import copy_matrix, copy_vector, solve_banded
 __all__ = [
     "GRAVITY_STEPS",
     "LOOSENING",
+    "LOWERING",
     "MAX_CROSSINGS",
+    "MAX_LOWERINGS",
     "Iteration",
     "Position",
     "equilibrate",
     "apply_gravity",
     "impose_displacement",
+    "lower",
 ]
 
 GRAVITY_STEPS = 10
@@ -36,6 +41,10 @@ LOOSENING = 100.0
 """Factor on the tolerance when a step is repeated."""
 MAX_CROSSINGS = 20
 """How often stress jumps may be crossed in one step."""
+LOWERING = 1e-5
+"""Part of the height by which the top is lowered at a time where the column does not carry the axial load."""
+MAX_LOWERINGS = 1000
+"""How often it is lowered in succession, before the column counts as collapsed."""
 
 
 class Iteration(NamedTuple):
@@ -74,7 +83,7 @@ class Position(NamedTuple):
 
 
 @kernel
-def equilibrate(column, position, load, imposed, increment, tolerance, max_iterations):
+def equilibrate(column, position, load, imposed, increment, held, tolerance, max_iterations):
     """Iterate to equilibrium with a load, in place.
 
     Parameters
@@ -88,6 +97,8 @@ def equilibrate(column, position, load, imposed, increment, tolerance, max_itera
         Degree of freedom that moves by `increment`, whatever force it takes; -1 for none.
     increment : float
         [m or rad]
+    held : int
+        Another degree of freedom, which does not move; -1 for none.
     tolerance : float
         Norm of the last correction [m and rad].
     max_iterations : int
@@ -119,6 +130,12 @@ def equilibrate(column, position, load, imposed, increment, tolerance, max_itera
             matrix[imposed, imposed] = 1.0
             du[imposed] = step
             step = 0.0
+        if held >= 0:
+            for i in range(n):
+                matrix[i, held] = 0.0
+                matrix[held, i] = 0.0
+            matrix[held, held] = 1.0
+            du[held] = 0.0
         solve_banded(matrix, du)
         norm = 0.0
         for i in range(n):
@@ -137,25 +154,53 @@ def equilibrate(column, position, load, imposed, increment, tolerance, max_itera
 
 
 @kernel
+def lower(column, position, load, imposed, iteration):
+    """Lower the top until the column carries the axial load again, in place; the imposed displacement is held.
+
+    Each position on the way is an equilibrium with a smaller axial load, and the fibers are committed there. This is
+    the motion of a load that comes down slowly, without the inertia of a fall.
+
+    Returns
+    -------
+    bool
+        True where the load is carried again. On failure the column stays where it has come to.
+    """
+    vertical = imposed + 1
+    if load[vertical] == 0.0:
+        return False
+    downwards = math.copysign(1.0, load[vertical])
+    move = downwards * LOWERING * column.length * column.elements.state.shape[0]
+    tolerance, max_iterations = LOOSENING * iteration.tolerance, iteration.max_iterations
+    for _ in range(MAX_LOWERINGS):
+        if not equilibrate(column, position, load, vertical, move, imposed, tolerance, max_iterations):
+            return False
+        if downwards * position.force[vertical] >= downwards * load[vertical]:
+            return equilibrate(column, position, load, imposed, 0.0, -1, tolerance, max_iterations)
+    return False
+
+
+@kernel
 def _advance_to(column, position, load, total, share, imposed, increment, iteration):
     """Add `share` of the load `total` and an imposed displacement, in halved steps where it does not converge.
 
     Returns
     -------
-    int
+    retries : int
         Number of retries, or -1 on failure.
+    lowerings : int
+        How often the top was lowered until the axial load was carried again.
     """
-    done, part, retries, crossings = 0.0, 1.0, 0, 0
+    done, part, retries, crossings, lowerings = 0.0, 1.0, 0, 0, 0
     smallest = 0.5**iteration.halvings
     tolerance, max_iterations = iteration.tolerance, iteration.max_iterations
     while done < 1.0:
         for i in range(load.shape[0]):
             load[i] += part * share * total[i]
         move = part * increment
-        converged = equilibrate(column, position, load, imposed, move, tolerance, max_iterations)
+        converged = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
         if not converged:
             retries += 1
-            converged = equilibrate(column, position, load, imposed, move, LOOSENING * tolerance, max_iterations)
+            converged = equilibrate(column, position, load, imposed, move, -1, LOOSENING * tolerance, max_iterations)
         if converged:
             done += part
             continue
@@ -164,10 +209,14 @@ def _advance_to(column, position, load, total, share, imposed, increment, iterat
         part *= 0.5
         if part < smallest:
             crossings += 1
-            if crossings > MAX_CROSSINGS or cross_jumps(column) == 0:
-                return -1
+            if crossings > MAX_CROSSINGS:
+                return -1, lowerings
+            if cross_jumps(column) == 0:
+                if imposed < 0 or not lower(column, position, load, imposed, iteration):
+                    return -1, lowerings
+                lowerings += 1
             part = 1.0 - done
-    return retries
+    return retries, lowerings
 
 
 @kernel
@@ -195,7 +244,7 @@ def apply_gravity(column, position, gravity, iteration):
     assemble(position.u, column, position.force, position.stiffness)
     total = 0
     for _ in range(GRAVITY_STEPS):
-        retries = _advance_to(column, position, load, gravity, 1.0 / GRAVITY_STEPS, -1, 0.0, iteration)
+        retries, _ = _advance_to(column, position, load, gravity, 1.0 / GRAVITY_STEPS, -1, 0.0, iteration)
         if retries < 0:
             return -1
         total += retries
@@ -224,20 +273,23 @@ def impose_displacement(column, gravity, targets, iteration, history, sections):
     status : int
         0 on success, -1 when gravity failed, k > 0 when step k failed.
     retries : int
+    lowerings : int
+        How often the top was lowered until the axial load was carried again.
     """
     u, force, load = column.vectors[4], column.vectors[5], column.vectors[3]
     position = Position(u, force, column.matrices[2])
     state = column.elements.state
     retries = apply_gravity(column, position, gravity, iteration)
     if retries < 0:
-        return -1, 0
-    top = gravity.shape[0] - 3
+        return -1, 0, 0
+    top, lowerings = gravity.shape[0] - 3, 0
     for step in range(targets.shape[0]):
         increment = targets[step] - u[top]
         if increment != 0.0:
-            more = _advance_to(column, position, load, gravity, 0.0, top, increment, iteration)
+            more, lowered = _advance_to(column, position, load, gravity, 0.0, top, increment, iteration)
+            lowerings += lowered
             if more < 0:
-                return step + 1, retries
+                return step + 1, retries, lowerings
             retries += more
         history[0, step] = u[top]
         history[1, step] = u[top + 1]
@@ -253,4 +305,4 @@ def impose_displacement(column, gravity, targets, iteration, history, sections):
         history[8, step] = shear
         if sections.shape[0] > 0:
             record_sections(column, sections[step])
-    return 0, retries
+    return 0, retries, lowerings

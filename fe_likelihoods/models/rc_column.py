@@ -38,7 +38,7 @@ from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
 from ..simulation.model import ContinuedResponse
 from .circular_section import Confinement, gauss_lobatto
-from .rc_column_analysis import ColumnHistory
+from .rc_column_analysis import ColumnHistory, check_loading
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
 from .rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Patches, Steel
 from .rc_column_presets import lhpost_arguments
@@ -438,12 +438,6 @@ class RCColumn(ThreadedModel):
 
     def _check_arguments(self) -> None:
         """Raise ValueError for arguments from which no column can be built."""
-        if not isinstance(self.loading, Record | DisplacementHistory):
-            raise invalid(
-                "a Record or a DisplacementHistory as loading",
-                type(self.loading).__name__,
-                "read a Record with fe_likelihoods.read_csv, read_at2 or read_v2",
-            )
         parts = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops}
         failure = {"fatigue": LowCycleFatigue, "buckling": BarBuckling}
         for name, kind in (parts | failure).items():
@@ -457,6 +451,7 @@ class RCColumn(ThreadedModel):
             finite=("axial_load",),
             optional=("max_increment", "axial_load"),
         )
+        check_loading(self.loading, self.height)
         check_integer("n_elements", self.n_elements, 1, 50)
         check_integer("n_points", self.n_points, 2, 7)
         check_integer("substeps", self.substeps, 1, 1000)

@@ -21,19 +21,23 @@ from ..simulation.model import SimulationFailed
 from .base import BuiltInModel, History, remark_on_range
 from .circular_section import Confinement
 from .rc_column_parts import BarBuckling, Concrete, LowCycleFatigue, Steel, hardening_fault
-from .validation import check_values
+from .validation import check_values, invalid
 
 __all__ = [
     "Analysis",
     "BaseMotion",
     "ColumnHistory",
     "ImposedMotion",
+    "check_loading",
     "check_physical_values",
     "checked_history",
     "expect_fracture",
     "set_materials",
 ]
 
+
+LARGEST_DRIFT = 0.5
+"""Largest imposed displacement by the height; tested columns have failed at 0.05 to 0.15."""
 
 _MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 
@@ -69,11 +73,15 @@ class ColumnHistory(History):
     bar_damage : ndarray[n_bars] or None
         Miner's sum of each bar at the last sample, in the section where it is largest; a bar has fractured above 1. The
         bars are those of ``model.section.fibers()[2]``: two at the same position count as one. None without fatigue.
+    lowerings : int
+        Number of times the column could not carry the axial load at an imposed displacement, and its top came down
+        until the cracks were closed (``docs/theory/time_integration.rst``). 0 under a base acceleration.
     """
 
     retries: int
     beyond_range: float
     bar_damage: np.ndarray | None = None
+    lowerings: int = 0
 
 
 class Analysis(NamedTuple):
@@ -89,12 +97,15 @@ class Analysis(NamedTuple):
         Number of steps that were repeated with half their size.
     sections : ndarray[n_steps, n_sections, 2]
         Axial strain and curvature [1/m] of every section, from the base up; (0, n_sections, 2) if not recorded.
+    lowerings : int
+        As of `ColumnHistory`.
     """
 
     names: tuple[str, ...]
     values: np.ndarray
     retries: int
     sections: np.ndarray
+    lowerings: int = 0
 
 
 class BaseMotion(NamedTuple):
@@ -161,7 +172,7 @@ class BaseMotion(NamedTuple):
         )
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
-            raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings))
+            raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings, column.sections))
         start = first + 1 if first else 0
         return Analysis(HISTORY_ROWS, history[:, start:], retries, _by_section(sections[start:]))
 
@@ -198,12 +209,29 @@ class ImposedMotion(NamedTuple):
         """
         history = np.zeros((len(IMPOSED_ROWS), len(self.targets)))
         sections = _allocate_sections(column, len(self.targets) if record_sections else 0)
-        status, retries = impose_displacement(column, gravity, self.targets, iteration, history, sections)
+        status, retries, lowerings = impose_displacement(column, gravity, self.targets, iteration, history, sections)
         if status:
-            raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings))
-        return Analysis(
-            IMPOSED_ROWS, history[:, self.kept], retries, sections[self.kept] if record_sections else sections
+            raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings, column.sections))
+        kept = sections[self.kept] if record_sections else sections
+        return Analysis(IMPOSED_ROWS, history[:, self.kept], retries, kept, lowerings)
+
+
+def check_loading(loading: object, height: float) -> None:
+    """Raise ValueError for a loading of another type, and for displacements that are not in metres."""
+    if not isinstance(loading, Record | DisplacementHistory):
+        raise invalid(
+            "a Record or a DisplacementHistory as loading",
+            type(loading).__name__,
+            "read a Record with fe_likelihoods.read_csv, read_at2 or read_v2",
         )
+    if isinstance(loading, DisplacementHistory):
+        largest = float(np.abs(loading.displacement).max())
+        if largest > LARGEST_DRIFT * height:
+            raise ValueError(
+                f"expected displacements of the top in m, up to half the height of {height:g} m; got {largest:g} m in "
+                f"{loading.name!r}, a drift of {largest / height:.3g}; convert other units with to_si, as in "
+                "to_si(values, 'mm')"
+            )
 
 
 def check_physical_values(values: dict[str, float], steel: Steel) -> None:
@@ -264,7 +292,7 @@ def checked_history(
             f"at which bars fracture; the law was continued along its tangent, at {at}. {advice}, "
             "or a weaker loading. This model gives no further warnings: check history(theta).beyond_range",
         )
-    return ColumnHistory(analysis.names, analysis.values, analysis.retries, beyond, bar_damage)
+    return ColumnHistory(analysis.names, analysis.values, analysis.retries, beyond, bar_damage, analysis.lowerings)
 
 
 def expect_fracture(model: BuiltInModel) -> None:
@@ -315,7 +343,14 @@ def _allocate_sections(column: Column, n_steps: int) -> np.ndarray:
     return np.zeros((n_steps, len(column.sections.virgin), 2))
 
 
-def _reason(status: int, n_steps: int, at: str, halvings: int) -> str:
+def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Sections) -> str:
     if status < 0:
         return "the gravity load did not converge: the section cannot carry it at these parameters"
-    return f"step {status} of {n_steps}{at} did not converge, halved {halvings} times"
+    reason = f"step {status} of {n_steps}{at} did not converge, halved {halvings} times"
+    if sections.failure.shape[0] == 0:
+        return reason
+    broken = sections.steel_memory[:, :, bar_failure.FRACTURED]
+    lost = float((broken @ sections.bar_area[: broken.shape[1]]).max()) / float(sections.bar_area.sum())
+    if lost == 0.0:
+        return reason
+    return f"{reason}; bars with {lost:.0%} of the area of all bars of a section had fractured before"

@@ -130,8 +130,8 @@ class LowCycleFatigue:
     ----------
     cf, alpha : float
         Coefficient and exponent of Coffin and Manson, for the plastic strain of a half cycle from one reversal to the
-        next. The defaults are those that OpenSees documents for its material ReinforcingSteel, from the tests of Brown
-        & Kunnath (2004).
+        next. The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from
+        tests of Brown & Kunnath (2000) with bars of a slenderness of 6.
     cd : float
         Coefficient of the loss of strength, at least `cf`; a large one means no loss before fracture.
     """
@@ -160,7 +160,8 @@ class BarBuckling:
         Unsupported length of the bars divided by their diameter. None: the spacing of the hoops divided by the diameter
         of the bars. Where hoops yield or are weak, bars buckle over several spacings, and the ratio is larger.
     alpha : float
-        1 for steel that hardens linearly, 0.75 for steel that does not.
+        1 for steel that hardens linearly, 0.75 for steel that does not (``docs/theory/reinforcing_steel.rst`` has a
+        formula for steels between them).
     """
 
     slenderness: float | None = None

@@ -34,6 +34,9 @@ PARAMETERS = {
 }
 
 
+LARGEST_STRAIN = 0.5  # real bars fracture at 0.1 to 0.3
+
+
 @dataclass(frozen=True, eq=False)
 class SteelCoupon(BuiltInModel):
     """Stress of a bar under a strain history; theta holds multiples of the nominal parameters.
@@ -53,7 +56,7 @@ class SteelCoupon(BuiltInModel):
     Raises
     ------
     ValueError
-        If the strains are not one-dimensional, at least two, finite and above -0.95, or a parameter is unknown or
+        If the strains are not one-dimensional, at least two, and within 0.5 of zero, or a parameter is unknown or
         repeated.
     """
 
@@ -68,10 +71,11 @@ class SteelCoupon(BuiltInModel):
 
     def __post_init__(self) -> None:
         strain = np.array(self.strain, dtype=float)
-        if strain.ndim != 1 or strain.size < 2 or not np.isfinite(strain).all() or strain.min() <= -0.95:
+        largest = float(np.abs(strain).max()) if strain.size else 0.0
+        if strain.ndim != 1 or strain.size < 2 or not largest <= LARGEST_STRAIN:  # neither is NaN
             raise invalid(
-                "strains (n_steps,), two or more, finite and above -0.95",
-                f"an array of shape {strain.shape}" + (f" with a minimum of {strain.min():g}" if strain.size else ""),
+                f"strains (n_steps,), two or more, finite and between -{LARGEST_STRAIN:g} and {LARGEST_STRAIN:g}",
+                f"an array of shape {strain.shape} with a largest absolute value of {largest:g}",
                 "give engineering strains, not per cent",
             )
         strain.flags.writeable = False

@@ -38,6 +38,7 @@ from . import (
     starts,
     startup,
     storage,
+    strain_penetration,
     transfer,
     truth,
 )
@@ -63,6 +64,7 @@ BENCHMARKS = {
     "transfer_median": transfer.transfer_median,
     "noises": noises.noises,
     "transfer_columns": measured_columns.columns,
+    "strain_penetration": strain_penetration.evidence,
     "transfer_frame": measured_tests.frame,
     "transfer_meloland": measured_tests.meloland,
     "transfer_coupon": measured_tests.coupon,

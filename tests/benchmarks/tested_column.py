@@ -1,10 +1,14 @@
-"""The cyclic test of a reinforced-concrete column, calibrated as in ``tutorials/08_cyclic_column.py``.
+"""Cyclic tests of reinforced-concrete columns, as in ``tutorials/08_cyclic_column.py``.
 
-Lehman & Moehle, specimen 415, first half of the history, one sample in two and all turning points; seven parameters.
-The data are those that the tutorial names, in the folder ``measured/rc_column_cyclic`` of the reference material.
+The problem of a calibration is Lehman & Moehle, specimen 415, first half of the history, one sample in two and all
+turning points; seven parameters. The data are those that the tutorial names, in the folder
+``measured/rc_column_cyclic`` of the reference material. Further tests of the same database are found by themselves
+(`specimens`): a CSV file ``TSN_Test.csv`` with the columns ``disp_in`` and ``force_kip``, where TSN and Test are those
+of a row of the table of properties, such as ``2018_Lehman_815.csv``.
 """
 
 import csv
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,18 +36,21 @@ from fe_likelihoods import (
 from .targets import SHARED
 
 __all__ = [
+    "Found",
     "Specimen",
     "autoregressive",
     "failure",
     "first_half",
     "missing",
     "specimen",
+    "specimens",
     "start",
     "white",
 ]
 
 FOLDER = SHARED / "measured" / "rc_column_cyclic"
 HISTORY, PROPERTIES = "2017_Lehman_415.csv", "properties_circular_columns.csv"
+WITHOUT_P_DELTA = range(9, 24)  # numbers of tests whose forces do not contain the contribution of the axial load
 EVERY = 2
 SENSOR = to_si(0.13, "kip").item()  # upper bound of the noise of the force, as the tutorial finds it
 SIGMA = to_si(5.0, "kip").item()  # scale of the prior of the error
@@ -92,14 +99,69 @@ def failure(displacement: np.ndarray, force: np.ndarray) -> int:
     return len(displacement)
 
 
-def specimen(test: str, history: str, every: int = EVERY) -> Specimen:
-    """Read a test: its name in the table of properties, and the file of its history; one sample in `every` is kept."""
-    with (FOLDER / PROPERTIES).open() as rows:
-        row = next(row for row in csv.DictReader(rows) if row["Test"] == test)
-    v = {key: float(value) for key, value in row.items() if key != "Test"}
+class Found(NamedTuple):
+    """Tests in the folder.
+
+    Attributes
+    ----------
+    specimens : tuple of Specimen
+        The tests that can be simulated, that of the calibration first.
+    skipped : dict of str to str
+        Why other files cannot be used.
+    """
+
+    specimens: tuple[Specimen, ...]
+    skipped: dict[str, str]
+
+
+def specimens(every: int = EVERY) -> Found:
+    """Read all tests of the folder for which the table of properties has a row; one sample in `every` is kept."""
+    found, skipped = [], {}
+    for path in sorted(FOLDER.glob("*.csv"), key=lambda path: (path.name != HISTORY, path.name)):
+        if path.name == PROPERTIES:
+            continue
+        try:
+            found.append(specimen(path.name, every))
+        except ValueError as error:
+            skipped[path.name] = str(error)
+    return Found(tuple(found), skipped)
+
+
+def _properties(history: str) -> tuple[str, dict[str, float]]:
+    """Name of a test and its row of the table, without cells that are empty; ValueError if there is none."""
+    with (FOLDER / PROPERTIES).open() as table:
+        rows = {f"{row['TSN']}_{row['Test']}": row for row in csv.DictReader(table)}
+    stem = history.removesuffix(".csv")
+    if stem not in rows:
+        raise ValueError(f"{PROPERTIES} has no row whose TSN and Test make the name {stem!r}")
+    row = rows[stem]
+    name = row.pop("Test")
+    return name, {key: float(value) for key, value in row.items() if value and value.strip()}
+
+
+def specimen(history: str, every: int = EVERY) -> Specimen:
+    """Read a test from the file of its history, such as ``2017_Lehman_415.csv``; one sample in `every` is kept.
+
+    The lateral force is M/h of the base moment where the axial load has no part in it ("linear" geometry), else the
+    reading of the actuator ("corotational"). The script ``example/FiberElementBarFractureTest_Spiral.m`` of the
+    repository subtracts P times drift from the forces of the tests 9 to 23 of the table before it compares them with
+    simulations with P-Delta; it takes those of the other tests as they are.
+
+    Raises
+    ------
+    ValueError
+        If the table has no row for this test, or lacks a value that the model needs, the history lacks a column, or the
+        values describe no column.
+    """
+    test, v = _properties(history)
+
+    def value(key: str) -> float:
+        if key not in v:
+            raise ValueError(f"{PROPERTIES} has no {key!r} of {test}")
+        return v[key]
 
     def si(key: str, unit: str) -> float:
-        return to_si(abs(v[f"{key} ({unit})"]), unit).item()
+        return to_si(abs(value(f"{key} ({unit})")), unit).item()
 
     channel = Channel("force", "lateral force", "kip")
     data = read_imposed_test(FOLDER / history, "disp_in", [channel], ["force_kip"])
@@ -115,12 +177,13 @@ def specimen(test: str, history: str, every: int = EVERY) -> Specimen:
         height=si("L", "in"),
         cover=si("c", "in"),
         concrete=Concrete(fc=si("fc", "ksi"), ec=si("Ec", "ksi"), ft=si("ft", "ksi")),
-        steel=Steel(si("fyl", "ksi"), si("ful", "ksi"), si("Esl", "ksi"), si("Esh", "ksi"), v["esh"], v["esu"]),
-        bars=Bars(int(v["nsl"]), si("dbl", "in")),
+        steel=Steel(si("fyl", "ksi"), si("ful", "ksi"), si("Esl", "ksi"), si("Esh", "ksi"), value("esh"), value("esu")),
+        bars=Bars(int(value("nsl")), si("dbl", "in")),
         hoops=Hoops(si("dbt", "in"), si("s", "in"), si("fyt", "ksi"), spiral=True),
         mass=1.0,  # unused in a quasi-static test, but must be positive
-        axial_load=to_si(v["P (kips)"], "kip").item(),
-        penetration=to_si(v["Sy"], "in").item() / v["esy"],
+        axial_load=to_si(value("P (kips)"), "kip").item(),
+        penetration=to_si(value("Sy"), "in").item() / value("esy"),
+        geometry="linear" if value("No.") in WITHOUT_P_DELTA else "corotational",
         parameters=tuple(PRIOR),
         mesh=20,
         max_increment=si("L", "in") / 200.0,
@@ -133,13 +196,15 @@ def specimen(test: str, history: str, every: int = EVERY) -> Specimen:
 def first_half(tested: Specimen) -> tuple[RCColumn, Measurements]:
     """Model and data of the first half of a test."""
     part = tested.parts["first half"]
-    history = DisplacementHistory(f"{tested.name}, first half", tested.model.loading.displacement[part], HISTORY)
+    whole = tested.model.loading
+    history = DisplacementHistory(f"{tested.name}, first half", whole.displacement[part], whole.source)
     model = tested.model.with_record(history)
     return model, Measurements(model.channels, model.dt, tested.measured.values[:, part], history.name)
 
 
 def _model_and_data() -> tuple[RCColumn, Measurements]:
-    return first_half(specimen("Lehman_415", HISTORY))
+    tested = specimen(HISTORY)  # the references of this problem were made with the forces of the actuator
+    return first_half(tested._replace(model=replace(tested.model, geometry="corotational")))
 
 
 def white(seed: int) -> Posterior:

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.kernels import concrete04
-from fe_likelihoods.kernels.static import GRAVITY_STEPS, Iteration, Position, apply_gravity, impose_displacement
+from fe_likelihoods.kernels.static import (
+    GRAVITY_STEPS,
+    Iteration,
+    Position,
+    apply_gravity,
+    equilibrate,
+    impose_displacement,
+    lower,
+)
 
 from . import golden
 
@@ -91,7 +99,7 @@ def test_imposed_displacement_is_reached_and_the_base_balances_it(column):
     """Equilibrium in the deformed position: M at the base = force x height of the top + weight x its drift."""
     targets = 2.0 * np.sin(np.linspace(0.0, 4.0 * np.pi, 400)) * np.linspace(0.0, 1.0, 400)
     status, history = push(column, targets)
-    assert status == (0, 0)
+    assert status == (0, 0, 0)
     np.testing.assert_allclose(history[0], targets, atol=1e-12)
     moment = -history[3] * (golden.HEIGHT + history[1]) - golden.WEIGHT * history[0]
     largest = np.abs(history[7]).max()
@@ -122,8 +130,8 @@ def test_large_steps_are_retried_and_reach_the_same_force():
     fine = np.linspace(0.0, 3.0, 601)
     coarse = fine[::100]
     status, expected = push(golden.column(golden.circle()), fine)
-    assert status == (0, 0)
-    (status, retries), history = push(golden.column(golden.circle()), coarse, max_iterations=4, halvings=10)
+    assert status == (0, 0, 0)
+    (status, retries, _), history = push(golden.column(golden.circle()), coarse, max_iterations=4, halvings=10)
     assert status == 0
     assert retries > 0
     np.testing.assert_allclose(history[3], expected[3, ::100], rtol=0, atol=2e-3 * np.abs(expected[3]).max())
@@ -131,7 +139,7 @@ def test_large_steps_are_retried_and_reach_the_same_force():
 
 def test_impossible_step_ends_the_run_with_its_number():
     targets = np.concatenate([np.linspace(0.0, 1.0, 50), [1.0e4], np.ones(5)])
-    (status, _), history = push(golden.column(golden.circle()), targets, halvings=2)
+    (status, _, _), history = push(golden.column(golden.circle()), targets, halvings=2)
     assert status == 51
     assert np.isfinite(history[:, :50]).all()
     assert np.isnan(history[:, 50:]).all()
@@ -144,3 +152,40 @@ def test_impossible_gravity_is_reported():
     status, history = push(golden.column(golden.circle()), np.zeros(3), halvings=2, gravity=golden.gravity(weight=1e6))
     assert status[0] == -1
     assert np.isnan(history).all()
+
+
+def lowered(column, factor):
+    """Lower a displaced column until it carries `factor` times its weight; success, position, and the one before."""
+    iteration = Iteration(TOLERANCE, 50, 6)
+    position = Position(np.zeros(6), np.zeros(6), np.zeros((6, 6)))
+    assert apply_gravity(column, position, golden.gravity(), iteration) == 0
+    load = golden.gravity()
+    for _ in range(20):
+        assert equilibrate(column, position, load, 3, 0.05, -1, TOLERANCE, 50)
+    before = position.u.copy()
+    load = factor * load
+    return lower(column, position, load, 3, iteration), position, before, load
+
+
+def test_a_lowered_column_carries_its_load_with_the_lateral_displacement_held():
+    """Where the load can also be added at once, the position is the same."""
+    done, position, before, load = lowered(golden.column(golden.circle()), 1.5)
+    assert done
+    assert position.u[3] == pytest.approx(before[3], abs=1e-12)
+    assert position.u[4] < before[4]
+    np.testing.assert_allclose(position.force[[0, 1, 2, 4, 5]], load[[0, 1, 2, 4, 5]], atol=1e-5 * golden.WEIGHT)
+    column = golden.column(golden.circle())
+    _, other, _, load = lowered(column, 1.0)
+    assert equilibrate(column, other, 1.5 * load, 3, 0.0, -1, TOLERANCE, 50)
+    np.testing.assert_allclose(position.u, other.u, rtol=2e-3, atol=1e-6)
+
+
+def test_a_load_beyond_the_strength_is_a_collapse():
+    done, *_ = lowered(golden.column(golden.circle()), 100.0)
+    assert not done
+
+
+def test_a_column_without_load_is_not_lowered():
+    done, position, before, _ = lowered(golden.column(golden.circle()), 0.0)
+    assert not done
+    np.testing.assert_array_equal(position.u, before)

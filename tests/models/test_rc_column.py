@@ -695,6 +695,7 @@ WRONG = [
     (dict(units=(("acceleration", "in"),)), "unit"),
     (dict(units={"acc": "g"}), "unit"),
     (dict(loading=np.zeros(10)), "Record or a DisplacementHistory"),
+    (dict(loading=DisplacementHistory("mm", [0.0, 20.0, -70.0]), parameters=("Ec",)), r"got 70 m in 'mm', a drift of"),
     (dict(concrete=dict(fc=-42e6)), "fc"),
     (dict(concrete=dict(fc=6.1)), "tensile strength between 0 and fc"),  # one of them in ksi
     (dict(concrete=dict(ec=0.0)), "ec"),

@@ -23,6 +23,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.kernels import bar_failure
 from fe_likelihoods.problems import bridge_column_data
+from fe_likelihoods.units import G0
 from tests.kernels import golden
 
 WEAK = LowCycleFatigue(cf=0.09, cd=0.389)
@@ -82,6 +83,28 @@ def test_base_force_is_that_of_the_bars_that_remain(column):
         assert "did not converge" in str(failure)
     else:
         assert late[-1] < 0.3 * late[0]
+
+
+@pytest.mark.parametrize("cf", [0.036, 0.039])
+def test_the_column_goes_on_after_it_has_lost_bars(column, cf):
+    """Steps in which bars fractured had no equilibrium nearby, and both simulations failed."""
+    model = replace(column, fatigue=LowCycleFatigue(cf=cf, cd=0.389), max_increment=0.02)
+    history = model.history([1.0])
+    assert (history.bar_damage > 1.0).sum() >= 7
+    np.testing.assert_allclose(history["displacement"], model.loading.displacement, atol=1e-12)
+    # equilibrium at every sample, with the weight and its moment
+    weight = model.mass * G0
+    np.testing.assert_allclose(history["base axial force"], -weight, rtol=0.03)
+    moment = history["force"] * (model.height + history["vertical displacement"]) + weight * history["displacement"]
+    np.testing.assert_allclose(-history["base moment"], moment, atol=1e-5 * np.abs(moment).max())
+
+
+def test_a_failure_says_how_many_bars_had_fractured(column):
+    model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), max_increment=0.02, halvings=0)
+    with pytest.raises(
+        SimulationFailed, match=r"did not converge.*; bars with \d+% of the area .* had fractured before"
+    ):
+        model.simulate([1.0])
 
 
 def test_default_slenderness_is_that_between_hoops(column):

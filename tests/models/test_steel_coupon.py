@@ -98,6 +98,8 @@ def test_parameters_that_describe_no_steel_fail(coupon, theta, words):
         (dict(strain=[0.0]), "two or more"),
         (dict(strain=[0.0, np.inf]), "finite"),
         (dict(strain=[0.0, -2.0]), "per cent"),
+        (dict(strain=[0.0, 3.0, -3.0]), "largest absolute value of 3'; give engineering strains, not per cent"),
+        (dict(strain=[0.0, np.nan]), "finite"),
         (dict(steel=450e6), "Steel"),
         (dict(parameters=("fy", "R")), "parameters out of"),
         (dict(parameters=("fy", "fy")), "once"),
