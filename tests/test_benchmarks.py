@@ -10,6 +10,7 @@ from scipy import integrate, stats
 
 from fe_likelihoods import (
     BridgeDeck,
+    EventRatios,
     FELikelihood,
     HalfNormal,
     LinearStructure,
@@ -20,7 +21,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.models.linear_system import respond_structure
 from samplers import SMCSampler
-from tests.benchmarks import job, new_event, noises, peers, transfer, truth, truth_targets
+from tests.benchmarks import job, new_event, noises, peers, transfer, transfer_twins, truth, truth_targets
 from tests.benchmarks.comparison import compare
 from tests.benchmarks.growth import exponent
 from tests.benchmarks.rows import Row, as_table, machine, write_json
@@ -225,6 +226,14 @@ def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, mon
     for part in (noises._painter_street, noises._meloland):
         (row,) = part(1)
         assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+
+
+def test_left_out_ratios_have_the_t_distribution_of_event_ratios(rng):
+    logs = 0.1 * rng.standard_normal(11)
+    t, scale = transfer_twins.leave_one_out_t(logs[None])
+    ratios = EventRatios(np.exp(np.delete(logs, 3)))
+    assert scale[0, 3] == pytest.approx(ratios.scale)
+    assert t[0, 3] == pytest.approx((logs[3] - np.log(ratios.median)) / ratios.scale)
 
 
 def test_files_that_cannot_be_used_are_named_and_left_out(tmp_path, monkeypatch):

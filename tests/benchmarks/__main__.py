@@ -40,6 +40,7 @@ from . import (
     storage,
     strain_penetration,
     transfer,
+    transfer_twins,
     truth,
 )
 from .comparison import compare
@@ -62,6 +63,7 @@ BENCHMARKS = {
     "hierarchy_warnings": hierarchy_warnings.alarms,
     "transfer": transfer.transfer,
     "transfer_median": transfer.transfer_median,
+    "transfer_twins": transfer_twins.transfer_twins,
     "noises": noises.noises,
     "transfer_columns": measured_columns.columns,
     "strain_penetration": strain_penetration.evidence,
