@@ -9,8 +9,8 @@ parameters are those of the real events, which differ.
 The rows are the shares of the peaks within their intervals over 300 data sets per repeat, with the standard error from
 the scatter between data sets, the share of the data sets in which 7 or more, and 8 or more, of the eleven are within
 those of 50 %, and the median factor between the ends of the 90 % interval. The last rows have log peaks that are
-independent and normal (7 %), and the same with one event that is four standard deviations off. The excitations are real and
-no part of the project, see `tests.benchmarks.transfer`.
+independent and normal (7 %), and the same with one event that is four standard deviations off. The excitations are real
+and no part of the project, see `tests.benchmarks.transfer`.
 """
 
 import numpy as np
