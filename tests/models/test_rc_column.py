@@ -695,7 +695,6 @@ WRONG = [
     (dict(units=(("acceleration", "in"),)), "unit"),
     (dict(units={"acc": "g"}), "unit"),
     (dict(loading=np.zeros(10)), "Record or a DisplacementHistory"),
-    (dict(loading=DisplacementHistory("mm", [0.0, 20.0, -70.0]), parameters=("Ec",)), r"got 70 m in 'mm', a drift of"),
     (dict(concrete=dict(fc=-42e6)), "fc"),
     (dict(concrete=dict(fc=6.1)), "tensile strength between 0 and fc"),  # one of them in ksi
     (dict(concrete=dict(ec=0.0)), "ec"),
@@ -722,6 +721,15 @@ WRONG = [
     (dict(hoops=dict(ultimate_strain=-0.1)), "ultimate_strain"),
     (dict(hoops=dict(ultimate_strain=math.nan)), "ultimate_strain"),
 ]
+
+
+def test_displacements_in_millimetres_are_rejected(pushed):
+    largest = 0.6 * pushed.height
+    with pytest.raises(
+        ValueError, match=r"up to half the height of .* m in 'mm', a drift of 0\.6; convert other units"
+    ):
+        pushed.with_record(DisplacementHistory("mm", [0.0, 0.1, -largest]))
+    assert pushed.with_record(DisplacementHistory("m", [0.0, 0.1, -0.8 * largest])).n_steps == 3
 
 
 @pytest.mark.parametrize(("change", "words"), [pytest.param(*case, id=str(case[0])) for case in WRONG])
