@@ -70,6 +70,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     )
     from .tempering.failed_region import (
         NearFailures,
+        failures_near,
     )
     from .tempering.guide import (
         Guide,
@@ -124,6 +125,7 @@ __all__ = [
     "compare_models",
     "comparison_table",
     "estimate_cost",
+    "failures_near",
     "ladder_table",
     "plot_corner",
     "plot_ladder",
@@ -178,7 +180,10 @@ _EXPORTS = {
     "tempered": ("TemperedSampler",),
     "tempering.diagnostics": ("SamplingWarning",),
     "tempering.evidence_check": ("EvidenceCheck",),
-    "tempering.failed_region": ("NearFailures",),
+    "tempering.failed_region": (
+        "NearFailures",
+        "failures_near",
+    ),
     "tempering.guide": (
         "Guide",
         "GuideSession",

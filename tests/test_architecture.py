@@ -81,6 +81,14 @@ def test_the_two_packages_do_not_import_each_other():
     assert not [name(p) for p in foreign if not name(p).startswith(ON_TOP_OF_BOTH)]
 
 
+def test_fe_likelihoods_uses_what_samplers_exports_not_its_modules():
+    sources = list((ROOT / "fe_likelihoods").rglob("*.py"))
+    inside = re.compile(r"^\s*(from|import) samplers\.", re.MULTILINE)
+    assert len(sources) > 100
+    assert not [path.name for path in sources if inside.search(path.read_text(encoding="utf-8"))]
+    assert inside.search("from samplers.tempering.failed_region import NearFailures")
+
+
 def test_folders_import_only_from_folders_below_them():
     for package, order in ORDER.items():
         graph = package_graph(package)

@@ -1,10 +1,10 @@
 """Predictions of other events: base motions that a TOML file lists as ``[events.NAME]``."""
 
-import contextlib
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,8 +27,8 @@ __all__ = [
     "describe_events",
     "predict_events",
     "prediction_options",
+    "propagate_quietly",
     "read_events",
-    "without_warnings",
     "write_events",
 ]
 
@@ -107,17 +107,38 @@ def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measur
         raise ValueError(str(error).replace("] file: ", "] measured: ", 1)) from error
 
 
-@contextlib.contextmanager
-def without_warnings() -> Iterator[None]:
-    """Without the warnings of `propagate`, which its result keeps as remarks: the command says and writes these."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
+def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str, Prediction]:
+    """The result of `propagate`, without those of its warnings that the result keeps as remarks.
+
+    The command says and writes the remarks, which are in the words of the TOML file. All other warnings, such as those
+    of a model of the user, are given after the prediction.
+    """
+    from ..prediction.propagation import propagate
+
+    kept: set[str] = set()
+    caught: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = propagate(*arguments, **options)
+            kept.update(*(each.remarks for each in (found.values() if isinstance(found, Mapping) else [found])))
+    finally:  # also where all simulations have failed
+        shown: dict[Any, Any] = {}  # equal ones of the same line once, as without this function
+        for each in caught:
+            if str(each.message) not in kept:
+                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno, registry=shown)
+    if isinstance(found, Mapping):
+        return {name: _in_toml_terms(each) for name, each in found.items()}
+    return _in_toml_terms(found)
+
+
+def _in_toml_terms(prediction: Prediction) -> Prediction:
+    return replace(prediction, remarks=tuple(map(in_toml_terms, prediction.remarks)))
 
 
 def predict_events(
     job: Job, events: tuple[Event, ...], problem: Problem, samples: np.ndarray, progress: bool
-) -> dict[str, dict[str, Prediction]]:
+) -> dict[str, dict[str, Prediction] | SimulationFailed]:
     """Predict histories and peaks under other base motions, one simulation per sample and event.
 
     Responses are stored in the cache of the likelihood, so that events whose prediction was interrupted go on there.
@@ -134,8 +155,8 @@ def predict_events(
 
     Returns
     -------
-    dict of str to dict of str to Prediction
-        "histories" and "peaks" of each event by its name, but of those of which all simulations fail.
+    dict of str to dict of str to Prediction, or to SimulationFailed
+        "histories" and "peaks" of each event by its name, or the error that says that all its simulations have failed.
     """
     found = {}
     for event in events if len(samples) else ():
@@ -143,13 +164,13 @@ def predict_events(
             found[event.name] = _predict_event(job, event, problem.posterior, samples, progress)
         except SimulationFailed as error:
             logger.warning("event %s is left out: %s", event.name, error)
+            found[event.name] = error
     return found
 
 
 def _predict_event(
     job: Job, event: Event, posterior: Posterior, samples: np.ndarray, progress: bool
 ) -> dict[str, Prediction]:
-    from ..prediction.propagation import propagate
     from ..prediction.quantities import peak
 
     channels = posterior.likelihood.model.channels
@@ -158,24 +179,23 @@ def _predict_event(
     if event.measured is not None:  # measurements contain noise
         options["noise"] = job.prediction.get("noise", True)
     try:
-        with without_warnings():
-            return propagate(
-                posterior,
-                samples,
-                record=event.record,
-                quantity={"histories": None, "peaks": [peak(channel.name) for channel in channels]},
-                cache=posterior.likelihood.cache,
-                **options,
-                progress=progress,
-            )
+        return propagate_quietly(
+            posterior,
+            samples,
+            record=event.record,
+            quantity={"histories": None, "peaks": [peak(channel.name) for channel in channels]},
+            cache=posterior.likelihood.cache,
+            **options,
+            progress=progress,
+        )
     except ValueError as error:
         raise ValueError(f"{job.file.name}: [events.{event.name}] {error}") from error
 
 
 def describe_events(
-    events: tuple[Event, ...], predictions: Mapping[str, dict[str, Prediction]]
+    events: tuple[Event, ...], predictions: Mapping[str, dict[str, Prediction] | SimulationFailed]
 ) -> tuple[OtherEvent, ...]:
-    """Numbers, scores and sentences of the events that were predicted."""
+    """Numbers, scores and sentences of the events, also of those of which all simulations have failed."""
     return tuple(
         describe_event(event.name, predictions[event.name], event.measured)
         for event in events
@@ -183,34 +203,30 @@ def describe_events(
     )
 
 
-def write_events(
-    folder: Path,
-    events: tuple[Event, ...],
-    predictions: Mapping[str, dict[str, Prediction]],
-    described: tuple[OtherEvent, ...],
-) -> tuple[str, ...]:
+def write_events(folder: Path, events: tuple[Event, ...], described: tuple[OtherEvent, ...]) -> tuple[str, ...]:
     """Write tables and pictures of predicted events, which `describe_events` has described.
 
     Returns
     -------
     tuple of str
-        Names of the files: ``event-NAME.txt``, ``event-NAME.csv`` and ``event-NAME.png`` of each event.
+        Names of the files: ``event-NAME.txt``, ``event-NAME.csv`` and ``event-NAME.png`` of each event that has a
+        prediction.
     """
     files: list[str] = []
     by_name = {event.name: event for event in events}
     for found in described:
+        if not found.predictions:
+            continue
         names = tuple(f"event-{found.name}.{ending}" for ending in ("txt", "csv", "png"))
-        _write_event([folder / name for name in names], by_name[found.name], predictions[found.name], found)
+        _write_event([folder / name for name in names], by_name[found.name], found)
         files += names
     return tuple(files)
 
 
-def _write_event(paths: list[Path], event: Event, predictions: dict[str, Prediction], found: OtherEvent) -> None:
+def _write_event(paths: list[Path], event: Event, found: OtherEvent) -> None:
     from ..plots.predictions import plot_bands
-    from ..reporting.other_events import describe_event
     from ..text_tables import text_table
 
-    found = describe_event(event.name, predictions, event.measured)
     steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
     lines = [f"Event {event.name}: {event.record.name}, {steps}", found.sentence]
     lines += [f"CAUTION: {remark}" for remark in found.remarks]
@@ -223,11 +239,11 @@ def _write_event(paths: list[Path], event: Event, predictions: dict[str, Predict
         lines += ["", "Histories against the measurements", *map(str, found.histories)]
     paths[0].write_text(in_toml_terms("\n".join(lines)) + "\n", encoding="utf-8")
     rows = []
-    for channel, row in zip(predictions["peaks"].channels, found.numbers, strict=True):
+    for channel, row in zip(found.predictions["peaks"].channels, found.numbers, strict=True):
         values = {"q05": row.ends[0], "q25": row.quartiles[0], "median": row.median}
         values |= {"q75": row.quartiles[1], "q95": row.ends[1]}
         if event.measured is not None:
             values |= {"measured": row.measured, "pit": row.pit}
         rows.append({"channel": channel.name, "unit": row.unit} | values)
     write_csv(paths[1], rows)
-    plot_bands(predictions["histories"], event.measured).savefig(paths[2], dpi=150)
+    plot_bands(found.predictions["histories"], event.measured).savefig(paths[2], dpi=150)

@@ -13,6 +13,7 @@ from ..probability.posterior import Posterior
 from ..reporting.run import FinishedRun
 from ..signals.channels import Measurements
 from ..signals.error_measures import rrmse
+from ..simulation.model import SimulationFailed
 from .hints import in_toml_terms
 
 __all__ = ["write_csv", "write_report", "write_samples", "write_tables"]
@@ -135,7 +136,7 @@ def write_report(
     prediction: Prediction | None,
     again: str,
     truth: Mapping[str, float] | None,
-    events: Mapping[str, Mapping[str, Prediction]],
+    events: Mapping[str, Mapping[str, Prediction] | SimulationFailed],
     measured: Mapping[str, Measurements],
 ) -> str:
     """Write the report in HTML, with the command that makes it again; return the name of the file."""

@@ -24,8 +24,8 @@ from .events import (
     describe_events,
     predict_events,
     prediction_options,
+    propagate_quietly,
     read_events,
-    without_warnings,
     write_events,
 )
 from .hints import in_toml_terms
@@ -184,14 +184,13 @@ def _write(
     samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS))
     predicted = predict_events(job, events, problem, drawn, progress)
     described = describe_events(events, predicted)
-    pictures = write_events(folder, events, predicted, described)
+    pictures = write_events(folder, events, described)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     page, truth = folder / "report.html", problem.truth
     report = write_report(page, run, prediction, again, truth, predicted, measured)
     tables = write_tables(folder, run)  # last: they say how many simulations there are
     cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
     cautions += [f"event {each.name}: {remark}" for each in described for remark in each.remarks]
-    cautions += [f"event {event.name}: all simulations failed" for event in events if event.name not in predicted]
     return (report, *tables, samples, *pictures), tuple(map(in_toml_terms, cautions)), not run.is_inconclusive
 
 
@@ -247,13 +246,10 @@ def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
 
 
 def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:
-    from ..prediction.propagation import propagate
-
     if not len(drawn):
         return None
     cache = problem.posterior.likelihood.cache
     try:
-        with without_warnings():
-            return propagate(problem.posterior, drawn, cache=cache, **prediction_options(job), progress=progress)
+        return propagate_quietly(problem.posterior, drawn, cache=cache, **prediction_options(job), progress=progress)
     except ValueError as error:
         raise ValueError(f"{job.where('prediction')} {error}") from error

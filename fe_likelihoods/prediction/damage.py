@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..text_tables import number
+from ..units import DIMENSIONS, find_unit, from_si
 from .damage_measures import SIDES, STRAIN_MEASURES, DamageMeasures
 from .event_ratios import EventRatios, LevelRatios
 from .event_spread import EventSpread
@@ -40,8 +41,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Damage", "LimitState", "damage", "limit_states"]
 
-_UNITS = {"dissipated energy": (1e-3, "kJ"), "period": (1.0, "s")}
-"""Factor and unit in which a measure is printed; the others are numbers."""
+_UNITS = {"dissipated energy": "kJ", "period": "s"}
+"""Units in which measures are printed; the others are numbers."""
 
 
 _DECREASING = ("stiffness ratio",)
@@ -70,9 +71,11 @@ class LimitState(NamedTuple):
     source: str = ""
 
     def __str__(self) -> str:
-        limits = np.ravel(self.limit)
+        unit = _UNITS.get(self.measure, "1")
+        limits = from_si(np.ravel(self.limit), unit)
         value = number(limits[0]) if len(limits) == 1 else f"{number(limits.min())} to {number(limits.max())}"
-        return f"{self.name}: {self.measure} beyond {value} [SI]" + (f" ({self.source})" if self.source else "")
+        value += "" if unit == "1" else f" {unit}"
+        return f"{self.name}: {self.measure} beyond {value}" + (f" ({self.source})" if self.source else "")
 
 
 _ASSUMED = (
@@ -171,10 +174,10 @@ class Damage(NamedTuple):
             quantiles = "quantiles " + ", ".join(f"{p:g}" for p in self.probabilities)
             rows += [("", []), (quantiles, events)]
         for name, values in self.extent.items():
-            factor, unit = _UNITS.get(name, (1.0, ""))
-            largest = values.reshape(*values.shape[:2], -1).max(axis=2) * factor
+            unit = _UNITS.get(name, "1")
+            largest = from_si(values.reshape(*values.shape[:2], -1).max(axis=2), unit)
             cells = [" ".join(f"{v:.3g}" for v in column) for column in largest.T]
-            rows.append((name + (f" [{unit}]" if unit else ""), cells))
+            rows.append((name + ("" if unit == "1" else f" [{unit}]"), cells))
         first = max(len(name) for name, _ in rows)
         width = max([20, *(len(cell) for _, cells in rows for cell in cells)]) + 2
         lines = [(f"{name:<{first}}" + "".join(f"{c:>{width}}" for c in cells)).rstrip() for name, cells in rows]
@@ -293,12 +296,13 @@ def damage(
             )
         found, limit = values[state.measure], _limit_per_sample(state, prediction)
         reported = np.asarray(state.limit if np.ndim(state.limit) == 0 else limit.mean(), dtype=float)
+        shown = {"threshold": reported, "unit": DIMENSIONS[find_unit(_UNITS.get(state.measure, "1")).dimension]}
         spread = EventSpread(found, weights, errors.get(state.measure))
         options = (limit, spread, effective, level, seed, state.measure in _DECREASING)
         largest = found.max(axis=(2, 3)) if found.ndim == 4 else found
-        presence[state.name] = _exceeded(largest, *options)._replace(threshold=reported)
+        presence[state.name] = _exceeded(largest, *options)._replace(**shown)
         if found.ndim == 4:
-            location[state.name] = _exceeded(found, *options)._replace(threshold=reported)
+            location[state.name] = _exceeded(found, *options)._replace(**shown)
     without = [state.name for state in states if state.measure not in errors]
     if without and noise is None:
         guess = "state a guess, such as EventRatios([1.0], prior_sd=0.3, prior_events=10)"

@@ -45,7 +45,8 @@ class Excitation(NamedTuple):
     def simulate(self, thetas: np.ndarray, pool: Any = None, stored: StoredResponses | None = None) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters).
 
-        With `stored`, they are looked up and stored there, those of the whole excitation.
+        With `stored`, they are looked up and stored there, those of the whole excitation. New ones are then simulated
+        from its beginning: a simulation from a kept state has only the last part of the response.
         """
         if stored is not None:
             responses, reasons = stored.simulate(thetas)

@@ -19,6 +19,7 @@ from ..probability.hierarchy import Hierarchy
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from ..text_tables import number, text_table
+from ..units import DIMENSIONS
 from .event_ratios import EventRatios, LevelRatios
 from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .excitation import chosen_state, excite, under_record
@@ -34,6 +35,7 @@ from .reliability import (
     contents,
     interval_of_draws,
     threshold_in_si,
+    unit_of_threshold,
     warn_of_missing_error,
 )
 
@@ -71,6 +73,8 @@ class Fragility(NamedTuple):
         and bands are made. None if there are neither ratios nor a population.
     uncertainty : str
         What the probabilities contain.
+    unit, intensity_unit : str
+        SI units of the threshold and of the intensities; "SI" where they are not known.
     """
 
     names: tuple[str, ...]
@@ -85,14 +89,17 @@ class Fragility(NamedTuple):
     from_state: str = "virgin"
     draws: np.ndarray | None = None
     uncertainty: str = ""
+    unit: str = "SI"
+    intensity_unit: str = "SI"
 
     def __str__(self) -> str:
-        rows = [("record", "intensity [SI]", "P(exceed)", "MC error", "interval", "failed")]
+        rows = [("record", f"intensity [{self.intensity_unit}]", "P(exceed)", "MC error", "interval", "failed")]
         for k, name in enumerate(self.names):
             numbers = number(self.intensity[k]), number(self.probability[k]), number(self.standard_error[k], 2)
             ends = f"{number(self.lower[k])} to {number(self.upper[k])}"
             rows.append((name, *numbers, ends, f"{self.n_failed[k]}"))
-        lines = [f"Probability to exceed {number(self.threshold)} [SI], from the state {self.from_state!r}"]
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        lines = [f"Probability to exceed {number(self.threshold)}{unit}, from the state {self.from_state!r}"]
         lines += [
             text_table(rows),
             "no curve: the points do not determine one" if self.curve is None else f"{self.curve}",
@@ -311,6 +318,8 @@ def fragility(
         state,
         found.draws,
         contents(bool(noise), spread),
+        unit_of_threshold(unit, known.channels),
+        DIMENSIONS["acceleration"] if intensity is peak_ground_acceleration else "SI",
     )
 
 

@@ -54,7 +54,14 @@ from .inputs import (
 from .model_error import follows_response
 from .prediction import Prediction
 from .quantities import Quantity, evaluator, measured_quantity
-from .transfer_checks import Peaks, calibration_of, remark_on_peaks, remark_on_residuals, sample_to_check
+from .transfer_checks import (
+    Peaks,
+    calibration_of,
+    is_first_warning,
+    remark_on_peaks,
+    remark_on_residuals,
+    sample_to_check,
+)
 
 __all__ = ["check_effective_sample_size", "fit_measures", "propagate"]
 
@@ -139,20 +146,23 @@ def propagate(
     state_bytes : int or None
         Largest size [bytes] of the states that this process keeps for "end". A later prediction with samples at the
         same parameters then does not run the earlier excitations again; its results have the same bits. 0: no states.
-        None: no limit. Models without a method ``simulate_from`` run the whole excitation.
+        None: no limit. Models without a method ``simulate_from``, and predictions with `cache`, run the whole
+        excitation.
     pool : optional
         Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
     cache : SimulationCache or path, optional
         Where responses are looked up and stored as soon as they are simulated, so that a prediction which was
         interrupted, or is made again, repeats none of them but one or two that are compared. Those of the whole
-        excitation are stored, also for "end". Default: responses are not stored.
+        excitation are stored, also for "end", so that new ones need it simulated from its beginning: without `cache`
+        kept states save that (`state_bytes`). Default: responses are not stored.
     calibrated : sequence of Measurements, optional
         Measurements of the events with which the parameters were calibrated, whose amplitudes a prediction under
         another record is compared with. Default: those of the likelihood. An empty sequence for no comparison.
     check : bool
         Whether the residuals of the calibration are compared with the noise, once for each likelihood, where samples
-        of all parameters are given. Under another record this needs one simulation of that of the calibration, which
-        the likelihood counts, or none if it has stored responses.
+        of all parameters are given; `Prediction.remarks` has what was found, also of later predictions. Under another
+        record this needs one simulation of that of the calibration, which the likelihood counts, or none if it has
+        stored responses.
     seed : int, optional
         Seed of the noise and of the subsample for quantiles. The result depends neither on `batch` nor on `pool`,
         except for round-off.
@@ -258,7 +268,7 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
-    remarks = []
+    remarks, of_residuals = [], ""
     if peaks is not None:
         remarks.append(remark_on_peaks(peaks, model.channels, known))
     if record is not None and noise:
@@ -266,10 +276,12 @@ def propagate(
         remarks.append(_remark_on_level((histories or list(predictions.values()))[0], source))
     if checked is not None and (record is not None or own_response is not None):
         point = as_points(samples, (*source.model.parameter_names, *source.noise.parameter_names))[checked]
-        remarks.append(remark_on_residuals(source, point, own_response))
+        of_residuals = remark_on_residuals(source, point, own_response)
+        remarks.append(of_residuals)
     remarks = tuple(remark for remark in remarks if remark)
     for remark in remarks:
-        warnings.warn(remark, stacklevel=2)
+        if remark is not of_residuals or is_first_warning(source.likelihood):
+            warnings.warn(remark, stacklevel=2)
     predictions = {name: replace(each, remarks=remarks) for name, each in predictions.items()}
     return predictions if isinstance(quantity, Mapping) else predictions[""]
 

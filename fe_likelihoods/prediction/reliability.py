@@ -27,7 +27,7 @@ from scipy import stats
 
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
-from ..units import to_si
+from ..units import DIMENSIONS, find_unit, to_si
 from .event_ratios import EventRatios, LevelRatios
 from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .prediction import Prediction
@@ -42,6 +42,7 @@ __all__ = [
     "exceedance_probability",
     "interval_of_draws",
     "threshold_in_si",
+    "unit_of_threshold",
     "warn_of_missing_error",
 ]
 
@@ -71,10 +72,13 @@ class Exceedance(NamedTuple):
     uncertainty : str
         What the probability contains.
     upper_by_events : ndarray or None
-        With ratios, the upper end of the Clopper-Pearson interval of the share of the events whose ratio exceeds, mean
-        over the samples: what the events tell without the normal form of the logarithms of their ratios. Where it is
-        far above `upper`, no event was near the threshold, and the probability is that of the assumed tail. None
-        without ratios.
+        With `EventRatios`, the upper end of the Clopper-Pearson interval of the share of the events whose ratio
+        exceeds, mean over the samples: what the events tell without the normal form of the logarithms of their ratios.
+        Where it is far above `upper`, no event was near the threshold, and the probability is that of the assumed tail.
+        None without ratios, and with `LevelRatios`: ratios at other levels are no trials of the level that is
+        predicted.
+    unit : str
+        SI unit of the threshold; "SI" where its dimension is not known.
     """
 
     threshold: np.ndarray
@@ -85,12 +89,17 @@ class Exceedance(NamedTuple):
     effective_sample_size: float
     uncertainty: str = ""
     upper_by_events: np.ndarray | None = None
+    unit: str = "SI"
 
     def __str__(self) -> str:
-        arrays = (self.threshold, self.probability, self.standard_error, self.lower, self.upper)
-        rows = [("threshold [SI]", "probability", "MC error", "interval")]
-        for limit, share, error, lower, upper in zip(*map(np.ravel, np.broadcast_arrays(*arrays)), strict=True):
-            rows.append((number(limit), number(share), number(error, 2), f"{number(lower)} to {number(upper)}"))
+        arrays = [self.threshold, self.probability, self.standard_error, self.lower, self.upper]
+        by_events = self.upper_by_events is not None
+        arrays += [self.upper_by_events] if by_events else []
+        first = "threshold" if self.unit == "1" else f"threshold [{self.unit}]"
+        rows = [(first, "probability", "MC error", "interval", *(["upper end by the events alone"] * by_events))]
+        for limit, share, error, low, high, *rest in zip(*map(np.ravel, np.broadcast_arrays(*arrays)), strict=True):
+            cells = number(limit), number(share), number(error, 2), f"{number(low)} to {number(high)}"
+            rows.append((*cells, *map(number, rest)))
         said = f"\nThe probability contains {self.uncertainty}." if self.uncertainty else ""
         return text_table(rows) + said
 
@@ -187,7 +196,7 @@ def exceedance(
             f"{limits.shape}"
         )
     check_level(level)
-    said = contents(has_error, spread)
+    said, unit = contents(has_error, spread), unit_of_threshold(unit, channels)
     if spread.ratios is None and spread.weights is None:
         if values.ndim == 1:
             share = 1.0 - np.searchsorted(np.sort(values), limits, side="right") / len(values)
@@ -195,7 +204,7 @@ def exceedance(
             share = (values > limits).mean(axis=0)
         lower, upper = binomial_interval(share, effective, level)
         error = np.sqrt(share * (1.0 - share) / effective)
-        return Exceedance(limits, share, error, lower, upper, effective, said)
+        return Exceedance(limits, share, error, lower, upper, effective, said, unit=unit)
     if spread.ratios is not None:
         if not (limits > 0.0).all():
             raise ValueError(f"with ratios, thresholds must be positive; got {limits}")
@@ -213,11 +222,12 @@ def exceedance(
             for k in range(len(rows))
         ]
         numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
-        return Exceedance(limits, *numbers, effective, said, np.array([each.upper_by_events for each in columns]))
+        by_events = np.array([each.upper_by_events for each in columns])
+        return Exceedance(limits, *numbers, effective, said, by_events, unit)
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
     found = exceedance_probability(values, limits, spread, effective, level, seed)
-    return found._replace(threshold=limits, uncertainty=said)
+    return found._replace(threshold=limits, uncertainty=said, unit=unit)
 
 
 def exceedance_probability(
@@ -253,12 +263,14 @@ def exceedance_probability(
     draws = exceedance_draws(values, limits, spread, np.random.default_rng(seed), below)
     share, error = single.mean(axis=0), single.std(axis=0) / np.sqrt(effective)
     lower, upper = interval_of_draws(draws, share, effective, spread, level)
-    by_events = None if spread.ratios is None else _upper_by_events(values, limits, spread.ratios, level, below)
+    by_events = None
+    if isinstance(spread.ratios, EventRatios):
+        by_events = _upper_by_events(values, limits, spread.ratios, level, below)
     return Exceedance(limits[0], share, error, lower, upper, effective, contents(False, spread), by_events)
 
 
 def _upper_by_events(
-    values: np.ndarray, limits: np.ndarray, ratios: EventRatios | LevelRatios, level: float, below: bool
+    values: np.ndarray, limits: np.ndarray, ratios: EventRatios, level: float, below: bool
 ) -> np.ndarray:
     """Upper end of the interval of the share of the events that exceed, of as many trials as there are events."""
     exceeded = [(values * each < limits if below else values * each > limits).mean(axis=0) for each in ratios.values]
@@ -337,6 +349,12 @@ def threshold_in_si(threshold: ArrayLike, unit: str | None, channels: Sequence[C
             "units, without a unit"
         )
     return np.asarray(to_si(limits, unit, *dimensions))
+
+
+def unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:
+    """SI unit of a threshold that was given in a unit, or for channels; "SI" where the dimension is not known."""
+    dimensions = {channel.dimension for channel in channels} or ({find_unit(unit).dimension} if unit else set())
+    return DIMENSIONS[dimensions.pop()] if len(dimensions) == 1 else "SI"
 
 
 def binomial_interval(share: np.ndarray, effective: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:

@@ -29,6 +29,7 @@ __all__ = [
     "Peaks",
     "calibration_of",
     "sample_to_check",
+    "is_first_warning",
     "remark_on_peaks",
     "remark_on_residuals",
 ]
@@ -41,7 +42,9 @@ _WEAK = 0.2  # lag-one correlation that hardly changes intervals, as in `residua
 _LARGEST_COUNT_RATIO = 2.0  # of independent samples: assumed by the noise, and found
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
-_CHECKED = weakref.WeakSet()  # likelihoods whose residuals were checked
+# what the residuals of likelihoods say, and the likelihoods of which a warning has said it
+_FOUND: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
+_WARNED: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 class Peaks:
@@ -104,7 +107,7 @@ def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calib
     if not far:
         return ""
     # Several events show how parameters vary between them, but not at amplitudes that none of them had.
-    other = "" if len(calibrated) > 1 else ", or let parameters vary between events (Hierarchy)"
+    other = "" if len(calibrated) > 1 else ", or let parameters vary between events (in Python, Hierarchy)"
     return (
         f"the predicted peaks are outside of the range of the calibration by more than a factor of "
         f"{_LARGEST_PEAK_RATIO:g}: {', '.join(far)}. The parameters were calibrated at other amplitudes; where "
@@ -116,11 +119,11 @@ def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calib
 def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
     """Index of the sample nearest to the mean, whose residuals are compared with the noise.
 
-    None if there is nothing to check: without a likelihood, for a noise that is not listed in `propagate`, for samples
-    of the structural parameters alone, and after the first check of a likelihood.
+    None if there is nothing to check: without a likelihood, for a noise that is not listed in `propagate`, and for
+    samples of the structural parameters alone.
     """
     kinds = (GaussianNoise, SharedGaussianNoise, RelativeNoise, AutoregressiveNoise)
-    if source.likelihood is None or not isinstance(source.noise, kinds) or source.likelihood in _CHECKED:
+    if source.likelihood is None or not isinstance(source.noise, kinds):
         return None
     names = (*source.model.parameter_names, *source.noise.parameter_names)
     if (len(samples) if isinstance(samples, Mapping) else np.shape(samples)[-1]) != len(names):
@@ -132,9 +135,10 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
 
 
 def remark_on_residuals(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> str:
-    """What to say, once for a likelihood, if its residuals contradict the noise with which it was sampled.
+    """What to say if the residuals of a likelihood contradict the noise with which it was sampled.
 
-    Samples that do not fit, such as draws of the prior, are not judged.
+    Samples that do not fit, such as draws of the prior, are not judged. What the first judged samples of a likelihood
+    have shown is kept for all later ones, so that equal predictions have equal remarks without another simulation.
 
     Parameters
     ----------
@@ -143,8 +147,8 @@ def remark_on_residuals(source: PredictionSource, point: np.ndarray, response: n
     point : (ndim,) ndarray
         A sample of all parameters.
     response : (n_channels, n_steps) ndarray, or None
-        Its response to the excitation of the calibration [SI]. None: it is taken from the responses that the likelihood
-        has stored, or simulated.
+        Its response to the excitation of the calibration [SI]. None: what is kept is returned. Where nothing is kept,
+        the response is taken from those that the likelihood has stored, or simulated.
 
     Returns
     -------
@@ -154,18 +158,33 @@ def remark_on_residuals(source: PredictionSource, point: np.ndarray, response: n
     likelihood, noise = source.likelihood, source.noise
     n_structural = len(source.model.parameter_names)
     if response is None:
+        if likelihood in _FOUND:
+            return _FOUND[likelihood]
         response = _response(likelihood, point[:n_structural])
     if response is None:
         return ""
     residuals, parameters = likelihood.residuals_of(response, point), point[None, n_structural:]
-    channels = source.model.channels
     if not (np.isfinite(residuals).sum(axis=1) > 1).all() or not np.nanmax(np.abs(residuals), axis=1).all():
         return ""
     stated = noise.standard_deviations(parameters)[0]
     found = np.sqrt(np.nanmean(np.square(residuals), axis=1))
     if (np.maximum(found / stated, stated / found) > _OTHER_LEVEL).any():
         return ""
-    _CHECKED.add(likelihood)
+    if likelihood not in _FOUND:
+        _FOUND[likelihood] = _contradiction(source, residuals, parameters)
+    return _FOUND[likelihood]
+
+
+def is_first_warning(likelihood: Any) -> bool:
+    """Whether the residuals of a likelihood are to be warned of: once, while every prediction keeps the remark."""
+    first = likelihood not in _WARNED
+    _WARNED.add(likelihood)
+    return first
+
+
+def _contradiction(source: PredictionSource, residuals: np.ndarray, parameters: np.ndarray) -> str:
+    """How residuals (n_channels, n_steps) contradict a noise with parameters (1, n_noise), in words; empty if not."""
+    noise, channels = source.noise, source.model.channels
     autoregressive = isinstance(noise, AutoregressiveNoise)
     if autoregressive:
         residuals = innovations(residuals, noise.lag_one_correlations(parameters)[0])
@@ -191,8 +210,8 @@ def remark_on_residuals(source: PredictionSource, point: np.ndarray, response: n
     other = "fewer samples, BandNoise" if autoregressive else "AutoregressiveNoise"
     return (
         f"the {what} not independent, as the noise says they are: {names}. The posterior is too narrow, and so is the "
-        f"spread of the predictions between its samples. Calibrate with {other} or effective_samples=, see "
-        "residual_checks, or predict with the spread between events (predict_new_event). This is said once"
+        f"spread of the predictions between its samples. Calibrate with {other} or effective_samples=, or predict with "
+        "the spread between several calibrated events (in Python, predict_new_event; residual_checks has the figures)"
     )
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import ks_2samp
 
-from samplers.tempering.failed_region import NearFailures, failures_near
+from samplers import NearFailures, failures_near
 
 from ..probability.likelihood import FELikelihood
 from .run import FinishedRun

@@ -9,6 +9,7 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores, central_interval
 from ..signals.channels import Measurements
+from ..simulation.model import SimulationFailed
 from ..units import from_si
 from .contents import names_of_values
 
@@ -63,7 +64,7 @@ class OtherEvent(NamedTuple):
     ----------
     name : str
     predictions : mapping of str to Prediction
-        By quantity.
+        By quantity; none where all simulations have failed.
     measured : Measurements or None
     numbers : tuple of NumberRow
         Of all predictions that are not histories.
@@ -87,42 +88,54 @@ class OtherEvent(NamedTuple):
     remarks: tuple[str, ...]
 
 
-def as_events(events: Any) -> dict[str, EventPredictions]:
-    """Predictions of each event by quantity; ValueError for other objects.
+def as_events(events: Any) -> dict[str, EventPredictions | SimulationFailed]:
+    """Predictions of each event by quantity, or why there are none; ValueError for other objects.
 
     Parameters
     ----------
-    events : mapping of str to Prediction, or to mapping of str to Prediction
+    events : mapping of str to Prediction, to mapping of str to Prediction, or to SimulationFailed
         By the name of the event.
     """
     if not isinstance(events, Mapping):
         raise ValueError(f"events must be a mapping of names to predictions of these events; got {events!r}")
     found = {}
     for name, given in events.items():
+        if isinstance(given, SimulationFailed):
+            found[str(name)] = given
+            continue
         of_event = {"": given} if isinstance(given, Prediction) else given
         if not isinstance(of_event, Mapping) or not all(isinstance(each, Prediction) for each in of_event.values()):
             raise ValueError(
                 f"events: expected the result of propagate for each event, of one quantity or of several by name; "
                 f"{name!r} is {given!r}"
             )
+        if not of_event:
+            raise ValueError(
+                f"events: {name!r} has no prediction; give the result of propagate for it, or leave the event out"
+            )
         found[str(name)] = dict(of_event)
     return found
 
 
-def describe_event(name: str, predictions: EventPredictions, measured: Measurements | None) -> OtherEvent:
+def describe_event(
+    name: str, predictions: EventPredictions | SimulationFailed, measured: Measurements | None
+) -> OtherEvent:
     """Score the predictions of an event, and say how it compares with the measurements.
 
     Parameters
     ----------
     name : str
-    predictions : mapping of str to Prediction
-        By quantity.
+    predictions : mapping of str to Prediction, or SimulationFailed
+        By quantity, or the error that `fe_likelihoods.propagate` raises where all simulations fail.
     measured : Measurements or None
 
     Returns
     -------
     OtherEvent
     """
+    if isinstance(predictions, SimulationFailed):
+        remark = f"all simulations failed: {predictions.reason}"
+        return OtherEvent(name, {}, measured, (), (), (), "It could not be predicted.", (remark,))
     remarks = list(dict.fromkeys(remark for each in predictions.values() for remark in each.remarks))
     first = next(iter(predictions.values()))
     if first.n_failed:
@@ -147,8 +160,8 @@ def describe_event(name: str, predictions: EventPredictions, measured: Measureme
     if missed:
         remarks.append(
             f"the {_percent(LEVEL)} band contains less than half of the strong part of {', '.join(missed)}: its spread "
-            "is not that of a new event. Calibrate with several events (predict_new_event), or with a noise that "
-            "follows the response; and look for what the model lacks"
+            "is not that of a new event. Calibrate with several events (in Python, predict_new_event has their "
+            "spread), or with a noise that follows the response; and look for what the model lacks"
         )
     sentence = _sentence(first, measured, histories, numbers)
     return OtherEvent(
@@ -202,8 +215,11 @@ def _sentence(
         shares = ", ".join(
             f"{_percent(share)} of {channel.name}"
             for channel, share in zip(scores.channels, scores.coverage_strong, strict=True)
+            if np.isfinite(share)
         )
-        text += f" In the strong part, the {_percent(LEVEL)} band contains {shares}."
+        text += f" In the strong part, the {_percent(LEVEL)} band contains {shares}." if shares else ""
+        unknown = [c.name for c, share in zip(scores.channels, scores.coverage_strong, strict=True) if np.isnan(share)]
+        text += f" In the strong part, no sample of {', '.join(unknown)} can be compared." if unknown else ""
     if not first.noise:
         text += " A band without noise is that of the response, and contains fewer measurements."
     return text

@@ -12,6 +12,7 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
+from ..simulation.model import SimulationFailed
 from ..units import from_si
 from .advice import Advice, advise
 from .contents import (
@@ -101,7 +102,7 @@ def report(
     names: Sequence[str] | None = None,
     truth: Mapping[str, float] | Sequence[float] | None = None,
     measured: Measurements | Mapping[str, Measurements] | None = None,
-    events: Mapping[str, Prediction | EventPredictions] | None = None,
+    events: Mapping[str, Prediction | EventPredictions | SimulationFailed] | None = None,
     discard: int = 0,
     thin: int = 1,
     repeat: str = "",
@@ -132,11 +133,11 @@ def report(
         True values of synthetic data, in the units of the samples.
     measured : Measurements, or mapping of str to Measurements, optional
         Measurements to draw with the predictions, by the title of the prediction or the name of the event.
-    events : mapping of str to Prediction, or to mapping of str to Prediction, optional
+    events : mapping of str to Prediction, to mapping of str to Prediction, or to SimulationFailed, optional
         Predictions of other events than that of the calibration, by the name of the event: results of
         `fe_likelihoods.propagate` with ``record=`` or of `fe_likelihoods.predict_new_event`, of one quantity or of
         several by name, such as ``{"histories": None, "peaks": [peak("top")]}``. They are scored where `measured` has
-        the event.
+        the event. The error `SimulationFailed` of an event that could not be predicted names it in the report.
     discard, thin : int
         Iterations of the chain to leave out at its beginning (burn-in), and of which to keep one in `thin`.
     repeat : str

@@ -1,11 +1,22 @@
 """Other events in the TOML file: their predictions, their scores, their errors."""
 
 import csv
+import re
+import warnings
 
 import numpy as np
 import pytest
 
-from fe_likelihoods import LinearOscillator, SimulationCache, from_si, propagate, read_csv
+from fe_likelihoods import (
+    LinearOscillator,
+    Measurements,
+    Prediction,
+    SimulationCache,
+    SimulationFailed,
+    from_si,
+    propagate,
+    read_csv,
+)
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
@@ -92,7 +103,61 @@ def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
     assert (events / "r" / "event-weaker.csv").is_file()
 
 
-def test_the_prediction_is_that_of_propagate(events):
+class Doubtful(LinearOscillator):
+    """An oscillator of a user, which fails in weak motions, and warns in others."""
+
+    def simulate(self, theta):
+        if np.abs(self.record.acceleration).max() < 0.9 * np.abs(read_csv("base.csv").acceleration).max():
+            raise SimulationFailed("no motion")
+        warnings.warn("the oscillator is very soft", UserWarning, stacklevel=1)
+        return super().simulate(theta)
+
+
+def test_warnings_of_the_model_are_given_and_remarks_are_not(events):
+    from fe_likelihoods.command.events import propagate_quietly
+
+    problem = make_problem(read_job("oscillator.toml"))
+    oscillator = problem.posterior.likelihood.model
+    model, measured = Doubtful(oscillator.record, 0.8), problem.posterior.likelihood.measurements
+    weak = Measurements(measured.channels, measured.dt, 0.1 * measured.values)  # other amplitudes than predicted ones
+    options = {"record": oscillator.record, "calibrated": [weak], "progress": False}
+    with pytest.warns(UserWarning) as caught:
+        found = propagate_quietly(model, np.ones((5, 2)), **options)
+    assert [str(each.message) for each in caught] == ["the oscillator is very soft"]
+    assert len(found.remarks) == 1 and "predicted peaks are outside" in found.remarks[0]
+    with pytest.warns(UserWarning) as caught:  # control: what the command does not filter
+        propagate(model, np.ones((5, 2)), **options)
+    assert {str(each.message) for each in caught} == {"the oscillator is very soft", *found.remarks}
+
+
+def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monkeypatch):
+    weak, one = 0.7 * np.abs(read_csv("base.csv").acceleration).max(), LinearOscillator.simulate
+
+    def simulate(self, theta):
+        if np.abs(self.record.acceleration).max() < weak:
+            raise SimulationFailed("no motion")
+        return one(self, theta)
+
+    monkeypatch.setattr(LinearOscillator, "simulate", simulate)
+    said = call("run", "oscillator.toml", "--out", "r", "--quiet")
+    assert "CAUTION: event weaker: all simulations failed" in said and "event-weaker.txt" not in said
+    report = read_page(events / "r" / "report.html")
+    assert "All simulations failed" in report.notes["weaker"] and "no motion" in report.notes["weaker"]
+    assert "weaker: It could not be predicted." in report.text
+    numbers = next(table for table in report.tables if table[0][1:3] == ["Quantity", "Median"])[1:]
+    assert {row[0] for row in numbers} == {"after"}
+
+
+def test_remarks_are_in_words_of_the_file_also_in_the_report(events):
+    call("run", "oscillator.toml", "--out", "r", "--quiet")
+    page = (events / "r" / "report.html").read_text().split('<section id="events">')[1].split("</section>")[0]
+    for text in (page, (events / "r" / "event-weaker.txt").read_text()):
+        assert "residuals of the calibration are not independent" in text and "effective_samples=" not in text
+        assert "in [noise], or predict with the spread between several calibrated events" in text
+        assert not re.search(r"(?<!in Python, )(predict_new_event|Hierarchy)", text)
+
+
+def test_the_prediction_is_that_of_propagate(events, monkeypatch):
     from fe_likelihoods.command.events import describe_events, predict_events, read_events, write_events
     from fe_likelihoods.prediction.quantities import peak
 
@@ -102,7 +167,9 @@ def test_the_prediction_is_that_of_propagate(events):
     found = read_events(job, problem)
     assert [event.name for event in found] == ["weaker", "after"]
     predicted = predict_events(job, found, problem, samples, False)
-    write_events(events, found, predicted, describe_events(found, predicted))
+    described = describe_events(found, predicted)
+    monkeypatch.setattr(Prediction, "score", lambda *_: pytest.fail("scored twice"))
+    write_events(events, found, described)
     for event in found:
         noise = event.measured is not None
         options = {"record": event.record, "seed": 1, "noise": noise, "progress": False} | event.options

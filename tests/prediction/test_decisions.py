@@ -133,6 +133,24 @@ def test_what_the_events_tell_of_a_probability_without_the_form_of_their_ratios(
     np.testing.assert_allclose(both.upper_by_events, stats.beta.ppf(0.975, [2.0, 2.0], [2.0, 2.0]))
 
 
+@pytest.mark.parametrize("slope", [-0.22, 0.22])
+def test_events_at_other_levels_are_no_trials_of_the_predicted_one(slope, rng):
+    """Ratios with a trend: the share of the raw ones was below the probability, or far above it."""
+    levels = np.geomspace(0.1, 2.0, 12)
+    values = np.exp(0.3 + slope * np.log(levels / 0.1) + 0.03 * rng.standard_normal(12))
+    predicted = 2.0 * np.exp(0.01 * rng.standard_normal(400))
+    limits = 2.0 * np.exp(0.3 + slope * np.log(20.0)) * np.array([0.95, 1.0, 1.05])
+    found = exceedance(predicted, limits, ratios=LevelRatios(values, levels=levels))
+    assert np.all((found.lower <= found.probability) & (found.probability <= found.upper))
+    assert 0.7 < found.probability[0] and found.probability[2] < 0.3
+    assert found.upper_by_events is None and "events alone" not in str(found)
+    # control: the same ratios without levels are trials of one population, of which the share is known
+    middle = 2.0 * np.exp(np.log(values).mean())
+    share = np.mean([(predicted * each > middle).mean() for each in values])
+    without = exceedance(predicted, middle, ratios=EventRatios(values)).upper_by_events
+    assert without == pytest.approx(stats.beta.ppf(0.975, 12.0 * share + 1.0, 12.0 * (1.0 - share)))
+
+
 @pytest.mark.parametrize("degrees", [2.0, 50.0])
 def test_what_the_events_tell_holds_for_any_tail_of_the_ratios(degrees):
     """Ratios with heavy tails: the upper end by the events contains the truth at its level, that of the normal not."""
@@ -172,7 +190,7 @@ def test_fragility_of_a_hierarchy_is_compared_with_all_its_events(wave, rng):
     assert "10 times the largest" in beyond and "Hierarchy" not in beyond
     assert said(hierarchy, 2.0, calibrated=[posteriors["weak"].likelihood.measurements])
     (single,) = said(rng.normal(1.0, 0.05, size=(50, 1)), 2.0)
-    assert "vary between events (Hierarchy)" in single
+    assert "vary between events (in Python, Hierarchy)" in single
 
 
 def test_exceedance_of_a_new_event_has_the_spread_of_the_population(hierarchy):  # noqa: F811

@@ -64,9 +64,15 @@ def test_averages_of_models(predicted):
 def test_exceedance_and_fragility(predicted):
     found = exceedance(predicted["peak"], [10.0, 12.0], unit="cm", ratios=RATIOS)
     text = str(found)
+    assert cells(text, 0)[::4] == ["threshold [m]", "upper end by the events alone"]
     assert [cells(text, row)[0] for row in (1, 2)] == ["0.1", "0.12"]
+    assert [float(cells(text, row)[4]) for row in (1, 2)] == pytest.approx(list(found.upper_by_events), rel=5e-3)
     assert float(cells(text, 1)[1]) == pytest.approx(found.probability[0], rel=5e-3)
     assert text.endswith("The probability contains " + found.uncertainty + ".")
+    alone = str(exceedance(predicted["peak"], 0.1, noise=False))
+    assert cells(alone, 0)[0] == "threshold [m]" and "events" not in alone
+    assert cells(str(exceedance([0.1, 0.2], 0.15, noise=False)), 0)[0] == "threshold [SI]"
+    assert cells(str(exceedance([0.1, 0.2], 15.0, unit="cm", noise=False)), 0)[0] == "threshold [m]"
     records = [RECORD.scale(factor) for factor in (0.5, 1.0, 2.0)]
     curve = fragility(
         Flexible(RECORD),
@@ -80,7 +86,8 @@ def test_exceedance_and_fragility(predicted):
         progress=False,
     )
     text = str(curve)
-    assert text.startswith("Probability to exceed 0.02 [SI], from the state 'virgin'")
+    assert text.startswith("Probability to exceed 0.02 m, from the state 'virgin'")
+    assert cells(text, 1)[1] == "intensity [m/s2]"
     assert [float(cells(text, row)[2]) for row in (2, 3, 4)] == pytest.approx(list(curve.probability), rel=5e-3)
     assert f"lognormal fragility curve: median {curve.curve.median:.3g}" in text and "array" not in text
     assert str(fit_fragility([1.0, 2.0, 3.0], [1, 5, 9], [10, 10, 10])).count("+-") == 0
@@ -136,11 +143,12 @@ def test_constants_and_limits():
     text = str(ParkAng(0.25, 4.0e5, 0.05, "pushed to failure"))
     assert text == "Park-Ang index: ultimate displacement 250 mm, yield force 400 kN, beta 0.05 (pushed to failure)"
     assert str(LimitState("wide cracks", "bar tension", 0.015, "Kowalsky")) == (
-        "wide cracks: bar tension beyond 0.015 [SI] (Kowalsky)"
+        "wide cracks: bar tension beyond 0.015 (Kowalsky)"
     )
     assert str(LimitState("yield", "bar tension", np.array([0.002, 0.003]))) == (
-        "yield: bar tension beyond 0.002 to 0.003 [SI]"
+        "yield: bar tension beyond 0.002 to 0.003"
     )
+    assert str(LimitState("worn", "dissipated energy", 2.5e4)) == "worn: dissipated energy beyond 25 kJ"
 
 
 def test_tables_are_aligned_and_missing_cells_are_dashes():

@@ -209,4 +209,22 @@ def test_the_prediction_keeps_what_was_said(rng):
     texts = tuple(str(each.message) for each in caught)
     assert len(texts) == 3 and all(each.filename == __file__ for each in caught)
     assert found["a"].remarks == found["b"].remarks == texts
-    assert propagate(posterior, samples, progress=False).remarks == ()
+    (of_residuals,) = (text for text in texts if "not independent" in text)
+    assert propagate(posterior, samples, progress=False).remarks == (of_residuals,)
+
+
+@pytest.mark.parametrize("strength", (None, 1.0))
+def test_remarks_of_equal_predictions_are_equal_and_warned_of_once(rng, strength):
+    posterior, samples = calibrated(rng, rho=0.9)
+    record = None if strength is None else excitation(rng, strength)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = [
+            propagate(posterior, samples, record=record, noise=True, seed=1, progress=False).remarks for _ in range(3)
+        ]
+    assert found[0] == found[1] == found[2] and len(found[0]) == 1 and "not independent" in found[0][0]
+    assert sum("not independent" in str(each.message) for each in caught) == 1
+    # control: what the samples of the posterior have shown is not said of draws of the prior
+    assert propagate(posterior, posterior.sample_prior(100, 1), noise=True, progress=False).remarks == ()
+    right, samples = calibrated(rng)
+    assert propagate(right, samples, record=record, noise=True, progress=False).remarks == ()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import Measurements, peak, propagate, report
+from fe_likelihoods import Measurements, SimulationFailed, peak, propagate, report
 from fe_likelihoods.reporting.other_events import describe_event
 from tests.reporting.report_page import read_page
 from tests.reporting.test_report import vibrating
@@ -72,6 +72,21 @@ def test_what_speaks_against_an_event_is_said(vibrating, tmp_path):
     assert any(remark.startswith("no scores: ") for remark in other.remarks)
 
 
+@pytest.mark.filterwarnings("ignore:the residuals")
+def test_what_is_not_known_of_an_event_is_said_in_words(vibrating, tmp_path, monkeypatch):
+    sampler, posterior = vibrating
+    found = predicted(vibrating, noise=True)
+    scores = found["histories"].score(posterior.likelihood.measurements)
+    monkeypatch.setattr(
+        type(found["histories"]), "score", lambda *_: scores._replace(coverage_strong=np.array([np.nan]))
+    )
+    told = describe_event("silent", {"": found["histories"]}, posterior.likelihood.measurements)
+    assert "nan" not in told.sentence and "In the strong part, no sample of top can be compared." in told.sentence
+    failed = SimulationFailed("nothing to predict from, all 3 samples failed (3: unstable)")
+    page = read_page(report(sampler, posterior, out=tmp_path / "report.html", events={"strong": failed}))
+    assert "strong: It could not be predicted." in page.text and "3: unstable" in page.notes["strong"]
+
+
 def test_what_are_no_predictions_of_events_is_refused(vibrating, tmp_path):
     sampler, posterior = vibrating
     path = tmp_path / "report.html"
@@ -80,6 +95,8 @@ def test_what_are_no_predictions_of_events_is_refused(vibrating, tmp_path):
         report(sampler, posterior, out=path, events=predicted(vibrating)["peaks"])
     with pytest.raises(ValueError, match="expected the result of propagate for each event.*'second' is 3.0"):
         report(sampler, posterior, out=path, events={"second": 3.0})
+    with pytest.raises(ValueError, match="'second' has no prediction; give the result of propagate"):
+        report(sampler, posterior, out=path, events={"second": {}})
     with pytest.raises(ValueError, match="measured has third, .* no event has this name"):
         report(sampler, posterior, out=path, events={"second": predicted(vibrating)}, measured={"third": measured})
     with pytest.raises(ValueError, match="measured must be a mapping of the names of events"):
