@@ -18,7 +18,12 @@ from ..simulation.model import SimulationBatch
 from ..simulation.residual_statistics import needs_response
 from .quadratic import sums_of_squares
 
-__all__ = ["StackedLikelihood", "stack"]
+__all__ = ["TIME_SHIFTS", "StackedLikelihood", "stack"]
+
+TIME_SHIFTS = (
+    "a guide cannot emulate time shifts of channels: sample without a guide, or estimate the lags with align and "
+    "correct the measurements with Measurements.shift"
+)
 
 
 def stack(likelihood: Any) -> Any:
@@ -101,6 +106,8 @@ class StackedLikelihood:
         names = joint.parameter_names[: joint.ndim - len(joint.fast_parameters)]
         found, channels, numbers = [], 0, 0
         for likelihood, columns in parts:
+            if isinstance(likelihood.measured, Comparison) and likelihood.measured.lags is not None:
+                raise ValueError(TIME_SHIFTS)
             if isinstance(likelihood.measured, Comparison):
                 raise ValueError(
                     "a guide of a JointLikelihood needs data sets that have all samples at the steps of their models: "

@@ -20,7 +20,7 @@ from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
 from ..simulation.residual_statistics import needs_response
 from .quadratic import check_quadratic, sums_of_squares
-from .stacked import stack
+from .stacked import TIME_SHIFTS, stack
 
 __all__ = ["Archive", "NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
 
@@ -196,10 +196,7 @@ class ResponseTarget:
         self.n_noise = self.ndim - self.n_structural
         self.comparison = self._likelihood.measured
         if isinstance(self.comparison, Comparison) and self.comparison.lags is not None:
-            raise ValueError(
-                "a guide cannot emulate time shifts of channels: sample without a guide, or estimate the lags with "
-                "align and correct the measurements with Measurements.shift"
-            )
+            raise ValueError(TIME_SHIFTS)
         self.measured = measured_values(self.comparison)
         self.n_steps = self.measured.shape[1]
         self.n_samples = self._likelihood.n_samples

@@ -77,7 +77,7 @@ def excited_parts(model: Any, part: float, first: int = 0) -> Excited:
 
 
 def squared_levels(
-    sums: np.ndarray, counts: np.ndarray, local: float, excited: Excited, reference: float | None, growth: float
+    sums: np.ndarray, counts: np.ndarray, local: float, excited: Excited, reference: float | None, growth: float | None
 ) -> np.ndarray:
     """Squared levels of responses in each part of the time.
 
@@ -94,7 +94,7 @@ def squared_levels(
         Events and deformations of the parts.
     reference : float or None
         Deformation at which the factor of the growth is one; None for no growth.
-    growth : float
+    growth : float or None
         Exponent of the deformation reached.
 
     Returns

@@ -81,6 +81,9 @@ def _rows(case: str, errors: np.ndarray) -> list[Row]:
         inside = (np.abs(t) < stats.t.ppf(0.5 + 0.5 * level, degrees)).mean(axis=1)
         note = f"+- {100.0 * inside.std() / np.sqrt(len(inside)):.1f}"
         rows.append(Row(f"peaks within {level:.0%}", case, 100.0 * float(inside.mean()), "%", note))
+        half = stats.t.ppf(0.5 + 0.5 * level, degrees)
+        score = scale * (2.0 * half + 2.0 / (1.0 - level) * np.maximum(np.abs(t) - half, 0.0))
+        rows.append(Row(f"interval score of the log peak, {level:.0%}", case, float(score.mean()), ""))
         if level == 0.5:
             counts = np.round(inside * errors.shape[1])
             for least in (7, 8):

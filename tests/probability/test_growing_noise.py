@@ -78,6 +78,10 @@ def noise_of(specimen, **options):
     return ModulatedNoise(FORCE, **settings | options)
 
 
+def without_growth():
+    return ModulatedNoise(FORCE, window=WINDOW, sensor=[SENSOR])
+
+
 def deviations(specimen, theta, share, local=0.25, first=0):
     """From the definitions, with loops, of the response from the step `first` on."""
     force, time = specimen.simulate(theta)[0, first:], specimen.dt * np.arange(specimen.n_steps - first)
@@ -112,7 +116,7 @@ def test_the_likelihood_is_the_multivariate_normal_density_with_and_without_gaps
         assert likelihood([theta, share]) == pytest.approx(normal.logpdf(measured.values[0]), rel=1e-11)
     # other settings need no other simulations, and are another density
     assert likelihood.simulations == 3
-    without = likelihood.with_noise(noise_of(specimen, deformation=None))
+    without = likelihood.with_noise(without_growth())
     assert without.density_parts() != likelihood.density_parts() and without.fingerprint == likelihood.fingerprint
     assert abs(without([1.0, 0.1]) - likelihood([1.0, 0.1])) > 10.0
     # samples that are missing have no factor; the deformation is known there all the same
@@ -187,6 +191,8 @@ def test_predictions_of_a_larger_test_cover_errors_that_grow(rng):
             samples = np.column_stack([np.ones(200), shares])
             found = propagate(posterior, samples, noise=True, seed=k, progress=False).score(truth)
             coverage[growth][k], score[growth][k] = found.coverage[0], found.interval_score[0]
+    for growth in (GROWTH, 0.0):
+        print(growth, coverage[growth].mean(), "interval score [N]:", score[growth].mean())
     error = coverage[GROWTH].std() / np.sqrt(20)
     assert abs(coverage[GROWTH].mean() - 0.9) < 4.0 * error + 0.01  # 0.01: quantiles of 200 samples
     assert coverage[0.0].mean() < 0.8 and (score[0.0] > score[GROWTH]).all()
@@ -208,6 +214,20 @@ def test_another_record_has_its_own_deformation(rng):
         ValueError, match=r"deformation= is for a model under an imposed deformation.*leave deformation"
     ):
         noise_of(specimen).under(_Shaken())
+
+
+@pytest.mark.parametrize("rest", [7.0, 10.0, 12.0])  # steps; parts begin at the start of the record, not of the test
+def test_a_test_that_follows_keeps_the_deformation_of_the_test_before(rest, rng):
+    """`propagate` with from_state="end": a smaller history after the larger one, with errors of the larger drift."""
+    specimen, smaller = Specimen(cycles(0.04)), cycles(0.02, 100)
+    posterior = posterior_of(specimen, measured_of(specimen, SHARE, rng))
+    options = {"record": smaller, "noise": True, "progress": False, "calibrated": ()}
+    found = propagate(posterior, np.array([[1.0, SHARE]] * 2), from_state="end", rest=rest, **options).sd[0]
+    joined = specimen.followed_by(smaller, rest)
+    expected = deviations(joined, (1.0,), SHARE, first=joined.n_steps - len(found))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    fresh = propagate(posterior, np.array([[1.0, SHARE]] * 2), **options).sd[0]  # control: its own deformation alone
+    assert len(fresh) == len(found) and np.all(fresh < found / 1.3)
 
 
 class _Shaken:
@@ -249,3 +269,6 @@ def test_deformations_that_a_test_imposes():
         ModulatedNoise(FORCE, window=1.0, sensor=[1.0], deformation=0.0)
     with pytest.raises(ValueError, match="growth must be an exponent"):
         ModulatedNoise(FORCE, window=1.0, sensor=[1.0], deformation=1.0, growth=-1.0)
+    with pytest.raises(ValueError, match=r"growth=2.0 without deformation=.*give it, or leave growth out"):
+        ModulatedNoise(FORCE, window=1.0, sensor=[1.0], growth=2.0)
+    assert ModulatedNoise(FORCE, window=1.0, sensor=[1.0], deformation=1.0).growth == 0.25
