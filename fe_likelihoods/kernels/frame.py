@@ -16,7 +16,16 @@ from .corotational import BasicForces, add_to_stiffness, deformations
 from .fiber_section import Sections
 from .jit import kernel
 
-__all__ = ["Column", "allocate", "initialise_column", "assemble", "commit_sections", "cross_jumps", "record_sections"]
+__all__ = [
+    "Column",
+    "allocate",
+    "initialise_column",
+    "assemble",
+    "commit_sections",
+    "cross_jumps",
+    "bars_have_fractured",
+    "record_sections",
+]
 
 LARGEST_AXIAL_STRAIN = 0.2
 """An element that becomes longer or shorter by more than this share of its length has failed."""
@@ -241,3 +250,16 @@ def cross_jumps(column):
             k = HEAD + PER_SECTION * m
             count += fiber_section.cross_jumps(state[e, k], state[e, k + 1], e * n_points + m, column.sections)
     return count
+
+
+@kernel
+def bars_have_fractured(column):
+    """Return whether a bar of any section has fractured; never where the bars do not fail."""
+    memory = column.sections.steel_memory
+    if column.sections.failure.shape[0] == 0:
+        return False
+    for j in range(memory.shape[0]):
+        for i in range(memory.shape[1]):
+            if memory[j, i, bar_failure.FRACTURED] == 1.0:
+                return True
+    return False

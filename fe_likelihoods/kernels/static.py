@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .beam_column import HEAD
-from .frame import assemble, commit_sections, cross_jumps, initialise_column, record_sections
+from .frame import assemble, bars_have_fractured, commit_sections, cross_jumps, initialise_column, record_sections
 from .jit import kernel
 from .linear_solve import copy_matrix, copy_vector, solve_banded
 
@@ -163,19 +163,21 @@ def lower(column, position, load, imposed, iteration):
     Returns
     -------
     bool
-        True where the load is carried again. On failure the column stays where it has come to.
+        True where the load is carried again. False where no bar has fractured, where the first lowered position
+        carries the load, so that it was not lost, and where it is not carried again. On failure the column stays where
+        it has come to.
     """
     vertical = imposed + 1
-    if load[vertical] == 0.0:
+    if load[vertical] == 0.0 or not bars_have_fractured(column):
         return False
     downwards = math.copysign(1.0, load[vertical])
     move = downwards * LOWERING * column.length * column.elements.state.shape[0]
     tolerance, max_iterations = LOOSENING * iteration.tolerance, iteration.max_iterations
-    for _ in range(MAX_LOWERINGS):
+    for count in range(MAX_LOWERINGS):
         if not equilibrate(column, position, load, vertical, move, imposed, tolerance, max_iterations):
             return False
         if downwards * position.force[vertical] >= downwards * load[vertical]:
-            return equilibrate(column, position, load, imposed, 0.0, -1, tolerance, max_iterations)
+            return count > 0 and equilibrate(column, position, load, imposed, 0.0, -1, tolerance, max_iterations)
     return False
 
 

@@ -101,8 +101,12 @@ def column(
     height: float = HEIGHT,
     corotational: bool = True,
     element_tolerance: float = 1e-12,
+    bars_fail: bool = False,
 ) -> frame.Column:
-    """Return a virgin column with its materials set; by default two elements of three points each."""
+    """Return a virgin column with its materials set; by default two elements of three points each.
+
+    Bars that fail have neither fatigue nor buckling until their constants are set: they fail where a test says so.
+    """
     points, weights = lobatto(n_points)
     out = frame.allocate(
         n_elements=n_elements,
@@ -114,6 +118,7 @@ def column(
         core=fibers.core,
         cover=fibers.cover,
         bars=fibers.bars,
+        bars_fail=bars_fail,
     )
     concrete04.constants(*map(float, core), out.sections.concrete[0])
     concrete04.constants(*map(float, cover), out.sections.concrete[1])

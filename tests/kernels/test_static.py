@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels import concrete04
+from fe_likelihoods.kernels import bar_failure, concrete04
 from fe_likelihoods.kernels.static import (
     GRAVITY_STEPS,
     LOWERING,
@@ -155,39 +155,67 @@ def test_impossible_gravity_is_reported():
     assert np.isnan(history).all()
 
 
-def lowered(column, factor):
-    """Lower a displaced column until it carries `factor` times its weight; success, position, and the one before."""
+def test_a_failed_run_without_fatigue_is_not_lowered():
+    """Step 7 is too large for four iterations in any of its parts; a column that is lowered there goes on to step 24."""
+    targets = 3.614 * np.sin(np.linspace(0.0, 3.0 * np.pi, 33)) * np.linspace(0.2, 1.0, 33)
+    (status, _, lowerings), history = push(golden.column(golden.circle()), targets, max_iterations=4, halvings=3)
+    assert (status, lowerings) == (7, 0)
+    assert np.isfinite(history[:, :6]).all()
+
+
+def lowered(factor, fractured=1):
+    """Lower a displaced column until it carries `factor` times its weight; some bars of its base have fractured.
+
+    Returns
+    -------
+    done : bool
+    position : Position
+    before : ndarray (6,)
+        Displacements before.
+    load : ndarray (6,)
+    column : Column
+    """
+    column = golden.column(golden.circle(), bars_fail=True)
     iteration = Iteration(TOLERANCE, 50, 6)
     position = Position(np.zeros(6), np.zeros(6), np.zeros((6, 6)))
     assert apply_gravity(column, position, golden.gravity(), iteration) == 0
+    column.sections.virgin[0] = 0.0
+    column.sections.steel_memory[0, :fractured, bar_failure.FRACTURED] = 1.0
     load = golden.gravity()
     for _ in range(20):
         assert equilibrate(column, position, load, 3, 0.05, -1, TOLERANCE, 50)
     before = position.u.copy()
     load = factor * load
-    return lower(column, position, load, 3, iteration), position, before, load
+    return lower(column, position, load, 3, iteration), position, before, load, column
 
 
 def test_a_lowered_column_carries_its_load_with_the_lateral_displacement_held():
     """Where the load can also be added at once, the position is the same, to a tenth of a step of the lowering."""
-    done, position, before, load = lowered(golden.column(golden.circle()), 1.5)
+    done, position, before, load, _ = lowered(1.5)
     assert done
     assert position.u[3] == pytest.approx(before[3], abs=1e-12)
     assert position.u[4] < before[4]
     np.testing.assert_allclose(position.force[[0, 1, 2, 4, 5]], load[[0, 1, 2, 4, 5]], atol=1e-5 * golden.WEIGHT)
-    column = golden.column(golden.circle())
-    _, other, _, load = lowered(column, 1.0)
+    _, other, _, load, column = lowered(1.0)
     assert equilibrate(column, other, 1.5 * load, 3, 0.0, -1, TOLERANCE, 50)
     np.testing.assert_allclose(position.u, other.u, rtol=0, atol=0.1 * LOWERING * golden.HEIGHT)
     assert before[4] - position.u[4] > LOWERING * golden.HEIGHT
 
 
 def test_a_load_beyond_the_strength_is_a_collapse():
-    done, *_ = lowered(golden.column(golden.circle()), 100.0)
+    done, *_ = lowered(100.0)
     assert not done
 
 
-def test_a_column_without_load_is_not_lowered():
-    done, position, before, _ = lowered(golden.column(golden.circle()), 0.0)
+@pytest.mark.parametrize(("factor", "fractured"), [(0.0, 1), (1.5, 0)])
+def test_a_column_without_load_or_with_all_its_bars_is_not_lowered(factor, fractured):
+    done, position, before, *_ = lowered(factor, fractured)
     assert not done
     np.testing.assert_array_equal(position.u, before)
+
+
+def test_a_load_that_the_first_lowered_position_carries_was_not_lost():
+    """Three bars fractured, and the load is in equilibrium: there is no reason to come down."""
+    done, position, before, *_ = lowered(1.0, fractured=3)
+    assert not done
+    assert before[4] - position.u[4] == pytest.approx(LOWERING * golden.HEIGHT, rel=1e-3)

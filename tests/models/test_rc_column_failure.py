@@ -99,6 +99,39 @@ def test_the_column_goes_on_after_it_has_lost_bars(column, cf):
     np.testing.assert_allclose(-history["base moment"], moment, atol=1e-5 * np.abs(moment).max())
 
 
+def weakened(column, drifts, points=30, **changes):
+    """A column on a rigid anchorage in linear geometry, with buckling, under cycles of other drifts."""
+    loading = cycles(*drifts, points=points)
+    return replace(column, loading=loading, penetration=0.0, geometry="linear", **changes)
+
+
+def test_a_column_that_loses_the_axial_load_comes_down_and_carries_it_again(column):
+    """Without the lowering, the simulation fails: the bars that remain yield in compression over open cracks."""
+    late = dict(fatigue=LowCycleFatigue(cf=0.088, cd=0.389), buckling=BarBuckling(8.5), max_increment=0.04)
+    model = weakened(column, (0.02, 0.05, 0.07), points=20, axial_load=1.4e6, **late)
+    history = model.history([1.0])
+    assert history.lowerings == 1
+    assert (history.bar_damage > 1.0).all()
+    np.testing.assert_allclose(history["displacement"], model.loading.displacement, atol=1e-12)
+    # a cantilever in linear geometry carries its load and the moment of the force at every sample, also afterwards
+    np.testing.assert_allclose(history["base axial force"], -1.4e6, rtol=1e-6)
+    moment = -history["force"] * model.height
+    np.testing.assert_allclose(history["base moment"], moment, atol=1e-6 * np.abs(moment).max())
+    # controls: neither cycles before the loss nor bars that do not fracture need it
+    early = replace(model, loading=cycles(0.02, points=20)).history([1.0])
+    assert early.lowerings == 0
+    assert early.bar_damage.max() < 1.0
+    assert replace(model, fatigue=None).history([1.0]).lowerings == 0
+
+
+def test_a_step_that_fails_while_the_axial_load_is_carried_is_not_a_lowering(column):
+    """A third of the bars has fractured, but the lowered column carries more: the step has another cause."""
+    failing = dict(fatigue=LowCycleFatigue(cf=0.037, cd=0.389), buckling=BarBuckling(10.8), max_increment=0.02)
+    model = weakened(column, (0.01, 0.03, 0.05, 0.07), axial_load=0.53e6, **failing)
+    with pytest.raises(SimulationFailed, match=r"bars with 33% of the area .* had fractured before"):
+        model.simulate([1.0])
+
+
 def test_a_failure_says_how_many_bars_had_fractured(column):
     """Seven times the weight: the core alone does not carry it in bending."""
     model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), max_increment=0.02, axial_load=16e6)
