@@ -156,7 +156,7 @@ def test_impossible_gravity_is_reported():
 
 
 def test_a_failed_run_without_fatigue_is_not_lowered():
-    """Step 7 is too large for four iterations in any of its parts; a column that is lowered there goes on to step 24."""
+    """Step 7 is too large for four iterations in any of its parts; a column lowered there goes on to step 24."""
     targets = 3.614 * np.sin(np.linspace(0.0, 3.0 * np.pi, 33)) * np.linspace(0.2, 1.0, 33)
     (status, _, lowerings), history = push(golden.column(golden.circle()), targets, max_iterations=4, halvings=3)
     assert (status, lowerings) == (7, 0)
