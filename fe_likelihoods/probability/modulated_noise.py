@@ -15,6 +15,7 @@ See ``docs/theory/noise.rst``.
 """
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -33,6 +34,7 @@ __all__ = ["ModulatedNoise", "PartSums"]
 _PARTS = 3  # parts of a window, in steps of which it moves
 _ROUND_OFF = 1e-6  # of a part
 _GROWTH = 0.25  # see docs/theory/noise.rst
+_LARGEST_GAP = 0.05  # part of the samples of a channel
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,9 @@ class ModulatedNoise:
 
     The mean square R^2 is that of the samples that are there; under `fe_likelihoods.Events` each event, and each
     pause, has its own. The share is the ratio of the root mean squares of error and response, for every `local`, and
-    may exceed one.
+    may exceed one. A share that was found in a part of a motion, beside a gap or with a long quiet end therefore
+    belongs to another R^2 than the whole motion has: calibrate and predict whole motions, with quiet ends of about the
+    same part of the duration, or use ``local=1``, which does not depend on R^2 (``docs/theory/noise.rst``).
 
     The level depends on the structural parameters, not on the measurements. The likelihood is therefore a normalised
     density, and evidences can be compared with those of `GaussianNoise` and others, unlike those of `RelativeNoise`.
@@ -254,6 +258,25 @@ class ModulatedNoise:
         counts = sums_of_parts(there.astype(float), sums.places(there.shape[1]), there).astype(int)
         return replace(self, layout=MeasuredLayout(sums.steps, sums.starts, tuple(map(tuple, counts.tolist()))))
 
+    def _warn_of_gaps(self, events: tuple[int, ...]) -> None:
+        """Warn of channels whose mean square is that of a part of the motion, or of an event."""
+        named, counts = [], np.array(self.layout.counts)
+        for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
+            known = np.flatnonzero(row)
+            inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # whole parts
+            if events:  # odd numbers; nothing needs to be measured in the pauses
+                inside = inside[np.array(events)[np.minimum(inside, len(events) - 1)] % 2 == 1]
+            expected = self.window / _PARTS / step * inside.size
+            share = 1.0 - row[inside].sum() / expected if inside.size else 0.0
+            named += [f"{channel.name!r} ({share:.0%})"] if share > _LARGEST_GAP else []
+        if named and self.local < 1.0:
+            warnings.warn(
+                f"ModulatedNoise: samples are missing within the channels {', '.join(named)}. The share is that of the "
+                "mean square of the other samples. If the strong part of the motion is missing, the share is too large "
+                "and predictions of whole motions too wide: use local=1, whose level is that of samples near by",
+                stacklevel=5,
+            )
+
     def under(self, model: Any, first: int = 0) -> "ModulatedNoise":
         """The same noise under the excitation of a model, whose response begins at the step `first`.
 
@@ -261,6 +284,11 @@ class ModulatedNoise:
         ------
         ValueError
             If the noise grows with a deformation, and none is imposed on the model.
+
+        Warns
+        -----
+        UserWarning
+            If `local` is below 1 and more than 5 % of the samples of a channel are missing within the motion.
         """
         excited = excited_parts(model, self.window / _PARTS, first)
         if self.deformation is not None and not excited.reached:
@@ -269,6 +297,8 @@ class ModulatedNoise:
                 "in its attribute loading or record, or an array (n_steps,) in its attribute deformation or strain; "
                 f"this {type(model).__name__} has none: leave deformation out"
             )
+        if self.layout is not None:
+            self._warn_of_gaps(excited.events)
         return replace(self, excited=excited)
 
     def log_likelihood(self, statistics: np.ndarray, n_samples: int | SampleCounts, shares: np.ndarray) -> np.ndarray:

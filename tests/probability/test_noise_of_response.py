@@ -1,6 +1,8 @@
 """`ModulatedNoise` and `BandNoise`: densities against scipy, calibration, predictive draws, gaps, caches, reports."""
 
 import pickle
+import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -244,7 +246,12 @@ def test_gaps_and_times_of_channels(kind, rng):
     values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
     gap, parameters = values.copy(), PARAMETERS[kind]
     gap[0, 100:130] = np.nan
-    likelihood, simulated = likelihood_of(kind, gap), response([1.2])
+    named = (
+        pytest.warns(UserWarning, match=r"within the channels .* \(\d+%\)") if kind == "modulated" else nullcontext()
+    )
+    with named:
+        likelihood = likelihood_of(kind, gap)
+    simulated = response([1.2])
     if kind == "modulated":  # the envelope is that of the samples that are there
         there = np.where(np.isnan(gap), np.nan, simulated)
         sd = likelihood.noise.response_deviations(parameters, there)
@@ -455,7 +462,9 @@ def test_events_have_levels_of_their_own_response(kind, rng):
         part = simulated[:, window.samples]
         own = noise.with_measurements(Measurements(model.channels, DT, part))
         single[window.name] = Measurements(model.channels, DT, part + draw(own, parameters, part, rng))
-    likelihood = FELikelihood(model, single, noise)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # the pause is no gap
+        likelihood = FELikelihood(model, single, noise)
     if kind == "modulated":  # in the likelihood and in a prediction of both, the level of each event is its own
         both = likelihood.noise.response_deviations(parameters, simulated, DT)
         for window in events.windows:
@@ -478,3 +487,34 @@ def test_events_have_levels_of_their_own_response(kind, rng):
     assert best[1] in (0.8, 1.0, 1.25)
     white = residual_checks(likelihood.noise.whitened(likelihood.residuals([1.0, 1.0]), simulated, parameters))
     np.testing.assert_allclose(white.standard_deviation, 1.0, atol=0.15)
+
+
+def test_a_gap_makes_the_share_that_of_another_level_and_is_named(rng):
+    """The share of the whole response is too large beside a gap in the strong part; that of the envelope is not."""
+    motion = response([1.0])
+    strong = slice(*np.searchsorted(np.cumsum(motion[0] ** 2) / np.sum(motion[0] ** 2), [0.2, 0.8]))
+    shares = np.linspace(0.02, 1.0, 400)
+
+    def found(local, gap):
+        noise = ModulatedNoise(CHANNELS, window=WINDOW, sensor=SENSOR, local=local)
+        values = motion.copy()
+        exact = noise.with_measurements(Measurements(CHANNELS, DT, values))
+        values += exact.response_deviations(np.array([0.2, 0.2]), motion) * rng.standard_normal(motion.shape)
+        if gap:
+            values[0, strong] = np.nan
+        likelihood = FELikelihood(MODEL, Measurements(CHANNELS, DT, values), noise)
+        grid = np.column_stack([np.ones(400), shares, np.full(400, 0.2)])
+        return shares[np.argmax(likelihood(grid))]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = [found(0.0, False) for _ in range(20)]
+        nearby = [found(1.0, True) for _ in range(20)]
+    with pytest.warns(UserWarning, match="local=1"):
+        beside = [found(0.0, True) for _ in range(20)]
+
+    def differs(sample):
+        return abs(np.mean(sample) - 0.2) / (np.std(sample, ddof=1) / np.sqrt(20))
+
+    assert differs(whole) < 4.0 and differs(nearby) < 4.0
+    assert differs(beside) > 4.0 and np.mean(beside) > 0.2
