@@ -25,6 +25,7 @@ _LARGEST_SHARE = 0.1  # of the hyper-samples at which weights may be unusable
 _LARGEST_OUTSIDE = 0.05  # of a population beyond bounds that the samples of a test reach
 _LARGEST_OUTSIDE_SUM = 0.06  # sum over the tests, without bounds at zero, which are those of positive parameters
 _OUTER = 0.02  # probability of the prior next to a bound
+_PILED = 0.09  # probability of the posterior of a test there, above which one bound alone is an alarm
 _NORMAL = 0.5  # largest skewness and excess kurtosis of a prior that a normal density describes
 
 
@@ -186,16 +187,22 @@ def _outside(
 
 def _reached(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
     """Whether the samples of a test reach the lower and the upper end of the prior of each varying parameter."""
+    return _probability_at_bounds(posterior, name) > 0.5 * _OUTER
+
+
+def _probability_at_bounds(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
+    """Probability (n_varying, 2) of the samples of a test in the outer 2 % of the prior at its lower and upper end."""
     samples = posterior.from_scale(posterior.described[name].points)[:, : len(posterior.varying)]
     weights, prior = np.exp(posterior.described[name].log_weights), _prior_draws(posterior, name)
     low, high = np.quantile(prior, [_OUTER, 1.0 - _OUTER], axis=0)
-    return np.stack([weights @ (samples < low), weights @ (samples > high)], axis=1) > 0.5 * _OUTER
+    return np.stack([weights @ (samples < low), weights @ (samples > high)], axis=1)
 
 
 def _flat(posterior: "HierarchicalPosterior", name: str) -> list[str]:
-    """Varying parameters that a test leaves between two bounds of its prior, which is not normal on their scale."""
+    """Varying parameters that reach both bounds, or pile up at one, of a prior that is not normal on their scale."""
     bounds = posterior.described[name].prior.bounds[: len(posterior.varying)]
-    flat = (_reached(posterior, name) & np.isfinite(bounds)).all(axis=1)
+    at_bounds = np.where(np.isfinite(bounds), _probability_at_bounds(posterior, name), 0.0)
+    flat = (at_bounds > 0.5 * _OUTER).all(axis=1) | (at_bounds > _PILED).any(axis=1)
     draws = posterior.scales.first(len(posterior.varying)).to_scale(_prior_draws(posterior, name))
     z = (draws - draws.mean(axis=0)) / draws.std(axis=0)
     moments = np.abs([(z**3).mean(axis=0), (z**4).mean(axis=0) - 3.0]).max(axis=0)
@@ -237,14 +244,14 @@ def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCh
                 f"{1.0 - each.sample_share:.0%} of its marginal likelihood is from the fitted mixture. Give more "
                 "samples of this test, or draw fresh samples with the population as its prior"
             )
-    # the mixture, which alone serves common parameters, does not describe a density that ends at two bounds
+    # the mixture, which alone serves common parameters, does not describe a density that ends at a bound
     flat = {name: _flat(posterior, name) for name in found} if posterior.common else {}
     if named := ", ".join(f"{each} in {test!r}" for test, names in flat.items() for each in names):
         messages.append(
-            f"{named}: the samples reach both bounds of the prior, so that the test says little about this varying "
-            f"parameter, and with common parameters ({', '.join(posterior.common)}) the fitted mixture makes values "
-            "between the bounds unequally likely. Leave these tests out, or sample them again with a prior that is "
-            "normal on the scale of the population, such as LogNormal for scale='log'"
+            f"{named}: the samples reach both bounds of the prior, or pile up at one, and with common parameters "
+            f"({', '.join(posterior.common)}) the likelihood is that of a fitted mixture, which is not reliable at a "
+            "bound. Sample these tests again with a prior that is normal on the scale of the population, such as "
+            "LogNormal for scale='log', or, where they say little about the parameter, leave them out"
         )
     if error > _LARGEST_ERROR:
         worst = max(found, key=lambda name: found[name].shift)

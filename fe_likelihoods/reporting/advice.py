@@ -161,6 +161,19 @@ def _of_failures(failed: Failures, inconclusive: bool) -> list[Advice]:
             "run again. Only if these parameters are impossible, a bound of the prior may stand there instead."
         )
         found.append(Advice(SEVERE, "Failures border on the samples", text, action))
+    elif failed.near.place == "edge" and not inconclusive:
+        text = (
+            f"{failed.near.adjoining} failed points adjoin the samples at an edge. If the posterior goes on there, its "
+            "interval is too narrow."
+        )
+        action = "See in the table of failures where they happen, and in the figures whether the samples end there."
+        found.append(Advice(CAUTION, "Failures at an edge of the samples", text, action))
+    elif failed.near.place == "scattered" and not inconclusive:
+        text = (
+            f"In the region of the samples, {failed.near.failed} of {failed.near.evaluated} simulated points failed, "
+            "scattered among successful ones. The posterior is right if they do not depend on the parameters."
+        )
+        found.append(Advice(CAUTION, "Failures among the samples", text, "See their reasons, and mend the model."))
     return found
 
 

@@ -1,21 +1,31 @@
 """Whether failed evaluations border on the posterior, so that they may end it instead of the data.
 
-A failed simulation counts as impossible. Far from the posterior that changes nothing. Among the final points, however,
-it cuts off a part of the posterior, and no weight, evidence or move shows it: all of them describe the density that is
-left.
+A failed simulation counts as impossible. Far from the posterior that changes nothing. Next to the final points it cuts
+off a part of the posterior, and no weight, evidence or move shows it: all of them describe the density that is left.
+Failures that are scattered among successful points thin the posterior out evenly, which changes its mean and standard
+deviation little.
 """
 
 from collections import deque
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import binom
 
 from .population import Doubt
 
 __all__ = ["EvaluatedPoints", "NearFailures", "check_failed_region", "failures_near"]
 
-FEWEST_NEAR = 3  # failures among the samples
+# A failure adjoins the samples if it is one of the evaluated points that are nearest to a sample. Other points lie
+# between the samples and failures further away, whatever the form of the posterior. With 20 points and at least 5
+# failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge of the posterior do.
+NEAREST = 20
+FEWEST_ADJOINING = 5
+LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the share of all points there
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
+NEIGHBOURS = 5  # evaluated points about a failure, which tell scattered failures from those that fill a region
+UNLIKELY = 1e-4  # probability that so many of them fail by chance
 INSIDE = 0.99  # share of the samples that are closer to their mean than the region that counts as theirs
 # The latest points are those near the posterior.
 KEPT_POINTS = 20_000
@@ -27,27 +37,50 @@ class NearFailures(NamedTuple):
     Attributes
     ----------
     failed : int
-        Number of failures there.
+        Number of failures in the ellipsoid about the mean of the samples that holds 99 % of them.
     evaluated : int
         Number of all distinct points there.
     known : bool
         Whether they are known to be failures; otherwise a log-probability of -inf may have another cause.
+    adjoining : int
+        Number of failures, in the ellipsoid or not, among the 20 evaluated points that are nearest to a sample.
+    scattered : bool
+        Whether the points about these failures fail no more often than other points among the samples.
+    nearest : int
+        Number of all distinct points among those 20 of each sample.
     """
 
     failed: int
     evaluated: int
     known: bool = True
+    adjoining: int = 0
+    scattered: bool = False
+    nearest: int = 0
+
+    @property
+    def place(self) -> Literal["away", "scattered", "edge", "border"]:
+        """Where the failures are.
+
+        "away" from the samples, or few; "scattered" among successful points; at an "edge" of the samples, where few
+        of the evaluated points failed, or few failures adjoin; or on a "border", with more than 2 % of these points.
+        """
+        if self.adjoining < FEWEST_ADJOINING:
+            return "away"
+        is_large = self.failed > LARGE_SHARE_NEAR * self.evaluated
+        if self.scattered:
+            return "scattered" if is_large else "away"
+        # of failures beside a bent posterior, far fewer adjoin the samples than of the other points in the ellipsoid
+        adjoin = self.adjoining * self.evaluated > LEAST_ADJOINING * self.failed * self.nearest
+        return "border" if is_large and adjoin else "edge"
 
     @property
     def borders(self) -> bool:
         """Whether failures border on the samples, so that they may end the posterior."""
-        return self.failed >= FEWEST_NEAR and self.failed > LARGE_SHARE_NEAR * self.evaluated
+        return self.place == "border"
 
 
 def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray) -> NearFailures:
     """Failures in the region of samples of the posterior, and all distinct points there.
-
-    The region is an ellipsoid about the mean of the samples with their covariance, which holds 99 % of them.
 
     Parameters
     ----------
@@ -59,16 +92,30 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
     # parameters may differ by many orders of magnitude
     mean, sd = samples.mean(axis=0), samples.std(axis=0)
     sd = np.where(sd > 0.0, sd, 1.0)
-    inverse = np.linalg.pinv(np.atleast_2d(np.cov((samples - mean) / sd, rowvar=False)), hermitian=True)
+    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov((samples - mean) / sd, rowvar=False)))
+    used = values > 1e-12 * values.max()
+    root = vectors[:, used] / np.sqrt(values[used])
 
-    def distances(points: np.ndarray) -> np.ndarray:
-        offsets = (points - mean) / sd
-        return np.einsum("ij,jk,ik->i", offsets, inverse, offsets)
+    def white(points: np.ndarray) -> np.ndarray:
+        return (points.reshape(-1, len(mean)) - mean) / sd @ root
 
-    limit = np.quantile(distances(samples), INSIDE)
-    number = int(np.count_nonzero(distances(np.unique(failed, axis=0)) <= limit)) if len(failed) else 0
-    successes = np.unique(np.concatenate([succeeded, samples]), axis=0)
-    return NearFailures(number, number + int(np.count_nonzero(distances(successes) <= limit)))
+    successes = np.unique(np.concatenate([succeeded.reshape(-1, len(mean)), samples]), axis=0)
+    points = np.concatenate([white(np.unique(failed, axis=0)), white(successes)])
+    has_failed = np.arange(len(points)) < len(points) - len(successes)
+    inside = np.square(points).sum(axis=1) <= np.quantile(np.square(white(samples)).sum(axis=1), INSIDE)
+    number, evaluated = int(np.count_nonzero(inside & has_failed)), int(np.count_nonzero(inside))
+    if not has_failed.any():
+        return NearFailures(number, evaluated)
+    tree = cKDTree(points)
+    nearest = np.unique(tree.query(white(np.unique(samples, axis=0)), k=min(NEAREST + 1, len(points)))[1])
+    adjoining = nearest[has_failed[nearest]]
+    if len(adjoining) == 0:
+        return NearFailures(number, evaluated)
+    about = tree.query(points[adjoining], k=min(NEIGHBOURS + 1, len(points)))[1][:, 1:]
+    by_chance = binom.isf(UNLIKELY, about.size, number / evaluated)
+    return NearFailures(
+        number, evaluated, True, len(adjoining), bool(has_failed[about].sum() <= by_chance), len(nearest)
+    )
 
 
 class EvaluatedPoints:
@@ -115,11 +162,23 @@ class EvaluatedPoints:
 
 
 def check_failed_region(near: NearFailures) -> list[Doubt]:
-    """A doubt if failures border on the final points: grave if they are known to be failures."""
-    if not near.borders:
+    """A doubt if failures adjoin the final points: grave if they are known to be failures, many and not scattered."""
+    if near.place == "away":
         return []
     where = f"in the region of the final points, {near.failed} of {near.evaluated} evaluated points"
-    if near.known:
+    if near.place == "scattered":
+        message = (
+            f"{where} failed, scattered among successful ones. Means and standard deviations are right if these "
+            "failures do not depend on the parameters. Look at their reasons, and mend the model or its solver"
+        )
+    elif near.place == "edge":
+        message = (
+            f"{near.adjoining} failed points adjoin the final points at an edge ({where} failed). If the posterior "
+            "goes on there, standard deviations are too small. Look at the parameters of the failures, and whether "
+            "the final points end there abruptly: if so, mend the model there, or exclude the region by the prior if "
+            "it is impossible"
+        )
+    elif near.known:
         message = (
             f"{where} failed: the failures, not the data, end the posterior there, so means and standard deviations "
             "may be wrong. Mend the model there, or exclude the region by the prior if it is impossible"
@@ -129,4 +188,4 @@ def check_failed_region(near: NearFailures) -> list[Doubt]:
             f"{where} have a log-probability of -inf, and whether these are failed simulations is not known. If they "
             "are, they end the posterior, not the data: mend the model there. If not, let log_prior exclude them"
         )
-    return [Doubt(message, near.known)]
+    return [Doubt(message, near.borders and near.known)]

@@ -7,7 +7,7 @@ from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
 from samplers.tempering import failed_region
-from samplers.tempering.failed_region import EvaluatedPoints, failures_near
+from samplers.tempering.failed_region import EvaluatedPoints, NearFailures, failures_near
 from tests.contract.targets import Box, Gaussian
 
 N = 250
@@ -38,7 +38,7 @@ class Counting(Cut):
 
 
 def run(posterior, Sampler=SMCSampler, nwalkers=N, steps=1, **options):
-    options = {"vectorize": True, "seed": 1} | options
+    options = {"vectorize": True, "seed": 1, "max_failure_share": 0.99} | options
     sampler = Sampler(nwalkers, posterior.ndim, posterior, **options)
     sampler.run_mcmc(None, steps)
     return sampler
@@ -77,7 +77,7 @@ def test_control_failures_away_from_the_posterior_are_no_doubt(way):
 def test_control_a_bound_of_the_prior_is_no_failure():
     """The posterior leans against a corner of the box, outside of which nothing is evaluated."""
     sampler = run(Box([0.0, 0.0], [1.0, 1.0], lambda x: -20.0 * np.sum(x, axis=-1)))
-    assert sampler.failures_near == (0, 0, True) and sampler.verdict.status == "converged"
+    assert sampler.failures_near == NearFailures(0, 0) and sampler.verdict.status == "converged"
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
@@ -126,3 +126,73 @@ def test_the_region_is_that_of_the_samples_in_any_units(rng):
     assert failures_near(samples * scale, failed * scale, succeeded * scale) == found
     inside = np.sum(failed**2, axis=1) < np.quantile(np.sum(samples**2, axis=1), 0.99)
     assert abs(found.failed - inside.sum()) <= 4 and found.evaluated > found.failed
+
+
+class Plane:
+    """A log-likelihood of two parameters with a flat prior between -6 and 6, some of whose simulations fail."""
+
+    ndim = 2
+
+    def __init__(self, log_likelihood, fails):
+        self.log_likelihood, self.fails, self.failed = log_likelihood, fails, 0
+
+    def log_prior(self, x):
+        return np.where(np.all(np.abs(x) < 6.0, axis=-1), -2.0 * np.log(12.0), -np.inf)
+
+    def sample_prior(self, n, rng=None):
+        return np.random.default_rng(rng).uniform(-6.0, 6.0, size=(n, 2))
+
+    def __call__(self, x):
+        x = np.asarray(x)
+        failed = self.fails(x) & (self.log_prior(x) > -np.inf)
+        self.failed += int(np.sum(failed))
+        return np.where(failed, np.nan, self.log_prior(x) + self.log_likelihood(x))
+
+
+def gaussian(x):
+    return -0.5 * np.sum(x**2, axis=-1)
+
+
+def bent(x):
+    """A ridge along x1 = x0² - 2 whose conditional standard deviation is 0.2."""
+    return -0.5 * (x[..., 0] / 1.3) ** 2 - 0.5 * ((x[..., 1] - x[..., 0] ** 2 + 2.0) / 0.2) ** 2
+
+
+def gamma(x):
+    """Gamma with shape 2 and scale 0.5 in x0 + 6, standard normal in x1."""
+    return np.log(np.maximum(x[..., 0] + 6.0, 1e-300)) - 2.0 * (x[..., 0] + 6.0) - 0.5 * x[..., 1] ** 2
+
+
+def scattered(x):
+    """4 % of all points, without any order."""
+    return np.abs(np.sin(x @ np.array([12.9898, 78.233]) * 43758.5453)) % 1.0 < 0.04
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("seed", [101, 102])
+@pytest.mark.parametrize(
+    ("log_likelihood", "fails", "place", "status"),
+    [
+        (bent, lambda x: x[..., 1] > x[..., 0] ** 2 - 0.8, "away", "converged"),
+        (gaussian, lambda x: x[..., 0] > 4.0, "away", "converged"),
+        (gaussian, scattered, "scattered", "usable"),
+        (gamma, lambda x: x[..., 0] > -3.5, "edge", "usable"),
+        (gaussian, lambda x: x[..., 0] > 1.6, "border", "not usable"),
+    ],
+    ids=["inside a bend", "4 sd away", "scattered", "beyond the upper 4 %", "beyond the upper 5 %"],
+)
+def test_the_place_of_the_failures(log_likelihood, fails, place, status, seed):
+    """The standard deviation is right in the first three cases, and 20 % and 10 % too small in the others."""
+    posterior = Plane(log_likelihood, fails)
+    sampler = run(posterior, nwalkers=200, seed=seed)
+    assert posterior.failed > 10
+    assert (sampler.failures_near.place, sampler.verdict.status) == (place, status)
+    words = {"scattered": "scattered among successful ones", "edge": "at an edge", "border": "end the posterior there"}
+    assert [each for each in words if words[each] in str(sampler.verdict)] == [place] * (place in words)
+
+
+def test_scattered_failures_are_told_from_those_that_fill_a_hole(rng):
+    samples, points = rng.standard_normal((300, 2)), rng.standard_normal((1500, 2))
+    for fails, is_scattered in ((rng.random(1500) < 0.08, True), (np.linalg.norm(points, axis=1) < 0.4, False)):
+        found = failures_near(samples, points[fails], points[~fails])
+        assert found.scattered == is_scattered and found.borders != is_scattered and found.adjoining > 40
