@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..simulation.disk_cache import SimulationCache
-from ..simulation.salvage import salvage
+from ..simulation.salvage import number_or_unknown, salvage
 from ..simulation.sqlite_file import CacheFile
 
 __all__ = ["Verified", "describe", "export_cache", "salvage_cache", "verify_cache"]
@@ -114,6 +114,6 @@ def salvage_cache(file: Path, out: Path) -> str:
     found = salvage(file.resolve(), cache.file.connection())
     cache.close()
     return (
-        f"{found.rows} simulations copied to {out}, {found.lost} could not be read; "
-        f"{found.responses} responses copied, {found.lost_responses} could not be read"
+        f"{found.rows} simulations copied to {out}, {number_or_unknown(found.lost)} could not be read; "
+        f"{found.responses} responses copied, {number_or_unknown(found.lost_responses)} could not be read"
     )

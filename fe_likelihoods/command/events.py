@@ -95,6 +95,8 @@ def _read_event(job: Job, problem: Problem, name: str) -> Event:
     record, measured = reduce_data(own, record, measured)
     if not math.isclose(record.dt, problem.record.dt, rel_tol=1e-9):  # the step that the model was calibrated with
         record = record.resample(problem.record.dt)
+        if measured is not None and measured.end > record.time[-1]:  # by less than a step of the model
+            measured = measured.trim(0.0, record.time[-1])
     options = {"from_state": state} | ({"rest": given["rest"]} if "rest" in given else {})
     return Event(name, record, measured, options)
 
@@ -237,7 +239,7 @@ def _write_event(paths: list[Path], event: Event, found: OtherEvent) -> None:
         lines += ["", "Peaks", text_table([("quantity", "unit", "median", "5 %", "95 %"), *rows])]
     if found.histories:
         lines += ["", "Histories against the measurements", *map(str, found.histories)]
-    paths[0].write_text(in_toml_terms("\n".join(lines)) + "\n", encoding="utf-8")
+    paths[0].write_text(in_toml_terms("\n".join(lines), f"[events.{found.name}]") + "\n", encoding="utf-8")
     rows = []
     for channel, row in zip(found.predictions["peaks"].channels, found.numbers, strict=True):
         values = {"q05": row.ends[0], "q25": row.quartiles[0], "median": row.median}

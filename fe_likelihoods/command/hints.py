@@ -1,8 +1,14 @@
 """Messages of the library in the words of the TOML file, for users who call no Python function."""
 
+import contextlib
 import re
+import warnings
+from collections.abc import Iterator
+from typing import Any
 
-__all__ = ["in_toml_terms"]
+import click
+
+__all__ = ["in_toml_terms", "plain_warnings"]
 
 _TERMS = (
     (r"with Measurements\.select\b", "of `channels` in [measurements]"),
@@ -24,8 +30,32 @@ _TERMS = (
 )
 
 
-def in_toml_terms(message: str) -> str:
-    """A message with the keys of the TOML file instead of functions and attributes of the library."""
+def in_toml_terms(message: str, record: str = "[record]") -> str:
+    """A message with the keys of the TOML file instead of functions and attributes of the library.
+
+    Parameters
+    ----------
+    message : str
+        The message of the library.
+    record : str
+        The section of the base motion that it is about.
+    """
     for pattern, words in _TERMS:
-        message = re.sub(pattern, words, message)
+        message = re.sub(pattern, words.replace("[record]", record), message)
     return message
+
+
+@contextlib.contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Print warnings for users as sentences, without the file and the line of the library that issued them."""
+    usual = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *place: Any, **options: Any) -> None:
+        if issubclass(category, UserWarning):
+            click.echo(f"Warning: {in_toml_terms(str(message))}", err=True)
+        else:
+            usual(message, category, *place, **options)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield

@@ -30,8 +30,11 @@ class _Commands(click.Group):
         return super().main(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
+        from .hints import plain_warnings
+
         try:
-            return super().invoke(ctx)
+            with plain_warnings():
+                return super().invoke(ctx)
         except KeyboardInterrupt:
             message = ctx.obj.get("interrupted", "Interrupted: nothing was changed.")
             click.echo(f"\n{message}", err=True)

@@ -1,6 +1,7 @@
 """Files of a finished run: tables as text and CSV, samples for arviz, the prediction, and the report."""
 
 import csv
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -70,10 +71,15 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
         evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2f}"
         return [evidence, in_toml_terms(str(run.verdict))]
     used = run.sampler.iteration - run.discard
+    worth = (
+        f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
+        f"{run.autocorrelation_time:.0f} iterations)"
+        if math.isfinite(run.effective_sample_size)
+        else "too few to estimate the autocorrelation time and the error of the means"
+    )
     lines = [
         f"{len(run.samples)} samples of {run.sampler.nwalkers} walkers in {used} iterations, after {run.discard} that "
-        f"are left out; worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
-        f"{run.autocorrelation_time:.0f} iterations). emcee gives neither an evidence nor a verdict."
+        f"are left out; {worth}. emcee gives neither an evidence nor a verdict."
     ]
     if run.is_inconclusive:
         lines.append(

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..prediction.prediction import Prediction
 from ..reporting.run import read_run
+from ..signals.hdf5_files import DAMAGE
 from ..simulation.disk_cache import SimulationCache
 from .events import (
     Event,
@@ -99,8 +100,6 @@ def run_job(
     ValueError
         If anything in the file is wrong, or the folder contains the run of other settings.
     """
-    import emcee
-
     job = read_job(file)
     folder = folder or default_folder(file)
     tried = make_problem(job)
@@ -108,7 +107,7 @@ def run_job(
     events = read_events(job, tried)
     _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
-    sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
+    sampler = _stored_sampler(job, problem, folder)
     run_sampler(job, problem, sampler, progress)
     return Outcome(folder, sampler, problem, *_write(folder, job, job.file, sampler, problem, events, progress))
 
@@ -130,19 +129,17 @@ def report_run(path: Path) -> Outcome:
     ValueError
         If it is not such a folder, its data are no longer there, or the run has no samples yet.
     """
-    import emcee
-
     folder = path if path.is_dir() else path.parent
     if not (folder / SETTINGS).is_file() or not (folder / CHAIN).is_file():
         raise ValueError(
             f"{folder} is not the folder of a run: it has no {SETTINGS} or {CHAIN}; give the folder that "
             "`fe-likelihoods run` made"
         )
-    origin = json.loads((folder / ORIGIN).read_text(encoding="utf-8"))
+    origin = _origin(folder)
     job = parse_job((folder / SETTINGS).read_text(encoding="utf-8"), folder / SETTINGS, Path(origin["folder"]))
     cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
     problem = make_problem(job, cache)
-    sampler = make_sampler(job, problem, emcee.backends.HDFBackend(str(folder / CHAIN)))
+    sampler = _stored_sampler(job, problem, folder)
     if sampler.iteration <= discarded(job):
         raise ValueError(
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
@@ -156,6 +153,42 @@ def report_run(path: Path) -> Outcome:
     events = read_events(job, problem)
     file = Path(origin["file"])
     return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
+
+
+def _damaged(path: Path, error: Exception | str) -> ValueError:
+    """The error for a file of a run that cannot be read."""
+    return ValueError(
+        f"{path} is damaged ({error}): put back a copy of it, or begin again with `fe-likelihoods run FILE "
+        "--overwrite`, which deletes the run in this folder with its simulations"
+    )
+
+
+def _origin(folder: Path) -> dict[str, Any]:
+    """Where a run comes from; ValueError if its file is missing or damaged."""
+    try:
+        found = json.loads((folder / ORIGIN).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise _damaged(folder / ORIGIN, error) from error
+    if not isinstance(found, dict) or not {"file", "folder"} <= set(found):
+        raise _damaged(folder / ORIGIN, "file or folder is missing in it")
+    return found
+
+
+def _stored_sampler(job: Job, problem: Problem, folder: Path) -> Any:
+    """The sampler with the chain of a folder; ValueError if emcee's is damaged. Others rebuild it from the journal."""
+    import emcee
+
+    path = folder / CHAIN
+    backend = emcee.backends.HDFBackend(str(path))
+    if is_emcee(job) and path.is_file() and path.stat().st_size:
+        try:
+            with backend.open():  # `initialized` of emcee is silent about a damaged file
+                pass
+            if backend.initialized and backend.iteration:
+                backend.get_chain(), backend.get_log_prob()
+        except (*DAMAGE, ValueError) as error:
+            raise _damaged(path, error) from error
+    return make_sampler(job, problem, backend)
 
 
 @contextlib.contextmanager
@@ -190,8 +223,10 @@ def _write(
     report = write_report(page, run, prediction, again, truth, predicted, measured)
     tables = write_tables(folder, run)  # last: they say how many simulations there are
     cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
-    cautions += [f"event {each.name}: {remark}" for each in described for remark in each.remarks]
-    return (report, *tables, samples, *pictures), tuple(map(in_toml_terms, cautions)), not run.is_inconclusive
+    cautions = [in_toml_terms(caution) for caution in cautions]
+    for each in described:
+        cautions += [in_toml_terms(f"event {each.name}: {remark}", f"[events.{each.name}]") for remark in each.remarks]
+    return (report, *tables, samples, *pictures), tuple(cautions), not run.is_inconclusive
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:
@@ -200,13 +235,16 @@ def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, over
     if overwrite and settings.is_file():
         shutil.rmtree(folder)
     if settings.is_file():
-        changed = _changes(settings.read_text(encoding="utf-8"), job.text)
+        try:
+            changed = _changes(settings.read_text(encoding="utf-8"), job.text)
+        except ValueError as error:  # also of tomllib
+            raise _damaged(settings, error) from error
         if changed:
             raise ValueError(
                 f"{folder} contains a run with other settings: {', '.join(changed)} differ from {job.file.name}. Give "
                 "another folder with --out, or delete that run with --overwrite"
             )
-        stored = json.loads((folder / ORIGIN).read_text(encoding="utf-8"))
+        stored = _origin(folder)
         if stored.get("posterior", fingerprint) != fingerprint:
             raise ValueError(
                 f"{folder} contains a run with other data or another model, of {stored['file']}. Give another folder "

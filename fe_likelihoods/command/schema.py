@@ -241,7 +241,11 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("kind", "text", "see the table of kinds; per channel (white) by default"),
         Key("sensor", "table of quantities", "channel = known standard deviation of the noise of its sensor"),
         Key("window", "time", "modulated, relative: length of the window in which the level of the response is taken"),
-        Key("local", "number", "modulated: part of the variance that follows the response in time, 0 to 1 (0.25)"),
+        Key(
+            "local",
+            "number",
+            "modulated: 0 to 1 (0.25); 1: the noise follows the response in each window, 0: one level for the record",
+        ),
         Key("edges", "numbers", "bands: frequencies between the bands [Hz], ascending"),
         Key("shares", "yes or no", "bands: levels as shares of the simulated response (yes), or in SI units"),
     ),
@@ -291,8 +295,8 @@ NOISES = {
     "per event": NoiseKind("white, a level per channel and event of a data set with several"),
     "marginal": NoiseKind("white, the levels integrated out"),
     "relative": NoiseKind(
-        "white, one level per channel as a share of that of the measurements; a prediction has the share of the "
-        "predicted response, of its window if one is given",
+        "white, one level per channel: a share of the root mean square of the measurements. In predictions it is the "
+        "same share of the simulated response, or, with window, of the response in each window",
         ("sensor", "window"),
     ),
     "modulated": NoiseKind(

@@ -111,6 +111,11 @@ class Prediction:
         return np.sqrt(self.variance)
 
     @property
+    def has_ratios(self) -> bool:
+        """Whether the values are those of measurements, by ratios of measured to simulated values in other events."""
+        return self.spread is not None and self.spread.ratios is not None
+
+    @property
     def n_failed(self) -> int:
         """Number of samples that are left out."""
         return len(self.failed)
@@ -344,8 +349,10 @@ class Prediction:
     def _table(self) -> tuple[str, list[str], tuple[str, ...], list[tuple]]:
         """Title, lines of text, header and rows: the largest values of histories, or the moments of a few numbers."""
         noise = "with measurement noise" if self.noise else "without measurement noise"
+        if self.has_ratios:
+            noise = f"of measured values, by the ratios of {len(self.spread.ratios.values)} events"
         lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
-        if self.spread is not None and self.spread.ratios is not None:
+        if self.has_ratios:
             lines.append("the ratio of a new event has no mean: use the quantiles")
         if self.n_failed:
             lines.append(f"{self.n_failed} samples failed and are left out")

@@ -259,8 +259,10 @@ def _ensemble(log_prob: Callable[[np.ndarray], np.ndarray], start: np.ndarray, r
     state, time = first, np.inf
     while sampler.iteration < 2.0 * _FEWEST_TIMES * time and sampler.iteration < _MOST_STEPS:
         state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True)
-        times = sampler.get_autocorr_time(discard=sampler.iteration // 2, quiet=True, tol=0)
-        time = float(np.max(times)) if np.isfinite(times).all() else np.inf  # not known if a parameter never moved
+        half = sampler.iteration // 2
+        moved = (np.ptp(sampler.get_chain(discard=half), axis=0) > 0.0).all()  # emcee divides by the variance of each
+        times = sampler.get_autocorr_time(discard=half, quiet=True, tol=0) if moved else np.inf
+        time = float(np.max(times)) if np.isfinite(times).all() else np.inf
     if not sampler.iteration >= 2.0 * _FEWEST_TIMES * time:
         warnings.warn(
             f"a population was sampled for {sampler.iteration / 2.0 / time:.1f} autocorrelation times, "

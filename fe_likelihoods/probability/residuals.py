@@ -106,14 +106,14 @@ def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n
     elif whitened:
         found = [
             f"Not white: correlation {lag_one:.2f} from sample to sample is left. The errors have another correlation "
-            "than that of the noise, and intervals may be wrong: use fewer samples until this check passes, BandNoise, "
-            "or GaussianNoise(effective_samples=...)."
+            "than that of the noise, and intervals may be wrong: use fewer samples until this check passes, BandNoise "
+            '("bands" in TOML), or GaussianNoise(effective_samples=...).'
         ]
     else:
         found = [
             f"Not white: correlation {lag_one:.2f} from sample to sample. {n_samples:.0f} samples are worth "
             f"{n_effective:.0f} independent ones, and intervals under white noise are too narrow: use "
-            "AutoregressiveNoise or GaussianNoise(effective_samples=...)."
+            'AutoregressiveNoise ("autoregressive" in TOML) or GaussianNoise(effective_samples=...).'
         ]
     if normal < _UNLIKELY:
         found.append("Not normal: look at the tails for outliers or missing physics.")

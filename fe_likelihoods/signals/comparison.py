@@ -278,8 +278,8 @@ def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
         fits = last <= end + _LATEST * dt and stated >= end - (1.0 + _LATEST) * max(dt, *measurements.steps)
     if not fits:
         raise ValueError(
-            f"the response has {n_steps} samples at {dt} s, the measurements have {measurements.n_steps} at "
-            f"{measurements.dt} s (step), which end at {last:g} s instead of {end:g} s; make them equal with "
+            f"the response has {n_steps} samples with a step of {dt} s and ends at {end:g} s, the measurements have "
+            f"{measurements.n_steps} with a step of {measurements.dt} s and end at {last:g} s; make them equal with "
             "Record.trim(start, stop) and Measurements.trim(start, stop), correct the step, or fill times that were "
             "not measured with NaN"
         )

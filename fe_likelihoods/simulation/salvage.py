@@ -23,7 +23,7 @@ from .cache_rows import (
     is_undamaged_response,
 )
 
-__all__ = ["Salvaged", "read_options", "salvage"]
+__all__ = ["Salvaged", "number_or_unknown", "read_options", "salvage"]
 
 logger = logging.getLogger(__name__)
 
@@ -52,16 +52,17 @@ class Salvaged(NamedTuple):
     ----------
     rows : int
         Simulations that were copied.
-    lost : int
+    lost : int or None
         Simulations that could not be read, or whose checksum is wrong; at most so many where rows had been deleted.
+        None where the file does not tell how many there were.
     responses, lost_responses : int
         The same of stored responses.
     """
 
     rows: int
-    lost: int
+    lost: int | None
     responses: int
-    lost_responses: int
+    lost_responses: int | None
 
 
 def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
@@ -77,7 +78,7 @@ def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
     Returns
     -------
     Salvaged
-        The counts; zero where the file as a whole cannot be read.
+        The counts.
     """
     return Salvaged(*_copy(damaged, connection, _SIMULATIONS), *_copy(damaged, connection, _RESPONSES))
 
@@ -87,15 +88,24 @@ def read_options(path: Path) -> str:
     return "mode=ro" if path.with_name(f"{path.name}-wal").exists() else "mode=ro&immutable=1"
 
 
-def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple[int, int]:
-    """Copy the readable rows of a table; return how many were copied, and how many were lost."""
-    kept = lost = 0
+def number_or_unknown(n: int | None) -> str:
+    """A number of rows in words."""
+    return "an unknown number" if n is None else str(n)
+
+
+def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple[int, int | None]:
+    """Copy the readable rows of a table; return how many were copied, and how many were lost, None if not known."""
+    kept, lost, known = 0, 0, True
     try:
         with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
             source.text_factory = bytes
-            for rows, missing in _ranges(source, damaged, table):
+            source.execute("PRAGMA writable_schema = ON")  # a file that was cut off is read as far as it goes
+            if (largest := _largest_id(source, table.name)) is None:
+                known, largest = False, damaged.stat().st_size // FEWEST_BYTES
+            for rows, missing in _ranges(source, damaged, table, largest):
                 good = [row for row in rows if table.check(*row)]
-                lost += missing + len(rows) - len(good)
+                known = known and missing is not None
+                lost += (missing or 0) + len(rows) - len(good)
                 if good:
                     connection.execute("BEGIN IMMEDIATE")
                     connection.executemany(table.store, good)
@@ -105,14 +115,17 @@ def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple
         if connection.in_transaction:
             connection.execute("ROLLBACK")
         logger.warning("%s: no more %s can be salvaged (%s)", damaged.name, table.name, error)
-    return kept, lost
+        known = False
+    return kept, lost if known else None
 
 
-def _ranges(source: sqlite3.Connection, path: Path, table: _Table) -> Iterator[tuple[list[tuple], int]]:
-    """Rows of consecutive ranges of row numbers, and how many rows of each cannot be read."""
+def _ranges(
+    source: sqlite3.Connection, path: Path, table: _Table, largest: int
+) -> Iterator[tuple[list[tuple], int | None]]:
+    """Rows of consecutive ranges of row numbers, and how many rows of each cannot be read, None if not known."""
     query = f"SELECT {table.columns} FROM {table.name} WHERE id BETWEEN ? AND ?"
     stop = time.monotonic() + SECONDS
-    waiting = [(1, _largest_id(source, path, table.name))]
+    waiting = [(1, largest)]
     while waiting:
         first, last = waiting.pop()
         if last - first >= table.rows_per_query:
@@ -122,6 +135,7 @@ def _ranges(source: sqlite3.Connection, path: Path, table: _Table) -> Iterator[t
         if time.monotonic() > stop:
             text = "%s: salvage of %s ended after %g s, at row %d of %d"
             logger.warning(text, path.name, table.name, SECONDS, first, last)
+            yield [], None
             return
         try:
             yield source.execute(query, (first, last)).fetchall(), 0
@@ -135,11 +149,12 @@ def _ranges(source: sqlite3.Connection, path: Path, table: _Table) -> Iterator[t
                 waiting += [(middle + 1, last), (first, middle)]
 
 
-def _largest_id(source: sqlite3.Connection, path: Path, table: str) -> int:
-    """The largest row number, or an upper bound of it."""
-    bound = path.stat().st_size // FEWEST_BYTES
+def _largest_id(source: sqlite3.Connection, table: str) -> int | None:
+    """The largest row number, None if it cannot be read."""
     try:
         (largest,) = source.execute(f"SELECT max(id) FROM {table}").fetchone()
-    except (sqlite3.DatabaseError, MemoryError):
-        return bound
+    except (sqlite3.DatabaseError, MemoryError) as error:
+        if isinstance(error, sqlite3.OperationalError) and "no such" in str(error):
+            raise
+        return None
     return largest or 0

@@ -26,7 +26,7 @@ try:
 except ImportError:  # without such locks two programs must not find the same damage at the same time
     lock_file = None
 
-from .salvage import read_options, salvage
+from .salvage import number_or_unknown, read_options, salvage
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
 
@@ -231,11 +231,11 @@ class CacheFile:
             if self._aside is not None and self.writable:
                 aside, self._aside = self._aside, None
                 found = salvage(aside, self._connection)
-                text = "%s: %d simulations were salvaged, %d were lost"
-                logger.warning(text, aside.name, found.rows, found.lost)
-                if found.responses or found.lost_responses:
-                    text = "%s: %d responses were salvaged, %d were lost"
-                    logger.warning(text, aside.name, found.responses, found.lost_responses)
+                text = "%s: %d simulations were salvaged, %s were lost"
+                logger.warning(text, aside.name, found.rows, number_or_unknown(found.lost))
+                if found.responses or found.lost_responses != 0:
+                    text = "%s: %d responses were salvaged, %s were lost"
+                    logger.warning(text, aside.name, found.responses, number_or_unknown(found.lost_responses))
         return self._connection
 
     def close(self) -> None:

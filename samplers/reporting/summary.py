@@ -36,7 +36,7 @@ class Summary(NamedTuple):
     cv : ndarray, shape (ndim,)
         Coefficient of variation ``sd / |mean|`` [-]; inf where the mean is zero and the standard deviation is not.
     mean_error : ndarray, shape (ndim,), or None
-        Monte Carlo standard error of `mean`, in the units of the parameters.
+        Monte Carlo standard error of `mean`, in the units of the parameters; NaN where it is not known.
     """
 
     names: tuple[str, ...]
@@ -47,7 +47,8 @@ class Summary(NamedTuple):
 
     def __str__(self) -> str:
         width = max(len("parameter"), *(len(name) for name in self.names))
-        errors = ["-"] * len(self.names) if self.mean_error is None else [f"{error:.2g}" for error in self.mean_error]
+        unknown = np.full(len(self.names), np.nan)
+        errors = ["-" if np.isnan(e) else f"{e:.2g}" for e in (unknown if self.mean_error is None else self.mean_error)]
         rows = [f"{'parameter':<{width}} {'mean':>12} {'MC error':>10} {'sd':>12} {'CV':>10}"]
         for name, mean, error, sd, cv in zip(self.names, self.mean, errors, self.sd, self.cv, strict=True):
             rows.append(f"{name:<{width}} {mean:>12.5g} {error:>10} {sd:>12.4g} {cv:>10.3g}")
@@ -89,7 +90,8 @@ def summary(
         Non-negative weights of the samples; they need not sum to one.
     mean_error : array_like, shape (ndim,), optional
         Standard error of the mean, as ``sampler.mean_error()`` returns it for the same chain. It cannot be computed
-        from the samples alone, because copies made by resampling are correlated.
+        from the samples alone, because copies made by resampling are correlated. NaN says that it is not known, as for
+        a Markov chain that is too short for an estimate of its autocorrelation time.
 
     Returns
     -------
@@ -103,10 +105,10 @@ def summary(
     samples = _samples(samples)
     if mean_error is not None:
         mean_error = np.asarray(mean_error, dtype=float)
-        if mean_error.shape != samples.shape[1:] or not np.all(mean_error >= 0.0):
+        if mean_error.shape != samples.shape[1:] or np.any(mean_error < 0.0):
             raise ValueError(
-                f"mean_error must be {samples.shape[1]} non-negative numbers, as sampler.mean_error() returns; "
-                f"got {mean_error}"
+                f"mean_error must be {samples.shape[1]} numbers, each non-negative or NaN, as sampler.mean_error() "
+                f"returns; got {mean_error}"
             )
     if weights is None:
         weights = np.full(len(samples), 1.0)

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from fe_likelihoods import SimulationCache
-from fe_likelihoods.command.hints import in_toml_terms
+from fe_likelihoods.command.hints import in_toml_terms, plain_warnings
 from fe_likelihoods.command.job import parse_job, read_job
 from fe_likelihoods.command.main import main
 from fe_likelihoods.command.models import make_problem
@@ -22,6 +23,7 @@ from fe_likelihoods.command.starting import TEMPLATES
 from fe_likelihoods.models.isolated_bridge_parts import Bearing, Damper, Pier
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Steel
+from samplers import SamplingWarning
 from tests.command.key_tables import PAGE, key_tables
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -395,3 +397,11 @@ def test_quantities_and_priors_as_text():
             parse_prior(text)
     with pytest.raises(ValueError, match="section is missing"):
         parse_job("", Path("a.toml"), Path("."))
+
+
+def test_warnings_are_sentences_without_file_and_line(capsys):
+    with pytest.warns(RuntimeWarning, match="of another library") as shown, plain_warnings():
+        warnings.warn("the samples are few. Leave these out with Measurements.select", SamplingWarning, stacklevel=1)
+        warnings.warn("of another library", RuntimeWarning, stacklevel=1)
+    told = "Warning: the samples are few. Leave these out of `channels` in [measurements]\n"
+    assert capsys.readouterr().err == told and len(shown) == 1

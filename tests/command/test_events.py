@@ -17,6 +17,7 @@ from fe_likelihoods import (
     propagate,
     read_csv,
 )
+from fe_likelihoods.command.hints import in_toml_terms
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
@@ -216,3 +217,22 @@ def test_a_motion_with_another_step_is_resampled_to_that_of_the_model(events, st
     assert weaker.measured.dt == pytest.approx(0.02)  # compared at their own times
     propagate(problem.posterior, problem.posterior.sample_prior(3, 1), record=after.record, **after.options)
     assert "Event after: other" in call("check", "oscillator.toml")
+
+
+def test_measurements_that_end_between_two_steps_of_the_model_are_scored(events):
+    """With `every`, the motion may end one sample before the measurements."""
+    for name in ("base.csv", "top.csv", "weaker.csv"):
+        path = events / name
+        path.write_text("\n".join(path.read_text().splitlines()[:-1]))  # 300 samples, 0 to 5.98 s
+    text = (SETTINGS + EVENTS).replace('file = "base.csv"\n[measure', 'file = "base.csv"\nevery = 2\n[measure')
+    (events / "oscillator.toml").write_text(text)
+    said = call("run", "oscillator.toml", "--out", "r", "--quiet")
+    told = (events / "r" / "event-weaker.txt").read_text()
+    assert "no scores" not in said + told and "Histories against the measurements" in told
+    assert "150 samples at 0.04 s" in told
+
+
+def test_measurements_that_cannot_be_compared_name_the_section_of_the_event():
+    message = "make them equal with Record.trim(start, stop) and Measurements.trim(start, stop)"
+    assert in_toml_terms(message).endswith("`duration` in [record]")
+    assert in_toml_terms(message, "[events.weaker]").endswith("`duration` in [events.weaker]")

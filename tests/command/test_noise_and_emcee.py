@@ -193,3 +193,25 @@ def test_emcee_and_smc_find_the_same_posterior(folder):  # noqa: F811
     error = np.hypot(ours["mean_error"], theirs["mean_error"])
     assert (np.abs(ours["mean"] - theirs["mean"]) < 4.0 * error).all()
     assert (np.abs(np.log(ours["sd"] / theirs["sd"])) < 0.25).all()
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_a_chain_of_few_steps_is_told_after_its_tables(folder, steps):  # noqa: F811
+    """The autocorrelation time of so few steps is not a number."""
+    (folder / "oscillator.toml").write_text(EMCEE.replace("steps = 60", f"steps = {steps}"))
+    said = call("run", "oscillator.toml", "--quiet", "--out", "r", code=3)
+    assert "too few to estimate the autocorrelation time" in said and "Give more `steps`" in said
+    assert "nan" not in said and (folder / "r" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("name", ["run.h5", "origin.json", "settings.toml"])
+def test_a_damaged_file_of_a_run_is_named(folder, name):  # noqa: F811
+    (folder / "oscillator.toml").write_text(EMCEE.replace("steps = 60", "steps = 2"))
+    call("run", "oscillator.toml", "--quiet", "--out", "r", code=3)
+    path = folder / "r" / name
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    before = path.read_bytes()
+    said = call("run", "oscillator.toml", "--quiet", "--out", "r", code=1)
+    assert f"r/{name} is damaged (" in said and "--overwrite" in said
+    assert name in call("report", "r", code=1) and path.read_bytes() == before
+    call("run", "oscillator.toml", "--quiet", "--out", "r", "--overwrite", code=3)

@@ -334,6 +334,18 @@ def test_a_bad_page_loses_its_own_rows_only(filled, thetas, expected, caplog, pa
     assert lost == 0 if page == "index" else 0 < lost < len(thetas)
 
 
+def test_a_file_that_was_cut_off_keeps_its_first_rows(filled, thetas, expected, caplog):
+    """How many rows were in the other part is not known, and no number is stated."""
+    data = filled.read_bytes()
+    filled.write_bytes(data[: len(data) * 7 // 10 // 4096 * 4096])
+    likelihood = likelihood_of(filled)
+    np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+    (message,) = (r.getMessage() for r in caplog.records if "simulations were salvaged" in r.getMessage())
+    (kept,) = (int(word) for word in message.split() if word.isdigit())
+    assert 0 < kept == likelihood.disk_hits < len(thetas)
+    assert message.endswith("an unknown number were lost")
+
+
 @pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
 def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog, damage):
     likelihood = likelihood_of(filled)

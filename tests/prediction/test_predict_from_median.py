@@ -63,6 +63,8 @@ def test_the_peak_has_the_t_distribution_of_the_ratios_at_the_median(events):
     expected = stats.t(3, np.log(2.0 * MEDIAN * LARGEST) + LOGS.mean(), LOGS.std(ddof=1) * np.sqrt(1.25))
     assert stats.kstest(np.log(found.values), expected.cdf).pvalue > 1e-3
     assert found.noise and found.n_samples == 20_000
+    assert "20000 samples, of measured values, by the ratios of 4 events;" in str(found)
+    assert "with measurement noise" not in str(found)
     limit = np.exp(expected.ppf(0.9))
     exceeded = exceedance(found, limit)
     assert float(exceeded.probability) == pytest.approx(0.1, abs=1e-4)

@@ -1,5 +1,6 @@
 """Populations without one test, by weights and by a new run, against the exact density of the other tests on a grid."""
 
+import importlib
 import warnings
 
 import numpy as np
@@ -18,6 +19,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.probability.pareto_smoothing import smoothed_weights
 
+module = importlib.import_module("fe_likelihoods.probability.leave_one_out")
 ERROR, WIDE = 0.2, 2.0  # standard deviations of a measurement and of the prior of a test
 LINEAR = Varying(TruncatedNormal(0.0, 2.0, -np.inf, np.inf), HalfNormal(1.0), "linear")
 GRID = np.stack([each.ravel() for each in np.meshgrid(np.linspace(-1, 3, 120), np.linspace(0.01, 2.4, 120))], axis=1)
@@ -154,3 +156,20 @@ def test_a_population_of_too_few_different_samples_is_refused():
         hierarchy = Hierarchy(posterior, np.repeat([[1.0, 0.4], [1.1, 0.3]], 50, axis=0))
     with pytest.raises(ValueError, match="expected 4 different hyper-samples or more.*got 2"):
         leave_one_out(hierarchy)
+
+
+def test_walkers_that_never_move_are_told_without_a_division_by_zero(monkeypatch, rng):
+    """The autocorrelation time of a constant chain is not known."""
+    monkeypatch.setattr(module, "_MOST_STEPS", module._BLOCK)
+    start, calls = rng.standard_normal((50, 2)), []
+
+    def log_prob(points):  # finite for the start only
+        calls.append(len(points))
+        return np.full(len(points), 0.0 if len(calls) <= 2 else -np.inf)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = module._ensemble(log_prob, start, rng)
+    (told,) = caught
+    assert "sampled for 0.0 autocorrelation times" in str(told.message)
+    assert len(np.unique(found, axis=0)) <= max(module._WALKERS, 8)
