@@ -21,6 +21,7 @@ __all__ = ["EvaluatedPoints", "NearFailures", "check_failed_region", "failures_n
 # between the samples and failures further away, whatever the form of the posterior. With 20 points and at least 5
 # failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge of the posterior do.
 NEAREST = 20
+NEAREST_PER_SAMPLE = 1.5  # at least, in units of the evaluated points per sample
 FEWEST_ADJOINING = 5
 LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the share of all points there
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
@@ -107,7 +108,10 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
     if not has_failed.any():
         return NearFailures(number, evaluated)
     tree = cKDTree(points)
-    nearest = np.unique(tree.query(white(np.unique(samples, axis=0)), k=min(NEAREST + 1, len(points)))[1])
+    distinct = white(np.unique(samples, axis=0))
+    # long chains evaluate many points per sample, all of them closer than the next sample
+    count = max(NEAREST, int(NEAREST_PER_SAMPLE * evaluated / len(distinct)))
+    nearest = np.unique(tree.query(distinct, k=min(count + 1, len(points)))[1])
     adjoining = nearest[has_failed[nearest]]
     if len(adjoining) == 0:
         return NearFailures(number, evaluated)

@@ -196,3 +196,11 @@ def test_scattered_failures_are_told_from_those_that_fill_a_hole(rng):
     for fails, is_scattered in ((rng.random(1500) < 0.08, True), (np.linalg.norm(points, axis=1) < 0.4, False)):
         found = failures_near(samples, points[fails], points[~fails])
         assert found.scattered == is_scattered and found.borders != is_scattered and found.adjoining > 40
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_a_long_chain_says_the_same():
+    """Its many evaluated points are all closer to a sample than the next sample is."""
+    posterior = Plane(gaussian, lambda x: x[..., 0] > 1.6)
+    sampler = run(posterior, nwalkers=200, steps=90, seed=102)
+    assert (sampler.failures_near.place, sampler.verdict.status) == ("border", "not usable")
