@@ -21,7 +21,7 @@ __all__ = ["EvaluatedPoints", "NearFailures", "check_failed_region", "failures_n
 # between the samples and failures further away, whatever the form of the posterior. With 20 points and at least 5
 # failures, those 6 standard deviations beside a bent ridge rarely count, and those at an edge of the posterior do.
 NEAREST = 20
-NEAREST_PER_SAMPLE = 1.5  # at least, in units of the evaluated points per sample
+NEAREST_PER_SAMPLE = 1.0  # at least, in units of the evaluated points per sample
 FEWEST_ADJOINING = 5
 LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the share of all points there
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
