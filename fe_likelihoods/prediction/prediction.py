@@ -210,7 +210,7 @@ class Prediction:
             raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
         compared = self._compared(measurements, time_shifts)
         measured = _values_of(compared)[:, part]
-        below, above = (_at_samples(compared, self.quantile(p))[:, part] for p in (lower, upper))
+        below, above = _band_at_samples(compared, self.quantile(lower), self.quantile(upper))[..., part]
         samples = np.isfinite(measured).sum(axis=1)
         if not samples.all():
             empty = [c.name for c, n in zip(self.channels, samples, strict=True) if not n]
@@ -273,8 +273,9 @@ class Prediction:
             raise ValueError(f"score: a prediction of histories needs Measurements; got {type(measured).__name__}")
         compared = self._compared(measured, time_shifts)
         values = _values_of(compared)
-        histories = [self.mean, self.sd, self._near_quantile(0.5 - 0.5 * level), self._near_quantile(0.5 + 0.5 * level)]
-        mean, sd, lower, upper, around = (_at_samples(compared, each) for each in [*histories, envelope(self.mean)])
+        mean, sd, around = (_at_samples(compared, each) for each in [self.mean, self.sd, envelope(self.mean)])
+        ends = (self._near_quantile(0.5 - 0.5 * level), self._near_quantile(0.5 + 0.5 * level))
+        lower, upper = _band_at_samples(compared, *ends)
         scored = (each[:, part] for each in (values, mean, sd, lower, upper, around))
         values, mean, sd, lower, upper, around = scored
         _check_number(self.n_quantile, 2, level)
@@ -429,6 +430,15 @@ def _check_number(n_samples: int, least: int, level: float) -> None:
 
 def _values_of(compared: np.ndarray | Comparison) -> np.ndarray:
     return compared.values if isinstance(compared, Comparison) else compared
+
+
+def _band_at_samples(compared: np.ndarray | Comparison, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """The ends of a band (2, n_channels, n_samples) at the times of the samples, in ascending order.
+
+    Interpolated ends of a narrow band of few draws may cross. Their order is then changed, which brings them nearer to
+    the true quantiles (Chernozhukov, Fernandez-Val and Galichon, 2010, doi:10.3982/ECTA7880).
+    """
+    return np.sort([_at_samples(compared, each) for each in (lower, upper)], axis=0)
 
 
 def _at_samples(compared: np.ndarray | Comparison, histories: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from fe_likelihoods.data.make_isolated_bridge import table_motion
 from scipy import integrate, stats
 
 from fe_likelihoods.models.function import FunctionModel
@@ -25,6 +26,7 @@ from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.relative_noise import RelativeNoise
 from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.interpolation import interpolate, make_interpolation
 
 PAIR = (Channel("top", "displacement", "mm"), Channel("base", "acceleration", "g"))
 
@@ -340,3 +342,24 @@ def test_channels_with_steps_of_their_own_are_scored_at_their_samples(oscillator
         scores = prediction.score(coarse)
     assert scores.without_spread.tolist() == [25] and np.isnan(scores.log_score[0])
     assert scores.samples.tolist() == [25] and scores.rrmse[0] < 1e-9
+
+
+@pytest.mark.filterwarnings("ignore:score. the intervals are from 3 samples")
+def test_a_rough_band_is_scored_between_its_samples():
+    """The band of three draws with noise crosses where it is interpolated: its ends are put in order."""
+    record = table_motion().trim(0.0, 6.0).resample(0.04)
+    model, theta = LinearOscillator(record, 0.8), [1.1, 0.9]
+    fine = LinearOscillator(record.resample(0.02), 0.8).simulate(theta)
+    likelihood = FELikelihood(model, Measurements(model.channels, 0.04, model.simulate(theta)))
+    samples = np.array([[1.1, 0.9, 0.5, 0.003], [1.12, 0.9, 0.5, 0.003], [1.08, 0.92, 0.5, 0.003]])
+    found = propagate(likelihood, samples, noise=True, quantiles=(0.05, 0.5, 0.95), seed=1, progress=False)
+    measured = Measurements(model.channels, 0.02, fine)
+    place = make_interpolation(0.04, model.n_steps, measured.times(model.channels[0].name))
+    ends = [interpolate(found.quantile(p), place) for p in (0.05, 0.95)]
+    assert (ends[0] > ends[1]).any()
+    scores = found.score(measured)
+    assert np.isfinite(scores.interval_score).all() and (scores.width > 0.0).all()
+    lower, upper = np.minimum(*ends), np.maximum(*ends)
+    expected = ((lower <= fine) & (fine <= upper)).mean(axis=1)
+    np.testing.assert_allclose(scores.coverage, expected)
+    np.testing.assert_allclose(found.coverage(measured), expected)
