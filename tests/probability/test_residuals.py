@@ -130,6 +130,7 @@ def test_verdicts_say_what_to_do(rng):
     first, second, third, fourth = checks.sentences
     assert first == "White: no correlation from sample to sample was found."
     assert second.startswith(f"Not white: correlation {checks.lag_one[1]:.2f} from sample to sample. 800 samples are ")
+    assert 'use AutoregressiveNoise ("autoregressive" in TOML) or' in second
     assert f"worth {checks.n_effective[1]:.0f} independent ones" in second and "AutoregressiveNoise" in second
     assert third.startswith("Nearly white: ") and checks.white[2] < 0.01
     assert "Not normal" in fourth and "Not normal" not in first
