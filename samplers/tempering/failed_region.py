@@ -89,7 +89,16 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
         Samples of the posterior.
     failed, succeeded : (m, k) float, (l, k) float
         Points that failed and that did not.
+
+    Returns
+    -------
+    NearFailures
+        Without points if fewer than k + 1 samples are different: they have no region, as in a run that a limit ended
+        with all walkers in one place. The verdict says so elsewhere.
     """
+    distinct = np.unique(samples, axis=0)
+    if len(distinct) <= samples.shape[1]:
+        return NearFailures(0, 0)
     # parameters may differ by many orders of magnitude
     mean, sd = samples.mean(axis=0), samples.std(axis=0)
     sd = np.where(sd > 0.0, sd, 1.0)
@@ -108,10 +117,9 @@ def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray
     if not has_failed.any():
         return NearFailures(number, evaluated)
     tree = cKDTree(points)
-    distinct = white(np.unique(samples, axis=0))
     # long chains evaluate many points per sample, all of them closer than the next sample
     count = max(NEAREST, int(NEAREST_PER_SAMPLE * evaluated / len(distinct)))
-    nearest = np.unique(tree.query(distinct, k=min(count + 1, len(points)))[1])
+    nearest = np.unique(tree.query(white(distinct), k=min(count + 1, len(points)))[1])
     adjoining = nearest[has_failed[nearest]]
     if len(adjoining) == 0:
         return NearFailures(number, evaluated)

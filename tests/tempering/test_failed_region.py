@@ -204,3 +204,12 @@ def test_a_long_chain_says_the_same():
     posterior = Plane(gaussian, lambda x: x[..., 0] > 1.6)
     sampler = run(posterior, nwalkers=200, steps=90, seed=102)
     assert (sampler.failures_near.place, sampler.verdict.status) == ("border", "not usable")
+
+
+def test_walkers_in_one_place_have_no_region(rng):
+    """As where a limit ended the run after a collapse; the smallest number of points that span a region has one."""
+    failed, succeeded = rng.normal(0.0, 1.0, (40, 2)), rng.normal(0.0, 1.0, (40, 2))
+    for samples in (np.full((30, 2), 0.1), np.repeat([[0.1, 0.3], [0.2, 0.5]], 15, axis=0)):
+        assert failures_near(samples, failed, succeeded) == NearFailures(0, 0)
+    triangle = np.repeat([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]], 10, axis=0)
+    assert failures_near(triangle, failed, succeeded).evaluated > 0
