@@ -7,6 +7,7 @@ The longest tests come first, and `make test` distributes tests by stealing: no 
 """
 
 import os
+import sys
 from pathlib import Path
 
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -40,6 +41,14 @@ def seed() -> int:
 def rng(seed) -> np.random.Generator:
     """Generator seeded with `seed`."""
     return np.random.default_rng(seed)
+
+
+@pytest.fixture(autouse=True)
+def figures_are_closed():
+    """Close the figures of a test: matplotlib warns of more than 20, in whichever test comes next."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 @pytest.hookimpl(trylast=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods import Channel, FunctionModel, LogNormal, Measurements, arias_intensity, peak
+from fe_likelihoods import Channel, FunctionModel, LogNormal, Measurements, ModulatedNoise, arias_intensity, peak
 from tests.benchmarks import measured_columns, measured_tests, measured_transfer, strain_penetration, tested_column
 
 BENCHMARKS = (
@@ -92,12 +92,15 @@ def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(
     numbers = {"peak": peak("top"), "energy": arias_intensity("top")}
     ratios = measured_transfer.ratios_of(fit, strong[0], numbers)
     assert ratios["energy"] == pytest.approx(1.0 + 0.25**2, abs=0.03)  # the measured energy contains the errors
-    case = measured_transfer.Case("weak", *weak, slice(None), numbers)
-    rows, scored = measured_transfer.score_case(case, fit, 1.0, ratios, None, 1)
+    noise = ModulatedNoise(channels, window=1.0, sensor=[1e-3])
+    modulated = measured_transfer.calibrate(*strong, {"gain": LogNormal(1.0, 0.5)}, 5.0, 1, noise=noise, walkers=100)
+    case = measured_transfer.Case("weak", *weak, slice(None), numbers, noise)
+    rows, scored = measured_transfer.score_case(case, fit, modulated, ratios, 1)
     found = {row.what: row.value for row in rows}
     ideal = 0.25 * np.sqrt(0.5) * 2.0 * (stats.norm.ppf(0.95) + stats.norm.pdf(1.645) / 0.05 - stats.norm.ppf(0.95))
     rms = np.sqrt(np.mean(weak[1].values ** 2))
     assert found["interval score / RMS, relative"] == pytest.approx(ideal / rms, rel=0.15)
+    assert found["interval score / RMS, modulated"] == pytest.approx(ideal / rms, rel=0.15)
     assert found["interval score / RMS, SI"] > 5.0 * found["interval score / RMS, relative"]
     assert scored["relative"].within.all() and not scored["SI"].within.any()
     assert measured_transfer.within([scored])[0].note.startswith("of 2;")

@@ -132,6 +132,8 @@ def _say_cost(problem: Problem, sampler: object, guided: bool, budget: dict, say
 
 def _draw(problem: Problem, seconds: float, picture: Path) -> None:
     """Simulations at draws of the prior with the measurements, as a PNG file."""
+    import matplotlib.pyplot as plt
+
     from ..plots.predictions import plot_bands
     from ..prediction.propagation import propagate
 
@@ -143,3 +145,4 @@ def _draw(problem: Problem, seconds: float, picture: Path) -> None:
     figure = plot_bands(prediction, posterior.likelihood.measurements)
     figure.suptitle(f"{n} draws of the prior and the measurements")
     figure.savefig(picture, dpi=130)
+    plt.close(figure)

@@ -9,8 +9,6 @@ from fe_likelihoods.signals.records import Record
 @pytest.fixture(autouse=True)
 def figures_without_a_window():
     matplotlib.use("Agg")
-    yield
-    matplotlib.pyplot.close("all")
 
 
 @pytest.fixture
