@@ -132,10 +132,9 @@ def _say_cost(problem: Problem, sampler: object, guided: bool, budget: dict, say
 
 def _draw(problem: Problem, seconds: float, picture: Path) -> None:
     """Simulations at draws of the prior with the measurements, as a PNG file."""
-    import matplotlib.pyplot as plt
-
     from ..plots.predictions import plot_bands
     from ..prediction.propagation import propagate
+    from ..reporting.pictures import save_picture
 
     posterior = problem.posterior
     n = int(np.clip(PICTURE_SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))
@@ -144,5 +143,4 @@ def _draw(problem: Problem, seconds: float, picture: Path) -> None:
     prediction = propagate(posterior.likelihood.model, draws, quantiles=(0.05, 0.95), progress=False)
     figure = plot_bands(prediction, posterior.likelihood.measurements)
     figure.suptitle(f"{n} draws of the prior and the measurements")
-    figure.savefig(picture, dpi=130)
-    plt.close(figure)
+    save_picture(figure, picture)

@@ -226,9 +226,8 @@ def write_events(folder: Path, events: tuple[Event, ...], described: tuple[Other
 
 
 def _write_event(paths: list[Path], event: Event, found: OtherEvent) -> None:
-    import matplotlib.pyplot as plt
-
     from ..plots.predictions import plot_bands
+    from ..reporting.pictures import save_picture
     from ..text_tables import text_table
 
     steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
@@ -250,6 +249,4 @@ def _write_event(paths: list[Path], event: Event, found: OtherEvent) -> None:
             values |= {"measured": row.measured, "pit": row.pit}
         rows.append({"channel": channel.name, "unit": row.unit} | values)
     write_csv(paths[1], rows)
-    figure = plot_bands(found.predictions["histories"], event.measured)
-    figure.savefig(paths[2], dpi=150)
-    plt.close(figure)
+    save_picture(plot_bands(found.predictions["histories"], event.measured), paths[2])

@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ __all__ = [
     "draw_run",
     "draw_scores",
     "draw_scores_of_events",
+    "save_picture",
 ]
 
 LEGIBLE = 80  # pixels per inch at which the smallest labels can be read
@@ -57,6 +59,14 @@ class Picture(NamedTuple):
     source: str
     problem: str
     width: int = 0
+
+
+def save_picture(figure: "Figure", path: Path) -> None:
+    """Write a figure to a file and close it: matplotlib keeps figures of pyplot in memory until then."""
+    import matplotlib.pyplot as plt
+
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
 
 
 def _picture(title: str, caption: str, alt: str, draw: Callable[[], "Figure"]) -> Picture:
