@@ -44,11 +44,12 @@ class NearFailures(NamedTuple):
     known : bool
         Whether they are known to be failures; otherwise a log-probability of -inf may have another cause.
     adjoining : int
-        Number of failures, in the ellipsoid or not, among the 20 evaluated points that are nearest to a sample.
+        Number of failures, in the ellipsoid or not, among the evaluated points that are nearest to a sample: 20, or
+        more after a long chain.
     scattered : bool
         Whether the points about these failures fail no more often than other points among the samples.
     nearest : int
-        Number of all distinct points among those 20 of each sample.
+        Number of all distinct points among those nearest to the samples.
     """
 
     failed: int
@@ -62,8 +63,9 @@ class NearFailures(NamedTuple):
     def place(self) -> Literal["away", "scattered", "edge", "border"]:
         """Where the failures are.
 
-        "away" from the samples, or few; "scattered" among successful points; at an "edge" of the samples, where few
-        of the evaluated points failed, or few failures adjoin; or on a "border", with more than 2 % of these points.
+        "away" from the samples: fewer than 5 adjoin them, or 2 % or fewer of the points in the ellipsoid are scattered
+        failures. "scattered": more than 2 %, among successful points. "border": more than 2 %, of which enough adjoin
+        the samples to end the posterior. "edge": others that adjoin the samples.
         """
         if self.adjoining < FEWEST_ADJOINING:
             return "away"
