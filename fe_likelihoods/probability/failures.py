@@ -1,6 +1,7 @@
 """Record of the simulations that failed."""
 
 import logging
+import re
 from collections import Counter, OrderedDict
 from collections.abc import Sequence
 
@@ -9,7 +10,7 @@ import numpy as np
 from ..simulation.faults import TransientReason
 from ..simulation.model import split_seconds
 
-__all__ = ["FailureLog", "TooManyFailures"]
+__all__ = ["FailureLog", "TooManyFailures", "reason_without_numbers"]
 
 logger = logging.getLogger(__name__)
 
@@ -18,6 +19,20 @@ _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
 _OTHER_FAULTS = "other faults of the infrastructure"
 _MIN_SIMULATIONS = 20  # before the share of failures is checked
+_NUMBER = re.compile(r"(?:(?<![\w.])[-+])?(?<![\w.])(?:0x[0-9a-f]+|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
+
+
+def reason_without_numbers(reason: str) -> str:
+    """The reason of a failure with "#" in the place of each number, the same for all failures with one cause.
+
+    Digits that are part of a name are kept.
+
+    Examples
+    --------
+    >>> reason_without_numbers("Steel02: no convergence at step 31, residual 2.5e-03")
+    'Steel02: no convergence at step #, residual #'
+    """
+    return _NUMBER.sub("#", reason)
 
 
 class TooManyFailures(RuntimeError):
@@ -45,8 +60,8 @@ class FailureLog:
     transient : int
         Number of failures whose cause is not the model.
     reasons : collections.Counter
-        Number of failures per reason; reasons beyond the first 100 are counted together, those of the model and the
-        others apart.
+        Number of failures per reason. After the first 100 reasons, further ones are counted by their text without
+        numbers (`reason_without_numbers`), and after 100 of these together, those of the model and the others apart.
 
     Raises
     ------
@@ -96,9 +111,8 @@ class FailureLog:
             if transient:
                 self.records[-1]["transient"] = True
         known = self._transient_reasons if transient else self._reasons_of_model
-        if len(known) < _MAX_REASONS:
-            known.add(reason)
-        self.reasons[reason if reason in known else _OTHER_FAULTS if transient else _OTHER_REASONS] += 1
+        other = _OTHER_FAULTS if transient else _OTHER_REASONS
+        self.reasons[_counted_under(reason, known) or other] += 1
 
     def check(self, n_simulations: int, running: int = 0) -> None:
         """Raise `TooManyFailures` if too large a share of `n_simulations` simulations (20 or more) failed.
@@ -115,3 +129,12 @@ class FailureLog:
                 f"largest share allowed is {self.max_share:g}. See failures and report(); then correct the model, "
                 "narrow the prior or raise max_failure_share"
             )
+
+
+def _counted_under(reason: str, known: set[str]) -> str:
+    """The text under which a reason is counted, which is added to those known; empty if these are too many."""
+    for text, most in ((reason, _MAX_REASONS), (reason_without_numbers(reason), 2 * _MAX_REASONS)):
+        if text in known or len(known) < most:
+            known.add(text)
+            return text
+    return ""

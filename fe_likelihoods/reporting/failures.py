@@ -12,11 +12,13 @@ from scipy.stats import ks_2samp
 
 from samplers import NearFailures, failures_near
 
+from ..probability.failures import reason_without_numbers
 from ..probability.likelihood import FELikelihood
 from .run import FinishedRun
 
 __all__ = ["Failure", "Failures", "failures"]
 
+KEPT_APART = 3  # reasons that differ in their numbers only: these may be codes, such as those of signals
 FEWEST_TO_COMPARE = 5  # failures, below which their place is not a pattern
 CLEAR_SEPARATION = 0.5  # Kolmogorov-Smirnov distance between the failed and the successful points
 UNLIKELY = 0.01  # probability of such a distance by chance
@@ -28,16 +30,20 @@ class Failure(NamedTuple):
     Attributes
     ----------
     reason : str
+        The reason; with "#" in the place of numbers where there are more than three with other numbers.
     count : int
     where : str
         The parameter that tells these failures from the successful simulations best, in words.
+    ranges : str
+        Smallest and largest values of the parameters of all that are recorded.
     example : str
-        The parameters of one of them.
+        The parameters of one of them, after its reason where `reason` has "#".
     """
 
     reason: str
     count: int
     where: str
+    ranges: str
     example: str
 
 
@@ -131,11 +137,7 @@ def _of_function(run: FinishedRun) -> Failures:
 
 
 def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str, count: int | None = None) -> Failures:
-    rows = [
-        Failure(reason, n, _where(run, source, reason), _example(run, source, reason))
-        for source in sources
-        for reason, n in source.counts.items()
-    ]
+    rows = [row for source in sources for row in _by_reason(run, source)]
     rows.sort(key=lambda row: -row.count)
     count = sum(row.count for row in rows) if count is None else count
     draws = getattr(run.sampler, "prior_draws", None)
@@ -145,6 +147,34 @@ def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str
         bad = np.any([_are_among(draws[:, each.columns], each.failed) for each in sources], axis=0)
         prior = (int(bad.sum()), len(draws))
     return Failures(tuple(rows), count, max(attempts, count), remark, *prior, _near_the_samples(run, sources))
+
+
+def _by_reason(run: FinishedRun, source: _Source) -> list[Failure]:
+    """Failures of one model; more than three reasons that differ in their numbers only are one."""
+    common = Counter(map(reason_without_numbers, source.counts))
+
+    def shown(text: str) -> str:
+        return text if common[reason_without_numbers(text)] <= KEPT_APART else reason_without_numbers(text)
+
+    counts: Counter = Counter()
+    for text, count in source.counts.items():
+        counts[shown(text)] += count
+    recorded = list(map(shown, source.reasons))
+    return [_failure(run, source, reason, count, recorded) for reason, count in counts.items()]
+
+
+def _failure(run: FinishedRun, source: _Source, reason: str, count: int, recorded: list[str]) -> Failure:
+    """A row for one reason; `recorded` are the reasons of the points that have failed, as they are shown."""
+    chosen = [row for row, each in enumerate(recorded) if each == reason]
+    if not chosen:
+        return Failure(reason, count, "", "", "")
+    failed, names = source.failed[chosen], [run.names[column] for column in source.columns]
+    ends = zip(names, failed.min(axis=0), failed.max(axis=0), strict=True)
+    ranges = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, low, high in ends)
+    example = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, failed[0], strict=True))
+    if (text := source.reasons[chosen[0]]) != reason:
+        example = f"{text}: {example}"
+    return Failure(reason, count, _where(run, source, failed), ranges, example)
 
 
 def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -168,12 +198,11 @@ def _near_the_samples(run: FinishedRun, sources: list[_Source]) -> NearFailures:
     return max(found, key=lambda each: each.failed)
 
 
-def _where(run: FinishedRun, source: _Source, reason: str) -> str:
-    """The parameter whose values tell the failures from the successes best, by the Kolmogorov-Smirnov distance."""
-    failed = source.failed[[each == reason for each in source.reasons]]
+def _where(run: FinishedRun, source: _Source, failed: np.ndarray) -> str:
+    """The parameter whose values tell these failures from the successes best, by the Kolmogorov-Smirnov distance."""
     succeeded = np.concatenate([source.succeeded, run.samples[:, source.columns]])
     if len(failed) < FEWEST_TO_COMPARE:
-        return "too few to see a pattern" if len(failed) else ""
+        return "too few to see a pattern"
     tests = [ks_2samp(failed[:, i], succeeded[:, i]) for i in range(failed.shape[1])]
     i = int(np.argmax([test.statistic for test in tests]))
     test, name = tests[i], run.names[source.columns[i]]
@@ -186,10 +215,3 @@ def _where(run: FinishedRun, source: _Source, reason: str) -> str:
         f"at {name} {'up to' if low else 'above'} {place:.4g} ({100.0 * shares[0]:.3g} % of these failures, "
         f"{100.0 * shares[1]:.3g} % of the successful points)"
     )
-
-
-def _example(run: FinishedRun, source: _Source, reason: str) -> str:
-    if reason not in source.reasons:
-        return ""
-    point = source.failed[source.reasons.index(reason)]
-    return ", ".join(f"{run.names[c]} = {value:.4g}" for c, value in zip(source.columns, point, strict=True))

@@ -14,6 +14,7 @@ from scipy import optimize, stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods.probability.failures import FailureLog, reason_without_numbers
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import SharedGaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
@@ -364,6 +365,31 @@ def test_records_of_failures_are_bounded():
     assert report["failure_count"] == sum(report["failure_reasons"].values()) == 1500
     assert len(report["failures"]) == 1000
     assert len(report["failure_reasons"]) == 101
+    assert report["failure_reasons"]["no convergence at offset #"] == 1400
+
+
+@pytest.mark.parametrize(
+    ("reason", "text"),
+    [
+        ("no convergence at step 31, residual -2.5e-03", "no convergence at step #, residual #"),
+        ("[1. .5 -2]: 3 s after 0x7fA1", "[# # #]: # s after #"),
+        ("Steel02 of section_3 in model.04: step-7", "Steel02 of section_3 in model.04: step-#"),
+        ("no reason given", "no reason given"),
+    ],
+)
+def test_reasons_without_their_numbers(reason, text):
+    assert reason_without_numbers(reason) == text
+
+
+def test_reasons_are_bounded_and_later_ones_are_counted_apart():
+    log = FailureLog(["x"], 1.0)
+    for k in range(300):
+        log.add(np.array([k]), f"no convergence at step {k}")
+    log.add(np.array([0.0]), "buckled")
+    assert log.reasons["no convergence at step #"] == 200 and log.reasons["buckled"] == 1
+    for k in range(300):
+        log.add(np.array([k]), f"error {'a' * k}")
+    assert len(log.reasons) == 201 and log.reasons["other reasons"] == 202 and log.reasons.total() == 601
 
 
 def test_nan_from_a_noise_is_a_failure():

@@ -27,18 +27,16 @@ from tests.reporting.report_page import read_page
 TIME = 0.02 * np.arange(150)
 
 
-def free_vibration(theta, limit=1.1):
+def free_vibration(theta, limit=1.1, numbers=False):
     if theta[0] > limit:
-        raise SimulationFailed("no convergence")
+        raise SimulationFailed(f"no convergence, residual {theta[0]:.9e}" if numbers else "no convergence")
     omega = 2.0 * np.pi * 2.0 * np.sqrt(theta[0])
     return [0.05 * np.exp(-0.02 * theta[1] * omega * TIME) * np.cos(omega * TIME)]
 
 
-def posterior_of(truth):
+def posterior_of(truth, function=free_vibration):
     """A model that fails above a stiffness of 1.1, with data of a model that does not."""
-    model = FunctionModel(
-        free_vibration, ["stiffness", "damping"], [Channel("top", "displacement", "mm")], 0.02, len(TIME)
-    )
+    model = FunctionModel(function, ["stiffness", "damping"], [Channel("top", "displacement", "mm")], 0.02, len(TIME))
     noise = 0.002 * np.random.default_rng(1).standard_normal((1, len(TIME)))
     measured = Measurements(model.channels, model.dt, np.array(free_vibration(truth, np.inf)) + noise)
     prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")} | {"sigma_top": HalfNormal(0.01)}
@@ -70,6 +68,38 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     assert "Do not use these numbers" in contents.summary[2]
     bad = int((sampler.prior_draws[:, 0] > 1.1).sum())
     assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].text
+
+
+def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):
+    posterior = posterior_of([1.05, 0.8], lambda theta: free_vibration(theta, numbers=True))
+    sampler = run(posterior)
+    posterior.likelihood.simulate([[1.1 + 1e-3 * k, 1.0] for k in range(1, 131)])
+    found = failures(read_run(sampler, posterior))
+    (row,) = found.rows
+    assert (row.reason, row.count) == ("no convergence, residual #", found.count)
+    assert row.count == posterior.report()["failure_count"] > 130
+    stiffness, damping = np.array([list(each["parameters"].values()) for each in posterior.report()["failures"]]).T
+    ends = [f"{each.min():.4g} to {each.max():.4g}" for each in (stiffness, damping)]
+    assert row.ranges == f"stiffness {ends[0]}, damping {ends[1]}"
+    first = f"{stiffness[0]:.4g}, damping = {damping[0]:.4g}"
+    assert row.example == f"no convergence, residual {stiffness[0]:.9e}: stiffness = {first}"
+    assert row.where.startswith("at stiffness above 1.1 (100 %")
+    text = read_page(report(sampler, posterior, out=tmp_path / "run.html")).text
+    assert text.count("no convergence, residual") == 2 and row.ranges in text
+
+
+def test_control_few_numbers_may_be_codes():
+    reasons = iter([9, 11, 9] * 500)
+
+    def killed(theta):
+        if theta[0] > 1.1:
+            raise SimulationFailed(f"the worker process died (signal {next(reasons)})")
+        return free_vibration(theta)
+
+    posterior = posterior_of([1.05, 0.8], killed)
+    rows = failures(read_run(run(posterior, steps=1), posterior)).rows
+    assert [row.reason for row in rows] == [f"the worker process died (signal {k})" for k in (9, 11)]
+    assert all("died" not in row.example for row in rows)
 
 
 def test_control_failures_far_from_the_samples_are_no_severe_doubt():
