@@ -73,8 +73,10 @@ class Fragility(NamedTuple):
         and bands are made. None if there are neither ratios nor a population.
     uncertainty : str
         What the probabilities contain.
-    unit, intensity_unit : str
-        SI units of the threshold and of the intensities; "SI" where they are not known.
+    unit : str
+        SI unit of the threshold; "SI" where its dimension is not known.
+    intensity_unit : str
+        Unit of the intensities: m/s2 for `peak_ground_acceleration`, empty for another function.
     """
 
     names: tuple[str, ...]
@@ -90,10 +92,11 @@ class Fragility(NamedTuple):
     draws: np.ndarray | None = None
     uncertainty: str = ""
     unit: str = "SI"
-    intensity_unit: str = "SI"
+    intensity_unit: str = ""
 
     def __str__(self) -> str:
-        rows = [("record", f"intensity [{self.intensity_unit}]", "P(exceed)", "MC error", "interval", "failed")]
+        intensity = f"intensity [{self.intensity_unit}]" if self.intensity_unit else "intensity"
+        rows = [("record", intensity, "P(exceed)", "MC error", "interval", "failed")]
         for k, name in enumerate(self.names):
             numbers = number(self.intensity[k]), number(self.probability[k]), number(self.standard_error[k], 2)
             ends = f"{number(self.lower[k])} to {number(self.upper[k])}"
@@ -299,9 +302,11 @@ def fragility(
         values[np.setdiff1d(np.arange(n), prediction.failed, assume_unique=True), k] = prediction.values
     spread = EventSpread(values, weights, ratios)
     found = _probabilities(spread, float(limit), failures_exceed, effective, level, seed)
+    intensity_unit = DIMENSIONS["acceleration"] if intensity is peak_ground_acceleration else ""
     try:
         rng = np.random.default_rng(seed)
         curve = curve_with_errors(intensities, found.single, found.counted, effective, found.draws, rng)
+        curve = curve._replace(unit=intensity_unit)
     except ValueError as reason:
         logger.warning("no fragility curve: %s", reason)
         curve = None
@@ -319,7 +324,7 @@ def fragility(
         found.draws,
         contents(bool(noise), spread),
         unit_of_threshold(unit, known.channels),
-        DIMENSIONS["acceleration"] if intensity is peak_ground_acceleration else "SI",
+        intensity_unit,
     )
 
 

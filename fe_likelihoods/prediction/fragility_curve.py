@@ -38,19 +38,23 @@ class FragilityCurve(NamedTuple):
         Errors for fixed records: from what is unknown of the ratios and of the population of events, if there are any;
         otherwise Monte Carlo errors, by resampling the samples (which all records share). They do not include the
         effect of other records. They are inf if more than a tenth of the resamplings do not determine a curve.
+    unit : str
+        Unit of the intensities; empty where it is not known.
     """
 
     median: float
     dispersion: float
     median_error: float = np.inf
     dispersion_error: float = np.inf
+    unit: str = ""
 
     def __str__(self) -> str:
         median, dispersion = number(self.median), number(self.dispersion)
         if np.isfinite(self.median_error) and np.isfinite(self.dispersion_error):
             median += f" +- {number(self.median_error, 2)}"
             dispersion += f" +- {number(self.dispersion_error, 2)}"
-        return f"lognormal fragility curve: median {median} [SI], dispersion {dispersion}"
+        unit = f" {self.unit}" if self.unit else ""
+        return f"lognormal fragility curve: median {median}{unit}, dispersion {dispersion}"
 
     def probability(self, intensity: ArrayLike) -> np.ndarray:
         """Return the probability of an exceedance at positive intensities."""
@@ -72,7 +76,7 @@ def fit_fragility(intensity: ArrayLike, exceedances: ArrayLike, trials: ArrayLik
     Returns
     -------
     FragilityCurve
-        The curve, without errors (inf).
+        The curve, without errors (inf) and without a unit.
 
     Raises
     ------

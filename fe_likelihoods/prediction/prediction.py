@@ -334,6 +334,11 @@ class Prediction:
         """The quantile of a probability that is known up to round-off."""
         return self.quantile(next((p for p in self.probabilities if abs(p - probability) < 1e-9), probability))
 
+    def __repr__(self) -> str:
+        names = f"channels {', '.join(channel.name for channel in self.channels)}, " if self.channels else ""
+        noise = "with noise" if self.noise else "without noise"
+        return f"<Prediction of shape {self.mean.shape}: {names}{self.n_samples} samples, {noise}>"
+
     def __str__(self) -> str:
         title, lines, header, rows = self._table()
         cells = [[each if isinstance(each, str) else number(each) for each in row] for row in rows]

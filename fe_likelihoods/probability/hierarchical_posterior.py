@@ -203,6 +203,23 @@ class HierarchicalPosterior:
         ]
         self._smallest_sd = _SMALLEST_SD * np.min(deviations, axis=0)[: len(self.varying)]
 
+    def __repr__(self) -> str:
+        common = f"common {', '.join(self.common)}, " if self.common else ""
+        return (
+            f"<HierarchicalPosterior: {len(self.tests)} tests, varying {', '.join(self.varying)}, {common}{self.ndim} "
+            "hyper-parameters>"
+        )
+
+    def __str__(self) -> str:
+        varying = ", ".join(f"{name} ({each.scale})" for name, each in self.varying.items())
+        return "\n".join(
+            [
+                f"Hierarchical posterior of {len(self.tests)} tests: {', '.join(self.tests)}",
+                f"varying: {varying}; common: {', '.join(self.common) or 'none'}",
+                f"{self.ndim} hyper-parameters: {', '.join(self.parameter_names)}",
+            ]
+        )
+
     def without(self, test: str) -> "HierarchicalPosterior":
         """The same posterior density without the data of one test; ValueError for the only test, or an unknown one."""
         if test not in self.tests or len(self.tests) < 2:

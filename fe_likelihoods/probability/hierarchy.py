@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..text_tables import number, text_table
 from .distributions import RandomState
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy_checks import check_hierarchy
@@ -72,6 +73,22 @@ class Hierarchy:
         self.checks = check_hierarchy(posterior, points, seed)
         for message in self.checks.messages:
             warnings.warn(message, stacklevel=2)
+
+    def __repr__(self) -> str:
+        return f"<Hierarchy: {len(self.samples)} samples of {self.posterior!r}>"
+
+    def __str__(self) -> str:
+        rows = [("hyper-parameter", "mean", "sd", "5 %", "95 %")]
+        columns = [
+            self.samples.mean(axis=0),
+            self.samples.std(axis=0),
+            *np.quantile(self.samples, [0.05, 0.95], axis=0),
+        ]
+        for name, *each in zip(self.posterior.parameter_names, *columns, strict=True):
+            rows.append((name, *map(number, each)))
+        first = f"Population of {len(self.posterior.tests)} tests, {len(self.samples)} samples"
+        messages = [f"CAUTION: {message}" for message in self.checks.messages]
+        return "\n".join([f"{first}: {', '.join(self.posterior.tests)}", text_table(rows), *messages])
 
     def new_test(self, n: int, names: Sequence[str] | None = None, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Draw the parameters of a further test: the predictive density of the population.

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..signals.channels import Measurements
+from ..text_tables import number, text_table
 from .distributions import TruncatedNormal
 from .inputs import as_points
 from .mixture_prior import MixtureDistribution, fit_mixture
@@ -115,6 +116,20 @@ class StoredPosterior:
             ("effective_sample_size", float(effective)),
         ):
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        n, names = len(self.samples), ", ".join(self.prior.names)
+        return f"<StoredPosterior: {n} samples of {names}; effective sample size {self.effective_sample_size:.0f}>"
+
+    def __str__(self) -> str:
+        weights = np.exp(self.log_weights)
+        means = weights @ self.samples
+        deviations = np.sqrt(weights @ np.square(self.samples - means))
+        rows = [("parameter", "mean", "sd")]
+        rows += [(name, *map(number, each)) for name, *each in zip(self.prior.names, means, deviations, strict=True)]
+        first = f"{len(self.samples)} samples of one test, effective sample size {self.effective_sample_size:.0f}"
+        evidence = "" if self.log_evidence is None else f"; log-evidence {self.log_evidence:.2f}"
+        return f"{first}{evidence}\n{text_table(rows)}"
 
 
 class DescribedPosterior(NamedTuple):

@@ -8,7 +8,10 @@ from fe_likelihoods import (
     LevelRatios,
     LimitState,
     ParkAng,
+    Prior,
     Record,
+    StoredPosterior,
+    Uniform,
     average_predictions,
     compare_tests,
     exceedance,
@@ -53,6 +56,16 @@ def test_predictions(predicted):
     assert abs(float(cells(text, 2)[2])) == pytest.approx(1e2 * largest, rel=5e-3)
 
 
+def test_predictions_in_a_list(predicted):
+    """`repr` is one short line."""
+    histories, value = (repr(predicted[name]) for name in ("histories", "peak"))
+    n = predicted["histories"].mean.shape[1]
+    assert histories == f"<Prediction of shape (1, {n}): channels displacement, 41 samples, without noise>"
+    assert value == "<Prediction of shape (): channels displacement, 41 samples, without noise>"
+    own = propagate(Flexible(RECORD), np.zeros((3, 1)), quantity=lambda response: response.sum(), progress=False)
+    assert repr([own]) == "[<Prediction of shape (): 3 samples, without noise>]"
+
+
 def test_averages_of_models(predicted):
     for each in predicted.values():
         text = str(average_predictions({"a": each, "b": each}, {"a": 0.25, "b": 0.75}))
@@ -90,7 +103,26 @@ def test_exceedance_and_fragility(predicted):
     assert cells(text, 1)[1] == "intensity [m/s2]"
     assert [float(cells(text, row)[2]) for row in (2, 3, 4)] == pytest.approx(list(curve.probability), rel=5e-3)
     assert f"lognormal fragility curve: median {curve.curve.median:.3g}" in text and "array" not in text
-    assert str(fit_fragility([1.0, 2.0, 3.0], [1, 5, 9], [10, 10, 10])).count("+-") == 0
+    assert " m/s2, dispersion" in str(curve.curve) and "SI" not in text
+    alone = str(fit_fragility([1.0, 2.0, 3.0], [1, 5, 9], [10, 10, 10]))
+    assert alone.count("+-") == 0 and "SI" not in alone
+
+
+def test_the_unit_of_an_intensity_of_the_users_own_is_not_invented():
+    records = [RECORD.scale(factor) for factor in (0.5, 1.0, 2.0)]
+    samples = np.linspace(-0.5, 0.5, 41)[:, None]
+    curve = fragility(
+        Flexible(RECORD),
+        samples,
+        records,
+        peak("displacement"),
+        0.02,
+        ratios=RATIOS,
+        intensity=lambda record: float(np.abs(record.acceleration).max() / 9.81),
+        seed=1,
+        progress=False,
+    )
+    assert cells(str(curve), 1)[1] == "intensity" and curve.intensity_unit == curve.curve.unit == ""
 
 
 def test_ratios():
@@ -159,3 +191,30 @@ def test_tables_are_aligned_and_missing_cells_are_dashes():
             self.cells = found
 
     assert str(NamedResults(x=Value(p="1"), y=Value(q="22"))) == "event  p   q\nx      1   -\ny      -  22"
+
+
+def test_hierarchies():
+    hierarchy = hierarchy_of(ALIKE, n=500)
+    posterior = hierarchy.posterior
+    names, tests = posterior.parameter_names, list(posterior.tests)
+    text = str(hierarchy)
+    assert text.startswith(f"Population of {len(tests)} tests, {len(hierarchy.samples)} samples: {', '.join(tests)}\n")
+    assert [cells(text, 2 + k)[0] for k in range(len(names))] == names
+    low, high = np.quantile(hierarchy.samples, [0.05, 0.95], axis=0)
+    expected = np.transpose([hierarchy.samples.mean(axis=0), hierarchy.samples.std(axis=0), low, high])
+    printed = [[float(cell) for cell in cells(text, 2 + k)[1:]] for k in range(len(names))]
+    assert np.allclose(printed, expected, rtol=5e-3)
+    varying = ", ".join(posterior.varying)
+    inner = f"<HierarchicalPosterior: {len(tests)} tests, varying {varying}, {posterior.ndim} hyper-parameters>"
+    assert repr(posterior) == inner
+    assert repr(hierarchy) == f"<Hierarchy: {len(hierarchy.samples)} samples of {inner}>"
+    assert ", ".join(names) in str(posterior) and "common: none" in str(posterior)
+
+
+def test_stored_posteriors():
+    prior = Prior({"a": Uniform(0.0, 10.0), "b": Uniform(0.0, 10.0)})
+    stored = StoredPosterior([[1.0, 2.0], [3.0, 8.0]], prior, log_weights=np.log([0.75, 0.25]), log_evidence=-3.456)
+    assert repr(stored) == "<StoredPosterior: 2 samples of a, b; effective sample size 2>"
+    text = str(stored)
+    assert text.startswith("2 samples of one test, effective sample size 2; log-evidence -3.46\n")
+    assert [cells(text, row) for row in (2, 3)] == [["a", "1.5", "0.866"], ["b", "3.5", "2.6"]]
