@@ -14,7 +14,9 @@ models are compared:
 
 import json
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +33,7 @@ from fe_likelihoods import (
     Prediction,
     Prior,
     ResidualChecks,
+    SimulationCache,
     Uniform,
     effective_samples,
     innovations,
@@ -227,26 +230,11 @@ def predict(fit: Fit, n: int, seed: int, model: Any) -> tuple[Prediction, Predic
     chosen = np.random.default_rng(seed).choice(len(fit.samples), min(n, len(fit.samples)), replace=False)
     # the prediction depends only on parameters and noise: the measurements of the likelihood are not used
     unused = Measurements(model.channels, model.dt, np.zeros((1, model.n_steps)))
-    likelihood = FELikelihood(_CachedResponses(model), unused, fit.posterior.likelihood.noise)
-    posterior = Posterior(likelihood, fit.posterior.prior)
-    return tuple(
-        propagate(posterior, fit.samples[chosen], noise=noise, seed=seed, progress=False) for noise in (False, True)
-    )
-
-
-class _CachedResponses:
-    """A model that caches its responses, so that the prediction with noise needs no further simulations."""
-
-    def __init__(self, model: Any) -> None:
-        self.parameter_names, self.channels = model.parameter_names, model.channels
-        self.dt, self.n_steps, self.fingerprint = model.dt, model.n_steps, model.fingerprint
-        self._model, self._responses = model, {}
-
-    def simulate(self, theta: np.ndarray) -> np.ndarray:
-        key = np.asarray(theta).tobytes()
-        if key not in self._responses:
-            self._responses[key] = self._model.simulate(theta)
-        return self._responses[key]
+    posterior = Posterior(FELikelihood(model, unused, fit.posterior.likelihood.noise), fit.posterior.prior)
+    # the prediction with noise finds the responses in the cache; verify=False, because the model cannot have changed
+    with TemporaryDirectory() as folder, closing(SimulationCache(Path(folder) / "cache", verify=False)) as cache:
+        settings = {"seed": seed, "cache": cache, "progress": False}
+        return tuple(propagate(posterior, fit.samples[chosen], noise=noise, **settings) for noise in (False, True))
 
 
 def prediction_row(

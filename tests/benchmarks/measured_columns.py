@@ -12,7 +12,7 @@ import numpy as np
 from fe_likelihoods import ModulatedNoise, dissipated_energy, peak, propagate
 
 from . import tested_column
-from .measured_transfer import CachedResponses, Case, Fit, calibrate, ratios_of, score_case, skipped, within
+from .measured_transfer import Case, Fit, calibrate, ratios_of, score_case, skipped, stored_responses, within
 from .rows import Row
 from .tested_column import HISTORY, PRIOR, PROPERTIES, SENSOR, SIGMA, Specimen, first_half, specimens
 
@@ -46,24 +46,23 @@ def columns(repeats: int = 1) -> list[Row]:
         half = tests[0].parts["first half"]
         ratios = ratios_of(fit, calibrated, _numbers(tests[0], half, half))
         for test in tests:
-            model = CachedResponses(test.model)
-            growth = _growth(test, model, fit)
+            growth = _growth(test, fit)
             rows.append(Row("growth of the error, power of the drift", f"{test.name}, seed {seed}", growth, ""))
             for label, part in test.parts.items():
                 if test is not tests[0] or label != "first half":
                     numbers = _numbers(test, part, slice(None))
                     name = f"{test.name}, {label}"
-                    case = Case(name, model, test.measured, part, numbers, _noise(test))
+                    case = Case(name, test.model, test.measured, part, numbers, _noise(test))
                     found, each = score_case(case, fit, modulated, ratios, seed)
                     rows += found
                     scored.append(each)
     return rows + within(scored)
 
 
-def _growth(test: Specimen, model: CachedResponses, fit: Fit) -> float:
+def _growth(test: Specimen, fit: Fit) -> float:
     """Power of the drift with which the error of the mean response grows, by least squares over twelfths of a test."""
     kept = slice(0, test.parts["second half"].stop)
-    mean = propagate(model, fit.structure, quantiles=(), progress=False).mean[0, kept]
+    mean = propagate(test.model, fit.structure, quantiles=(), cache=stored_responses(), progress=False).mean[0, kept]
     error = np.square(test.measured.values[0, kept] - mean)
     reached = np.maximum.accumulate(np.abs(test.model.loading.displacement[kept]))
     parts = np.array_split(np.arange(len(error)), 12)

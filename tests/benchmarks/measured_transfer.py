@@ -18,7 +18,10 @@ note has the relative error, the CRPS and the width of the band in the same unit
 strong part. The rows of numbers have the score as a multiple of the measured value, and say in which intervals it is.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,18 +36,18 @@ from fe_likelihoods import (
     Posterior,
     QuantityScores,
     RelativeNoise,
+    SimulationCache,
     propagate,
     share_within,
 )
 from fe_likelihoods.prediction.quantities import ChannelQuantity, measured_quantity
 from fe_likelihoods.prediction.score_tables import score_values
-from fe_likelihoods.probability.response_levels import imposed_deformation
 from samplers import SMCSampler
 
 from .rows import Row
 from .targets import SHARED
 
-__all__ = ["GUESS", "CachedResponses", "Case", "Fit", "calibrate", "ratios_of", "score_case", "skipped", "within"]
+__all__ = ["GUESS", "Case", "Fit", "calibrate", "ratios_of", "score_case", "skipped", "stored_responses", "within"]
 
 GUESS = {"prior_sd": 0.1, "prior_events": 3.0}
 """Stated spread between events of the logarithm of measured / fitted, worth three events (assumed)."""
@@ -98,21 +101,14 @@ class Fit(NamedTuple):
     simulations: int
 
 
-class CachedResponses:
-    """A model that keeps its responses, so that each way to predict needs no further simulations."""
+@functools.cache
+def _folder() -> TemporaryDirectory:
+    return TemporaryDirectory()  # deleted when the process ends
 
-    def __init__(self, model: Any) -> None:
-        self.parameter_names, self.channels = model.parameter_names, model.channels
-        self.dt, self.n_steps, self.fingerprint = model.dt, model.n_steps, model.fingerprint
-        self.deformation = imposed_deformation(model)
-        self._model, self._responses = model, {}
 
-    def simulate(self, theta: np.ndarray) -> np.ndarray:
-        """The response at one point."""
-        key = np.asarray(theta).tobytes()
-        if key not in self._responses:
-            self._responses[key] = self._model.simulate(theta)
-        return self._responses[key]
+def stored_responses() -> SimulationCache:
+    """Cache of the predicted responses of this process, so that each way to predict needs no further simulations."""
+    return SimulationCache(Path(_folder().name) / "responses.sqlite", verify=False)
 
 
 def skipped(name: str, *files: str) -> list[Row]:
@@ -191,13 +187,15 @@ def score_case(
         "window": (RelativeNoise(channels, unused, window=case.noise.window, **options), fit.structure, shares),
         "modulated": (case.noise, modulated.structure, of_channels(modulated.sigma)),
     }
-    model, rows, scored = CachedResponses(case.model), [], {}
+    rows, scored = [], {}
     quantities = list(case.numbers.values())
+    settings = {"cache": stored_responses(), "progress": False}
     for way, (noise, structure, parameters) in kinds.items():
-        likelihood = FELikelihood(model, case.measured, noise)
+        likelihood = FELikelihood(case.model, case.measured, noise)
         samples = np.hstack([structure, parameters])
-        histories = propagate(likelihood, samples, noise=True, seed=seed, progress=False)
-        scores = histories.score(case.measured, part=case.part)
+        wanted = {"histories": None, "numbers": quantities}
+        predicted = propagate(likelihood, samples, quantity=wanted, noise=True, seed=seed, **settings)
+        scores = predicted["histories"].score(case.measured, part=case.part)
         for k, channel in enumerate(channels):
             scaled = scores.crps[k] / scores.rms[k], scores.width[k] / scores.rms[k]
             note = (
@@ -206,9 +204,8 @@ def score_case(
             )
             label = f"{case.name}, {channel.name}" if len(channels) > 1 else case.name
             rows.append(Row(f"interval score / RMS, {way}", label, scores.interval_score[k] / scores.rms[k], "", note))
-        numbers = propagate(likelihood, samples, quantity=quantities, noise=True, seed=seed, progress=False)
-        scored[way] = numbers.score(case.measured)
-    alone = propagate(model, fit.structure, quantity=quantities, progress=False)
+        scored[way] = predicted["numbers"].score(case.measured)
+    alone = propagate(case.model, fit.structure, quantity=quantities, **settings)
     rng = np.random.default_rng(seed)
     draws = [EventRatios([ratios[name]], **GUESS).draw(len(alone.values), rng) for name in case.numbers]
     names, units = zip(*((channel.name, channel.unit) for channel in alone.channels), strict=True)
