@@ -76,7 +76,7 @@ def test_further_column_tests_are_found_by_their_row_in_the_table(tmp_path, monk
     assert "no row whose TSN and Test make the name '2099_Unknown'" in unknown
 
 
-def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(rng):
+def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(rng, monkeypatch):
     """An oscillator that is ten times weaker than in its calibration, with errors of a quarter of the response."""
     time = 0.05 * np.arange(400)
     channels = [Channel("top", "acceleration", "g")]
@@ -95,7 +95,16 @@ def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(
     noise = ModulatedNoise(channels, window=1.0, sensor=[1e-3])
     modulated = measured_transfer.calibrate(*strong, {"gain": LogNormal(1.0, 0.5)}, 5.0, 1, noise=noise, walkers=100)
     case = measured_transfer.Case("weak", *weak, slice(None), numbers, noise)
+    runs = 0
+
+    def counted(model, theta, simulate=FunctionModel.simulate):
+        nonlocal runs
+        runs += 1
+        return simulate(model, theta)
+
+    monkeypatch.setattr(FunctionModel, "simulate", counted)
     rows, scored = measured_transfer.score_case(case, fit, modulated, ratios, 1)
+    assert runs == len(np.unique(np.concatenate([fit.structure, modulated.structure]))), "each is simulated once"
     found = {row.what: row.value for row in rows}
     ideal = 0.25 * np.sqrt(0.5) * 2.0 * (stats.norm.ppf(0.95) + stats.norm.pdf(1.645) / 0.05 - stats.norm.ppf(0.95))
     rms = np.sqrt(np.mean(weak[1].values ** 2))

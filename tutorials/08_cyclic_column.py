@@ -23,7 +23,6 @@ numbers in the text are those of the default options.
 """
 
 import argparse
-import csv
 import os
 import time
 from dataclasses import replace
@@ -49,28 +48,23 @@ from cyclic_tests import (
     table,
 )
 from real_data import add_common_options
+from tested_columns import PROPERTIES, read_column
 
 from fe_likelihoods import (
     BarBuckling,
-    Bars,
-    Channel,
-    Concrete,
     DisplacementHistory,
     FELikelihood,
     HalfNormal,
-    Hoops,
     LowCycleFatigue,
     Measurements,
     Posterior,
     Prediction,
     Prior,
     RCColumn,
-    Steel,
     TruncatedNormal,
     Uniform,
     from_si,
     propagate,
-    read_imposed_test,
     rrmse,
     to_si,
 )
@@ -82,7 +76,6 @@ FILES = {
     "Lehman_407": "2020_Lehman_407.csv",
     "Lehman_1015": "2019_Lehman_1015.csv",
 }
-PROPERTIES = "properties_circular_columns.csv"
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 KIP = to_si(1.0, "kip").item()
 # walkers, one sample kept in `every`, number of propagated draws, settings of the sampler, parameters
@@ -117,12 +110,12 @@ args.out.mkdir(parents=True, exist_ok=True)
 # The columns
 # -----------
 #
-# Dimensions, reinforcement and strengths come from the table of properties. The slip of the bars at yield comes from it
-# too; slip divided by yield strain is the length over which strain penetrates into the foundation. Without strain
-# penetration the anchorage is rigid and the model is too stiff. The model includes spalling of the cover, crushing and
-# confinement (Mander), but by default no buckling and fracture of bars. It then cannot predict the part called "after
-# failure": it begins with the first excursion that goes as far as any before it and reaches less than 80 % of the
-# largest force. The last section adds buckling and fracture.
+# ``tested_columns.py`` reads the files and makes the models. Dimensions, reinforcement and strengths come from the
+# table of properties. The slip of the bars at yield comes from it too; slip divided by yield strain is the length over
+# which strain penetrates into the foundation. Without strain penetration the anchorage is rigid and the model is too
+# stiff. The model includes spalling of the cover, crushing and confinement (Mander), but by default no buckling and
+# fracture of bars. It then cannot predict the part called "after failure": it begins with the first excursion that goes
+# as far as any before it and reaches less than 80 % of the largest force. The last section adds buckling and fracture.
 #
 # One sample in ``every`` is kept, and every turning point. This thinning is a first, crude way to treat correlated
 # errors. The test is quasi-static: the response depends on the order of the samples and not on time.
@@ -154,56 +147,14 @@ class Specimen(NamedTuple):
 
 def read_specimen(test: str) -> Specimen:
     """Read the properties and the measured history of a column."""
-    file = FILES[test]
-    with (folder / PROPERTIES).open() as rows:
-        row = next(row for row in csv.DictReader(rows) if row["Test"] == test)
-    v = {key: float(value) for key, value in row.items() if key != "Test"}
-
-    def si(key: str, unit: str) -> float:
-        return to_si(abs(v[f"{key} ({unit})"]), unit).item()
-
-    channel = Channel("force", "lateral force", "kip")
-    test_data = read_imposed_test(folder / file, "disp_in", [channel], ["force_kip"])
-    displacement, force = test_data.history.displacement, test_data.measurements.values[0]
-    moves = np.flatnonzero(np.diff(displacement))
-    turns = moves[1:][np.diff(np.sign(np.diff(displacement)[moves])) != 0]
-    kept = np.unique(np.concatenate([np.arange(0, len(displacement), every), turns, [len(displacement) - 1]]))
-    model = RCColumn(
-        loading=DisplacementHistory(test, displacement[kept], file),
-        diameter=si("D", "in"),
-        height=si("L", "in"),
-        cover=si("c", "in"),
-        concrete=Concrete(fc=si("fc", "ksi"), ec=si("Ec", "ksi"), ft=si("ft", "ksi")),
-        steel=Steel(si("fyl", "ksi"), si("ful", "ksi"), si("Esl", "ksi"), si("Esh", "ksi"), v["esh"], v["esu"]),
-        bars=Bars(int(v["nsl"]), si("dbl", "in")),
-        hoops=Hoops(si("dbt", "in"), si("s", "in"), si("fyt", "ksi"), spiral=True),
-        mass=1.0,  # unused in a quasi-static test, but must be positive
-        axial_load=to_si(v["P (kips)"], "kip").item(),
-        penetration=to_si(v["Sy"], "in").item() / v["esy"],
-        geometry=args.geometry,
-        parameters=parameters,
-        mesh=20,
-        max_increment=si("L", "in") / 200.0,
-        units=(("force", "kip"),),
-    )
-    half = int(np.searchsorted(kept, len(displacement) // 2))
-    failed = int(np.searchsorted(kept, find_failure(displacement, force)))
-    parts = {"first half": slice(0, half), "second half, to failure": slice(half, failed)}
-    parts["after failure"] = slice(failed, len(kept))
-    return Specimen(test.replace("_", " "), model, force[kept], parts, scatter(displacement, force))
-
-
-def find_failure(displacement: np.ndarray, force: np.ndarray) -> int:
-    """First sample of the first excursion to the largest displacement so far with less than 80 % of the peak force."""
-    ends = [0, *(np.flatnonzero(np.diff(np.sign(displacement)) != 0) + 1), len(displacement)]
-    reached = 0.0
-    for start, stop in zip(ends[:-1], ends[1:], strict=True):
-        peak = np.abs(displacement[start:stop]).max()
-        if peak > 0.97 * reached and reached > 0.01 * np.abs(displacement).max():
-            if np.abs(force[start:stop]).max() < 0.8 * np.abs(force).max() and start > np.argmax(np.abs(force)):
-                return start
-        reached = max(reached, peak)
-    return len(displacement)
+    read = read_column(folder, FILES[test], every, parameters)
+    parts = {
+        "first half": slice(0, read.half),
+        "second half, to failure": slice(read.half, read.failure),
+        "after failure": slice(read.failure, len(read.force)),
+    }
+    noise = scatter(read.displacement, read.whole_force)
+    return Specimen(read.name, replace(read.model, geometry=args.geometry), read.force, parts, noise)
 
 
 columns = [read_specimen("Lehman_415"), read_specimen("Hose_SRPH1")]

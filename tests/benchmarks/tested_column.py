@@ -7,7 +7,6 @@ turning points; seven parameters. The data are those that the tutorial names, in
 of a row of the table of properties, such as ``2018_Lehman_815.csv``.
 """
 
-import csv
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,23 +14,18 @@ import numpy as np
 
 from fe_likelihoods import (
     AutoregressiveNoise,
-    Bars,
-    Channel,
-    Concrete,
     DisplacementHistory,
     FELikelihood,
     GaussianNoise,
     HalfNormal,
-    Hoops,
     Measurements,
     Posterior,
     RCColumn,
-    Steel,
     TruncatedNormal,
     Uniform,
-    read_imposed_test,
     to_si,
 )
+from tutorials.tested_columns import PROPERTIES, read_column
 
 from .targets import SHARED
 
@@ -39,7 +33,6 @@ __all__ = [
     "Found",
     "Specimen",
     "autoregressive",
-    "failure",
     "first_half",
     "missing",
     "specimen",
@@ -49,7 +42,7 @@ __all__ = [
 ]
 
 FOLDER = SHARED / "measured" / "rc_column_cyclic"
-HISTORY, PROPERTIES = "2017_Lehman_415.csv", "properties_circular_columns.csv"
+HISTORY = "2017_Lehman_415.csv"
 WITHOUT_P_DELTA = range(9, 24)  # numbers of tests whose forces do not contain the contribution of the axial load
 EVERY = 2
 SENSOR = to_si(0.13, "kip").item()  # upper bound of the noise of the force, as the tutorial finds it
@@ -77,26 +70,13 @@ class Specimen(NamedTuple):
     measured : Measurements
         Lateral force [N].
     parts : dict of str to slice
-        "first half" and "second half", which ends where the column fails (`failure`).
+        "first half" and "second half", which ends where the column fails (`find_failure`).
     """
 
     name: str
     model: RCColumn
     measured: Measurements
     parts: dict[str, slice]
-
-
-def failure(displacement: np.ndarray, force: np.ndarray) -> int:
-    """First sample of the first excursion to the largest displacement so far with less than 80 % of the peak force."""
-    ends = [0, *(np.flatnonzero(np.diff(np.sign(displacement)) != 0) + 1), len(displacement)]
-    reached = 0.0
-    for start, stop in zip(ends[:-1], ends[1:], strict=True):
-        largest = np.abs(displacement[start:stop]).max()
-        if largest > 0.97 * reached and reached > 0.01 * np.abs(displacement).max():
-            if np.abs(force[start:stop]).max() < 0.8 * np.abs(force).max() and start > np.argmax(np.abs(force)):
-                return start
-        reached = max(reached, largest)
-    return len(displacement)
 
 
 class Found(NamedTuple):
@@ -127,70 +107,18 @@ def specimens(every: int = EVERY) -> Found:
     return Found(tuple(found), skipped)
 
 
-def _properties(history: str) -> tuple[str, dict[str, float]]:
-    """Name of a test and its row of the table, without cells that are empty; ValueError if there is none."""
-    with (FOLDER / PROPERTIES).open() as table:
-        rows = {f"{row['TSN']}_{row['Test']}": row for row in csv.DictReader(table)}
-    stem = history.removesuffix(".csv")
-    if stem not in rows:
-        raise ValueError(f"{PROPERTIES} has no row whose TSN and Test make the name {stem!r}")
-    row = rows[stem]
-    name = row.pop("Test")
-    return name, {key: float(value) for key, value in row.items() if value and value.strip()}
-
-
 def specimen(history: str, every: int = EVERY) -> Specimen:
     """Read a test from the file of its history, such as ``2017_Lehman_415.csv``; one sample in `every` is kept.
 
     The lateral force is M/h of the base moment where the axial load has no part in it ("linear" geometry), else the
     reading of the actuator ("corotational"). The script ``example/FiberElementBarFractureTest_Spiral.m`` of the
     repository subtracts P times drift from the forces of the tests 9 to 23 of the table before it compares them with
-    simulations with P-Delta; it takes those of the other tests as they are.
-
-    Raises
-    ------
-    ValueError
-        If the table has no row for this test, or lacks a value that the model needs, the history lacks a column, or the
-        values describe no column.
+    simulations with P-Delta; it takes those of the other tests as they are. ValueError as `read_column`.
     """
-    test, v = _properties(history)
-
-    def value(key: str) -> float:
-        if key not in v:
-            raise ValueError(f"{PROPERTIES} has no {key!r} of {test}")
-        return v[key]
-
-    def si(key: str, unit: str) -> float:
-        return to_si(abs(value(f"{key} ({unit})")), unit).item()
-
-    channel = Channel("force", "lateral force", "kip")
-    data = read_imposed_test(FOLDER / history, "disp_in", [channel], ["force_kip"])
-    displacement, force = data.history.displacement, data.measurements.values[0]
-    moves = np.flatnonzero(np.diff(displacement))
-    turns = moves[1:][np.diff(np.sign(np.diff(displacement)[moves])) != 0]
-    kept = np.unique(np.concatenate([np.arange(0, len(displacement), every), turns, [len(displacement) - 1]]))
-    half, failed = np.searchsorted(kept, [len(displacement) // 2, failure(displacement, force)]).tolist()
-    name = test.replace("_", " ")
-    model = RCColumn(
-        loading=DisplacementHistory(name, displacement[kept], history),
-        diameter=si("D", "in"),
-        height=si("L", "in"),
-        cover=si("c", "in"),
-        concrete=Concrete(fc=si("fc", "ksi"), ec=si("Ec", "ksi"), ft=si("ft", "ksi")),
-        steel=Steel(si("fyl", "ksi"), si("ful", "ksi"), si("Esl", "ksi"), si("Esh", "ksi"), value("esh"), value("esu")),
-        bars=Bars(int(value("nsl")), si("dbl", "in")),
-        hoops=Hoops(si("dbt", "in"), si("s", "in"), si("fyt", "ksi"), spiral=True),
-        mass=1.0,  # unused in a quasi-static test, but must be positive
-        axial_load=to_si(value("P (kips)"), "kip").item(),
-        penetration=to_si(value("Sy"), "in").item() / value("esy"),
-        geometry="linear" if value("No.") in WITHOUT_P_DELTA else "corotational",
-        parameters=tuple(PRIOR),
-        mesh=20,
-        max_increment=si("L", "in") / 200.0,
-        units=(("force", "kip"),),
-    )
-    parts = {"first half": slice(0, half), "second half": slice(half, failed)}
-    return Specimen(name, model, Measurements(model.channels, model.dt, force[None, kept], name), parts)
+    read = read_column(FOLDER, history, every, tuple(PRIOR))
+    model = replace(read.model, geometry="linear" if read.number in WITHOUT_P_DELTA else "corotational")
+    parts = {"first half": slice(0, read.half), "second half": slice(read.half, read.failure)}
+    return Specimen(read.name, model, Measurements(model.channels, model.dt, read.force[None], read.name), parts)
 
 
 def first_half(tested: Specimen) -> tuple[RCColumn, Measurements]:

@@ -1,0 +1,144 @@
+"""Read cyclic tests of circular reinforced-concrete columns: a history and a row of the table of properties.
+
+The files are made from the repository kuanshi/ductile-fracture (https://github.com/kuanshi/ductile-fracture), as
+``08_cyclic_column.py`` says: the history ``2017_Lehman_415.csv`` has the columns ``disp_in`` and ``force_kip``, and
+belongs to the row of ``properties_circular_columns.csv`` whose TSN is 2017 and whose Test is Lehman_415. Any other test
+of this table is read in the same way.
+"""
+
+import csv
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fe_likelihoods import (
+    Bars,
+    Channel,
+    Concrete,
+    DisplacementHistory,
+    Hoops,
+    RCColumn,
+    Steel,
+    read_imposed_test,
+    to_si,
+)
+
+PROPERTIES = "properties_circular_columns.csv"
+
+
+class TestedColumn(NamedTuple):
+    """A tested column: model and measurement at the kept samples.
+
+    Attributes
+    ----------
+    name : str
+        Name of the test.
+    number : int
+        Number of the test in the table of properties.
+    model : RCColumn
+        Model under the imposed displacements at the kept samples.
+    force : (n_steps,) float
+        Measured lateral force [N].
+    half, failure : int
+        First kept sample of the second half of the history, and the first one after failure (`find_failure`).
+    displacement, whole_force : (n,) float
+        All samples of the displacement [m] and of the force [N].
+    """
+
+    name: str
+    number: int
+    model: RCColumn
+    force: np.ndarray
+    half: int
+    failure: int
+    displacement: np.ndarray
+    whole_force: np.ndarray
+
+
+def read_column(folder: Path, history: str, every: int, parameters: tuple[str, ...]) -> TestedColumn:
+    """Read a tested column.
+
+    Parameters
+    ----------
+    folder : path
+        Where the files are.
+    history : str
+        File of the history, such as ``2017_Lehman_415.csv``.
+    every : int
+        One sample in `every` is kept, and every turning point.
+    parameters : tuple of str
+        Parameters of the model.
+
+    Returns
+    -------
+    TestedColumn
+        Its model has "linear" geometry, for a force that is the base moment divided by the height.
+
+    Raises
+    ------
+    ValueError
+        If the table has no row for this test, or lacks a value that the model needs, the history lacks a column, or the
+        values describe no column.
+    """
+    test, v = _properties(folder, history)
+
+    def value(key: str) -> float:
+        if key not in v:
+            raise ValueError(f"{PROPERTIES} has no {key!r} of {test}")
+        return v[key]
+
+    def si(key: str, unit: str) -> float:
+        return to_si(abs(value(f"{key} ({unit})")), unit).item()
+
+    data = read_imposed_test(folder / history, "disp_in", [Channel("force", "lateral force", "kip")], ["force_kip"])
+    displacement, force = data.history.displacement, data.measurements.values[0]
+    moves = np.flatnonzero(np.diff(displacement))
+    turns = moves[1:][np.diff(np.sign(np.diff(displacement)[moves])) != 0]
+    kept = np.unique(np.concatenate([np.arange(0, len(displacement), every), turns, [len(displacement) - 1]]))
+    half, failure = np.searchsorted(kept, [len(displacement) // 2, find_failure(displacement, force)]).tolist()
+    name = test.replace("_", " ")
+    model = RCColumn(
+        loading=DisplacementHistory(name, displacement[kept], history),
+        diameter=si("D", "in"),
+        height=si("L", "in"),
+        cover=si("c", "in"),
+        concrete=Concrete(fc=si("fc", "ksi"), ec=si("Ec", "ksi"), ft=si("ft", "ksi")),
+        steel=Steel(si("fyl", "ksi"), si("ful", "ksi"), si("Esl", "ksi"), si("Esh", "ksi"), value("esh"), value("esu")),
+        bars=Bars(int(value("nsl")), si("dbl", "in")),
+        hoops=Hoops(si("dbt", "in"), si("s", "in"), si("fyt", "ksi"), spiral=True),
+        mass=1.0,  # unused in a quasi-static test, but must be positive
+        axial_load=to_si(value("P (kips)"), "kip").item(),
+        penetration=to_si(value("Sy"), "in").item() / value("esy"),
+        geometry="linear",
+        parameters=parameters,
+        mesh=20,
+        max_increment=si("L", "in") / 200.0,
+        units=(("force", "kip"),),
+    )
+    return TestedColumn(name, int(value("No.")), model, force[kept], half, failure, displacement, force)
+
+
+def _properties(folder: Path, history: str) -> tuple[str, dict[str, float]]:
+    """Name of a test and its row of the table, without cells that are empty; ValueError if there is none."""
+    with (folder / PROPERTIES).open() as table:
+        rows = {f"{row['TSN']}_{row['Test']}": row for row in csv.DictReader(table)}
+    stem = history.removesuffix(".csv")
+    if stem not in rows:
+        raise ValueError(f"{PROPERTIES} has no row whose TSN and Test make the name {stem!r}")
+    row = rows[stem]
+    name = row.pop("Test")
+    return name, {key: float(value) for key, value in row.items() if value and value.strip()}
+
+
+def find_failure(displacement: np.ndarray, force: np.ndarray) -> int:
+    """First sample of the first excursion to the largest displacement so far with less than 80 % of the peak force."""
+    ends = [0, *(np.flatnonzero(np.diff(np.sign(displacement)) != 0) + 1), len(displacement)]
+    reached = 0.0
+    for start, stop in zip(ends[:-1], ends[1:], strict=True):
+        largest = np.abs(displacement[start:stop]).max()
+        if largest > 0.97 * reached and reached > 0.01 * np.abs(displacement).max():
+            if np.abs(force[start:stop]).max() < 0.8 * np.abs(force).max() and start > np.argmax(np.abs(force)):
+                return start
+        reached = max(reached, largest)
+    return len(displacement)
