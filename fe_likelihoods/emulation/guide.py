@@ -22,6 +22,7 @@ from .density import EmulatedPosterior, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes
+from .stacked import is_joint
 from .student import StudentMixture, draw_mixture, mixture_log_density
 from .target import ResponseTarget
 
@@ -217,7 +218,7 @@ class ResponseGuide:
 
     def _check_memory(self) -> None:
         """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
-        if len(self._posterior.likelihood.parts()) > 1:
+        if is_joint(self._posterior.likelihood):
             raise ValueError("asynchronous=True is not possible with a guide of a JointLikelihood: leave it out")
         target, memory = self._target, self._posterior.likelihood.response_memory
         most = self._starts * max(target.n_structural, POINTS_PER_STEP)

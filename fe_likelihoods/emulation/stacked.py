@@ -18,7 +18,7 @@ from ..simulation.model import SimulationBatch
 from ..simulation.residual_statistics import needs_response
 from .quadratic import sums_of_squares
 
-__all__ = ["TIME_SHIFTS", "StackedLikelihood", "stack"]
+__all__ = ["TIME_SHIFTS", "StackedLikelihood", "is_joint", "stack"]
 
 TIME_SHIFTS = (
     "a guide cannot emulate time shifts of channels: sample without a guide, or estimate the lags with align and "
@@ -27,9 +27,13 @@ TIME_SHIFTS = (
 
 
 def stack(likelihood: Any) -> Any:
-    """The likelihood itself if it has one data set, else a `StackedLikelihood`."""
-    parts = likelihood.parts() if hasattr(likelihood, "parts") else ()
-    return StackedLikelihood(likelihood, parts) if len(parts) > 1 else likelihood
+    """The likelihood itself if it has a model, else a `StackedLikelihood` of its data sets, also of a single one."""
+    return StackedLikelihood(likelihood, likelihood.parts()) if is_joint(likelihood) else likelihood
+
+
+def is_joint(likelihood: Any) -> bool:
+    """Whether a likelihood is a `JointLikelihood`, whose parts have a model each."""
+    return not hasattr(likelihood, "model")
 
 
 class _StackedModel(NamedTuple):

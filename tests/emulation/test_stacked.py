@@ -83,7 +83,14 @@ def with_other_parameters():
     return Posterior(JointLikelihood({"first": first, "second": second}), prior)
 
 
-@pytest.mark.parametrize("make", [joint, lambda: joint(marginal=False), with_other_parameters])
+def joint_of_one():
+    """A `JointLikelihood` of the first event alone, with a name of its own for its noise."""
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
+    prior |= {"sigma_top_first": HalfNormal(0.01)}
+    return Posterior(JointLikelihood({"first": likelihoods()["first"]}, separate=["sigma_top"]), prior)
+
+
+@pytest.mark.parametrize("make", [joint, lambda: joint(marginal=False), with_other_parameters, joint_of_one])
 def test_the_stacked_likelihood_is_that_of_all_data_sets(make):
     posterior = make()
     target = ResponseTarget(posterior)
@@ -164,6 +171,23 @@ def test_two_events_take_hundreds_of_simulations():
     samples = np.concatenate(chains)
     assert np.all(np.abs(samples.mean(axis=0) - mean) < 4.0 * sd * np.sqrt(variance))
     assert samples.std(axis=0) == pytest.approx(sd, rel=4.0 * np.sqrt(variance / 2.0))
+
+
+def test_a_joint_likelihood_of_one_event_is_guided_as_the_event_itself():
+    """Both are the same density, up to the name of a parameter."""
+    of_one = joint_of_one()
+    prior = {name.removesuffix("_first"): each for name, each in of_one.prior.distributions.items()}
+    alone = Posterior(likelihoods()["first"], prior)
+    runs = [guided(posterior) for posterior in (of_one, alone)]
+    assert runs[0].verdict.status == "converged"
+    assert np.array_equal(*(run.get_chain() for run in runs)) and runs[0].log_evidence == runs[1].log_evidence
+
+
+def test_an_asynchronous_run_with_a_guide_of_a_joint_likelihood_is_refused():
+    for posterior in (joint(), joint_of_one()):
+        with pytest.raises(ValueError, match="asynchronous=True is not possible with a guide of a JointLikelihood"):
+            guided(posterior, asynchronous=True)
+        assert posterior.likelihood.simulations == 0
 
 
 def test_control_one_event_alone_has_another_posterior():
