@@ -312,7 +312,8 @@ def joint(amplitude: bool) -> tuple[Posterior, SMCSampler]:
     own = {"softening": Uniform(0.0, 0.6), "damping_growth": Uniform(0.0, 1.0)} if amplitude else {}
     prior = {name: MODEL_PRIOR[name] for name in ("frequency", "damping")} | {"share_deck": HalfNormal(1.0)}
     posterior = Posterior(JointLikelihood(likelihoods), prior | own)
-    sampler = SMCSampler(60 if fast else 120, posterior.ndim, posterior, vectorize=True, seed=args.seed)
+    guide = posterior.guide()  # hundreds of simulations instead of thousands
+    sampler = SMCSampler(60 if fast else 120, posterior.ndim, posterior, vectorize=True, seed=args.seed, guide=guide)
     sampler.run_mcmc(None, 2, progress=False)
     return posterior, sampler
 
