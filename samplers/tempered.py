@@ -396,7 +396,8 @@ class TemperedSampler(Resumption, RunResults, EnsembleSampler):
             numbers = self.nwalkers, self.ndim, self.simulations
             searched = self._budget.of_guides
             slow = self._budget.slow_columns(self.ndim)
-            self._near = self._evaluator.points.near(coords, slow, self._optional.counts_failures)
+            optional = self._optional
+            self._near = self._evaluator.points.near(coords, slow, optional.counts_failures, optional.may_be_positive)
             self._verdict = judge(self._result, self.settings.guided, *numbers, missing, failed, searched, self._near)
             self._checkpoint.store_verdict(self._verdict)
 

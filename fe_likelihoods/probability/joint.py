@@ -148,14 +148,17 @@ class JointLikelihood:
         """
         points = as_points(x, self.parameter_names)
         rows = np.atleast_2d(points)
-        parts = [(likelihood, rows[:, columns]) for likelihood, columns in self.parts()]
-        left = np.all([likelihood.possible(part) for likelihood, part in parts], axis=0)
+        left = self.possible(rows)
         total = np.where(left, 0.0, -np.inf)
-        for likelihood, part in parts:
+        for likelihood, columns in self.parts():
             if left.any():
-                total[left] += likelihood.log_likelihood(part[left])
+                total[left] += likelihood.log_likelihood(rows[left][:, columns])
                 left = total > -np.inf
         return total if points.ndim == 2 else float(total[0])
+
+    def possible(self, rows: np.ndarray) -> np.ndarray:
+        """Whether each of the points (n, ndim) is possible for all likelihoods, see `FELikelihood.possible`."""
+        return np.all([likelihood.possible(rows[:, columns]) for likelihood, columns in self.parts()], axis=0)
 
     def parts(self) -> list[tuple[FELikelihood, list[int]]]:
         """The likelihoods in the order of their evaluation, with the indices of their parameters."""

@@ -150,6 +150,17 @@ class Posterior:
         """Minus `log_prob`, with 1e100 instead of inf, for minimisers: differences of infinities would be NaN."""
         return np.minimum(-self.log_prob(x), _ALMOST_INFINITE)[()]
 
+    def possible(self, x: Any) -> np.ndarray | bool:
+        """Whether the density may be positive, as far as prior and noise parameters tell; nothing is simulated.
+
+        Elsewhere `log_prob` is -inf without a simulation, so that -inf is not a failure there. Samplers ask for it.
+        """
+        points = as_points(x, self.prior.names)
+        rows = np.atleast_2d(points)
+        possible = np.atleast_1d(self.prior.logpdf(rows)) > -np.inf
+        possible[possible] = self.likelihood.possible(rows[possible])
+        return possible if points.ndim == 2 else bool(possible[0])
+
     def prior_transform(self, u: np.ndarray) -> np.ndarray:
         """Map from the unit cube to the parameters, (ndim,) or (n, ndim), for nested samplers."""
         return self.prior.transform(u)

@@ -80,7 +80,8 @@ class RunResults:
     def failures_near(self) -> NearFailures | None:
         """Failures in the region of the last walkers, which the verdict depends on; None for a chain of a file.
 
-        Values of -inf inside the support of the prior are failures if ``log_prob_fn.report()`` has a "failure_count".
+        Values of -inf inside the support of the prior are failures if ``log_prob_fn.report()`` has a "failure_count",
+        except where ``log_prob_fn.possible(points)`` is False: parameters that need no simulation are impossible there.
         """
         return None if self._result.independent_points is None else self._near
 

@@ -25,6 +25,9 @@ class OptionalAttributes(NamedTuple):
         Function of (n, random) that returns n draws of the prior.
     report : callable, optional
         Function that returns a dictionary, such as ``{"simulations": 120}``.
+    possible : callable, optional
+        Function of points (n, ndim), always an array, that returns whether each of them (n,) may have a positive
+        density, as far as is known without a simulation. A value of -inf elsewhere is no failed simulation.
     fast_parameters : sequence of int
         Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
     ndim : int, optional
@@ -36,6 +39,7 @@ class OptionalAttributes(NamedTuple):
     log_prior: Callable | None
     sample_prior: Callable | None
     report: Callable[[], Mapping[str, Any]] | None
+    possible: Callable[[np.ndarray], np.ndarray] | None
     fast_parameters: Sequence[int]
     ndim: int | None
     parameter_names: Sequence[str]
@@ -43,7 +47,7 @@ class OptionalAttributes(NamedTuple):
     @classmethod
     def of(cls, function: Callable) -> "OptionalAttributes":
         """Read the attributes of a function."""
-        found = (getattr(function, name, None) for name in ("log_prior", "sample_prior", "report"))
+        found = (getattr(function, name, None) for name in ("log_prior", "sample_prior", "report", "possible"))
         return cls(
             *found,
             getattr(function, "fast_parameters", ()),
@@ -53,9 +57,30 @@ class OptionalAttributes(NamedTuple):
 
     @property
     def counts_failures(self) -> bool:
-        """Whether the function counts failed simulations by itself, so that -inf inside the prior is a failure."""
+        """Whether the function counts failed simulations by itself, so that -inf at a possible point is a failure."""
         found = self.report() if callable(self.report) else None
         return isinstance(found, Mapping) and "failure_count" in found
+
+    def may_be_positive(self, coords: np.ndarray) -> np.ndarray:
+        """What `possible` says of points (n, ndim), as bool (n,); True for all of them where it is not known."""
+        unknown = np.ones(len(coords), dtype=bool)
+        if not callable(self.possible) or len(coords) == 0:
+            return unknown
+        try:
+            found = np.asarray(self.possible(coords))
+        except Exception as error:
+            logger.warning("the verdict takes all points as possible, since the method possible failed: %r", error)
+            return unknown
+        if found.shape != (len(coords),) or found.dtype != bool:
+            logger.warning(
+                "the verdict takes all points as possible: the method possible must return bool of shape (%d,); got "
+                "%s of shape %s",
+                len(coords),
+                found.dtype,
+                found.shape,
+            )
+            return unknown
+        return found
 
     def check_ndim(self, ndim: int, name: str) -> None:
         """Raise ValueError if the function states another number of parameters than `ndim`."""

@@ -7,6 +7,7 @@ deviation little.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -150,7 +151,13 @@ class EvaluatedPoints:
         while self._count - len(self._batches[0][0]) >= KEPT_POINTS:
             self._count -= len(self._batches.popleft()[0])
 
-    def near(self, samples: np.ndarray, columns: np.ndarray, counts_failures: bool) -> NearFailures:
+    def near(
+        self,
+        samples: np.ndarray,
+        columns: np.ndarray,
+        counts_failures: bool,
+        possible: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> NearFailures:
         """Failures in the region of samples (n, ndim).
 
         Parameters
@@ -162,11 +169,19 @@ class EvaluatedPoints:
         counts_failures : bool
             Whether the log-density counts failures by itself. All values of -inf are failures then; otherwise they may
             have another cause, which matters only where there are too few errors.
+        possible : callable, optional
+            Function of points (n, ndim) that returns whether each of them (n,) may have a positive density, as far as
+            is known without a simulation. Others end the support of the density, as the prior does, and do not count.
         """
         if not any(np.any(kinds > self.FINITE) for _, kinds in self._batches):
             return NearFailures(0, 0)
-        coords = np.concatenate([each for each, _ in self._batches])[:, columns]
+        coords = np.concatenate([each for each, _ in self._batches])
         kinds = np.concatenate([each for _, each in self._batches])
+        if possible is not None:
+            rows = np.flatnonzero(kinds == self.IMPOSSIBLE)
+            ruled_out = rows[~possible(coords[rows])]
+            coords, kinds = np.delete(coords, ruled_out, axis=0), np.delete(kinds, ruled_out)
+        coords = coords[:, columns]
         fewest = self.IMPOSSIBLE if counts_failures else self.FAILED
         found = failures_near(samples[:, columns], coords[kinds >= fewest], coords[kinds == self.FINITE])
         if found.borders or counts_failures:

@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
+from samplers.storage.user_functions import OptionalAttributes
 from samplers.tempering import failed_region
 from samplers.tempering.failed_region import EvaluatedPoints, NearFailures, failures_near
 from tests.contract.targets import Box, Gaussian
@@ -78,6 +79,49 @@ def test_control_a_bound_of_the_prior_is_no_failure():
     """The posterior leans against a corner of the box, outside of which nothing is evaluated."""
     sampler = run(Box([0.0, 0.0], [1.0, 1.0], lambda x: -20.0 * np.sum(x, axis=-1)))
     assert sampler.failures_near == NearFailures(0, 0) and sampler.verdict.status == "converged"
+
+
+class RulesOut(Cut):
+    """Its second parameter is impossible above 0.7, which `possible` tells without a simulation."""
+
+    def __call__(self, x):
+        values = np.array(super().__call__(x))
+        values[~self.possible(x)] = -np.inf
+        return values
+
+    def possible(self, x):
+        return np.asarray(x)[..., 1] < 0.7
+
+
+class CountingRulesOut(RulesOut, Counting):
+    """The same, with a number of failures."""
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("Posterior", [RulesOut, CountingRulesOut])
+def test_what_is_known_to_be_impossible_is_no_failure(Posterior):
+    sampler = run(Posterior(5.0, "inf"))
+    assert sampler.failures_near.failed == 0 and sampler.verdict.status == "converged"
+    # failures beside it still count
+    near = run(Posterior(0.7, "inf")).failures_near
+    assert near.borders and near.known == (Posterior is CountingRulesOut)
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("answer", [None, np.array([True]), "error"])
+def test_an_answer_that_cannot_be_used_rules_nothing_out(answer, caplog):
+    def possible(x):
+        if answer == "error":
+            raise RuntimeError("no answer")
+        return answer
+
+    posterior = RulesOut(5.0, "inf")
+    sampler = run(posterior)
+    posterior.possible = possible
+    expected = sampler._evaluator.points.near(sampler.get_chain(flat=True), np.arange(2), True)
+    optional = OptionalAttributes.of(posterior)
+    found = sampler._evaluator.points.near(sampler.get_chain(flat=True), np.arange(2), True, optional.may_be_positive)
+    assert found == expected and found.failed > 50 and "takes all points as possible" in caplog.text
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
