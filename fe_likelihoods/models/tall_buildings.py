@@ -29,7 +29,6 @@ from .validation import check_integer
 __all__ = ["BeamModes", "GroupedFrame", "ModalModel", "ShearFlexuralBeam", "beam_modes"]
 
 _MOST_MODES = 50
-_GAUSS_POINTS = 256  # of the square of a mode shape, whose shortest half wave has the length 1 / 50
 
 
 @dataclass(frozen=True)
@@ -313,34 +312,42 @@ def beam_modes(alpha: float, n_modes: int, heights: np.ndarray) -> BeamModes:
             + alpha**2 / (gamma * beta) * math.sin(gamma) * math.tanh(beta)
         )
 
-    ratios, shapes = np.empty(n_modes), np.empty((len(heights), n_modes))
-    for k in range(n_modes):
-        # one root in each interval of pi: between that of the shear beam, (k + 1/2) pi, and that of the flexural one
-        gamma = brentq(characteristic, max(k * math.pi, 1e-3), (k + 1) * math.pi, xtol=1e-14)
-        beta = math.hypot(gamma, alpha)
-        ratios[k] = gamma * beta
-        shapes[:, k] = _beam_shape(gamma, beta, heights)
-    return BeamModes(ratios / ratios[0], shapes)
+    # one root in each interval of pi: between that of the shear beam, (k + 1/2) pi, and that of the flexural one
+    roots = [brentq(characteristic, max(k * math.pi, 1e-3), (k + 1) * math.pi, xtol=1e-14) for k in range(n_modes)]
+    gamma = np.array(roots)
+    beta = np.hypot(gamma, alpha)
+    ratios = gamma * beta
+    return BeamModes(ratios / ratios[0], _beam_shapes(gamma, beta, heights))
 
 
-def _beam_shape(gamma: float, beta: float, heights: np.ndarray) -> np.ndarray:
-    """Mode shape times participation factor at the heights (n_heights,).
+def _beam_shapes(gamma: np.ndarray, beta: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Mode shapes times participation factors (n_heights, n_modes) at the roots gamma and beta (n_modes,).
 
     phi = sin(gamma x) - eta cos(gamma x) + eta cosh(beta x) - gamma / beta sinh(beta x), written with decaying
-    exponentials only. The integral of phi follows from its differential equation, that of its square by Gauss points.
+    exponentials only. The integral of phi follows from its differential equation, that of its square from those of the
+    products of its four terms.
     """
-    small = math.exp(-beta)
-    sine, cosine = math.sin(gamma), math.cos(gamma)
+    small = np.exp(-beta)
+    sine, cosine = np.sin(gamma), np.cos(gamma)
     denominator = 2.0 * gamma**2 * cosine * small + beta**2 * (1.0 + small**2)
     eta = (2.0 * gamma**2 * sine * small + gamma * beta * (1.0 - small**2)) / denominator
     rising = (gamma**2 * sine - gamma**3 / beta * cosine - gamma * beta * small) / denominator
     falling = 0.5 * (eta + gamma / beta)
-    nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_POINTS)
-    x = np.append(0.5 * (nodes + 1.0), heights)
+    x = heights[:, None]
     phi = np.sin(gamma * x) - eta * np.cos(gamma * x)
     phi += rising * np.exp(beta * (x - 1.0)) + falling * np.exp(-beta * x)
-    integral = (gamma**2 + beta**2) / (gamma * beta**2)
-    return integral / (0.5 * weights @ np.square(phi[:_GAUSS_POINTS])) * phi[_GAUSS_POINTS:]
+
+    sum_of_squares = gamma**2 + beta**2
+    # integrals over the height of sine and cosine times exp(beta (x - 1)), and times exp(-beta x)
+    sine_rising = (beta * sine - gamma * cosine + gamma * small) / sum_of_squares
+    cosine_rising = (beta * cosine + gamma * sine - beta * small) / sum_of_squares
+    sine_falling = (gamma - small * (beta * sine + gamma * cosine)) / sum_of_squares
+    cosine_falling = (beta + small * (gamma * sine - beta * cosine)) / sum_of_squares
+    square = 0.5 * (1.0 + eta**2) - 0.5 / gamma * sine * ((1.0 - eta**2) * cosine + 2.0 * eta * sine)
+    square += (rising**2 + falling**2) * 0.5 / beta * (1.0 - small**2) + 2.0 * rising * falling * small
+    square += 2.0 * rising * (sine_rising - eta * cosine_rising)
+    square += 2.0 * falling * (sine_falling - eta * cosine_falling)
+    return sum_of_squares / (gamma * beta**2) / square * phi
 
 
 def _modal_system(frequencies: np.ndarray, ratios: np.ndarray, shapes: np.ndarray) -> LinearSystem:
