@@ -1,5 +1,6 @@
 """Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails, bounds and errors."""
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from .stored_posterior import resampled_description
 if TYPE_CHECKING:
     from .hierarchical_posterior import HierarchicalPosterior
 
-__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy"]
+__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy", "ends_within"]
 
 _HYPER_SAMPLES = 100
 _RESAMPLINGS = 12
@@ -26,6 +27,7 @@ _LARGEST_OUTSIDE = 0.05  # of a population beyond bounds that the samples of a t
 _LARGEST_OUTSIDE_SUM = 0.06  # sum over the tests, without bounds at zero, which are those of positive parameters
 _OUTER = 0.02  # probability of the prior next to a bound
 _PILED = 0.09  # probability of the posterior of a test there, above which one bound alone is an alarm
+_NEAR = 2.0  # standard deviations from the mean to a bound that is reached; 1.95 if 5 % of a normal density are cut off
 _NORMAL = 0.5  # largest skewness and excess kurtosis of a prior that a normal density describes
 
 
@@ -149,7 +151,7 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
         found,
         dict(zip(posterior.parameter_names, errors.tolist(), strict=True)),
         float(np.sqrt(evidence**2 + evidences)),
-        tuple(_messages(posterior, found, errors)),
+        (*_messages(posterior, found, errors), *_common_messages(posterior, samples)),
     )
 
 
@@ -204,11 +206,14 @@ def _flat(posterior: "HierarchicalPosterior", name: str) -> list[str]:
     at_bounds = np.where(np.isfinite(bounds), _probability_at_bounds(posterior, name), 0.0)
     flat = (at_bounds > 0.5 * _OUTER).all(axis=1) | (at_bounds > _PILED).any(axis=1)
     draws = posterior.scales.first(len(posterior.varying)).to_scale(_prior_draws(posterior, name))
-    z = (draws - draws.mean(axis=0)) / draws.std(axis=0)
-    moments = np.abs([(z**3).mean(axis=0), (z**4).mean(axis=0) - 3.0]).max(axis=0)
-    return [
-        each for each, is_flat, far in zip(posterior.varying, flat, moments > _NORMAL, strict=True) if is_flat & far
-    ]
+    return [each for each, is_flat, row in zip(posterior.varying, flat, draws.T, strict=True) if is_flat and _far(row)]
+
+
+def _far(draws: np.ndarray) -> bool:
+    """Whether draws of a prior are far from normal on their scale; draws beyond its bounds do not count."""
+    known = draws[np.isfinite(draws)]
+    z = (known - known.mean()) / known.std()
+    return not max(abs((z**3).mean()), abs((z**4).mean() - 3.0)) <= _NORMAL  # too few draws: NaN
 
 
 def _prior_draws(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
@@ -251,7 +256,8 @@ def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCh
             f"{named}: the samples reach both bounds of the prior, or pile up at one, and with common parameters "
             f"({', '.join(posterior.common)}) the likelihood is that of a fitted mixture, which is not reliable at a "
             "bound. Sample these tests again with a prior that is normal on the scale of the population, such as "
-            "LogNormal for scale='log', or, where they say little about the parameter, leave them out"
+            "LogNormal for scale='log' and scipy.stats.johnsonsb(0.0, 0.6, low, high - low) for scale='logit', or, "
+            "where they say little about the parameter, leave them out"
         )
     if error > _LARGEST_ERROR:
         worst = max(found, key=lambda name: found[name].shift)
@@ -261,3 +267,52 @@ def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCh
             "of the tests"
         )
     return messages
+
+
+def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[str] = ()) -> dict[str, list[float]]:
+    """Bounds of the prior of a test that leave out values of common parameters which other priors permit.
+
+    Parameters
+    ----------
+    posterior : HierarchicalPosterior
+        Its prior permits the values.
+    name : str
+        The test.
+    others : iterable of str
+        Tests whose priors permit the values as well.
+
+    Returns
+    -------
+    dict of str to list of float
+        Bounds [unit of the parameter] by the name of the common parameter; no entry where nothing is left out.
+    """
+    first = posterior.ndim - len(posterior.common)
+    permitted = [posterior.prior.bounds[first:], *(_common_bounds(posterior, other) for other in others)]
+    low, high = np.max(permitted, axis=0)[:, 0], np.min(permitted, axis=0)[:, 1]
+    own = _common_bounds(posterior, name)
+    left_out = np.stack([own[:, 0] > low, own[:, 1] < high], axis=1)
+    return {
+        common: bounds[is_within].tolist()
+        for common, bounds, is_within in zip(posterior.common, own, left_out, strict=True)
+        if is_within.any()
+    }
+
+
+def _common_bounds(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
+    """Bounds (n_common, 2) of the prior of the common parameters in a test."""
+    return posterior.described[name].prior.bounds[len(posterior.varying) :]
+
+
+def _common_messages(posterior: "HierarchicalPosterior", samples: np.ndarray) -> list[str]:
+    """Sentences about tests whose priors end within the population of a common parameter."""
+    column = posterior.parameter_names.index
+    return [
+        f"test {name!r}: its prior of the common parameter {common} ends at {bound:g}, which the hyper-samples reach, "
+        f"and beyond which the likelihood is taken as zero. The prior of {common} in the hierarchical model does not "
+        f"end there: sample this test again with a wider prior of {common}, or, if the bound is physical, give it to "
+        "the prior in common= too"
+        for name in posterior.tests
+        for common, bounds in ends_within(posterior, name).items()
+        for bound in bounds
+        if abs(bound - samples[:, column(common)].mean()) < _NEAR * samples[:, column(common)].std()
+    ]

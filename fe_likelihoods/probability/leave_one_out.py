@@ -11,7 +11,9 @@ the expectation over :math:`p(\varphi \mid D)`. The hyper-samples are weighted w
 are nearly even. Otherwise the population without the test may be where no hyper-sample is, which weights cannot show:
 it is sampled anew, through populations in which the test counts less and less, :math:`p(\varphi \mid D_{-k}) m_k^t`
 with t from 1 to 0. The predictive density is then the product of the ratios of neighbouring populations, each by bridge
-sampling. No model is simulated in either case. See ``docs/theory/hierarchy.rst``.
+sampling. A test whose prior of a common parameter is narrower than what the other priors permit is always left out by
+sampling anew: beyond its bounds :math:`m_k` is zero, so that no hyper-sample is there. No model is simulated in either
+case. See ``docs/theory/hierarchy.rst``.
 
 References
 ----------
@@ -32,6 +34,7 @@ import numpy as np
 from ..text_tables import NamedResults, number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy import Hierarchy
+from .hierarchy_checks import ends_within
 from .inputs import as_points
 from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
 
@@ -54,11 +57,12 @@ class LeftOut(NamedTuple):
     effective_samples : float
         Effective number of hyper-samples after weighting, or of the new samples.
     sampled : bool
-        Whether the population was sampled anew, because the shape is 0.7 or more, or less than half of the
-        hyper-samples are effective.
+        Whether the population was sampled anew, because the shape is 0.7 or more, less than half of the hyper-samples
+        are effective, or the prior of the test leaves out values of a common parameter that the others permit.
     log_density : float
         Logarithm of the predictive density of all data of the test given the other tests, a proper score: larger is
-        better. NaN if its `StoredPosterior` has no `log_evidence`.
+        better. NaN if its `StoredPosterior` has no `log_evidence`, and where no sample of the population without the
+        test is within the prior of the test.
     log_density_error : float
         Standard error of it from the number of hyper-samples, which are taken as independent, that of the new samples,
         and the error of the evidence.
@@ -111,12 +115,13 @@ def leave_one_out(
     Raises
     ------
     ValueError
-        For a hierarchy of a single test, or with fewer different hyper-samples than twice the number of parameters.
+        For a hierarchy of a single test, with fewer different hyper-samples than twice the number of parameters, or
+        with hyper-samples that are impossible under the data of a test.
 
     Warns
     -----
     UserWarning
-        If a new run of the default sampler was too short.
+        If a new run of the default sampler was too short, or a predictive density is not known.
 
     Examples
     --------
@@ -133,12 +138,21 @@ def leave_one_out(
             f"hyper-parameters; got {different}: sample the population with more walkers or steps"
         )
     log_marginals = posterior.log_marginals(hierarchy.samples)
+    for name, column in zip(posterior.tests, log_marginals.T, strict=True):
+        if impossible := int((~np.isfinite(column)).sum()):
+            raise ValueError(
+                f"leave_one_out: expected samples of the posterior of all tests; {impossible} of {len(column)} "
+                f"hyper-samples are impossible under test {name!r}, such as common parameters beyond the bounds of its "
+                "prior: start the walkers where HierarchicalPosterior.log_prob is finite"
+            )
     rng, found = np.random.default_rng(seed), NamedResults()
     for k, name in enumerate(posterior.tests):
         rest, own = posterior.without(name), log_marginals[:, k]
         weights, shape = smoothed_weights(own.min() - own)
         effective = float(1.0 / np.square(weights).sum())
-        sampled = not (shape < LARGEST_SHAPE and effective >= _SMALLEST_SHARE * len(own))
+        even = shape < LARGEST_SHAPE and effective >= _SMALLEST_SHARE * len(own)
+        cut_off = ends_within(posterior, name, others=rest.tests)
+        sampled = not even or bool(cut_off)
         if not sampled:
             samples = hierarchy.samples[_systematic(weights, len(own), rng)]
             log_density, error = _log_mean(own, weights)
@@ -147,6 +161,13 @@ def leave_one_out(
         else:
             samples = as_points(sample(rest), rest.parameter_names)
             log_density, error = _bridge(own, posterior.log_marginals(samples)[:, k])
+        if np.isnan(log_density):
+            warnings.warn(
+                f"leave_one_out: no sample of the population without test {name!r} is possible under this test, whose "
+                f"prior of {', '.join(cut_off)} ends beside that population: its predictive density is not known. "
+                "Sample this test again with the prior of the hierarchical model",
+                stacklevel=2,
+            )
         stored = posterior.tests[name]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what limits the tests was said of all of them; checks have the rest
@@ -182,7 +203,8 @@ def _bridge(log_upper: np.ndarray, log_lower: np.ndarray) -> tuple[float, float]
     """Logarithm of the ratio of two normalising constants, and its standard error (Meng and Wong 1996, section 3).
 
     The densities have the ratio r, up to the wanted constant. Given is log r at independent samples of the density with
-    r as a factor (upper), and of that without it (lower).
+    r as a factor (upper), and of that without it (lower), where r may be zero; if it is zero at all of them, the result
+    is NaN.
     """
     from scipy.optimize import brentq  # slow to import
     from scipy.special import expit
@@ -192,7 +214,10 @@ def _bridge(log_upper: np.ndarray, log_lower: np.ndarray) -> tuple[float, float]
     def shares(log_ratio: float) -> tuple[np.ndarray, np.ndarray]:
         return expit(log_lower - log_ratio + shift), expit(log_ratio - shift - log_upper)
 
-    ends = [min(log_upper.min(), log_lower.min()) - 20.0, max(log_upper.max(), log_lower.max()) + 20.0]
+    possible = log_lower[log_lower > -np.inf]
+    if not possible.size:
+        return np.nan, np.nan
+    ends = [min(log_upper.min(), possible.min()) - 20.0, max(log_upper.max(), possible.max()) + 20.0]
     log_ratio = brentq(lambda x: np.subtract(*(each.sum() for each in shares(x))), *(np.array(ends) + shift))
     error = np.sqrt(sum(each.var() / (len(each) * each.mean() ** 2) for each in shares(log_ratio)))
     return float(log_ratio), float(error)
@@ -222,7 +247,9 @@ def _log_prob(posterior: HierarchicalPosterior, k: int, power: float, x: np.ndar
     inside = log_density > -np.inf
     if inside.any():
         marginals = posterior.log_marginals(x[inside])
-        log_density[inside] += marginals.sum(axis=1) - (1.0 - power) * marginals[:, k]
+        # no difference of sums: it is NaN where the test is impossible
+        marginals[:, k] = power * marginals[:, k] if power > 0.0 else 0.0
+        log_density[inside] += marginals.sum(axis=1)
     return log_density
 
 

@@ -148,6 +148,23 @@ def test_a_varying_parameter_that_tests_say_nothing_about(prior, scale, is_right
         assert not [each for each in check_hierarchy(alone, near[:, :2]).messages if "pile up" in each]
 
 
+@pytest.mark.parametrize("bounds", [None, (0.0, 1.0), (5e-4, 1.0 - 5e-4)])
+def test_flat_shares_are_told_with_bounds_of_the_scale_within_those_of_the_prior(bounds):
+    """Some draws of the prior are beyond them."""
+    low, high = bounds or (0.0, 1.0)
+    varying = {"share": Varying(Uniform(low, high), HalfNormal(0.5), "logit", bounds)}
+    tests = shares(3, "uniform", np.random.default_rng(3))
+    inside = {
+        name: StoredPosterior(each.samples[((each.samples > low) & (each.samples < high))[:, 0]], each.prior)
+        for name, each in tests.items()
+    }
+    posterior = HierarchicalPosterior(inside, varying, common={"c": LINEAR.location})
+    near = np.array([0.3, 0.4, 0.0]) + 0.02 * np.random.default_rng(1).random((50, 3))
+    (said,) = [each for each in check_hierarchy(posterior, near).messages if "pile up" in each]
+    assert all(f"share in 'T{k}'" in said for k in (2, 3, 4)) and "'T1'" not in said
+    assert "johnsonsb(0.0, 0.6, low, high - low) for scale='logit'" in said
+
+
 @pytest.mark.parametrize(("counts", "is_right"), [((0,) * 10, False), ((4, 7, 6, 5, 8, 6, 9, 6, 5, 7), True)])
 def test_tests_that_pile_up_at_one_bound(counts, is_right, rng):
     """Shares of 20 trials with a flat prior, whose posteriors are beta densities; the population is integrated exactly.

@@ -14,9 +14,11 @@ from fe_likelihoods import (
     Prior,
     StoredPosterior,
     TruncatedNormal,
+    Uniform,
     Varying,
     leave_one_out,
 )
+from fe_likelihoods.probability.hierarchy_checks import check_hierarchy
 from fe_likelihoods.probability.pareto_smoothing import smoothed_weights
 
 module = importlib.import_module("fe_likelihoods.probability.leave_one_out")
@@ -173,3 +175,131 @@ def test_walkers_that_never_move_are_told_without_a_division_by_zero(monkeypatch
     (told,) = caught
     assert "sampled for 0.0 autocorrelation times" in str(told.message)
     assert len(np.unique(found, axis=0)) <= max(module._WALKERS, 8)
+
+
+CENTERS, WIDTH = {"A": 0.0, "B": 0.3, "C": 1.2}, 0.5  # means and standard deviation of a common parameter in each test
+AXES = np.linspace(-0.6, 0.6, 9), np.linspace(0.02, 0.9, 9), np.linspace(-2.0, 3.0, 101)
+CUBE = np.stack([each.ravel() for each in np.meshgrid(*AXES, indexing="ij")], axis=1)
+
+
+def with_common(low: float, high: float) -> HierarchicalPosterior:
+    """Three tests of a varying and a common parameter, of which the last has this prior of the common one."""
+    rng, tests = np.random.default_rng(5), {}
+    for name, center in CENTERS.items():
+        bounds = (low, high) if name == "C" else (-5.0, 5.0)
+        c = stats.truncnorm(*((np.array(bounds) - center) / WIDTH), center, WIDTH).rvs(1000, random_state=rng)
+        prior = Prior({"a": TruncatedNormal(0.0, WIDE, -np.inf, np.inf), "c": Uniform(*bounds)})
+        tests[name] = StoredPosterior(np.column_stack([0.3 * rng.standard_normal(1000), c]), prior, log_evidence=0.0)
+    return HierarchicalPosterior(tests, {"a": LINEAR}, common={"c": Uniform(-5.0, 5.0)})
+
+
+def on_cube(posterior: HierarchicalPosterior) -> np.ndarray:
+    log_density = posterior.log_prob(CUBE)
+    density = np.exp(log_density - log_density.max())
+    return density / density.sum()
+
+
+def drawn(posterior: HierarchicalPosterior, n: int = 3000) -> np.ndarray:
+    return CUBE[np.random.default_rng(1).choice(len(CUBE), n, p=on_cube(posterior))]
+
+
+def hierarchy_with_common(low: float, high: float) -> Hierarchy:
+    posterior = with_common(low, high)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Hierarchy(posterior, drawn(posterior))
+
+
+def check_without_c(left_out, posterior) -> None:
+    weights = on_cube(posterior.without("C"))
+    mean, samples = weights @ CUBE[:, 2], left_out.hierarchy.samples[:, 2]
+    assert abs(mean - 0.15) < 0.05  # of two normal densities
+    sd = np.sqrt(weights @ (CUBE[:, 2] - mean) ** 2)
+    assert abs(samples.mean() - mean) < 4.0 * sd / np.sqrt(min(left_out.effective_samples, 500.0))
+    assert samples.std() == pytest.approx(sd, rel=0.15)
+    exact = np.log(weights @ np.exp(posterior.log_marginals(CUBE)[:, 2]))
+    assert abs(left_out.log_density - exact) < 4.0 * left_out.log_density_error
+    assert left_out.log_density_error < 0.5
+
+
+def test_a_prior_of_a_common_parameter_that_is_narrower_than_the_others():
+    """No hyper-sample is where only this test forbids the parameter, and the weights of the others are even."""
+    hierarchy = hierarchy_with_common(1.0, 5.0)
+    found = leave_one_out(hierarchy, sample=drawn)["C"]
+    assert found.sampled
+    check_without_c(found, hierarchy.posterior)
+    # control: the weights look right, and are not
+    own = hierarchy.posterior.log_marginals(hierarchy.samples)[:, 2]
+    weights, shape = smoothed_weights(own.min() - own)
+    assert shape < 0.5 and 1.0 / np.square(weights).sum() > 0.5 * len(own)
+    assert np.log(weights @ np.exp(own)) > found.log_density + 3.0
+
+
+@pytest.mark.slow
+def test_a_new_run_leaves_the_narrower_prior_of_a_common_parameter():
+    hierarchy = hierarchy_with_common(1.0, 5.0)
+    check_without_c(leave_one_out(hierarchy)["C"], hierarchy.posterior)
+
+
+def test_bounds_that_other_priors_have_too_are_no_reason_for_a_new_run():
+    wide, narrow = with_common(-5.0, 5.0), with_common(1.0, 5.0)
+    assert module.ends_within(wide, "C") == {} and module.ends_within(narrow, "A") == {}
+    assert module.ends_within(narrow, "C", others=["A", "B"]) == {"c": [1.0]}
+    assert module.ends_within(narrow, "C", others=["C"]) == {}
+
+
+@pytest.mark.parametrize(("bounds", "is_told"), [((1.0, 5.0), True), ((-5.0, 5.0), False), ((-3.0, 4.0), False)])
+def test_a_prior_that_ends_within_the_population_of_a_common_parameter_is_told(bounds, is_told):
+    posterior = with_common(*bounds)
+    samples = drawn(posterior, 200) + 1e-6 * np.random.default_rng(2).random((200, 3))
+    said = [each for each in check_hierarchy(posterior, samples).messages if "common parameter c ends at 1" in each]
+    assert len(said) == is_told and all("test 'C'" in each for each in said)
+
+
+def test_the_density_without_a_test_is_known_where_the_test_is_impossible():
+    """Not a difference of two infinite logarithms, which emcee refuses."""
+    posterior = with_common(1.0, 5.0)
+    points = np.array([[0.0, 0.3, 0.0], [0.0, 0.3, 2.0]])
+    own = posterior.log_marginals(points)[:, 2]
+    assert own[0] == -np.inf and np.isfinite(own[1])
+    rest = posterior.without("C").log_prob(points)
+    np.testing.assert_allclose(module._log_prob(posterior, 2, 0.0, points), rest)
+    np.testing.assert_allclose(module._log_prob(posterior, 2, 0.5, points), [-np.inf, rest[1] + 0.5 * own[1]])
+
+
+def test_bridge_between_a_density_and_its_part(rng):
+    """A standard normal density and its part above one: the ratio is the probability of that part."""
+    upper = np.zeros(2000)
+    ratios, errors = [], []
+    for _ in range(50):
+        lower = np.where(rng.standard_normal(2000) > 1.0, 0.0, -np.inf)
+        ratio, error = module._bridge(upper, lower)
+        ratios.append(ratio)
+        errors.append(error)
+    exact = stats.norm.logsf(1.0)
+    assert abs(np.mean(ratios) - exact) < 4.0 * np.std(ratios, ddof=1) / np.sqrt(50)
+    assert np.mean(errors) == pytest.approx(np.std(ratios, ddof=1), rel=0.4)
+    assert np.isnan(module._bridge(upper, np.full(10, -np.inf))).all()
+
+
+def test_a_test_that_the_others_exclude_has_no_predictive_density():
+    hierarchy = hierarchy_with_common(1.0, 5.0)
+
+    def below(posterior):
+        samples = drawn(posterior)
+        return samples if "C" in posterior.tests else samples[samples[:, 2] < 1.0]
+
+    with pytest.warns(UserWarning, match="test 'C'.*whose prior of c ends beside.*not known"):
+        found = leave_one_out(hierarchy, sample=below)
+    assert np.isnan(found["C"].log_density) and np.isfinite(found["A"].log_density)
+
+
+def test_hyper_samples_that_are_impossible_under_a_test_are_refused():
+    posterior = with_common(1.0, 5.0)
+    samples = drawn(posterior, 500)
+    samples[:3, 2] = 0.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        hierarchy = Hierarchy(posterior, samples)
+    with pytest.raises(ValueError, match="3 of 500 hyper-samples are impossible under test 'C'"):
+        leave_one_out(hierarchy)
