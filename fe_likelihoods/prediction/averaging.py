@@ -44,6 +44,8 @@ class AveragedPrediction(NamedTuple):
         Channels of the predictions.
     dt : float or None
         Time step of histories [s], None for other quantities.
+    remarks : tuple of str
+        What speaks against the predictions, each remark once.
     """
 
     mean: np.ndarray
@@ -54,6 +56,7 @@ class AveragedPrediction(NamedTuple):
     probabilities: dict[str, float]
     channels: tuple[Channel, ...]
     dt: float | None
+    remarks: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         shares = ", ".join(f"{name} {share:.2f}" for name, share in self.probabilities.items())
@@ -68,7 +71,8 @@ class AveragedPrediction(NamedTuple):
             name, unit = (self.channels[k].name, self.channels[k].unit) if known else (f"{k}", "SI")
             shown = [x if unit == "SI" else from_si(x, unit) for x in (mean, sd, np.sqrt(within), np.sqrt(between))]
             rows.append((name, unit, *map(number, shown)))
-        return f"Average of the models {shares}; {what}; sd within and between models\n{text_table(rows)}"
+        first = f"Average of the models {shares}; {what}; sd within and between models"
+        return "\n".join([first, text_table(rows), *(f"CAUTION: {remark}" for remark in self.remarks)])
 
     @property
     def sd(self) -> np.ndarray:
@@ -123,4 +127,6 @@ def average_predictions(
     between = np.tensordot(weights, [np.square(part.mean - mean) for part in parts], axes=1)
     error = np.sqrt(np.tensordot(weights**2, [np.square(part.standard_error) for part in parts], axes=1))
     known = dict(zip(names, weights.tolist(), strict=True))
-    return AveragedPrediction(mean, within + between, within, between, error, known, parts[0].channels, parts[0].dt)
+    remarks = tuple(dict.fromkeys(remark for part in parts for remark in part.remarks))
+    first = parts[0]
+    return AveragedPrediction(mean, within + between, within, between, error, known, first.channels, first.dt, remarks)

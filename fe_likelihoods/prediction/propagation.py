@@ -31,7 +31,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..probability.inputs import as_points
-from ..probability.noise import noise_time_shifts, noise_under
+from ..probability.noise import noise_time_shifts, noise_under, remark_on_gaps
 from ..probability.time_shift_noise import TimeShiftNoise
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
@@ -278,9 +278,10 @@ def propagate(
         point = as_points(samples, (*source.model.parameter_names, *source.noise.parameter_names))[checked]
         of_residuals = remark_on_residuals(source, point, own_response)
         remarks.append(of_residuals)
-    remarks = tuple(remark for remark in remarks if remark)
+    of_gaps = remark_on_gaps(source.likelihood.noise) if noise and source.likelihood is not None else ""
+    remarks = tuple(remark for remark in (*remarks, of_gaps) if remark)
     for remark in remarks:
-        if remark is not of_residuals or is_first_warning(source.likelihood):
+        if remark is not of_gaps and (remark is not of_residuals or is_first_warning(source.likelihood)):
             warnings.warn(remark, stacklevel=2)
     predictions = {name: replace(each, remarks=remarks) for name, each in predictions.items()}
     return predictions if isinstance(quantity, Mapping) else predictions[""]

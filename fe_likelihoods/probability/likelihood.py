@@ -8,6 +8,7 @@ of the residuals, see `fe_likelihoods.probability.noise`.) The simulations are r
 
 import math
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -25,7 +26,7 @@ from .distributions import Distribution, RandomState
 from .event_noise import join_measurements, named_noise
 from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
 from .marginal_noise import MarginalNoise
-from .noise import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under
+from .noise import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
 from .parameters import Parameter, describe_parameters
 from .report import simulation_report
 
@@ -102,6 +103,11 @@ class FELikelihood(CachedSimulations):
         channels of the noise, if samples are missing and the noise has no rule for them, if parameter names repeat, if
         `pool` is neither a number nor has ``map`` or ``gather``, if the model cannot be sent to its processes, or if
         the file of the cache cannot be used.
+
+    Warns
+    -----
+    UserWarning
+        If the share of a `ModulatedNoise` is that of a part of the motion, because samples are missing.
     """
 
     def __init__(
@@ -121,6 +127,8 @@ class FELikelihood(CachedSimulations):
         noise = named_noise(model, measurements, noise)
         check_noise_channels(model, noise)
         self.noise = noise_under(noise_of_part(noise, measurements), model)
+        if gaps := remark_on_gaps(self.noise):
+            warnings.warn(gaps, stacklevel=2)
         structural, others = tuple(model.parameter_names), tuple(self.noise.parameter_names)
         self.parameter_names = structural + others
         if len(set(self.parameter_names)) != len(self.parameter_names):

@@ -15,7 +15,6 @@ See ``docs/theory/noise.rst``.
 """
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -24,6 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
+from .event_noise import find_events
 from .grouped_errors import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
 from .noise import HALF_LOG_TWO_PI, PerChannel, as_number, options_repr, set_channels
 from .response_levels import Excited, excited_parts, squared_levels
@@ -248,19 +248,28 @@ class ModulatedNoise:
         ValueError
             If the window is shorter than three time steps.
         """
-        if self.window < (_PARTS - _ROUND_OFF) * max(measurements.steps):
-            raise ValueError(
-                f"ModulatedNoise: the window of {self.window:g} s must be at least three steps of "
-                f"{max(measurements.steps):g} s; give a longer one"
-            )
+        self._check_step(max(measurements.steps))
         sums = PartSums(self.window / _PARTS, tuple(measurements.steps), tuple(measurements.starts))
         there = ~np.isnan(measurements.values)
         counts = sums_of_parts(there.astype(float), sums.places(there.shape[1]), there).astype(int)
         return replace(self, layout=MeasuredLayout(sums.steps, sums.starts, tuple(map(tuple, counts.tolist()))))
 
-    def _warn_of_gaps(self, events: tuple[int, ...]) -> None:
-        """Warn of channels whose mean square is that of a part of the motion, or of an event."""
-        named, counts = [], np.array(self.layout.counts)
+    def _check_step(self, dt: float) -> None:
+        if self.window < (_PARTS - _ROUND_OFF) * dt:
+            raise ValueError(
+                f"ModulatedNoise: the window of {self.window:g} s must be at least three steps of {dt:g} s; give a "
+                "longer one, or a motion with a shorter time step (Record.resample)"
+            )
+
+    def remark_on_gaps(self) -> str:
+        """What to say of channels whose share is that of the mean square of a part of the motion, or of an event.
+
+        Empty for a noise without measurements, for ``local=1``, and if at most 5 % of the samples are missing within
+        the measured motion. The events are those of `excited`, which must be those of the measurements.
+        """
+        if self.layout is None or self.local == 1.0:
+            return ""
+        named, counts, events = [], np.array(self.layout.counts), self.excited.events
         for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
             known = np.flatnonzero(row)
             inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # whole parts
@@ -269,13 +278,13 @@ class ModulatedNoise:
             expected = self.window / _PARTS / step * inside.size
             share = 1.0 - row[inside].sum() / expected if inside.size else 0.0
             named += [f"{channel.name!r} ({share:.0%})"] if share > _LARGEST_GAP else []
-        if named and self.local < 1.0:
-            warnings.warn(
-                f"ModulatedNoise: samples are missing within the channels {', '.join(named)}. The share is that of the "
-                "mean square of the other samples. If the strong part of the motion is missing, the share is too large "
-                "and predictions of whole motions too wide: use local=1, whose level is that of samples near by",
-                stacklevel=5,
-            )
+        if not named:
+            return ""
+        return (
+            f"ModulatedNoise: samples are missing within the channels {', '.join(named)}. The share is that of the "
+            "mean square of the other samples. If the strong part of the motion is missing, the share is too large "
+            "and predictions of whole motions too wide: use local=1, whose level is that of samples near by"
+        )
 
     def under(self, model: Any, first: int = 0) -> "ModulatedNoise":
         """The same noise under the excitation of a model, whose response begins at the step `first`.
@@ -283,13 +292,17 @@ class ModulatedNoise:
         Raises
         ------
         ValueError
-            If the noise grows with a deformation, and none is imposed on the model.
-
-        Warns
-        -----
-        UserWarning
-            If `local` is below 1 and more than 5 % of the samples of a channel are missing within the motion.
+            If the noise grows with a deformation, and none is imposed on the model; if the window is shorter than three
+            time steps of the model, or longer than one of its `fe_likelihoods.Events`.
         """
+        self._check_step(model.dt)
+        events = find_events(model)
+        for each in () if events is None else events.windows:
+            if self.window > each.end - each.start + (1.0 + _ROUND_OFF) * model.dt:
+                raise ValueError(
+                    f"ModulatedNoise: the window of {self.window:g} s must not be longer than an event; {each.name!r} "
+                    f"has {each.end - each.start:g} s: give a shorter window, or leave out this event"
+                )
         excited = excited_parts(model, self.window / _PARTS, first)
         if self.deformation is not None and not excited.reached:
             raise ValueError(
@@ -297,8 +310,6 @@ class ModulatedNoise:
                 "in its attribute loading or record, or an array (n_steps,) in its attribute deformation or strain; "
                 f"this {type(model).__name__} has none: leave deformation out"
             )
-        if self.layout is not None:
-            self._warn_of_gaps(excited.events)
         return replace(self, excited=excited)
 
     def log_likelihood(self, statistics: np.ndarray, n_samples: int | SampleCounts, shares: np.ndarray) -> np.ndarray:

@@ -50,6 +50,7 @@ __all__ = [
     "noise_statistic",
     "noise_time_shifts",
     "noise_under",
+    "remark_on_gaps",
     "numbers",
     "options_repr",
     "set_channels",
@@ -129,6 +130,11 @@ def noise_of_part(noise: Noise, measurements: Measurements) -> Noise:
 def noise_under(noise: Noise, model: Any, first: int = 0) -> Noise:
     """Noise under the excitation of a model: the same, unless it has a method ``under``."""
     return noise.under(model, first) if hasattr(noise, "under") else noise
+
+
+def remark_on_gaps(noise: Noise) -> str:
+    """What a noise says of gaps in its measurements; empty if nothing, or without a method ``remark_on_gaps``."""
+    return noise.remark_on_gaps() if hasattr(noise, "remark_on_gaps") else ""
 
 
 def as_number(noise: Any, what: str, value: Any, unit: str) -> float:

@@ -1,5 +1,7 @@
 """What `print` shows of results: short tables and sentences with units, not arrays."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -72,6 +74,12 @@ def test_averages_of_models(predicted):
         assert text.startswith("Average of the models a 0.25, b 0.75") and "array" not in text
         assert cells(text, 2)[:2] == ["displacement", "cm"] and float(cells(text, 2)[-1]) < 1e-9
     assert float(cells(text, 2)[3]) == pytest.approx(1e2 * predicted["peak"].sd, rel=5e-3)
+    assert "CAUTION" not in text
+    far, peak = ("the response is far away", "few samples"), predicted["peak"]
+    parts = {"a": peak, "b": replace(peak, remarks=far[:1]), "c": replace(peak, remarks=far)}
+    average = average_predictions(parts, {"a": 0.2, "b": 0.3, "c": 0.5})
+    assert average.remarks == far  # each once
+    assert str(average).splitlines()[-2:] == [f"CAUTION: {each}" for each in far]
 
 
 def test_exceedance_and_fragility(predicted):

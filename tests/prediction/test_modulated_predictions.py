@@ -1,0 +1,93 @@
+"""Predictions with `ModulatedNoise`: gaps are those of the calibration; what has no level is refused before it runs."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Events, FELikelihood, LinearOscillator, Measurements, ModulatedNoise, Record, propagate
+
+DT, WINDOW = 0.02, 0.6
+SAMPLES = np.array([[1.0, 1.0, 0.1, 0.1]] * 10)
+OPTIONS = {"noise": True, "from_state": "virgin", "progress": False, "calibrated": (), "check": False}
+
+
+def quake(seed, duration=12.0):
+    time = DT * np.arange(round(duration / DT))
+    burst = np.exp(-(((time - 0.4 * duration) / (duration / 6.0)) ** 2))
+    return Record(f"q{seed}", DT, burst * np.random.default_rng(seed).standard_normal(len(time)))
+
+
+def noise_for(model, **options):
+    deviations = 1e-3 * np.abs(model.simulate([1.0, 1.0])).max(axis=1)
+    return ModulatedNoise(model.channels, window=WINDOW, sensor=deviations, **options)
+
+
+def with_gap(**options) -> tuple[FELikelihood, list[str]]:
+    """A likelihood with 2 s missing in the strong part, and its warnings of gaps."""
+    model = LinearOscillator(quake(1))
+    values = model.simulate([1.0, 1.0])
+    values[:, 200:300] = np.nan
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        likelihood = FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model, **options))
+    assert all(each.filename == __file__ for each in caught)
+    return likelihood, gaps_of(caught)
+
+
+def gaps_of(caught) -> list[str]:
+    return [str(each.message) for each in caught if "samples are missing" in str(each.message)]
+
+
+def test_pauses_of_the_calibration_are_no_gap_of_another_record():
+    events = Events([quake(1), quake(2)], rest=10.0, names=["a", "b"])
+    model = LinearOscillator(events)
+    simulated = model.simulate([1.0, 1.0])
+    single = {each.name: Measurements(model.channels, DT, simulated[:, each.samples]) for each in events.windows}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        likelihood = FELikelihood(model, single, noise_for(model))
+        found = propagate(likelihood, SAMPLES, record=quake(3), **OPTIONS)
+    assert found.remarks == ()
+
+
+@pytest.mark.parametrize("of_events", [False, True])
+def test_a_gap_of_the_calibration_is_warned_of_once_and_a_remark_of_every_prediction(of_events):
+    likelihood, (told,) = with_gap()
+    record = Events([quake(4, 4.0), quake(5, 4.0)], rest=6.0) if of_events else quake(3)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = [propagate(likelihood, SAMPLES, record=record, **OPTIONS) for _ in range(2)]
+    assert not gaps_of(caught)
+    assert found[0].remarks == found[1].remarks == (told,) and f"CAUTION: {told}" in str(found[0])
+    assert propagate(likelihood, SAMPLES, record=record, **OPTIONS | {"noise": False}).remarks == ()
+
+
+def test_the_envelope_alone_has_no_remark_on_gaps():
+    likelihood, told = with_gap(local=1.0)
+    assert not told and propagate(likelihood, SAMPLES, record=quake(3), **OPTIONS).remarks == ()
+
+
+@pytest.mark.parametrize(
+    ("record", "told"),
+    [
+        (quake(3).resample(0.3), "window of 0.6 s must be at least three steps of 0.3 s"),
+        (Events([quake(3), quake(4, 0.08)], rest=3.0, names=["a", "tiny"]), "longer than an event; 'tiny' has 0.06 s"),
+    ],
+    ids=["coarse", "short"],
+)
+def test_a_motion_without_levels_is_refused_before_it_is_simulated(record, told, monkeypatch):
+    model = LinearOscillator(quake(1))
+    measured, noise = Measurements(model.channels, DT, model.simulate([1.0, 1.0])), noise_for(model)
+    likelihood = FELikelihood(model, measured, noise)
+    monkeypatch.setattr(LinearOscillator, "simulate", lambda self, theta: pytest.fail("simulated"))
+    with pytest.raises(ValueError, match=told):
+        propagate(likelihood, SAMPLES, record=record, **OPTIONS)
+    with pytest.raises(ValueError, match=told):
+        noise.under(LinearOscillator(record))
+
+
+def test_an_event_as_long_as_the_window_has_a_level_of_its_own():
+    events = Events([quake(3), quake(4, WINDOW), quake(5)], rest=3.0)
+    excited = noise_for(LinearOscillator(quake(1))).under(LinearOscillator(events)).excited
+    assert {1, 3, 5} <= set(excited.events)
