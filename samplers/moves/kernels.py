@@ -13,6 +13,7 @@ The acceptance probabilities are derived in ``docs/theory/tempering``.
 
 import copy
 import math
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -45,6 +46,12 @@ REDRAWS = 20
 UNIT_SCALE_SHARE = 0.1
 # Crossover probabilities of the difference steps: one is chosen per sweep and walker.
 CROSSOVERS = (1.0 / 3.0, 2.0 / 3.0, 1.0)
+
+# A proposal that is fitted to fewer points than this times ndim + 1 may be so narrow in a direction that a chain of
+# thousands of steps has a wrong variance.
+FEWEST_PER_DIMENSION = 5
+# Spread of points in a direction, relative to their standard deviations, below which it counts as none.
+SMALLEST_SPREAD = 1e-8
 
 Inside = Callable[[np.ndarray], np.ndarray]
 
@@ -87,17 +94,52 @@ def calibrate_move(
         move.calibrate(coords, weights, inside)
 
 
+def _first_half(coords: np.ndarray) -> np.ndarray:
+    """Which of the walkers (n, ndim) belong to the first half of their places, in the order of the walkers.
+
+    Copies of one point are in one half: the other half then contains no point of the walkers that it is fitted for, and
+    each half has half of the distinct points. Without copies, it is the first half of the walkers.
+    """
+    _, first, place = np.unique(coords, axis=0, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[place.reshape(-1)] < len(first) // 2
+
+
+def _check_half(coords: np.ndarray) -> None:
+    """ValueError if the points (n, ndim) of half of the walkers span no volume; a warning if they are few."""
+    places, ndim = np.unique(coords, axis=0), coords.shape[1]
+    sd = places.std(axis=0)
+    standard = (places - places.mean(axis=0)) / np.where(sd > 0.0, sd, 1.0)
+    advice = "start from more walkers, or from different points, such as draws of the prior"
+    if np.linalg.matrix_rank(standard, tol=SMALLEST_SPREAD * np.sqrt(len(places))) < ndim:
+        raise ValueError(
+            f"a move is fitted to half of the walkers to move the other half, which needs points that span all {ndim} "
+            f"dimensions; got {len(places)} distinct points that do not: {advice}"
+        )
+    fewest = FEWEST_PER_DIMENSION * (ndim + 1)
+    if len(places) < fewest:
+        warnings.warn(
+            f"a move is fitted to {len(places)} distinct points, half of those of the walkers, in {ndim} dimensions, "
+            f"and may be too narrow: a long chain can have wrong variances. With fewer than {fewest} points in a half, "
+            f"{advice}",
+            stacklevel=2,
+        )
+
+
 class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points.
 
     Where it was not calibrated (in a plain EnsembleSampler, or in a run that goes on from a chain without its journal),
     two copies are fitted to one half of the walkers each, and move the other half. A proposal that was fitted to the
-    points that it moves would make their tails too light for many sweeps; this one is independent of them.
+    points that it moves would make their tails too light for many sweeps; this one is independent of them. The halves
+    and both fits stay as they are: the copies of one point are in one half, and each half has half of the distinct
+    points. A half needs ndim + 1 of them or more that span all dimensions (ValueError); with fewer than 5 (ndim + 1)
+    there is a warning, since the proposals may be too narrow.
     """
 
     def __init__(self):
         super().__init__(self._draw_all)
         self._halves: tuple[_FittedMove, ...] = ()
+        self._in_first = np.empty(0, dtype=bool)  # which walkers the first of the halves moves
 
     @property
     def _is_fitted(self) -> bool:
@@ -110,11 +152,10 @@ class _FittedMove(MHMove):
     def _draw_all(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         if not self._halves:
             return self._draw(coords, random)
-        # not every second walker: resampled copies are neighbours, and would be in both halves
-        middle = len(coords) // 2
-        parts = coords[:middle], coords[middle:]
-        drawn = [half._draw(part, random) for half, part in zip(self._halves, parts, strict=True)]
-        return np.concatenate([points for points, _ in drawn]), np.concatenate([ratios for _, ratios in drawn])
+        proposed, log_ratios = np.empty_like(coords), np.empty(len(coords))
+        for half, rows in zip(self._halves, (self._in_first, ~self._in_first), strict=True):
+            proposed[rows], log_ratios[rows] = half._draw(coords[rows], random)
+        return proposed, log_ratios
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Propose a new point for each walker.
@@ -127,10 +168,11 @@ class _FittedMove(MHMove):
             Which proposals were accepted.
         """
         if not self._is_fitted and not self._halves:
-            middle, halves = len(state.coords) // 2, (copy.deepcopy(self), copy.deepcopy(self))
-            for half, others in zip(halves, (state.coords[middle:], state.coords[:middle]), strict=True):
+            halves, in_first = (copy.deepcopy(self), copy.deepcopy(self)), _first_half(state.coords)
+            for half, others in zip(halves, (state.coords[~in_first], state.coords[in_first]), strict=True):
+                _check_half(others)
                 half.calibrate(others, np.full(len(others), 1.0 / len(others)))
-            self._halves = halves
+            self._halves, self._in_first = halves, in_first
         return super().propose(model, state)
 
     def tune(self, state: State, accepted: np.ndarray) -> None:

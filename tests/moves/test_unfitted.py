@@ -1,5 +1,7 @@
 """Moves that nobody has calibrated: no walker has a part in the fit of its own proposal."""
 
+import warnings
+
 import emcee
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from scipy import stats
 
 from samplers import SMCSampler
 from samplers.moves.fast_parameters import FastWalk
-from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
+from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove, _first_half
 from tests.statistics.test_tails import SCALE, StudentProduct
 
 N = 40
@@ -46,8 +48,9 @@ def test_a_walker_has_no_part_in_its_own_proposal(make, rng):
 def test_both_halves_are_tuned(make, rng):
     """Proposals of a rejected walk become shorter for all walkers; the fit does not change."""
     target = StudentProduct(2)
-    sampler = emcee.EnsembleSampler(10, 2, target, vectorize=True, moves=make())
-    sampler.run_mcmc(rng.standard_normal((10, 2)), 30, tune=True)
+    sampler = emcee.EnsembleSampler(30, 2, target, vectorize=True, moves=make())
+    sampler.random_state = np.random.RandomState(4).get_state()
+    sampler.run_mcmc(rng.standard_normal((30, 2)), 60, tune=True)
     assert np.all(sampler.backend.accepted > 0)
     move = RandomWalkMove(adapt=True)
     for _ in range(10):
@@ -59,6 +62,48 @@ def test_both_halves_are_tuned(make, rng):
         move.tune(None, np.zeros(N, dtype=bool))
     later = proposals_of(move, coords, 1)[0] - coords
     assert np.allclose(later, first * np.exp(-10 * move.target))
+
+
+@pytest.mark.parametrize("make", [RandomWalkMove, StudentTMove])
+def test_walkers_that_start_in_one_place_leave_it(make, rng):
+    """Walkers that are copies had been one half: the proposals to the others then had no width."""
+    start = rng.standard_normal((60, 2))
+    start[:30] = start[0]
+    sampler = emcee.EnsembleSampler(60, 2, lambda x: -0.5 * np.sum(x**2, axis=-1), vectorize=True, moves=make())
+    sampler.random_state = np.random.RandomState(4).get_state()
+    sampler.run_mcmc(start, 1500, skip_initial_state_check=True)
+    squares = np.mean(sampler.get_chain(discard=200) ** 2, axis=(0, 2))  # of each walker: they are independent
+    for half in (squares[:30], squares[30:]):
+        error = half.std(ddof=1) / np.sqrt(len(half))
+        assert error < 0.03 and abs(half.mean() - 1.0) < 3.0 * error
+
+
+def test_copies_are_in_one_half_and_places_are_divided(rng):
+    coords = rng.standard_normal((N, 3))
+    assert np.array_equal(_first_half(coords), np.arange(N) < N // 2)
+    resampled = coords[np.sort(rng.integers(0, N, N))]
+    for points in (resampled, rng.permutation(resampled), np.repeat(coords[:2], [35, 5], axis=0)):
+        in_first = _first_half(points)
+        halves = [{tuple(point) for point in points[rows]} for rows in (in_first, ~in_first)]
+        assert not halves[0] & halves[1] and len(halves[1]) - len(halves[0]) in (0, 1)
+
+
+@pytest.mark.parametrize("make", [MixtureMove, StudentTMove, RandomWalkMove, lambda: FastWalk([1])])
+def test_walkers_that_span_no_volume_are_refused(make, rng):
+    line = rng.standard_normal((N, 1)) * [1.0, 1e6, 1e-6]
+    few = np.repeat(rng.standard_normal((6, 3)), 10, axis=0)
+    for coords in (line, few, np.ones((N, 3)), rng.standard_normal((N, 3)) * [1.0, 0.0, 1.0]):
+        with pytest.raises(ValueError, match="points that span all 3 dimensions.*start from more walkers"):
+            proposals_of(make(), coords, 1)
+
+
+def test_few_walkers_are_warned_of(rng):
+    units = np.array([1e-6, 1e9])
+    with pytest.warns(UserWarning, match="fitted to 14 distinct points"):
+        proposals_of(StudentTMove(), units * rng.standard_normal((28, 2)), 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        proposals_of(StudentTMove(), units * rng.standard_normal((30, 2)), 1)
 
 
 def exact_draws(n, ndim, seed):
