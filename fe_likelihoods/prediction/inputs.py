@@ -214,12 +214,13 @@ def _noise_of_events(
     if not (deviations[~np.isnan(deviations)] > 0.0).all() or np.isinf(deviations).any():
         raise ValueError("the noise needs positive standard deviations; some samples have others")
     if not isinstance(noise, str):
-        if other_record:
+        events = find_events(model)
+        if other_record or events is None or events.names != noise_model.names:
             raise ValueError(
                 "the noise has levels per event, and the prediction is of another record: give the event whose levels "
                 f"hold for it, noise= one of {names}"
             )
-        steps = [(each.start / model.dt, each.end / model.dt) for each in find_events(model).windows]
+        steps = [(each.start / model.dt, each.end / model.dt) for each in events.windows]
         events = tuple(slice(math.ceil(start - 1e-6), math.floor(end + 1e-6) + 1) for start, end in steps)
         return SampleNoise(np.nan_to_num(deviations), None, events)
     if noise not in noise_model.names:

@@ -38,7 +38,7 @@ from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
 from ..simulation.disk_cache import SimulationCache
 from ..simulation.kept_states import KEPT_STATES
-from ..simulation.model import SimulationFailed
+from ..simulation.model import Model, SimulationFailed
 from ..simulation.stored_responses import StoredResponses
 from .accumulator import Accumulator
 from .excitation import chosen_state, excite, under_record
@@ -52,6 +52,7 @@ from .inputs import (
     split_samples,
 )
 from .model_error import follows_response
+from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator, measured_quantity
 from .transfer_checks import (
@@ -78,6 +79,7 @@ def propagate(
     samples: Any,
     *,
     part: str | None = None,
+    model: Model | None = None,
     quantity: Quantity | Mapping[str, Quantity] = None,
     record: Record | None = None,
     from_state: str | None = None,
@@ -107,6 +109,11 @@ def propagate(
         `Posterior.draw_noise`.
     part : str, optional
         For a `JointLikelihood` or its posterior: the name of the likelihood whose model and noise predict.
+    model : Model, optional
+        A model with the same parameters and other channels, such as floors that were not measured, which may have
+        another excitation; default: that of the posterior. With noise, a channel that was not measured has the mean of
+        the parameters of the noise of the measured channels of the same quantity: of shares if the noise is in shares
+        of the response, of standard deviations [SI] otherwise. `Prediction.remarks` states it.
     quantity : optional
         None for the histories of all channels, the name of a channel or several names for their histories,
         ``peak(name)`` or another `fe_likelihoods.prediction.quantities.ChannelQuantity` or several of them, or a
@@ -179,7 +186,8 @@ def propagate(
     ValueError
         Before any simulation: for samples of another shape, without rows, or not finite; unknown channels; noise of a
         bare model, or impossible parameters of the noise; a model with one excitation only, or one that cannot continue
-        from the end of its excitation; settings out of range.
+        from the end of its excitation; settings out of range; a `model` with other parameters, or with a channel whose
+        quantity was not measured and whose noise is wanted.
         Later: for a function that returns arrays of different shapes.
     SimulationFailed
         If every simulation fails.
@@ -187,16 +195,21 @@ def propagate(
     Warns
     -----
     UserWarning
-        If the median of the predicted peak of a channel, under another record, is more than twice the largest measured
-        peak of the calibration, or less than half of the smallest one.
-        If histories, or quantities of channels, under another record are predicted with noise in SI units, and their
-        level is more than three times that of the measurements of the calibration, or less than a third.
+        If channels of `model` have the mean noise of others.
+        If the median of the predicted peak of a channel, under another record or of another `model`, is more than twice
+        the largest measured peak of the calibration, or less than half of the smallest one.
+        If histories, or quantities of channels, under another record or of another `model` are predicted with noise in
+        SI units, and their level is more than three times that of the measurements of the calibration, or less than a
+        third.
         Once for each likelihood, if its residuals are correlated and `GaussianNoise`, `SharedGaussianNoise`,
         `RelativeNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent.
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
-    source = read_source(posterior_or_model, pool)
+    calibration = source = read_source(posterior_or_model, pool)
+    complete, assumed, other = samples, "", record is not None or model is not None
+    if model is not None:
+        source, samples, assumed = predict_channels_of(model, source, samples, noise)
     thetas, sample_noise = split_samples(source, samples, noise, record is not None)
     n = len(thetas)
     probabilities = _probabilities(quantiles)
@@ -248,15 +261,15 @@ def propagate(
     if cache is not None:
         cache = cache if isinstance(cache, SimulationCache) else SimulationCache(cache)
         stored = StoredResponses(model, source.executor, cache)
-    peaks = Peaks() if record is not None and known else None
-    checked = sample_to_check(source, samples) if check else None
+    peaks = Peaks() if other and known else None
+    checked = sample_to_check(calibration, complete) if check else None
     own_response = None  # of the checked sample to the excitation of the calibration
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
             responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor, stored)
             for accumulator in accumulators.values():
                 accumulator.add(start, responses, reasons)
-            if checked is not None and record is None and 0 <= (row := row_of_sample[checked] - start) < len(responses):
+            if checked is not None and not other and 0 <= (row := row_of_sample[checked] - start) < len(responses):
                 own_response = None if reasons[row] else responses[row].copy()
             if peaks is not None:
                 peaks.add(responses, reasons, accumulator.members[start : start + batch])
@@ -268,15 +281,15 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
-    remarks, of_residuals = [], ""
+    remarks, of_residuals = [assumed], ""
     if peaks is not None:
         remarks.append(remark_on_peaks(peaks, model.channels, known))
-    if record is not None and noise:
+    if other and noise:
         histories = [each for each in predictions.values() if each.dt is not None]
         remarks.append(_remark_on_level((histories or list(predictions.values()))[0], source))
-    if checked is not None and (record is not None or own_response is not None):
-        point = as_points(samples, (*source.model.parameter_names, *source.noise.parameter_names))[checked]
-        of_residuals = remark_on_residuals(source, point, own_response)
+    if checked is not None and (other or own_response is not None):
+        names = (*calibration.model.parameter_names, *calibration.noise.parameter_names)
+        of_residuals = remark_on_residuals(calibration, as_points(complete, names)[checked], own_response)
         remarks.append(of_residuals)
     of_gaps = remark_on_gaps(source.likelihood.noise) if noise and source.likelihood is not None else ""
     remarks = tuple(remark for remark in (*remarks, of_gaps) if remark)
@@ -413,16 +426,20 @@ def _remark_on_level(prediction: Prediction, source: PredictionSource) -> str:
     if follows_response(source.noise) or not prediction.channels:
         return ""
     measurements, far = source.likelihood.measurements, []
+    channels = prediction.channels
     if prediction.dt is not None:
-        levels = np.sqrt(np.mean(np.square(prediction.mean), axis=1))
-        measured = [np.sqrt(np.nanmean(np.square(measurements.channel(c.name)))) for c in prediction.channels]
+        known = {channel.name for channel in measurements.channels}
+        kept = [k for k, channel in enumerate(channels) if channel.name in known]
+        channels = [channels[k] for k in kept]
+        levels = np.sqrt(np.mean(np.square(prediction.mean[kept]), axis=1))
+        measured = [np.sqrt(np.nanmean(np.square(measurements.channel(c.name)))) for c in channels]
     else:
         levels = np.atleast_1d(prediction.mean)
         try:
             measured = np.atleast_1d(measured_quantity(prediction.quantity, measurements))
         except ValueError:  # samples are missing, so that the level of the calibration is not known
             return ""
-    for channel, level, reference in zip(prediction.channels, levels, measured, strict=True):
+    for channel, level, reference in zip(channels, levels, measured, strict=True):
         ratio = abs(level / reference) if reference else 1.0
         if not 1.0 / _LARGEST_LEVEL_RATIO <= ratio <= _LARGEST_LEVEL_RATIO:
             far.append(f"{channel.name} ({ratio:.2g} times)")

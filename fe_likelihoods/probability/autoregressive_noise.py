@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..signals.channels import Channel
-from .noise import HALF_LOG_TWO_PI, PerChannel, Statistic, options_repr, set_channels, total_deviations
+from .noise import HALF_LOG_TWO_PI, PerChannel, Statistic, options_repr, set_channels, total_deviations, weighted
 from .residuals import lag_one_sums
 from .sample_counts import SampleCounts
 
@@ -157,3 +157,9 @@ class AutoregressiveNoise:
     def lag_one_correlations(self, parameters: np.ndarray) -> np.ndarray:
         """Correlation of successive errors of every channel [-], (n, n_channels), from parameters (n, 2 n_channels)."""
         return np.asarray(parameters, dtype=float)[..., len(self.channels) :]
+
+    def with_channels(
+        self, channels: Sequence[Channel], weights: np.ndarray
+    ) -> "tuple[AutoregressiveNoise, np.ndarray]":
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
+        return AutoregressiveNoise(channels, sensor=weighted(self.sensor, weights)), np.kron(np.eye(2), weights)

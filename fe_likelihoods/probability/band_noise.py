@@ -18,7 +18,7 @@ import numpy as np
 
 from ..signals.channels import Channel, Measurements
 from .grouped_errors import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
-from .noise import HALF_LOG_TWO_PI, PerChannel, numbers, options_repr, set_channels
+from .noise import HALF_LOG_TWO_PI, PerChannel, numbers, options_repr, set_channels, weighted
 from .sample_counts import SampleCounts
 
 __all__ = ["BandNoise", "BandSums"]
@@ -277,6 +277,11 @@ class BandNoise:
         each = parameters.reshape(len(parameters), len(self.channels), self.n_bands)
         levels = np.zeros(each.shape[:2]) if self.relative else np.sqrt(np.square(each).sum(axis=2))
         return np.where((each >= 0.0).all(axis=2), np.hypot(levels, self._floor), np.nan)
+
+    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[BandNoise, np.ndarray]":
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
+        others = replace(self, channels=channels, sensor=weighted(self.sensor, weights), layout=None)
+        return others, np.kron(weights, np.eye(self.n_bands))
 
     def response_deviations(
         self, parameters: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None

@@ -5,7 +5,7 @@ standard deviation per channel and event, which are inferred like those of `Gaus
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -138,6 +138,22 @@ class EventNoise:
         for column, (event, row) in enumerate(self.levels):
             found[:, event, row] = np.asarray(parameters, dtype=float)[:, column]
         return found
+
+    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> tuple["EventNoise", np.ndarray]:
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`.
+
+        The level of a channel in an event is the mean of those with a weight that were measured in this event.
+        """
+        levels, rows = [], []
+        for event in range(len(self.names)):
+            measured = np.array([row if known == event else -1 for known, row in self.levels])
+            for other, of_channels in enumerate(weights):
+                row = np.where(measured >= 0, of_channels[measured], 0.0)
+                if row.any():
+                    levels.append((event, other))
+                    rows.append(row / row.sum())
+        noise = EventNoise(tuple(channels), self.names, self.windows, (), tuple(levels))
+        return noise, np.array(rows).reshape(-1, len(self.levels))
 
     def with_measurements(self, measurements: Measurements) -> "EventNoise":
         """The same noise, with the same parameters, for other measurements of the same events and channels."""

@@ -25,7 +25,7 @@ import numpy as np
 from ..signals.channels import Channel, Measurements
 from .event_noise import find_events
 from .grouped_errors import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
-from .noise import HALF_LOG_TWO_PI, PerChannel, as_number, options_repr, set_channels
+from .noise import HALF_LOG_TWO_PI, PerChannel, as_number, options_repr, set_channels, weighted
 from .response_levels import Excited, excited_parts, squared_levels
 from .sample_counts import SampleCounts
 
@@ -344,6 +344,10 @@ class ModulatedNoise:
         """
         parameters = np.asarray(parameters, dtype=float)
         return self._deviations(parameters, np.zeros_like(parameters))
+
+    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[ModulatedNoise, np.ndarray]":
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
+        return replace(self, channels=channels, sensor=weighted(self.sensor, weights), layout=None), weights
 
     def response_deviations(
         self, shares: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None

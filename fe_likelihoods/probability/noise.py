@@ -56,6 +56,7 @@ __all__ = [
     "set_channels",
     "set_effective",
     "total_deviations",
+    "weighted",
 ]
 
 PerChannel = Mapping[str, float] | Sequence[float] | None
@@ -91,6 +92,9 @@ class Noise(Protocol):
       ``first``; called by a likelihood with its model, and by a prediction with the model under the predicted record.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
       predictions with autoregressive noise.
+    * ``with_channels(channels, weights)`` with the weights (n_others, n_channels) of its channels in each of others,
+      which returns the noise of these for predictions, and the weights (n_others_noise, n_noise) of its parameters in
+      theirs; for predictions of channels that were not measured.
     """
 
     @property
@@ -244,6 +248,10 @@ class GaussianNoise:
         """
         return total_deviations(np.asarray(parameters, dtype=float), self.sensor)
 
+    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
+        return GaussianNoise(channels, sensor=weighted(self.sensor, weights)), weights
+
 
 @dataclass(frozen=True)
 class SharedGaussianNoise:
@@ -360,6 +368,13 @@ class SharedGaussianNoise:
         """
         return white_log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
 
+    def with_channels(
+        self, channels: Sequence[Channel], weights: np.ndarray
+    ) -> "tuple[SharedGaussianNoise, np.ndarray]":
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
+        scales, sensor = weighted(self.scales, weights), weighted(self.sensor, weights)
+        return SharedGaussianNoise(channels, scales, sensor=sensor), np.eye(1)
+
 
 def set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) -> None:
     """Set and check the fields `channels` and `sensor` of a frozen noise."""
@@ -415,6 +430,11 @@ def options_repr(sensor: tuple[float, ...] | None, effective_samples: tuple[floa
     """Options that differ from the default, for the `repr`, which fingerprints are made of."""
     options = {"sensor": sensor, "effective_samples": effective_samples}
     return [f"{name}={value!r}" for name, value in options.items() if value is not None]
+
+
+def weighted(values: tuple[float, ...] | None, weights: np.ndarray) -> np.ndarray | None:
+    """Weighted sums (n_others,) of one number per channel, such as those of the sensors; None for None."""
+    return None if values is None else weights @ np.array(values)
 
 
 def total_deviations(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.ndarray:

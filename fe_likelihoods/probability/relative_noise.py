@@ -31,6 +31,7 @@ from .noise import (
     set_channels,
     set_effective,
     total_deviations,
+    weighted,
     white_log_likelihood,
 )
 from .sample_counts import SampleCounts
@@ -163,6 +164,11 @@ class RelativeNoise:
         """
         shares = np.asarray(parameters, dtype=float)
         return total_deviations(np.where(shares < 1.0, shares, np.nan) * np.array(self.levels), self.sensor)
+
+    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[RelativeNoise, np.ndarray]":
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
+        levels, sensor = weighted(self.levels, weights), weighted(self.sensor, weights)
+        return RelativeNoise(channels, levels, window=self.window, sensor=sensor), weights
 
     def response_deviations(self, shares: np.ndarray, response: np.ndarray, dt: float) -> np.ndarray:
         """Standard deviations of the errors of a simulated response.

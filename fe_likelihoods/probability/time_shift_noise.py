@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ..signals.channels import Channel
 from ..signals.interpolation import POINTS
-from .noise import GaussianNoise, SharedGaussianNoise, as_number
+from .noise import GaussianNoise, Noise, SharedGaussianNoise, as_number
 from .sample_counts import SampleCounts
 
 __all__ = ["TimeShiftNoise"]
@@ -111,6 +112,17 @@ class TimeShiftNoise:
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
         """Standard deviation of the errors of every channel (n, n_channels), from parameters (n, n_noise)."""
         return self.noise.standard_deviations(np.asarray(parameters, dtype=float)[..., : self._n_noise])
+
+    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> tuple[Noise, np.ndarray]:
+        """Noise of other channels, and the weights of the parameters in its own; see `Noise`.
+
+        A measured channel keeps its unknown shift, another one has none.
+        """
+        noise, of_noise = self.noise.with_channels(channels, weights)
+        names = [channel.name for channel in channels]
+        kept = [k for k, (name, _) in enumerate(self.shifts) if name in names]
+        matrix = block_diag(of_noise, np.eye(len(self.shifts))[kept])
+        return (TimeShiftNoise(noise, dict(self.shifts[k] for k in kept), self.dt) if kept else noise), matrix
 
     def log_likelihood(
         self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray

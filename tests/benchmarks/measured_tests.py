@@ -93,9 +93,6 @@ def frame(repeats: int = 1) -> list[Row]:
     data = Measurements(raw.channels, raw.dt, raw.values - rest.mean(axis=1, keepdims=True))
     sensor = float(rest[1:].std(axis=1).mean())
 
-    def noise(floors: tuple[str, ...]) -> ModulatedNoise:
-        return ModulatedNoise(data.select(floors).channels, window=0.5, sensor=[sensor] * len(floors))
-
     def structure(floors: tuple[str, ...], shaking: str) -> LinearStructure:
         start, stop = _SHAKINGS[shaking]
         table = Record("table", data.dt, data.channel("table")).trim(_REST, stop)
@@ -104,11 +101,12 @@ def frame(repeats: int = 1) -> list[Row]:
 
     used = ("floor1", "floor3")
     model, measured = structure(used, "shaking 1"), data.select(used).trim(*_SHAKINGS["shaking 1"])
+    noise = ModulatedNoise(model.channels, window=0.5, sensor=[sensor] * len(used))
     prior = {f"stiffness_{i}": LogNormal(1.0, 0.5) for i in (1, 2, 3)}
     prior |= {f"damping_{i}": LogNormal(0.01, 1.0) for i in (1, 2, 3)}
     rows, scored = [], []
     for seed in range(1, repeats + 1):
-        fit, modulated = (calibrate(model, measured, prior, 3.0, seed, noise=each) for each in (None, noise(used)))
+        fit, modulated = (calibrate(model, measured, prior, 3.0, seed, noise=each) for each in (None, noise))
         known = ratios_of(fit, model, _of_accelerations(used))
         for what in ("peak", "energy"):  # of the floor that was not measured: between the two others
             known[f"{what} floor2"] = np.sqrt(known[f"{what} floor1"] * known[f"{what} floor3"])
@@ -116,7 +114,7 @@ def frame(repeats: int = 1) -> list[Row]:
             floors = tuple(_FLOORS)
             later = data.select(floors).trim(*_SHAKINGS[shaking])
             predicted, numbers = structure(floors, shaking), _of_accelerations(floors)
-            case = Case(f"frame, {shaking}", predicted, later, slice(None), numbers, noise(floors))
+            case = Case(f"frame, {shaking}", predicted, later, slice(None), numbers, noise)
             found, numbers = score_case(case, fit, modulated, known, seed)
             rows += found
             scored.append(numbers)

@@ -69,7 +69,8 @@ class Case(NamedTuple):
     numbers : mapping of str to ChannelQuantity
         Numbers that are scored, such as the peak in this part.
     noise : ModulatedNoise
-        Noise of its channels; the calibration with this kind of noise has the same settings.
+        Noise of the calibrated channels; the calibration with this kind of noise has the same settings, except for the
+        deformation of another specimen.
     """
 
     name: str
@@ -89,6 +90,8 @@ class Fit(NamedTuple):
         Parameters of the structure.
     sigma : ndarray, shape (n, n_channels)
         Standard deviations of the errors [SI]; with `ModulatedNoise` their shares of the level [-].
+    model : Model
+        The model of the calibration.
     measured : Measurements
         The measurements of the calibration, whose root mean squares are the levels of the shares.
     simulations : int
@@ -97,6 +100,7 @@ class Fit(NamedTuple):
 
     structure: np.ndarray
     sigma: np.ndarray
+    model: Any
     measured: Measurements
     simulations: int
 
@@ -145,7 +149,7 @@ def calibrate(
     sampler.run_mcmc(None, 2, progress=False)
     samples, n = sampler.get_chain(flat=True), len(model.parameter_names)
     chosen = np.random.default_rng(seed).choice(len(samples), min(draws, len(samples)), replace=False)
-    return Fit(samples[chosen, :n], samples[chosen, n:], measured, posterior.report()["simulations"])
+    return Fit(samples[chosen, :n], samples[chosen, n:], model, measured, posterior.report()["simulations"])
 
 
 def ratios_of(fit: Fit, model: Any, quantities: Mapping[str, ChannelQuantity]) -> dict[str, float]:
@@ -171,30 +175,24 @@ def score_case(
     seed : int
         Seed of the noise and of the ratios.
     """
-    calibrated = [channel.name for channel in fit.measured.channels]
     levels = np.sqrt(np.nanmean(np.square(fit.measured.values), axis=1))
-    channels = case.model.channels
-    columns = [calibrated.index(c.name) if c.name in calibrated else None for c in channels]
-
-    def of_channels(values: np.ndarray) -> np.ndarray:
-        return np.stack([values.mean(axis=1) if k is None else values[:, k] for k in columns], axis=1)
-
-    shares, unused = np.minimum(of_channels(fit.sigma / levels), 0.99), np.ones(len(channels))
-    options = {"sensor": case.noise.sensor}  # and levels of one, which act in a likelihood only
+    shares, sensor, channels = np.minimum(fit.sigma / levels, 0.99), case.noise.sensor, case.model.channels
+    relative, window = (RelativeNoise.of(fit.measured, window=w, sensor=sensor) for w in (None, case.noise.window))
     kinds = {
-        "SI": (GaussianNoise(channels), fit.structure, of_channels(fit.sigma)),
-        "relative": (RelativeNoise(channels, unused, **options), fit.structure, shares),
-        "window": (RelativeNoise(channels, unused, window=case.noise.window, **options), fit.structure, shares),
-        "modulated": (case.noise, modulated.structure, of_channels(modulated.sigma)),
+        "SI": (GaussianNoise(fit.model.channels), fit.structure, fit.sigma),
+        "relative": (relative, fit.structure, shares),
+        "window": (window, fit.structure, shares),
+        "modulated": (case.noise, modulated.structure, modulated.sigma),
     }
     rows, scored = [], {}
     quantities = list(case.numbers.values())
     settings = {"cache": stored_responses(), "progress": False}
     for way, (noise, structure, parameters) in kinds.items():
-        likelihood = FELikelihood(case.model, case.measured, noise)
+        likelihood = FELikelihood(fit.model, fit.measured, noise)
         samples = np.hstack([structure, parameters])
         wanted = {"histories": None, "numbers": quantities}
-        predicted = propagate(likelihood, samples, quantity=wanted, noise=True, seed=seed, **settings)
+        options = {"model": case.model, "quantity": wanted, "noise": True, "seed": seed, "check": False}
+        predicted = propagate(likelihood, samples, **options, **settings)
         scores = predicted["histories"].score(case.measured, part=case.part)
         for k, channel in enumerate(channels):
             scaled = scores.crps[k] / scores.rms[k], scores.width[k] / scores.rms[k]

@@ -1,0 +1,110 @@
+"""Predictions of channels that were not measured, with the noise of those that were.
+
+A calibrated model predicts every floor of a building, but the posterior has parameters of the noise for the measured
+floors only. Those of another channel are taken to be the mean of those of the measured channels of its quantity. This
+is an assumption, which every such prediction states.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ..probability.inputs import as_points, check_model
+from ..probability.noise import noise_channels, noise_under
+from ..simulation.model import Model
+from .inputs import PredictionSource, split_samples
+
+__all__ = ["predict_channels_of"]
+
+
+def predict_channels_of(
+    model: Model, source: PredictionSource, samples: Any, noise: bool | str
+) -> tuple[PredictionSource, Any, str]:
+    """Return what predicts the channels of another model with the samples of a posterior.
+
+    Parameters
+    ----------
+    model : Model
+        A model with the same parameters.
+    source : PredictionSource
+        The model and the noise of the posterior.
+    samples : (n, ndim) array_like, or named values of shape (n,)
+        Samples of its parameters.
+    noise : bool or str
+        Whether the noise is wanted, as for `split_samples`.
+
+    Returns
+    -------
+    source : PredictionSource
+        With the model and the noise of its channels.
+    samples
+        With the parameters of this noise; as they were if it is not wanted.
+    remark : str
+        Which channels have the mean noise of which others; empty if there are none, or the noise is not wanted.
+
+    Raises
+    ------
+    ValueError
+        If there is no likelihood; the model has other parameters; or, if the noise is wanted, a channel has the
+        quantity of no measured one, a measured channel has another quantity, or the noise has no method
+        ``with_channels``. As `split_samples` for samples that do not fit.
+    """
+    if source.likelihood is None:
+        raise ValueError(
+            "model= predicts other channels of a posterior or likelihood; to predict with a model, give it alone"
+        )
+    check_model(model)
+    names, own = tuple(model.parameter_names), tuple(source.model.parameter_names)
+    if names != own:
+        raise ValueError(
+            f"model= must have the parameters of the calibrated model in the same order, {', '.join(own)}; got "
+            f"{', '.join(names)}"
+        )
+    if not noise:
+        return source._replace(model=model), samples, ""
+    thetas, _ = split_samples(source, samples, noise)
+    calibrated = source.noise
+    if not hasattr(calibrated, "with_channels"):
+        raise ValueError(
+            f"{type(calibrated).__name__} does not say what the noise of other channels is: give it a method "
+            "with_channels(channels, weights), see fe_likelihoods.Noise, or predict with noise=False"
+        )
+    weights, remark = _weights(model, source)
+    other, of_parameters = calibrated.with_channels(model.channels, weights)
+    points = as_points(samples, own + tuple(calibrated.parameter_names))
+    samples = np.hstack([thetas, points[:, len(own) :] @ of_parameters.T])
+    return source._replace(model=model, noise=noise_under(other, model)), samples, remark
+
+
+def _weights(model: Model, source: PredictionSource) -> tuple[np.ndarray, str]:
+    """Weights (n_channels, n_measured) of the measured channels in those of a model, and the remark on them."""
+    measured = noise_channels(source.noise, source.model.channels)
+    rows = {channel.name: k for k, channel in enumerate(measured)}
+    weights, of_quantity = np.zeros((len(model.channels), len(measured))), {}
+    for row, channel in zip(weights, model.channels, strict=True):
+        if channel.name in rows:
+            known = measured[rows[channel.name]]
+            if known.quantity != channel.quantity:
+                raise ValueError(
+                    f"the channel {channel.name!r} of model= is {channel.quantity!r}, and was calibrated as "
+                    f"{known.quantity!r}: give it another name"
+                )
+            row[rows[channel.name]] = 1.0
+            continue
+        alike = [k for k, known in enumerate(measured) if known.quantity == channel.quantity]
+        if not alike:
+            raise ValueError(
+                f"the noise of the channel {channel.name!r} is not known: no measured channel is {channel.quantity!r}; "
+                f"measured are {', '.join(f'{each.name} ({each.quantity})' for each in measured)}. Leave the channel "
+                "out of model=, or predict with noise=False"
+            )
+        row[alike] = 1.0 / len(alike)
+        of_quantity.setdefault(tuple(measured[k].name for k in alike), []).append(channel.name)
+    parts = [f"{', '.join(others)} (mean of {', '.join(known)})" for known, others in of_quantity.items()]
+    if not parts:
+        return weights, ""
+    return weights, (
+        f"the noise of channels that were not measured is assumed: {'; '.join(parts)}. The calibration made the error "
+        "of the model small at the measured channels only, so that it may be larger elsewhere. Hold a measured channel "
+        "out of a calibration to see how much"
+    )

@@ -1,0 +1,236 @@
+"""Predictions of channels that were not measured: their noise is the mean of that of the measured ones."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    BandNoise,
+    Channel,
+    Events,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    LinearOscillator,
+    Measurements,
+    ModulatedNoise,
+    Record,
+    RelativeNoise,
+    SharedGaussianNoise,
+    TimeShiftNoise,
+    peak,
+    propagate,
+)
+
+N, DT = 120, 0.02
+LOW, MIDDLE, TOP = (Channel(name, "acceleration", "m/s2") for name in ("low", "middle", "top"))
+DRIFT, FORCE = Channel("drift", "displacement", "mm"), Channel("force", "lateral force", "kN")
+WAVES = {"low": (1.0, 5.0), "middle": (2.0, 6.0), "top": (4.0, 7.0), "drift": (0.1, 8.0), "force": (1e3, 9.0)}
+SENSORS = {LOW: 0.01, MIDDLE: 0.02, TOP: 0.03, DRIFT: 0.001, FORCE: 10.0}
+MEASURED = (TOP, LOW, DRIFT)
+SENSORS_OF_ALL = [0.02, 0.01, 0.001, 0.03]  # of middle, the mean of top and low, and of low, drift and top
+ALL = (MIDDLE, LOW, DRIFT, TOP)
+
+
+def wave(channels, factor=1.0, runs=None):
+    time = DT * np.arange(N)
+
+    def simulate(theta):
+        if runs is not None:
+            runs.append(theta)
+        waves = [WAVES[channel.name] for channel in channels]
+        return factor * np.array([size * theta[0] * np.sin(theta[1] * speed * time) for size, speed in waves])
+
+    return FunctionModel(simulate, ["gain", "speed"], channels, DT, N)
+
+
+def measured(channels):
+    return Measurements(channels, DT, wave(channels).simulate([1.0, 1.0]))
+
+
+def sensors(channels):
+    return [SENSORS[channel] for channel in channels]
+
+
+KINDS = {
+    "white": lambda channels, sensor, levels: GaussianNoise(channels, sensor=sensor),
+    "shared": lambda channels, sensor, levels: SharedGaussianNoise(channels, levels, sensor=sensor),
+    "relative": lambda channels, sensor, levels: RelativeNoise(channels, levels, window=0.4, sensor=sensor),
+    "modulated": lambda channels, sensor, levels: ModulatedNoise(channels, window=0.4, sensor=sensor),
+    "bands": lambda channels, sensor, levels: BandNoise(channels, (2.0, 8.0), sensor=sensor),
+    "bands, SI": lambda channels, sensor, levels: BandNoise(channels, (2.0, 8.0), relative=False, sensor=sensor),
+    "autoregressive": lambda channels, sensor, levels: AutoregressiveNoise(channels, sensor=sensor),
+}
+
+
+def quiet(*args, **settings):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return propagate(*args, progress=False, check=False, seed=1, **settings)
+
+
+def drawn(likelihood, rng, n=30):
+    """Samples around a gain and a speed of one, with noise parameters from 0.1 to 0.4."""
+    n_noise = likelihood.ndim - 2
+    return np.hstack([rng.normal(1.0, 0.05, (n, 2)), rng.uniform(0.1, 0.4, (n, n_noise))])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_prediction_is_that_of_a_noise_of_all_channels_with_mean_parameters(kind, rng):
+    """Stacked by the names of the parameters: those of middle are the means of those of low and top, without drift."""
+    levels = {LOW: 0.7, MIDDLE: 1.7, TOP: 2.7, DRIFT: 0.07}  # middle has the mean
+    likelihood = FELikelihood(
+        wave(MEASURED), measured(MEASURED), KINDS[kind](MEASURED, sensors(MEASURED), [levels[c] for c in MEASURED])
+    )
+    samples = drawn(likelihood, rng)
+    values = dict(zip(likelihood.parameter_names, samples.T, strict=True))
+    whole = FELikelihood(wave(ALL), measured(ALL), KINDS[kind](ALL, SENSORS_OF_ALL, [levels[c] for c in ALL]))
+
+    def value(name):
+        if name in values:
+            return values[name]
+        return 0.5 * (values[name.replace("middle", "low")] + values[name.replace("middle", "top")])
+
+    stacked = np.stack([value(name) for name in whole.parameter_names], axis=1)
+    for settings in ({}, {"quantity": [peak(channel.name) for channel in ALL]}):
+        ours = quiet(likelihood, samples, model=wave(ALL), noise=True, **settings)
+        theirs = quiet(whole, stacked, noise=True, **settings)
+        without = quiet(likelihood, samples, model=wave(ALL), **settings)
+        np.testing.assert_allclose(ours.quantiles, theirs.quantiles, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-12)
+        assert (np.ptp(ours.quantiles[[0, 2]], axis=0) > np.ptp(without.quantiles[[0, 2]], axis=0)).mean() > 0.7
+    if kind in ("relative", "modulated", "bands"):
+        assert quiet(likelihood, samples, model=wave(ALL), noise="model", quantity=peak("middle")).noise
+
+
+def test_what_is_assumed_is_said_and_only_then(rng):
+    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
+    samples = drawn(likelihood, rng)
+    with pytest.warns(UserWarning, match=re.escape("is assumed: middle (mean of top, low)")) as caught:
+        prediction = propagate(likelihood, samples, model=wave(ALL), noise=True, check=False, progress=False)
+    assert prediction.remarks == tuple(str(each.message) for each in caught)
+    assert prediction.remarks[0] in str(prediction)
+    few = (DRIFT, TOP)
+    for settings in ({"model": wave(few), "noise": True}, {"model": wave((*ALL, FORCE))}):
+        assert quiet(likelihood, samples, **settings).remarks == ()
+    ours = quiet(likelihood, samples, model=wave(few), noise=True)
+    part = FELikelihood(wave(few), measured(few))
+    np.testing.assert_array_equal(ours.quantiles, quiet(part, samples[:, [0, 1, 4, 2]], noise=True).quantiles)
+    by_name = dict(zip(likelihood.parameter_names, samples.T, strict=True))
+    np.testing.assert_array_equal(ours.quantiles, quiet(likelihood, by_name, model=wave(few), noise=True).quantiles)
+
+
+def test_a_model_under_another_excitation_is_compared_with_the_calibration(rng):
+    """Peaks and levels of the measured channels that are ten times those of the calibration are said."""
+    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
+    samples = drawn(likelihood, rng)
+    _, peaks, level = quiet(likelihood, samples, model=wave(ALL, 10.0), noise=True).remarks
+    assert "top (" in peaks and "middle" not in peaks
+    assert "another level" in level and "top (" in level and "middle" not in level
+    assert quiet(likelihood, samples, model=wave(ALL), noise=True).remarks[1:] == ()
+
+
+def test_the_residuals_of_the_calibration_are_checked_and_not_those_of_the_other_model(rng):
+    time = DT * np.arange(N)
+    values = measured(MEASURED).values + 0.2 * np.sin(9.0 * time)
+    likelihood = FELikelihood(wave(MEASURED), Measurements(MEASURED, DT, values))
+    samples = np.tile([1.0, 1.0, 0.14, 0.14, 0.14], (20, 1)) + 1e-3 * rng.standard_normal((20, 5))
+    with pytest.warns(UserWarning, match="residuals of the calibration are not independent") as caught:
+        propagate(likelihood, samples, model=wave(ALL), noise=True, seed=1, progress=False)
+    assert "middle" not in str(caught[-1].message)
+
+
+@pytest.mark.parametrize(
+    ("other", "noise", "words"),
+    [
+        (wave((TOP, FORCE)), True, "no measured channel is 'lateral force'; measured are top (acceleration), low"),
+        (wave((Channel("top", "displacement", "mm"),)), True, "calibrated as 'acceleration': give it another name"),
+        (
+            FunctionModel(lambda theta: np.ones((1, N)), ["gain"], [TOP], DT, N),
+            False,
+            "in the same order, gain, speed;",
+        ),
+        (3.0, False, "is not a model"),
+    ],
+)
+def test_other_channels_that_cannot_be_predicted_are_refused(other, noise, words, rng):
+    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
+    with pytest.raises(ValueError, match=re.escape(words)):
+        propagate(likelihood, drawn(likelihood, rng), model=other, noise=noise, progress=False)
+
+
+def test_refusals_come_before_any_simulation(rng):
+    runs = []
+    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED))
+    samples = drawn(likelihood, rng)
+    with pytest.raises(ValueError, match="no measured channel"):
+        propagate(likelihood, samples, model=wave((TOP, FORCE), runs=runs), noise=True, progress=False)
+    with pytest.raises(ValueError, match="expected one value for each of the 5 parameters"):
+        propagate(likelihood, samples[:, :4], model=wave(ALL, runs=runs), noise=True, progress=False)
+    with pytest.raises(ValueError, match="to predict with a model, give it alone"):
+        propagate(wave(MEASURED), samples[:, :2], model=wave(ALL, runs=runs), progress=False)
+
+    class Own(GaussianNoise):
+        with_channels = property()
+
+    own = FELikelihood(wave(MEASURED), measured(MEASURED), Own(MEASURED))
+    with pytest.raises(ValueError, match="Own does not say what the noise of other channels is"):
+        propagate(own, samples, model=wave(ALL, runs=runs), noise=True, progress=False)
+    assert not runs
+
+
+def test_a_measured_channel_keeps_its_unknown_time_shift(rng):
+    noise = TimeShiftNoise(GaussianNoise(MEASURED), {"low": 0.05, "drift": 0.05}, DT)
+    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED), noise)
+    samples = np.hstack([drawn(FELikelihood(wave(MEASURED), measured(MEASURED)), rng), np.full((30, 2), 0.01)])
+    plain = FELikelihood(wave(MEASURED), measured(MEASURED))
+    for channels, shifted in ((ALL, ("low", "drift")), ((MIDDLE, TOP), ())):
+        ours = quiet(likelihood, samples, model=wave(channels), noise=True)
+        assert ours.shifted == shifted
+        np.testing.assert_array_equal(
+            ours.quantiles, quiet(plain, samples[:, :5], model=wave(channels), noise=True).quantiles
+        )
+
+
+def test_levels_per_event_are_means_of_the_channels_measured_in_the_event(rng):
+    records = [Record(name, 0.02, rng.normal(size=n)) for name, n in (("EQ1", 61), ("EQ2", 51))]
+    events = Events(records, rest=0.98)
+    oscillator = LinearOscillator(events, period=0.5)
+    acceleration = Channel("acceleration", "absolute acceleration", "g")
+
+    def copies(names):
+        """An oscillator with one sensor of the acceleration per name."""
+        channels = [Channel(name, acceleration.quantity, acceleration.unit) for name in names]
+        model = FunctionModel(
+            lambda theta, record: np.tile(LinearOscillator(record, period=0.5).simulate(theta)[0], (len(names), 1)),
+            oscillator.parameter_names,
+            channels,
+            oscillator.dt,
+            oscillator.n_steps,
+            record=events,
+        )
+        return model, channels
+
+    model, channels = copies(["a", "b"])
+    measured_in = {
+        "EQ1": Measurements(channels, 0.02, np.ones((2, 61))),
+        "EQ2": Measurements(channels[:1], 0.02, np.ones((1, 51))),
+    }
+    likelihood = FELikelihood(model, measured_in, "per event")
+    assert likelihood.parameter_names[2:] == ("sigma_a_EQ1", "sigma_b_EQ1", "sigma_a_EQ2")
+    samples = np.hstack([rng.normal(1.0, 0.05, (50, 2)), rng.uniform(0.5, 1.0, (50, 3))])
+    other, _ = copies(["c", "b"])
+    clean, noisy = (quiet(likelihood, samples, model=other, noise=noise) for noise in (False, True))
+    added = noisy.variance - clean.variance
+    mean = 0.5 * (samples[:, 2] + samples[:, 3])
+    expected = np.zeros_like(added)
+    expected[0, :61], expected[1, :61] = np.mean(mean**2), np.mean(samples[:, 3] ** 2)
+    expected[0, 110:161] = np.mean(samples[:, 4] ** 2)
+    np.testing.assert_allclose(added, expected, rtol=1e-9, atol=1e-9)
+    named = quiet(likelihood, samples, model=other.with_record(records[0]), noise="EQ1")
+    assert named.mean.shape == (2, 61)
+    with pytest.raises(ValueError, match="give the event whose levels hold for it"):
+        quiet(likelihood, samples, model=other.with_record(records[0]), noise=True)
