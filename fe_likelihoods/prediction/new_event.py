@@ -131,8 +131,8 @@ def predict_new_event(
         common, or have the same prior in all events. Shares of the response (`RelativeNoise`) transfer between events,
         levels in SI units do not.
     n : int
-        Number of draws, each one simulation. Draws with an impossible noise, such as a share of 1 or more, are left
-        out.
+        Number of draws, each one simulation. Draws with an impossible noise, such as a share of 1 or more of
+        `RelativeNoise`, are left out.
     seed : int, optional
         Seed of the draws of parameters, ratios and noise.
     **options
@@ -347,8 +347,9 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
     if possible.mean() < 1.0 - _LARGEST_IMPOSSIBLE:
         warnings.warn(
             f"predict_new_event: {1.0 - possible.mean():.0%} of the draws have an impossible noise, such as a share of "
-            "the response of 1 or more, and are left out: if this is not rare, use a noise with levels in SI units, or "
-            "a narrower prior of the spread between events",
+            "the measured signal of 1 or more, and are left out. Use ModulatedNoise, whose shares of the response have "
+            'no upper bound, let shares vary with Varying(..., scale="logit"), or state a narrower prior of their '
+            "spread between events",
             stacklevel=3,
         )
     return {name: values[possible] for name, values in draws.items()}

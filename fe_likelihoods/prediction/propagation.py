@@ -43,7 +43,6 @@ from ..simulation.stored_responses import StoredResponses
 from .accumulator import Accumulator
 from .excitation import chosen_state, excite, under_record
 from .inputs import (
-    PredictionSource,
     distinct_rows,
     part_of,
     read_source,
@@ -51,16 +50,17 @@ from .inputs import (
     simulates_in_batches,
     split_samples,
 )
-from .model_error import follows_response
 from .other_channels import predict_channels_of
 from .prediction import Prediction
-from .quantities import Quantity, evaluator, measured_quantity
+from .quantities import Quantity, evaluator
 from .transfer_checks import (
     Peaks,
     calibration_of,
     is_first_warning,
+    remark_on_level,
     remark_on_peaks,
-    remark_on_residuals,
+    remark_on_white_peaks,
+    remarks_on_calibration,
     sample_to_check,
 )
 
@@ -70,7 +70,6 @@ logger = logging.getLogger(__name__)
 
 _BATCH_VALUES = 2**22  # response values in one batch: 32 MiB
 _LARGEST_BATCH = 256
-_LARGEST_LEVEL_RATIO = 3.0  # of predicted and calibrated response, beyond which noise in SI units does not transfer
 _LARGEST_SERIAL_BATCH = 16  # small, so that the progress bar moves often when simulations run one by one
 
 
@@ -201,8 +200,12 @@ def propagate(
         If histories, or quantities of channels, under another record or of another `model` are predicted with noise in
         SI units, and their level is more than three times that of the measurements of the calibration, or less than a
         third.
+        If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response
+        (`RelativeNoise`, `ModulatedNoise`), and their median is more than 1.1 times that of the response.
         Once for each likelihood, if its residuals are correlated and `GaussianNoise`, `SharedGaussianNoise`,
-        `RelativeNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent.
+        `RelativeNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent, or the whitened
+        residuals of `ModulatedNoise` or `BandNoise` are correlated; and if less than 0.75 times the simulated response
+        fits the measurements better, under a noise whose likelihood has shares of this response (the same two).
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
@@ -261,7 +264,7 @@ def propagate(
     if cache is not None:
         cache = cache if isinstance(cache, SimulationCache) else SimulationCache(cache)
         stored = StoredResponses(model, source.executor, cache)
-    peaks = Peaks() if other and known else None
+    peaks = Peaks()
     checked = sample_to_check(calibration, complete) if check else None
     own_response = None  # of the checked sample to the excitation of the calibration
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
@@ -271,8 +274,7 @@ def propagate(
                 accumulator.add(start, responses, reasons)
             if checked is not None and not other and 0 <= (row := row_of_sample[checked] - start) < len(responses):
                 own_response = None if reasons[row] else responses[row].copy()
-            if peaks is not None:
-                peaks.add(responses, reasons, accumulator.members[start : start + batch])
+            peaks.add(responses, reasons, accumulator.members[start : start + batch])
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
     predictions = {
@@ -281,20 +283,21 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
-    remarks, of_residuals = [assumed], ""
-    if peaks is not None:
-        remarks.append(remark_on_peaks(peaks, model.channels, known))
+    remarks, of_calibration = [assumed], ()
+    if other:
+        remarks.append(remark_on_peaks(peaks, model.channels, known, alone=calibrated is None))
     if other and noise:
-        histories = [each for each in predictions.values() if each.dt is not None]
-        remarks.append(_remark_on_level((histories or list(predictions.values()))[0], source))
+        remarks.append(remark_on_level(predictions.values(), peaks, source))
+    if noise is True:
+        remarks.append(remark_on_white_peaks(predictions.values(), peaks, source))
     if checked is not None and (other or own_response is not None):
         names = (*calibration.model.parameter_names, *calibration.noise.parameter_names)
-        of_residuals = remark_on_residuals(calibration, as_points(complete, names)[checked], own_response)
-        remarks.append(of_residuals)
+        of_calibration = remarks_on_calibration(calibration, as_points(complete, names)[checked], own_response)
     of_gaps = remark_on_gaps(source.likelihood.noise) if noise and source.likelihood is not None else ""
-    remarks = tuple(remark for remark in (*remarks, of_gaps) if remark)
+    known_already = (of_gaps, *(of_calibration if of_calibration and not is_first_warning(source.likelihood) else ()))
+    remarks = tuple(remark for remark in (*remarks, *of_calibration, of_gaps) if remark)
     for remark in remarks:
-        if remark is not of_gaps and (remark is not of_residuals or is_first_warning(source.likelihood)):
+        if remark not in known_already:
             warnings.warn(remark, stacklevel=2)
     predictions = {name: replace(each, remarks=remarks) for name, each in predictions.items()}
     return predictions if isinstance(quantity, Mapping) else predictions[""]
@@ -415,40 +418,6 @@ def _prediction(
         noise=noise,
         from_state=from_state,
         shifted=shifted,
-    )
-
-
-def _remark_on_level(prediction: Prediction, source: PredictionSource) -> str:
-    """What to say if noise in SI units was calibrated with a much stronger or weaker response than the predicted one.
-
-    An empty text otherwise.
-    """
-    if follows_response(source.noise) or not prediction.channels:
-        return ""
-    measurements, far = source.likelihood.measurements, []
-    channels = prediction.channels
-    if prediction.dt is not None:
-        known = {channel.name for channel in measurements.channels}
-        kept = [k for k, channel in enumerate(channels) if channel.name in known]
-        channels = [channels[k] for k in kept]
-        levels = np.sqrt(np.mean(np.square(prediction.mean[kept]), axis=1))
-        measured = [np.sqrt(np.nanmean(np.square(measurements.channel(c.name)))) for c in channels]
-    else:
-        levels = np.atleast_1d(prediction.mean)
-        try:
-            measured = np.atleast_1d(measured_quantity(prediction.quantity, measurements))
-        except ValueError:  # samples are missing, so that the level of the calibration is not known
-            return ""
-    for channel, level, reference in zip(channels, levels, measured, strict=True):
-        ratio = abs(level / reference) if reference else 1.0
-        if not 1.0 / _LARGEST_LEVEL_RATIO <= ratio <= _LARGEST_LEVEL_RATIO:
-            far.append(f"{channel.name} ({ratio:.2g} times)")
-    if not far:
-        return ""
-    return (
-        "the predicted response has another level than the measurements of the calibration: "
-        f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
-        "too narrow for a stronger motion; ModulatedNoise, BandNoise and RelativeNoise scale with the response"
     )
 
 

@@ -1,21 +1,26 @@
 """Whether a prediction goes beyond its calibration: other amplitudes than those measured, or a noise that is wrong.
 
 Parameters of structures depend on the amplitude of the response, and noise in SI units does not scale with it. A
-posterior under white noise is too narrow where the residuals are correlated. A prediction warns of both.
+posterior under white noise is too narrow where the residuals are correlated, and a noise in shares of the simulated
+response may be fitted with a response that is too large. White errors make peaks too large. A prediction warns of
+these.
 """
 
 import logging
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..probability.autoregressive_noise import AutoregressiveNoise
+from ..probability.band_noise import BandNoise
 from ..probability.event_noise import find_events
 from ..probability.failures import TooManyFailures
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
+from ..probability.marginal_noise import sampled_noise
+from ..probability.modulated_noise import ModulatedNoise
 from ..probability.noise import GaussianNoise, SharedGaussianNoise
 from ..probability.relative_noise import RelativeNoise
 from ..probability.residuals import effective_samples, innovations, residual_checks
@@ -23,6 +28,9 @@ from ..signals.channels import Channel, Measurements
 from ..simulation.faults import ChangedModel
 from ..simulation.verification import StaleCache
 from .inputs import PredictionSource
+from .model_error import follows_response
+from .prediction import Prediction
+from .quantities import ChannelQuantity, measured_quantity, peak
 
 __all__ = [
     "Calibrated",
@@ -30,20 +38,25 @@ __all__ = [
     "calibration_of",
     "sample_to_check",
     "is_first_warning",
+    "remark_on_level",
     "remark_on_peaks",
-    "remark_on_residuals",
+    "remark_on_white_peaks",
+    "remarks_on_calibration",
 ]
 
 logger = logging.getLogger(__name__)
 
+_LARGEST_LEVEL_RATIO = 3.0  # of predicted and calibrated response, beyond which noise in SI units does not transfer
 _LARGEST_PEAK_RATIO = 2.0  # of a predicted peak to the largest calibrated one, or of the smallest one to it
 _UNLIKELY = 0.01  # probability of a correlation under white noise, for all channels together
 _WEAK = 0.2  # lag-one correlation that hardly changes intervals, as in `residual_checks`
 _LARGEST_COUNT_RATIO = 2.0  # of independent samples: assumed by the noise, and found
+_LARGEST_ADDED_PEAK = 1.1  # median of the peaks with white errors, as a multiple of that of the response
+_TOO_LARGE = 0.75  # multiple of the response that fits best, below which the response is too large
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
 # what the residuals of likelihoods say, and the likelihoods of which a warning has said it
-_FOUND: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
+_FOUND: weakref.WeakKeyDictionary[Any, tuple[str, ...]] = weakref.WeakKeyDictionary()
 _WARNED: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
@@ -88,10 +101,10 @@ def _names(measured: Measurements) -> list[str]:
     return [channel.name for channel in measured.channels]
 
 
-def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibrated) -> str:
+def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibrated, alone: bool) -> str:
     """What to say where the median of the peak of a channel is beyond the peaks of the calibration by a factor of two.
 
-    An empty text otherwise.
+    An empty text otherwise. `alone` is whether the parameters are those of one likelihood, not of a population.
     """
     predicted, far = peaks.median(), []
     if predicted is None:
@@ -107,13 +120,88 @@ def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calib
     if not far:
         return ""
     # Several events show how parameters vary between them, but not at amplitudes that none of them had.
-    other = "" if len(calibrated) > 1 else ", or let parameters vary between events (in Python, Hierarchy)"
+    other = ", or let parameters vary between events (in Python, Hierarchy)" if alone and len(calibrated) == 1 else ""
     return (
         f"the predicted peaks are outside of the range of the calibration by more than a factor of "
         f"{_LARGEST_PEAK_RATIO:g}: {', '.join(far)}. The parameters were calibrated at other amplitudes; where "
         "stiffness and damping depend on the amplitude, the prediction is beside the truth, and its spread does "
         f"not show it. Calibrate with events of this amplitude{other}"
     )
+
+
+def remark_on_level(predictions: Iterable[Prediction], peaks: Peaks, source: PredictionSource) -> str:
+    """What to say if noise in SI units was calibrated with a much stronger or weaker response than the predicted one.
+
+    An empty text otherwise. Compared are the root mean squares of histories; where only numbers are predicted, the
+    peaks of their channels, without noise.
+    """
+    if follows_response(source.noise):
+        return ""
+    histories = [each for each in predictions if each.dt is not None]
+    measurements, far = source.likelihood.measurements, []
+    if histories:
+        known = {channel.name for channel in measurements.channels}
+        names = [channel.name for channel in histories[0].channels]
+        kept = [k for k, name in enumerate(names) if name in known]
+        names = [names[k] for k in kept]
+        levels = np.sqrt(np.mean(np.square(histories[0].mean[kept]), axis=1))
+        measured = [np.sqrt(np.nanmean(np.square(measurements.channel(name)))) for name in names]
+    else:
+        names = list(dict.fromkeys(name for each in _of_channels(predictions) for name in each.channel_names))
+        levels = _of_names(peaks, source.model.channels, names)
+        try:
+            measured = [float(measured_quantity(peak(name), measurements)) for name in names]
+        except ValueError:  # samples are missing, so that the level of the calibration is not known
+            return ""
+    for name, level, reference in zip(names, levels, measured, strict=True):
+        ratio = abs(level / reference) if reference else 1.0
+        if not 1.0 / _LARGEST_LEVEL_RATIO <= ratio <= _LARGEST_LEVEL_RATIO:
+            far.append(f"{name} ({ratio:.2g} times)")
+    if not far:
+        return ""
+    return (
+        "the predicted response has another level than the measurements of the calibration: "
+        f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
+        "too narrow for a stronger motion; ModulatedNoise, BandNoise and RelativeNoise scale with the response"
+    )
+
+
+def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, source: PredictionSource) -> str:
+    """What to say where peaks with white errors of the model are much larger than those of the response.
+
+    An empty text otherwise, and for a noise with a spectrum, or in SI units, which may be that of the sensors.
+    """
+    if not follows_response(source.noise) or hasattr(source.noise, "response_errors"):
+        return ""
+    added = {}
+    for each in predictions:
+        wanted = [one for one in _of_channels([each]) if one.name == "peak" and one.part == slice(None)]
+        for one in wanted:
+            place = 0 if isinstance(each.quantity, ChannelQuantity) else list(each.quantity).index(one)
+            found = np.median(each.values.reshape(len(each.values), -1)[:, place])
+            (without,) = _of_names(peaks, source.model.channels, [one.channel])
+            if found > _LARGEST_ADDED_PEAK * without > 0.0:
+                added[one.channel] = f"{one.channel} ({found / without:.2g} times)"
+    if not added:
+        return ""
+    return (
+        f"the predicted peaks with noise=True are larger than those of the response: {', '.join(added.values())}. The "
+        "noise is drawn independently at each sample, and the largest of many draws adds to the peak, while errors of "
+        'a model change as slowly as the response. Predict peaks with noise="model" (docs/predictions.rst)'
+    )
+
+
+def _of_channels(predictions: Iterable[Prediction]) -> list[ChannelQuantity]:
+    """The numbers of channels that are predicted."""
+    wanted = [each.quantity for each in predictions]
+    several = [one for each in wanted for one in (each if isinstance(each, list | tuple) else [each])]
+    return [one for one in several if isinstance(one, ChannelQuantity)]
+
+
+def _of_names(peaks: Peaks, channels: Sequence[Channel], names: Sequence[str]) -> np.ndarray:
+    """Medians of the peaks of these channels [SI]."""
+    known = [channel.name for channel in channels]
+    return peaks.median()[[known.index(name) for name in names]]
 
 
 def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
@@ -123,7 +211,7 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
     samples of the structural parameters alone.
     """
     kinds = (GaussianNoise, SharedGaussianNoise, RelativeNoise, AutoregressiveNoise)
-    if source.likelihood is None or not isinstance(source.noise, kinds):
+    if source.likelihood is None or not (isinstance(source.noise, kinds) or hasattr(source.noise, "whitened")):
         return None
     names = (*source.model.parameter_names, *source.noise.parameter_names)
     if (len(samples) if isinstance(samples, Mapping) else np.shape(samples)[-1]) != len(names):
@@ -134,7 +222,7 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
     return int(np.argmin(np.square(scaled).sum(axis=1)))
 
 
-def remark_on_residuals(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> str:
+def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> tuple[str, ...]:
     """What to say if the residuals of a likelihood contradict the noise with which it was sampled.
 
     Samples that do not fit, such as draws of the prior, are not judged. What the first judged samples of a likelihood
@@ -152,40 +240,80 @@ def remark_on_residuals(source: PredictionSource, point: np.ndarray, response: n
 
     Returns
     -------
-    str
+    tuple of str
         Empty if there is nothing to say.
     """
-    likelihood, noise = source.likelihood, source.noise
+    likelihood = source.likelihood
     n_structural = len(source.model.parameter_names)
     if response is None:
         if likelihood in _FOUND:
             return _FOUND[likelihood]
         response = _response(likelihood, point[:n_structural])
     if response is None:
-        return ""
+        return ()
     residuals, parameters = likelihood.residuals_of(response, point), point[None, n_structural:]
     if not (np.isfinite(residuals).sum(axis=1) > 1).all() or not np.nanmax(np.abs(residuals), axis=1).all():
-        return ""
-    stated = noise.standard_deviations(parameters)[0]
-    found = np.sqrt(np.nanmean(np.square(residuals), axis=1))
+        return ()
+    noise = sampled_noise(likelihood.noise)  # under the excitation of the calibration; that of `source` may be another
+    simulated = likelihood.measurements.values - residuals
+    if hasattr(noise, "whitened"):
+        checked, stated = noise.whitened(residuals, simulated, parameters[0]), 1.0
+    else:
+        checked, stated = residuals, noise.standard_deviations(parameters)[0]
+    found = np.sqrt(np.nanmean(np.square(checked), axis=1))
     if (np.maximum(found / stated, stated / found) > _OTHER_LEVEL).any():
-        return ""
+        return ()
     if likelihood not in _FOUND:
-        _FOUND[likelihood] = _contradiction(source, residuals, parameters)
+        remarks = _contradiction(noise, source.model.channels, checked, parameters)
+        _FOUND[likelihood] = tuple(
+            each for each in (_too_large(noise, source.model.channels, residuals, simulated), remarks) if each
+        )
     return _FOUND[likelihood]
 
 
 def is_first_warning(likelihood: Any) -> bool:
-    """Whether the residuals of a likelihood are to be warned of: once, while every prediction keeps the remark."""
+    """Whether the residuals of a likelihood are to be warned of: once, while every prediction keeps the remarks."""
     first = likelihood not in _WARNED
     _WARNED.add(likelihood)
     return first
 
 
-def _contradiction(source: PredictionSource, residuals: np.ndarray, parameters: np.ndarray) -> str:
-    """How residuals (n_channels, n_steps) contradict a noise with parameters (1, n_noise), in words; empty if not."""
-    noise, channels = source.noise, source.model.channels
-    autoregressive = isinstance(noise, AutoregressiveNoise)
+def _too_large(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, simulated: np.ndarray) -> str:
+    """What to say where a fraction of the simulated response (n_channels, n_steps) fits much better; empty if not.
+
+    Only of a noise whose likelihood has shares of the simulated response: with others the response that fits best is
+    also the most probable one.
+    """
+    if not getattr(getattr(noise, "statistic", None), "of_response", False):
+        return ""
+    far = []
+    for channel, residual, response in zip(channels, residuals, simulated, strict=True):
+        there = np.isfinite(residual)
+        residual, response = residual[there], response[there]
+        power, measured = response @ response, response + residual
+        factor = max(measured @ response / power, 0.0) if power > 0.0 else 1.0
+        if factor < _TOO_LARGE:
+            errors = [np.sqrt(np.sum((measured - f * response) ** 2) / (measured @ measured)) for f in (1.0, factor)]
+            far.append(
+                f"{channel.name} (RRMSE {errors[0]:.2f}; {errors[1]:.2f} if the response is multiplied by {factor:.2f})"
+            )
+    if not far:
+        return ""
+    smaller = "a smaller local=, such as 0.25 or 0, " if isinstance(noise, ModulatedNoise) and noise.local > 0.0 else ""
+    return (
+        f"the simulated response of the calibration is too large: {', '.join(far)}. The noise is a share of the "
+        "simulated response, so that the likelihood may prefer a response that is larger or lasts longer than the "
+        "measured one, because it permits larger errors; the evidence and the verdict of the sampler do not show it. "
+        f"Calibrate with {smaller}RelativeNoise or GaussianNoise, and compare the RRMSE (in Python, fit_measures)"
+    )
+
+
+def _contradiction(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, parameters: np.ndarray) -> str:
+    """How residuals (n_channels, n_steps) contradict a noise with parameters (1, n_noise), in words; empty if not.
+
+    The residuals are whitened where the noise has shares of the response or a spectrum.
+    """
+    autoregressive, whitened = isinstance(noise, AutoregressiveNoise), hasattr(noise, "whitened")
     if autoregressive:
         residuals = innovations(residuals, noise.lag_one_correlations(parameters)[0])
     try:
@@ -206,11 +334,15 @@ def _contradiction(source: PredictionSource, residuals: np.ndarray, parameters: 
         )
         if is_wrong
     )
-    what = "innovations of the calibration are" if autoregressive else "residuals of the calibration are"
-    other = "fewer samples, BandNoise" if autoregressive else "AutoregressiveNoise"
+    what, other = "residuals", "AutoregressiveNoise or effective_samples="
+    if autoregressive:
+        what, other = "innovations", "fewer samples, BandNoise or effective_samples="
+    elif whitened:
+        bands = "other bands" if isinstance(noise, BandNoise) else "BandNoise"
+        what, other = "whitened residuals", f"fewer samples or {bands}"
     return (
-        f"the {what} not independent, as the noise says they are: {names}. The posterior is too narrow, and so is the "
-        f"spread of the predictions between its samples. Calibrate with {other} or effective_samples=, or predict with "
+        f"the {what} of the calibration are not independent, as the noise says they are: {names}. The posterior is too "
+        f"narrow, and so is the spread of the predictions between its samples. Calibrate with {other}, or predict with "
         "the spread between several calibrated events (in Python, predict_new_event; residual_checks has the figures)"
     )
 

@@ -149,8 +149,11 @@ class ModulatedNoise:
 
     With the default values of `local` and `growth` the predictions of 13 of 15 cases of real tests are better than with
     noise in SI units, one is equal and one worse (``docs/predictions.rst``). The defaults were chosen on these cases,
-    so they are no independent test of them, and coupon and columns were given a `deformation`. The evidence can choose
-    between values of `local` (`compare_models`).
+    so they are no independent test of them, and coupon and columns were given a `deformation`.
+
+    Do not choose `local` by the evidence alone: where the model is wrong, the likelihood with a `local` near 1 may
+    prefer a response that is too large, because it permits larger errors. Compare the RRMSE of the fit with that under
+    `GaussianNoise` (`fit_measures`); predictions warn of it.
 
     The statistics are not quadratic in the residuals, so samplers cannot use a guide (`fe_likelihoods.ResponseGuide`).
     Sums over the samples that are there take the place of all where samples are missing.

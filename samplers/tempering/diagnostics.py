@@ -155,8 +155,8 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
     )
     if check.reliable and difference > 3.0 * joint + 1e-6:
         message = (
-            f"{both}. The posterior may still be right. Check first that log_prior is normalised, which only the "
-            "second estimate depends on; otherwise use more walkers or more moves for the evidence"
+            f"{both}. The posterior may still be right. Use more walkers or more moves for the evidence. Where "
+            "log_prior is a function of your own, check that it is normalised: only the second estimate depends on this"
         )
         return [Doubt(message, False)]
     if not check.reliable and difference > LARGE_DIFFERENCE:
@@ -165,8 +165,8 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
             f"{check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f}). Either "
             "the errors of the stages have accumulated, as with many parameters and few walkers, or the posterior has "
             "heavier tails or more modes than the final points show. Evidence, means and standard deviations may be "
-            "wrong by more than their errors. Check first that log_prior is normalised; otherwise use more walkers and "
-            "more moves, and compare two runs"
+            "wrong by more than their errors. Use more walkers and more moves, and compare two runs. Where log_prior "
+            "is a function of your own, check that it is normalised"
         )
         return [Doubt(message, True)]
     if not check.reliable and check.effective_sample_size < LOW_YIELD * check.evaluations:

@@ -114,6 +114,7 @@ def test_the_range_is_that_of_all_calibrated_events(rng):
 
 def test_a_new_event_is_compared_with_the_events_of_the_hierarchy(rng):
     events = {name: calibrated(rng, strength=each) for name, each in (("weak", 1.0), ("strong", 4.0))}
+    measured = events["weak"][0].likelihood.measurements
     for stored, expected in ((True, 1), (False, 0)):
         tests = {
             name: StoredPosterior(samples, each.prior, measurements=each.likelihood.measurements if stored else None)
@@ -127,6 +128,18 @@ def test_a_new_event_is_compared_with_the_events_of_the_hierarchy(rng):
         for strength, number in ((4.0, 0), (1.0, 0), (12.0, expected), (0.2, expected)):
             found = said(predict_new_event, hierarchy, model, excitation(rng, strength), quantity=peak("top"), n=50)
             assert len(found) == number
+            assert not any("Hierarchy" in text for text in found), "which is the population in use"
+    # a population of one event: the spread between events is stated
+    tests = {"weak": StoredPosterior(events["weak"][1], events["weak"][0].prior, measurements=measured)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        single = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
+        single = Hierarchy(single, [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2))))
+    (text,) = said(predict_new_event, single, model, excitation(rng, 12.0), quantity=peak("top"), n=50)
+    assert "Calibrate with events of this amplitude" in text and "Hierarchy" not in text
+    # control: samples of one posterior
+    (text,) = said(propagate, *events["weak"], record=excitation(rng, 12.0), check=False)
+    assert "or let parameters vary between events (in Python, Hierarchy)" in text
     with pytest.raises(ValueError, match="measurements must be Measurements"):
         StoredPosterior(events["weak"][1], events["weak"][0].prior, measurements=[1.0])
 
