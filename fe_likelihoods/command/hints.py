@@ -26,6 +26,15 @@ _TERMS = (
     ),
     (r"ModulatedNoise, BandNoise and RelativeNoise scale", '"modulated", "bands" and "relative" of [noise] scale'),
     (r"Calibrate with AutoregressiveNoise or effective_samples=", 'Set kind = "autoregressive" or "bands" in [noise]'),
+    (r"Calibrate with fewer samples or BandNoise", 'Use fewer samples, or set kind = "bands" in [noise]'),
+    (
+        r"Calibrate with (a smaller local=, such as 0\.25 or 0, )?RelativeNoise or GaussianNoise",
+        'Set a smaller local, such as 0.25 or 0, or kind = "relative" or "per channel" in [noise]',
+    ),
+    (
+        r'Predict peaks with noise="model"',
+        'Compare the peaks with noise = false in [prediction], or in Python noise="model"',
+    ),
     (r"with guide=posterior\.guide\(\)", "with guide = true           "),  # a table: of the same width
 )
 

@@ -122,9 +122,18 @@ def test_messages_about_noises_are_in_the_words_of_the_file():
             "Calibrate with AutoregressiveNoise or effective_samples=",
             'Set kind = "autoregressive" or "bands" in [noise]',
         ),
+        ("Calibrate with fewer samples or BandNoise", 'Use fewer samples, or set kind = "bands" in [noise]'),
+        (
+            "Calibrate with a smaller local=, such as 0.25 or 0, RelativeNoise or GaussianNoise",
+            'Set a smaller local, such as 0.25 or 0, or kind = "relative" or "per channel" in [noise]',
+        ),
+        (
+            'Predict peaks with noise="model"',
+            'Compare the peaks with noise = false in [prediction], or in Python noise="model"',
+        ),
     ):
         assert in_toml_terms(f"the bands. {words} x") == f"the bands. {told} x"
-    source = (ROOT / "fe_likelihoods" / "prediction" / "propagation.py").read_text()
+    source = (ROOT / "fe_likelihoods" / "prediction" / "transfer_checks.py").read_text()
     assert "ModulatedNoise, BandNoise and RelativeNoise scale" in source
 
 
