@@ -337,7 +337,8 @@ class Prediction:
     def __repr__(self) -> str:
         names = f"channels {', '.join(channel.name for channel in self.channels)}, " if self.channels else ""
         noise = "with noise" if self.noise else "without noise"
-        return f"<Prediction of shape {self.mean.shape}: {names}{self.n_samples} samples, {noise}>"
+        state = f", from_state={self.from_state!r}" if self.from_state != "virgin" else ""
+        return f"<Prediction of shape {self.mean.shape}: {names}{self.n_samples} samples, {noise}{state}>"
 
     def __str__(self) -> str:
         title, lines, header, rows = self._table()
