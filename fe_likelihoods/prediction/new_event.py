@@ -128,8 +128,8 @@ def predict_new_event(
         only) the ratio of each draw is that at its predicted value.
     noise : bool or str
         Whether histories are predicted with noise, as for `propagate`. The parameters of the noise must be varying,
-        common, or have the same prior in all events. Shares of the response (`RelativeNoise`) transfer between events,
-        levels in SI units do not.
+        common, or have the same prior in all events. Shares of the response (`ModulatedNoise`, `RelativeNoise`)
+        transfer between events, levels in SI units do not.
     n : int
         Number of draws, each one simulation. Draws with an impossible noise, such as a share of 1 or more of
         `RelativeNoise`, are left out.

@@ -165,8 +165,8 @@ def check_evidence(log_evidence: float, error: float, check: EvidenceCheck) -> l
             f"{check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f}). Either "
             "the errors of the stages have accumulated, as with many parameters and few walkers, or the posterior has "
             "heavier tails or more modes than the final points show. Evidence, means and standard deviations may be "
-            "wrong by more than their errors. Use more walkers and more moves, and compare two runs. Where log_prior "
-            "is a function of your own, check that it is normalised"
+            "wrong by more than their errors. Use more walkers and more moves (min_moves, max_moves), and compare two "
+            "runs. Where log_prior is a function of your own, check that it is normalised"
         )
         return [Doubt(message, True)]
     if not check.reliable and check.effective_sample_size < LOW_YIELD * check.evaluations:

@@ -12,6 +12,7 @@ from fe_likelihoods.probability.distributions import HalfNormal, LogNormal
 from fe_likelihoods.probability.hierarchical_posterior import HierarchicalPosterior, Varying
 from fe_likelihoods.probability.hierarchy import Hierarchy
 from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.modulated_noise import ModulatedNoise
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import Prior
 from fe_likelihoods.probability.relative_noise import RelativeNoise
@@ -128,6 +129,19 @@ def test_histories_of_a_new_event_have_noise_of_its_own_level(hierarchy, posteri
     share = 0.2**2 * np.exp(2.0 * 0.1**2)
     variance = 0.01 * (squared - MEDIAN**2 * np.exp(SPREAD**2)) * SHAPE**2 + 0.01 * squared * share * np.mean(SHAPE**2)
     np.testing.assert_allclose(prediction.sd[0], np.sqrt(variance), rtol=0.06)
+
+
+def test_shares_of_modulated_noise_have_no_upper_limit(hierarchy):
+    wide = Hierarchy(hierarchy.posterior, hierarchy.samples * [1.0, 1e-4, 3.0, 5.0])  # median 0.6, spread 0.5; one gain
+    model = Amplified()
+    measured = Measurements([TOP], model.dt, model.simulate([MEDIAN]))
+    noise = ModulatedNoise(model.channels, window=0.5, sensor=(1e-9,), local=0.0)
+    posterior = Posterior(FELikelihood(model, measured, noise), {"gain": HalfNormal(1.0), "share_top": HalfNormal(0.5)})
+    prediction = predict_new_event(wide, posterior, 0.1, noise=True, n=2000, seed=1)
+    assert prediction.n_samples == 2000
+    level = 0.1 * MEDIAN * np.sqrt(np.mean(SHAPE**2))
+    expected = level * 0.6 * np.exp(0.5**2)  # root mean square of a log-normal share
+    np.testing.assert_allclose(prediction.sd[0].mean(), expected, rtol=0.05)
 
 
 def test_draws_of_impossible_shares_are_left_out(hierarchy, posterior):
