@@ -1,7 +1,6 @@
 """Models of tall buildings against eigenvalue solutions, the shear frame, beam elements, and OpenSees."""
 
 import math
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -190,25 +189,6 @@ def test_mode_shapes_are_orthogonal_with_the_effective_masses_as_squares(alpha):
     shapes, weights = beam_modes(alpha, 20, 0.5 * (nodes + 1.0)).shapes, 0.5 * weights
     np.testing.assert_allclose(shapes.T * weights @ shapes, np.diag(weights @ shapes), atol=1e-12)
     assert 0.95 < (weights @ shapes).sum() < 1.0
-
-
-def test_a_simulation_of_the_beam_costs_no_more_than_that_of_a_frame():
-    """The modes in closed form: a quadrature with 256 points per mode took thirty times as long as the frame."""
-    base = Record("base", DT, np.sin(0.1 * np.arange(2200)))
-    beam = LinearStructure(ShearFlexuralBeam({"middle": 0.4, "roof": 1.0}, n_modes=6), base)
-    frame = LinearStructure(
-        GroupedFrame({"middle": 8, "roof": 20}, [1.0] * 20, [4200.0] * 20, [1] * 10 + [2] * 10), base
-    )
-
-    def shortest(model, theta):
-        times = []
-        for _ in range(8):
-            begin = perf_counter()
-            model.simulate(theta)
-            times.append(perf_counter() - begin)
-        return min(times)
-
-    assert shortest(beam, [1.0, 6.0, 0.02]) < 5.0 * shortest(frame, [1.2, 1.2, 0.02])
 
 
 def test_the_beam_is_the_limit_of_a_frame_with_many_storeys(record):
