@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..prediction.model_error import follows_response
 from ..prediction.prediction import Prediction
 from ..probability.posterior import Posterior
 from ..reporting.other_events import OtherEvent, describe_event
@@ -141,7 +142,10 @@ def _in_toml_terms(prediction: Prediction) -> Prediction:
 def predict_events(
     job: Job, events: tuple[Event, ...], problem: Problem, samples: np.ndarray, progress: bool
 ) -> dict[str, dict[str, Prediction] | SimulationFailed]:
-    """Predict histories and peaks under other base motions, one simulation per sample and event.
+    """Predict histories and peaks under other base motions, one simulation per sample and event if there is a cache.
+
+    Peaks with a noise in shares of the response have the error of the model (``noise="model"`` of `propagate`), because
+    noise that is independent from sample to sample makes them too large.
 
     Responses are stored in the cache of the likelihood, so that events whose prediction was interrupted go on there.
 
@@ -180,16 +184,24 @@ def _predict_event(
     options["quantiles"] = tuple(sorted({*options["quantiles"], *_ENDS}))
     if event.measured is not None:  # measurements contain noise
         options["noise"] = job.prediction.get("noise", True)
+    quantities = {"histories": None, "peaks": [peak(channel.name) for channel in channels]}
+    noises = dict.fromkeys(quantities, options.pop("noise"))
+    if noises["peaks"] and follows_response(posterior.likelihood.noise):
+        noises["peaks"] = "model"  # errors that are independent from sample to sample raise the largest value
+    found: dict[str, Prediction] = {}
     try:
-        return propagate_quietly(
-            posterior,
-            samples,
-            record=event.record,
-            quantity={"histories": None, "peaks": [peak(channel.name) for channel in channels]},
-            cache=posterior.likelihood.cache,
-            **options,
-            progress=progress,
-        )
+        for noise in dict.fromkeys(noises.values()):  # the second kind finds all responses in the cache
+            found |= propagate_quietly(
+                posterior,
+                samples,
+                record=event.record,
+                quantity={name: quantities[name] for name in quantities if noises[name] == noise},
+                cache=posterior.likelihood.cache,
+                noise=noise,
+                **options,
+                progress=progress,
+            )
+        return found
     except ValueError as error:
         raise ValueError(f"{job.file.name}: [events.{event.name}] {error}") from error
 

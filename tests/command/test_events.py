@@ -180,6 +180,30 @@ def test_the_prediction_is_that_of_propagate(events, monkeypatch):
         assert float(row["median"]) == pytest.approx(from_si(expected.quantile(0.5), row["unit"]), rel=1e-12)
 
 
+def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events):
+    """Histories have the noise of each sample; no response is simulated twice for the two."""
+    from fe_likelihoods.command.events import predict_events, read_events
+    from fe_likelihoods.prediction.quantities import peak
+
+    noise = '[noise]\nkind = "relative"\nwindow = "1 s"\n'
+    text = re.sub(r"(?m)^(sigma_.*|guide = true)\n", "", SETTINGS + EVENTS)
+    (events / "oscillator.toml").write_text(text + noise)
+    job = read_job("oscillator.toml")
+    problem = make_problem(job, SimulationCache(events / "simulations.sqlite", verify=False))
+    samples = problem.posterior.sample_prior(12, 1)
+    found = read_events(job, problem)
+    predicted = predict_events(job, found, problem, samples, False)
+    assert problem.posterior.likelihood.cache.info().simulations == 24
+    for event in found:
+        measured = event.measured is not None
+        options = {"record": event.record, "seed": 1, "progress": False} | event.options
+        for quantity, kind in ((peak("displacement"), "model"), (None, True)):
+            expected = propagate(problem.posterior, samples, quantity=quantity, noise=measured and kind, **options)
+            own = predicted[event.name]["peaks" if quantity else "histories"].quantile(0.5)
+            np.testing.assert_allclose(own[1] if quantity else own, expected.quantile(0.5), rtol=1e-12)
+    assert predicted["weaker"]["peaks"].noise and not predicted["after"]["peaks"].noise
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
