@@ -112,4 +112,7 @@ def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(
     assert found["interval score / RMS, modulated"] == pytest.approx(ideal / rms, rel=0.15)
     assert found["interval score / RMS, SI"] > 5.0 * found["interval score / RMS, relative"]
     assert scored["relative"].within.all() and not scored["SI"].within.any()
+    assert set(scored) == {"SI", "relative", "relative, model", "window", "modulated", "modulated, model", "ratios"}
+    for way in ("relative", "modulated"):  # independent errors add to the largest value
+        assert scored[f"{way}, model"].median[0] < scored[way].median[0]
     assert measured_transfer.within([scored])[0].note.startswith("of 2;")

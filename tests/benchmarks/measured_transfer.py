@@ -10,7 +10,9 @@ made in several ways:
   prior of the share is that of the standard deviation divided by the same constant;
 * "modulated": shares of the level of the simulated response (`ModulatedNoise` with its default settings, and with the
   imposed deformation of a test that has one), calibrated with this noise: another posterior of the structure;
-* "ratios", for numbers such as peaks: the response without noise, times the ratio of measured to fitted value in the
+* "relative, model" and "modulated, model", for numbers such as peaks: with errors that have the spectrum of the response
+  in the place of errors that are independent from sample to sample (``noise="model"``);
+* "ratios", for numbers: the response without noise, times the ratio of measured to fitted value in the
   calibration, with a stated guess of its spread between events (`EventRatios`).
 
 Each row is the mean interval score of the 90 % band as a multiple of the root mean square of the measured channel; the
@@ -203,6 +205,9 @@ def score_case(
             label = f"{case.name}, {channel.name}" if len(channels) > 1 else case.name
             rows.append(Row(f"interval score / RMS, {way}", label, scores.interval_score[k] / scores.rms[k], "", note))
         scored[way] = predicted["numbers"].score(case.measured)
+        if way in ("relative", "modulated"):
+            options |= {"quantity": quantities, "noise": "model"}
+            scored[f"{way}, model"] = propagate(likelihood, samples, **options, **settings).score(case.measured)
     alone = propagate(case.model, fit.structure, quantity=quantities, **settings)
     rng = np.random.default_rng(seed)
     draws = [EventRatios([ratios[name]], **GUESS).draw(len(alone.values), rng) for name in case.numbers]
