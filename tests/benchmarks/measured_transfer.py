@@ -10,8 +10,8 @@ made in several ways:
   prior of the share is that of the standard deviation divided by the same constant;
 * "modulated": shares of the level of the simulated response (`ModulatedNoise` with its default settings, and with the
   imposed deformation of a test that has one), calibrated with this noise: another posterior of the structure;
-* "relative, model" and "modulated, model", for numbers such as peaks: with errors that have the spectrum of the response
-  in the place of errors that are independent from sample to sample (``noise="model"``);
+* "relative, model" and "modulated, model", for numbers such as peaks: with errors that have the spectrum of the
+  response in the place of errors that are independent from sample to sample (``noise="model"``);
 * "ratios", for numbers: the response without noise, times the ratio of measured to fitted value in the
   calibration, with a stated guess of its spread between events (`EventRatios`).
 

@@ -9,8 +9,8 @@ One sample in twelve is kept, with which the residuals of Lehman 415 are nearly 
 count correlated errors as independent ones, and state the differences too large by a factor. The rows of "lag-one
 correlation" say how far this holds for the other columns. White noise, standard deviation integrated out.
 
-The posteriors are bent. A guide needs about a thousand simulations; where its verdict is "not usable", the moves without
-recycling take its place, with about thirteen thousand.
+The posteriors are bent. A guide needs about a thousand simulations; where its verdict is "not usable", the moves
+without recycling take its place, with about thirteen thousand.
 """
 
 from dataclasses import replace
