@@ -234,10 +234,10 @@ print(f"\npropagate warned about {len(warned)} of {NEW} new events, such as:\n{n
 # median parameters of the population, which contains both with all that they have to do with each other. No event is
 # simulated again for the population.
 
-POPULATION = {  # priors of medians and of standard deviations of the logarithms: assumed, wide
+POPULATION = {  # priors of medians and of standard deviations of logarithms and logits: assumed, wide
     "frequency": Varying(LogNormal(5.0, 0.5), HalfNormal(0.3)),
     "damping": Varying(LogNormal(0.1, 1.0), HalfNormal(0.7)),
-    "share": Varying(LogNormal(0.8, 0.3), HalfNormal(0.1)),
+    "share": Varying(Uniform(0.0, 1.0), HalfNormal(1.0), "logit"),  # from 0 to 1, for every new event
 }
 
 
@@ -246,7 +246,10 @@ def population(tests: dict[str, StoredPosterior]) -> Hierarchy:
     names = next(iter(tests.values())).prior.names
     varying = {name: each for name, each in POPULATION.items() if name in names}
     hierarchical = HierarchicalPosterior(tests, varying, max_samples=200)
-    sampler = SMCSampler(max(WALKERS // 2, 60), hierarchical.ndim, hierarchical, vectorize=True, seed=args.seed)
+    moves = {} if fast else {"min_moves": 10, "max_moves": 30}  # they cost no simulation
+    sampler = SMCSampler(
+        max(WALKERS // 2, 60), hierarchical.ndim, hierarchical, vectorize=True, seed=args.seed, **moves
+    )
     sampler.run_mcmc(None, 1, progress=False)
     return Hierarchy(hierarchical, sampler.get_chain(flat=True))
 
