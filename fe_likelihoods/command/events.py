@@ -190,7 +190,8 @@ def _predict_event(
         noises["peaks"] = "model"  # errors that are independent from sample to sample raise the largest value
     found: dict[str, Prediction] = {}
     try:
-        for noise in dict.fromkeys(noises.values()):  # the second kind finds all responses in the cache
+        # The second kind finds all responses in the cache; with `[budget] cache = false` it simulates them again.
+        for noise in dict.fromkeys(noises.values()):
             found |= propagate_quietly(
                 posterior,
                 samples,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..probability.noise_draws import SampleNoise
+from ..simulation.model import split_seconds
 from .model_error import ModelError
 from .streaming import RetainedResults, RunningMoments
 
@@ -50,7 +51,7 @@ class Accumulator:
     failed : list of ndarray
         Indices of samples that are left out.
     reasons : Counter
-        Number of samples left out for each reason.
+        Number of samples left out for each reason, without the durations of the simulations.
     shape : tuple of int or None
         Shape of a result, None as long as it is unknown.
     """
@@ -176,4 +177,4 @@ class Accumulator:
 
     def _leave_out(self, samples: np.ndarray, reason: str) -> None:
         self.failed.append(samples)
-        self.reasons[reason] += len(samples)
+        self.reasons[split_seconds(reason)[0]] += len(samples)

@@ -61,7 +61,7 @@ class Prediction:
     failed : ndarray of int, shape (n_failed,)
         Indices of the samples that are left out, because the simulation failed or the quantity is not finite.
     failure_reasons : dict of str to int
-        Number of samples left out for each reason.
+        Number of samples left out for each reason, without the durations of the simulations.
     channels : tuple of Channel
         Channels of the histories, or the channels whose quantities the values are. Empty for a function of the whole
         response.

@@ -19,7 +19,9 @@ _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
 _OTHER_FAULTS = "other faults of the infrastructure"
 _MIN_SIMULATIONS = 20  # before the share of failures is checked
-_NUMBER = re.compile(r"(?:(?<![\w.])[-+])?(?<![\w.])(?:0x[0-9a-f]+|(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)", re.IGNORECASE)
+# A point without digits after it belongs to the number in arrays, "[1. 2.]", and before an exponent, "2.e-3".
+_DIGITS = r"\d+(?:\.\d+|\.(?=\s*(?:[-+\d\]),]|\.\d)|e[-+]?\d))?|\.\d+"
+_NUMBER = re.compile(rf"(?:(?<![\w.])[-+])?(?<![\w.])(?:0x[0-9a-f]+|(?:{_DIGITS})(?:e[-+]?\d+)?)", re.IGNORECASE)
 
 
 def reason_without_numbers(reason: str) -> str:

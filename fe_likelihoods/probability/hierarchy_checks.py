@@ -28,6 +28,7 @@ _LARGEST_OUTSIDE_SUM = 0.06  # sum over the tests, without bounds at zero, which
 _OUTER = 0.02  # probability of the prior next to a bound
 _PILED = 0.09  # probability of the posterior of a test there, above which one bound alone is an alarm
 _NEAR = 2.0  # standard deviations from the mean to a bound that is reached; 1.95 if 5 % of a normal density are cut off
+_ROUND_OFF = 1e-9  # of the width of a prior, by which equal bounds may differ
 _NORMAL = 0.5  # largest skewness and excess kurtosis of a prior that a normal density describes
 
 
@@ -290,7 +291,10 @@ def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[
     permitted = [posterior.prior.bounds[first:], *(_common_bounds(posterior, other) for other in others)]
     low, high = np.max(permitted, axis=0)[:, 0], np.min(permitted, axis=0)[:, 1]
     own = _common_bounds(posterior, name)
-    left_out = np.stack([own[:, 0] > low, own[:, 1] < high], axis=1)
+    widths = np.diff(own)
+    # of the width, and of the bound itself where the other one is infinite
+    round_off = _ROUND_OFF * np.where(np.isfinite(widths), widths, np.where(np.isfinite(own), np.abs(own), 0.0))
+    left_out = np.stack([own[:, 0] - round_off[:, 0] > low, own[:, 1] + round_off[:, 1] < high], axis=1)
     return {
         common: bounds[is_within].tolist()
         for common, bounds, is_within in zip(posterior.common, own, left_out, strict=True)

@@ -268,7 +268,8 @@ class ModulatedNoise:
         """What to say of channels whose share is that of the mean square of a part of the motion, or of an event.
 
         Empty for a noise without measurements, for ``local=1``, and if at most 5 % of the samples are missing within
-        the measured motion. The events are those of `excited`, which must be those of the measurements.
+        the measured motion. An event without any sample of a channel is no gap of it, since each event has a mean
+        square of its own. The events are those of `excited`, which must be those of the measurements.
         """
         if self.layout is None or self.local == 1.0:
             return ""
@@ -277,7 +278,9 @@ class ModulatedNoise:
             known = np.flatnonzero(row)
             inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # whole parts
             if events:  # odd numbers; nothing needs to be measured in the pauses
-                inside = inside[np.array(events)[np.minimum(inside, len(events) - 1)] % 2 == 1]
+                numbers = np.array(events)[np.minimum(np.arange(len(row)), len(events) - 1)]
+                measured = np.unique(numbers[row > 0])  # each event has its own mean square
+                inside = inside[(numbers[inside] % 2 == 1) & np.isin(numbers[inside], measured)]
             expected = self.window / _PARTS / step * inside.size
             share = 1.0 - row[inside].sum() / expected if inside.size else 0.0
             named += [f"{channel.name!r} ({share:.0%})"] if share > _LARGEST_GAP else []

@@ -95,6 +95,8 @@ class Noise(Protocol):
     * ``with_channels(channels, weights)`` with the weights (n_others, n_channels) of its channels in each of others,
       which returns the noise of these for predictions, and the weights (n_others_noise, n_noise) of its parameters in
       theirs; for predictions of channels that were not measured.
+    * ``remark_on_gaps()``, which returns a sentence on gaps in the measurements that make predictions doubtful, empty
+      if there are none. A likelihood warns with it, and predictions with noise have it among their remarks.
     """
 
     @property

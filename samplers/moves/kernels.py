@@ -131,9 +131,9 @@ class _FittedMove(MHMove):
     Where it was not calibrated (in a plain EnsembleSampler, or in a run that goes on from a chain without its journal),
     two copies are fitted to one half of the walkers each, and move the other half. A proposal that was fitted to the
     points that it moves would make their tails too light for many sweeps; this one is independent of them. The halves
-    and both fits stay as they are: the copies of one point are in one half, and each half has half of the distinct
-    points. A half needs ndim + 1 of them or more that span all dimensions (ValueError); with fewer than 5 (ndim + 1)
-    there is a warning, since the proposals may be too narrow.
+    and both fits stay as they are until the number of walkers changes: the copies of one point are in one half, and
+    each half has half of the distinct points. A half needs ndim + 1 of them or more that span all dimensions
+    (ValueError); with fewer than 5 (ndim + 1) there is a warning, since the proposals may be too narrow.
     """
 
     def __init__(self):
@@ -167,7 +167,7 @@ class _FittedMove(MHMove):
         accepted : ndarray of bool, shape (nwalkers,)
             Which proposals were accepted.
         """
-        if not self._is_fitted and not self._halves:
+        if not self._is_fitted and (not self._halves or len(state.coords) != len(self._in_first)):
             halves, in_first = (copy.deepcopy(self), copy.deepcopy(self)), _first_half(state.coords)
             for half, others in zip(halves, (state.coords[~in_first], state.coords[in_first]), strict=True):
                 _check_half(others)

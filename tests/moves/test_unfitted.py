@@ -64,6 +64,17 @@ def test_both_halves_are_tuned(make, rng):
     assert np.allclose(later, first * np.exp(-10 * move.target))
 
 
+@pytest.mark.parametrize("make", [MixtureMove, StudentTMove, RandomWalkMove, lambda: FastWalk([1])])
+def test_another_number_of_walkers_is_fitted_anew(make, rng):
+    """Proposals have the place and the width of the new walkers."""
+    move = make()
+    proposals_of(move, rng.standard_normal((60, 3)), 1)
+    for n in (80, N):
+        coords = 100.0 + 1e-3 * rng.standard_normal((n, 3))
+        proposed = proposals_of(move, coords, 6)
+        assert proposed.shape == (6, n, 3) and np.abs(proposed - coords).max() < 0.1
+
+
 @pytest.mark.parametrize("make", [RandomWalkMove, StudentTMove])
 def test_walkers_that_start_in_one_place_leave_it(make, rng):
     """Walkers that are copies had been one half: the proposals to the others then had no width."""

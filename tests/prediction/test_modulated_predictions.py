@@ -51,6 +51,22 @@ def test_pauses_of_the_calibration_are_no_gap_of_another_record():
     assert found.remarks == ()
 
 
+@pytest.mark.parametrize(("missing", "n_told"), [(slice(None), 0), (slice(200, 300), 1)], ids=["whole", "gap"])
+@pytest.mark.parametrize("event", [0, 1, 2])
+def test_an_event_without_a_channel_is_no_gap(event, missing, n_told):
+    """Each event has its own mean square; samples that are missing within one are still told."""
+    events = Events([quake(1), quake(2), quake(3)], rest=10.0)
+    model = LinearOscillator(events)
+    values = model.simulate([1.0, 1.0])
+    there = events.windows[event].samples
+    values[0, np.arange(values.shape[1])[there][missing]] = np.nan
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model))
+    told = gaps_of(caught)
+    assert len(told) == n_told and all(repr(model.channels[0].name) in each for each in told)
+
+
 @pytest.mark.parametrize("of_events", [False, True])
 def test_a_gap_of_the_calibration_is_warned_of_once_and_a_remark_of_every_prediction(of_events):
     likelihood, (told,) = with_gap()

@@ -324,6 +324,17 @@ def test_failures_are_counted_and_left_out(rng, caplog):
     assert np.array_equal(quiet(with_noise(Line(fails=True)), noisy, noise=True).failed, p.failed)
 
 
+def test_failures_that_differ_in_their_duration_only_have_one_reason():
+    class Slow(Line):
+        def simulate(self, theta):
+            if theta[0] < 0.9:
+                raise SimulationFailed(f"the offset is too small after {theta[0]:.3g} s")
+            return super().simulate(theta)
+
+    samples = np.column_stack([np.linspace(0.5, 1.5, 11), np.zeros(11)])
+    assert quiet(Slow(), samples).failure_reasons == {"the offset is too small": 4}
+
+
 def test_all_failed():
     with pytest.raises(SimulationFailed, match="all 3 samples failed .3: the offset is far too small"):
         quiet(Line(fails=True), np.zeros((3, 2)))

@@ -248,6 +248,11 @@ def test_bounds_that_other_priors_have_too_are_no_reason_for_a_new_run():
     assert module.ends_within(narrow, "C", others=["C"]) == {}
 
 
+@pytest.mark.parametrize(("inwards", "found"), [(4e-15, {}), (1e-9, {}), (1e-7, {"c": [-5.0 + 1e-7, 5.0 - 1e-7]})])
+def test_bounds_that_differ_by_round_off_leave_nothing_out(inwards, found):
+    assert module.ends_within(with_common(-5.0 + inwards, 5.0 - inwards), "C") == found
+
+
 @pytest.mark.parametrize(("bounds", "is_told"), [((1.0, 5.0), True), ((-5.0, 5.0), False), ((-3.0, 4.0), False)])
 def test_a_prior_that_ends_within_the_population_of_a_common_parameter_is_told(bounds, is_told):
     posterior = with_common(*bounds)

@@ -375,6 +375,9 @@ def test_records_of_failures_are_bounded():
         ("[1. .5 -2]: 3 s after 0x7fA1", "[# # #]: # s after #"),
         ("Steel02 of section_3 in model.04: step-7", "Steel02 of section_3 in model.04: step-#"),
         ("no reason given", "no reason given"),
+        ("failed at step 31. Reduce dt, 2 is", "failed at step #. Reduce dt, # is"),
+        ("failed at step 31.", "failed at step #."),
+        ("see /tmp/ab12/3.log: 2.e-3, 1.5", "see /tmp/ab12/#.log: #, #"),
     ],
 )
 def test_reasons_without_their_numbers(reason, text):
