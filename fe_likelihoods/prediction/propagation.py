@@ -133,9 +133,10 @@ def propagate(
         mean and variance are exact in the noise (the law of total variance adds the mean variance of the noise), and
         quantiles use one draw of the noise per sample. For other quantities, one draw per sample is added to the
         response. "model" predicts the response of the structure with the error of the model and without the noise of
-        the sensors, for a noise that follows the response (`RelativeNoise`); the errors have the spectrum of the
-        response, because white errors make peaks too large. A noise with levels per event (`EventNoise`) has those of
-        each event in that event; under another `record`, give the name of the event whose levels hold for it.
+        the sensors, for a noise that follows the response (`RelativeNoise`, `ModulatedNoise`, `BandNoise`); the errors
+        have the spectrum of the response, or that of the bands, because white errors make peaks too large. A noise with
+        levels per event (`EventNoise`) has those of each event in that event; under another `record`, give the name of
+        the event whose levels hold for it.
     quantiles : sequence of float
         Probabilities of the quantiles, between 0 and 1. An empty sequence for none.
     effective_sample_size : float, optional
@@ -165,10 +166,10 @@ def propagate(
         Measurements of the events with which the parameters were calibrated, whose amplitudes a prediction under
         another record is compared with. Default: those of the likelihood. An empty sequence for no comparison.
     check : bool
-        Whether the residuals of the calibration are compared with the noise, once for each likelihood, where samples
-        of all parameters are given; `Prediction.remarks` has what was found, also of later predictions. Under another
+        Whether the residuals of the calibration are compared with the noise, where samples of all parameters are
+        given. A warning says it once for each likelihood, `Prediction.remarks` with every prediction. Under another
         record this needs one simulation of that of the calibration, which the likelihood counts, or none if it has
-        stored responses.
+        stored responses or earlier samples of this likelihood were compared: then what these have shown is repeated.
     seed : int, optional
         Seed of the noise and of the subsample for quantiles. The result depends neither on `batch` nor on `pool`,
         except for round-off.
@@ -205,7 +206,8 @@ def propagate(
         Once for each likelihood, if its residuals are correlated and `GaussianNoise`, `SharedGaussianNoise`,
         `RelativeNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent, or the whitened
         residuals of `ModulatedNoise` or `BandNoise` are correlated; and if less than 0.75 times the simulated response
-        fits the measurements better, under a noise whose likelihood has shares of this response (the same two).
+        fits the measurements better by more than a tenth of the RRMSE, under a noise whose likelihood has shares of
+        this response (`ModulatedNoise`, `BandNoise`).
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
@@ -274,7 +276,8 @@ def propagate(
                 accumulator.add(start, responses, reasons)
             if checked is not None and not other and 0 <= (row := row_of_sample[checked] - start) < len(responses):
                 own_response = None if reasons[row] else responses[row].copy()
-            peaks.add(responses, reasons, accumulator.members[start : start + batch])
+            if other or noise is True:
+                peaks.add(responses, reasons, accumulator.members[start : start + batch])
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
     predictions = {

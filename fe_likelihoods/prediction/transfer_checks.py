@@ -53,6 +53,7 @@ _WEAK = 0.2  # lag-one correlation that hardly changes intervals, as in `residua
 _LARGEST_COUNT_RATIO = 2.0  # of independent samples: assumed by the noise, and found
 _LARGEST_ADDED_PEAK = 1.1  # median of the peaks with white errors, as a multiple of that of the response
 _TOO_LARGE = 0.75  # multiple of the response that fits best, below which the response is too large
+_WORSE = 1.1  # ratio of the RRMSE of the response to that of its best multiple, beyond which this is said
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
 # what the residuals of likelihoods say, and the likelihoods of which a warning has said it
@@ -149,10 +150,7 @@ def remark_on_level(predictions: Iterable[Prediction], peaks: Peaks, source: Pre
     else:
         names = list(dict.fromkeys(name for each in _of_channels(predictions) for name in each.channel_names))
         levels = _of_names(peaks, source.model.channels, names)
-        try:
-            measured = [float(measured_quantity(peak(name), measurements)) for name in names]
-        except ValueError:  # samples are missing, so that the level of the calibration is not known
-            return ""
+        measured = [_measured_peak(name, measurements) for name in names]
     for name, level, reference in zip(names, levels, measured, strict=True):
         ratio = abs(level / reference) if reference else 1.0
         if not 1.0 / _LARGEST_LEVEL_RATIO <= ratio <= _LARGEST_LEVEL_RATIO:
@@ -175,6 +173,8 @@ def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, sourc
         return ""
     added = {}
     for each in predictions:
+        if each.values is None:  # several numbers of all samples did not fit into memory
+            continue
         wanted = [one for one in _of_channels([each]) if one.name == "peak" and one.part == slice(None)]
         for one in wanted:
             place = 0 if isinstance(each.quantity, ChannelQuantity) else list(each.quantity).index(one)
@@ -186,9 +186,18 @@ def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, sourc
         return ""
     return (
         f"the predicted peaks with noise=True are larger than those of the response: {', '.join(added.values())}. The "
-        "noise is drawn independently at each sample, and the largest of many draws adds to the peak, while errors of "
-        'a model change as slowly as the response. Predict peaks with noise="model" (docs/predictions.rst)'
+        "noise is drawn independently at each sample, and the largest of many draws adds to the peak: those of the "
+        "noise of the sensors are in measured peaks too, while errors of a model change as slowly as the response. "
+        'Predict peaks of the structure with noise="model" (docs/predictions.rst)'
     )
+
+
+def _measured_peak(name: str, measurements: Measurements) -> float:
+    """Peak of a measured channel [SI]; zero if it was not measured or samples are missing, so that it is not known."""
+    try:
+        return float(measured_quantity(peak(name), measurements))
+    except ValueError:
+        return 0.0
 
 
 def _of_channels(predictions: Iterable[Prediction]) -> list[ChannelQuantity]:
@@ -225,8 +234,8 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
 def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> tuple[str, ...]:
     """What to say if the residuals of a likelihood contradict the noise with which it was sampled.
 
-    Samples that do not fit, such as draws of the prior, are not judged. What the first judged samples of a likelihood
-    have shown is kept for all later ones, so that equal predictions have equal remarks without another simulation.
+    Samples that do not fit, such as draws of the prior, are not judged. What the last judged samples of a likelihood
+    have shown is kept for predictions under other excitations, which then need no simulation for it.
 
     Parameters
     ----------
@@ -263,11 +272,10 @@ def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response
     found = np.sqrt(np.nanmean(np.square(checked), axis=1))
     if (np.maximum(found / stated, stated / found) > _OTHER_LEVEL).any():
         return ()
-    if likelihood not in _FOUND:
-        remarks = _contradiction(noise, source.model.channels, checked, parameters)
-        _FOUND[likelihood] = tuple(
-            each for each in (_too_large(noise, source.model.channels, residuals, simulated), remarks) if each
-        )
+    remarks = _contradiction(noise, source.model.channels, checked, parameters)
+    _FOUND[likelihood] = tuple(
+        each for each in (_too_large(noise, source.model.channels, residuals, simulated), remarks) if each
+    )
     return _FOUND[likelihood]
 
 
@@ -292,8 +300,10 @@ def _too_large(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, s
         residual, response = residual[there], response[there]
         power, measured = response @ response, response + residual
         factor = max(measured @ response / power, 0.0) if power > 0.0 else 1.0
-        if factor < _TOO_LARGE:
-            errors = [np.sqrt(np.sum((measured - f * response) ** 2) / (measured @ measured)) for f in (1.0, factor)]
+        if factor >= _TOO_LARGE:
+            continue
+        errors = [np.sqrt(np.sum((measured - f * response) ** 2) / (measured @ measured)) for f in (1.0, factor)]
+        if errors[0] > _WORSE * errors[1]:  # not so where the response is below the noise of the sensor
             far.append(
                 f"{channel.name} (RRMSE {errors[0]:.2f}; {errors[1]:.2f} if the response is multiplied by {factor:.2f})"
             )

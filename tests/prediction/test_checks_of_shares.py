@@ -10,6 +10,7 @@ from scipy.signal import butter, lfilter
 
 from fe_likelihoods import (
     BandNoise,
+    Channel,
     FELikelihood,
     FunctionModel,
     GaussianNoise,
@@ -232,3 +233,65 @@ def test_noise_in_si_units_is_compared_with_the_peak_of_the_response_without_it(
     assert f"top ({expected:.2g} times)" in text and expected < 0.2
     predicted = propagate(posterior, samples, record=record, progress=False, **options)
     assert np.median(predicted.values) > 0.5 * largest, "the predicted peak is that of the noise"
+
+
+def test_a_response_below_the_noise_of_its_sensor_is_not_said_to_be_too_large():
+    """The best multiple of such a response is anything by chance, but fits hardly better."""
+    channels = (Channel("weak", "displacement", "mm"), TOP)
+    times = DT * np.arange(STEPS)
+    waves = np.sqrt(2.0) * np.array([0.003 * np.sin(6.0 * times), np.sin(7.0 * times)])
+    noise = ModulatedNoise(channels, window=1.0, sensor=[0.1, 0.05])
+    small = 0
+    for seed in range(20):
+        rng = np.random.default_rng([5, seed])
+        deviations = noise.response_deviations(np.array([0.3, 0.3]), waves, dt=DT)
+        values = waves + deviations * rng.standard_normal(waves.shape)
+        model = FunctionModel(lambda theta: theta[0] * waves, ["gain"], channels, DT, STEPS)
+        likelihood = FELikelihood(model, Measurements(channels, DT, values), noise)
+        assert said(propagate, likelihood, np.tile([1.0, 0.3, 0.3], (3, 1))) == []
+        small += values[0] @ waves[0] < 0.75 * waves[0] @ waves[0]
+    assert small >= 4, "the best multiple alone would be an alarm"
+
+
+def test_every_judged_sample_is_said_whatever_was_judged_before(rng):
+    noise = ModulatedNoise([TOP], window=0.5, sensor={"top": SENSOR}, local=1.0)
+    posterior, _ = of_gain(rng, noise, correlated(rng, 0.0), lambda *_: [0.3])
+    right, large = np.tile([1.0, 0.3], (3, 1)), np.tile([2.0, 0.52], (3, 1))
+    assert not [text for text in said(propagate, posterior, right) if "too large" in text]
+    assert [text for text in said(propagate, posterior, large) if "too large" in text]
+    for samples, expected in ((right, False), (large, True)):
+        remarks = propagate(posterior, samples, progress=False).remarks
+        assert any("too large" in text for text in remarks) == expected
+
+
+def test_peaks_that_do_not_fit_into_memory_are_predicted_without_the_remark(rng):
+    channels = (TOP, Channel("low", "displacement", "mm"))
+    waves = Filter(excitation(rng)).unit * np.array([[1.0], [0.5]])
+    model = FunctionModel(lambda theta: theta[0] * waves, ["gain"], channels, DT, N)
+    measured = Measurements(channels, DT, waves)
+    likelihood = FELikelihood(model, measured, RelativeNoise.of(measured))
+    samples = np.array([1.0, 0.5, 0.5]) * np.exp(0.01 * rng.standard_normal((50, 3)))
+    options = {"quantity": [peak("top"), peak("low")], "noise": True, "seed": 1, "progress": False, "check": False}
+    predicted = propagate(likelihood, samples, memory_bytes=400, **options)
+    assert predicted.values is None and predicted.remarks == ()
+    with pytest.warns(UserWarning, match="peaks with noise=True"):
+        whole = propagate(likelihood, samples, **options)
+    np.testing.assert_allclose(predicted.mean, whole.mean)
+
+
+def test_an_unmeasured_channel_or_a_gap_does_not_silence_the_level_of_the_others(rng):
+    channels = (TOP, Channel("low", "displacement", "mm"))
+    waves = Filter(excitation(rng)).unit * np.array([[1.0], [0.5]])
+    values = waves.copy()
+    values[1, 10:20] = np.nan
+    model = FunctionModel(lambda theta: theta[0] * waves, ["gain"], channels, DT, N)
+    others = (*channels, Channel("roof", "displacement", "mm"))
+    factors = 10.0 * np.vstack([waves, waves[:1]])
+    stronger = FunctionModel(lambda theta: theta[0] * factors, ["gain"], others, DT, N)
+    likelihood = FELikelihood(model, Measurements(channels, DT, values))
+    samples = np.tile([1.0, 0.001, 0.001], (3, 1))
+    options = {"model": stronger, "noise": True, "seed": 1, "calibrated": (), "check": False}
+    for other in ("low", "roof"):
+        found = said(propagate, likelihood, samples, quantity=[peak("top"), peak(other)], **options)
+        (text,) = [each for each in found if "another level" in each]
+        assert "top (10 times)" in text and f"{other} (" not in text
