@@ -297,7 +297,9 @@ def propagate(
         names = (*calibration.model.parameter_names, *calibration.noise.parameter_names)
         of_calibration = remarks_on_calibration(calibration, as_points(complete, names)[checked], own_response)
     of_gaps = remark_on_gaps(source.likelihood.noise) if noise and source.likelihood is not None else ""
-    known_already = (of_gaps, *(of_calibration if of_calibration and not is_first_warning(source.likelihood) else ()))
+    known_already = [of_gaps]  # the likelihood has warned of gaps, and an earlier prediction of the residuals
+    if of_calibration and not is_first_warning(source.likelihood):
+        known_already += of_calibration
     remarks = tuple(remark for remark in (*remarks, *of_calibration, of_gaps) if remark)
     for remark in remarks:
         if remark not in known_already:

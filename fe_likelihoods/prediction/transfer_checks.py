@@ -272,10 +272,12 @@ def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response
     found = np.sqrt(np.nanmean(np.square(checked), axis=1))
     if (np.maximum(found / stated, stated / found) > _OTHER_LEVEL).any():
         return ()
-    remarks = _contradiction(noise, source.model.channels, checked, parameters)
-    _FOUND[likelihood] = tuple(
-        each for each in (_too_large(noise, source.model.channels, residuals, simulated), remarks) if each
+    channels = source.model.channels
+    remarks = (
+        _too_large(noise, channels, residuals, simulated),
+        _contradiction(noise, channels, checked, parameters),
     )
+    _FOUND[likelihood] = tuple(filter(None, remarks))
     return _FOUND[likelihood]
 
 
