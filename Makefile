@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 NEWER_PYTHON ?= python3.13
 READY := $(VENV)/.ready
 
-.PHONY: help update test test-newer test-slow clients tutorials bench docs figures lint format data clean
+.PHONY: help update size test test-newer test-slow clients tutorials bench docs figures lint format data clean
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/'
@@ -40,6 +40,9 @@ tutorials: $(READY) ## run every tutorial that needs no other data than the bund
 
 bench: $(READY)  ## measure speed against OpenSees, scipy and other samplers; prints one table
 	$(BIN)/python -m tests.benchmarks
+
+size: $(READY)   ## print the size of the project: lines, names, settings, frames, prose
+	$(BIN)/python -m tests.size
 
 docs: $(READY)   ## build the documentation into docs/_build/html; warnings are errors
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

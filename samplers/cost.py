@@ -1,113 +1,107 @@
-"""What a run will take, from a few timed evaluations before it.
+r"""Estimate of the evaluations and the wall time of a run, from a few timed evaluations.
 
-The number of evaluations comes from `samplers.tempering.expected_cost`, with the spread of the log-likelihood at the
-timed draws of the prior, which says where the tempering begins. The wall time follows from it by list scheduling:
-evaluations are started in order, each on the first worker that is free. Their durations are log-normal, with the mean
-and the spread of the timed ones. A synchronous run waits for the end of every batch.
+The number of evaluations is a range from a model of the tempering stages. From a stage to the next, beta grows by a
+factor g. A Gaussian posterior in d dimensions keeps a share :math:`(\sqrt{2 g - 1} / g)^d` of the effective sample
+size. Annealing by moves keeps a stated share of the walkers, which gives g. The growth of recycling was measured on
+Gaussian posteriors: :math:`\ln g = \min(1.7, 2.9 d^{-0.55})`. The number of stages is the logarithm of one over the
+first beta divided by the logarithm of g; the first beta is inversely proportional to the spread of the log-likelihood
+over the prior. The constants are means over ``python -m tests.benchmarks expected``.
+
+The wall time is the number of evaluations times their mean duration, divided by the number of workers.
 """
 
-import heapq
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .reporting.progress import as_duration
+from .settings import Settings, as_whole_number
 from .smc import SMCSampler
 from .tempered import TemperedSampler
-from .tempering.expected_cost import Expected, expected_left, first_beta
-from .tempering.settings import Settings, as_whole_number
-from .timing import Draws, time_evaluations
+from .tempering.recycling import DRAWS_PER_TARGET, POINTS_PER_DIMENSION, SEARCH_DRAWS, TARGET_SHARE
 
-__all__ = ["CostEstimate", "estimate_cost"]
+__all__ = ["CostEstimate", "Expected", "as_duration", "estimate_cost", "expected_evaluations", "first_beta"]
 
-REPETITIONS = 5  # of a scheduled batch
-SIMULATIONS_OF_A_GUIDE = 500
+# Recycling: draws per stage, and evaluations at beta = 1 per walker, which include repeated checks and final moves.
+DRAWS_PER_STAGE = DRAWS_PER_TARGET * 1.15
+AT_THE_END = (0.6, 1.8, 8.0)
+# Annealing by moves: sweeps per stage with 100 walkers per dimension, and the increase with fewer walkers.
+SWEEPS_AT_100 = 3.0
+MORE_SWEEPS = 2.2
+
+
+class Expected(NamedTuple):
+    """A range and a likely value, of numbers of evaluations or of times [s]."""
+
+    low: float
+    likely: float
+    high: float
 
 
 class CostEstimate(NamedTuple):
-    """What a run will take, until beta = 1 is reached.
+    """Expected cost of a run until beta = 1 is reached. ``str`` gives a small table.
 
     Attributes
     ----------
-    sampler : str
-        Name of the sampler.
-    nwalkers, ndim, workers : int
-        Numbers of walkers, of parameters, and of evaluations that run at once.
+    title : str
+        Sampler, number of walkers and number of parameters.
+    workers : int
+        Number of simultaneous evaluations.
     seconds : (runs,) float
         Durations of the timed evaluations [s].
-    evaluated : int
-        Number of all evaluations that were made: those that started the workers, the timed ones, and cached ones.
-    failures : int
-        How many of these returned -inf.
+    evaluated, failures, cached : int
+        Evaluations made for the estimate, evaluations that returned -inf, and evaluations that needed no simulation (0
+        for a posterior whose ``report()`` has no number of simulations).
     evaluations : Expected
-        Evaluations of the posterior: the low and the high end of a range, and a number between. Sweeps over fast
-        parameters, which need no simulation, do not count. Steps at beta = 1 come on top, with `nwalkers` each.
-    synchronous : Expected
-        Wall time [s] where every batch is waited for.
-    asynchronous : Expected or None
-        Wall time [s] with ``asynchronous=True``, at most the synchronous one; None without recycling.
-    guide : str
-        Duration of a run of 500 simulations with ``guide=posterior.guide()``; how many it needs is known only after its
-        search. Empty for a posterior without a guide.
-    cached : int
-        How many of the evaluations needed no new simulation. They are not timed, unless all are cached. 0 for a
-        posterior whose ``report()`` has no number of simulations.
+        Evaluations of the posterior, without sweeps over fast parameters, which need no simulation. Each step at
+        beta = 1 needs one more per walker.
+    wall_time : Expected
+        Wall time [s] with all workers busy. Without ``asynchronous=True``, a run also waits for the longest evaluation
+        of every batch.
     """
 
-    sampler: str
-    nwalkers: int
-    ndim: int
+    title: str
     workers: int
     seconds: np.ndarray
     evaluated: int
     failures: int
+    cached: int
     evaluations: Expected
-    synchronous: Expected
-    asynchronous: Expected | None
-    guide: str
-    cached: int = 0
+    wall_time: Expected
 
-    @property
-    def any_simulated(self) -> bool:
-        """Whether the durations are those of simulations, and not of points whose simulations are cached."""
-        return self.evaluated > self.cached
+    def time_of(self, evaluations: int) -> str:
+        """Wall time of a number of evaluations, as text."""
+        seconds = evaluations * float(self.seconds.mean()) / self.workers
+        return as_duration(seconds, seconds)
 
     def __repr__(self) -> str:
         return str(self)
 
     def __str__(self) -> str:
-        first, last = self.seconds.min(), self.seconds.max()
-        cached = f"{self.cached} cached, " if self.cached else ""
-        rows = [
-            (f"{self.sampler}, {self.nwalkers} walkers, {self.ndim} parameters", ""),
-            (
-                f"one evaluation ({self.evaluated} made, {cached}{len(self.seconds)} timed)",
-                f"mean {self.seconds.mean():.3g} s, {first:.3g} to {last:.3g} s",
+        low, high = (int(float(f"{n:.2g}")) for n in (self.evaluations.low, self.evaluations.high))
+        seconds = f"mean {self.seconds.mean():.3g} s, {self.seconds.min():.3g} to {self.seconds.max():.3g} s"
+        rows = {
+            self.title: "",
+            f"one evaluation ({self.evaluated} made, {len(self.seconds)} timed)": seconds,
+            "evaluations": f"about {low} to {high}",
+            f"wall time, {self.workers} worker{'s' if self.workers > 1 else ''}": as_duration(
+                self.wall_time.low, self.wall_time.high
             ),
-            ("evaluations", f"about {_rounded(self.evaluations.low)} to {_rounded(self.evaluations.high)}"),
-            (f"wall time, {self.workers} worker{'s' if self.workers > 1 else ''}", _range(self.synchronous)),
-        ]
-        without = "only with recycling (SMCSampler, recycle=True)"
-        rows.append(
-            ("the same, asynchronous=True", without if self.asynchronous is None else _range(self.asynchronous))
-        )
-        if self.guide:
-            rows.append(("with guide=posterior.guide()", self.guide))
-        if self.failures:
-            rows.append(("failed evaluations", f"{self.failures}"))
-        if not self.any_simulated:
-            rows.append(("note", "no point needed a simulation: the times are those of cached points"))
-        width = max(len(name) for name, _ in rows)
-        return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
+        }
+        rows |= {"failed evaluations": str(self.failures)} if self.failures else {}
+        rows |= {"note": f"{self.cached} points were cached, and the times contain theirs"} if self.cached else {}
+        width = max(map(len, rows))
+        return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows.items())
 
 
-def _rounded(number: float) -> int:
-    return int(float(f"{number:.2g}"))
-
-
-def _range(seconds: Expected) -> str:
-    return as_duration(seconds.low, seconds.high)
+def as_duration(low: float, high: float) -> str:
+    """Two durations [s] as text, in a unit that suits the larger one: "about 2.1 to 3.4 h"."""
+    size, unit = next(
+        ((s, u) for s, u in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")) if high >= 2.0 * s), (1.0, "s")
+    )
+    first, last = (f"{value / size:.2g}" if value < 99.5 * size else f"{value / size:.0f}" for value in (low, high))
+    return f"about {first} {unit}" if first == last else f"about {first} to {last} {unit}"
 
 
 def estimate_cost(
@@ -117,21 +111,14 @@ def estimate_cost(
     workers: int | None = None,
     runs: int = 3,
     seed: int | None = None,
-    recycle: bool | None = None,
+    **settings: Any,
 ) -> CostEstimate:
-    """Time a few evaluations, and estimate what a run will take; all settings but `recycle` are the defaults.
+    """Time a few evaluations, and estimate the cost of a run.
 
-    First, the workers are started: one point for each of them, at most 8, is evaluated at the same time and not timed,
-    because this may contain the wait in a job queue, the start of processes, or a compilation. This is repeated where
-    more workers are there afterwards, and with one point for every worker, however many, where no point took more than
-    a minute. Then `runs` points are timed.
-
-    All points are draws of the prior. With the same `seed`, a sampler starts from these points, so that a
-    posterior that caches its simulations does not repeat them. Points whose simulations are cached already, as after an
-    earlier estimate with the same seed, are passed over, and further draws take their place. The estimate of the
-    evaluations is a range, which held in 67 to 88 % of runs on posteriors that it was not made from
-    (``python -m tests.benchmarks expected``). A posterior with heavy tails needs more. Evaluations that take longer
-    near the posterior than over the prior are not foreseen.
+    First, one point per worker is evaluated without timing, because the first evaluations may include a job queue, the
+    start of processes, or a compilation. Then `runs` points are timed. All points are draws of the prior. A sampler
+    with the same `seed` starts from them, so a posterior with a cache does not repeat them. The range is too low for
+    many posteriors with heavy tails (``docs/accuracy``), and for models that take longer near the posterior.
 
     Parameters
     ----------
@@ -143,20 +130,13 @@ def estimate_cost(
     sampler : type
         `SMCSampler` or `TMCMCSampler`.
     workers : int, optional
-        Number of evaluations that run at once in the run to be estimated. By default that of the pool of the posterior
-        after its start, or 1 if it has none or does not say.
+        Number of simultaneous evaluations in the run. Default: the workers of the posterior's pool, or 1.
     runs : int
-        Number of timed evaluations, at least 2. They are made one after the other; or at the same time, where each
-        point that started the workers took more than a minute, and as many workers were started.
+        Number of timed evaluations, at least 2. They are made in groups of the size of the posterior's pool.
     seed : int, optional
-        Seed of the run to be estimated. By default the draws differ from call to call.
-    recycle : bool, optional
-        As for the sampler: `SMCSampler` recycles by default with 250 walkers or more.
-
-    Returns
-    -------
-    CostEstimate
-        Printed as a small table.
+        Seed of the run. By default the draws differ from call to call.
+    **settings
+        Settings of the sampler, such as ``recycle=False``.
 
     Raises
     ------
@@ -172,96 +152,78 @@ def estimate_cost(
         raise ValueError(f"runs must be at least 2, since one duration has no spread; got {runs}")
     if workers is not None and as_whole_number("workers", workers) < 1:
         raise ValueError(f"workers must be at least 1; got {workers}")
-    for name in ("ndim", "log_prior", "sample_prior"):
-        if not hasattr(posterior, name):
-            raise ValueError(f"estimate_cost needs a posterior with {name}; got {type(posterior).__name__} without it")
+    if missing := [name for name in ("ndim", "log_prior", "sample_prior") if not hasattr(posterior, name)]:
+        raise ValueError(f"estimate_cost needs a posterior with {', '.join(missing)}; got {type(posterior).__name__}")
     ndim = as_whole_number("ndim", posterior.ndim)
-    # also checks the arguments
-    settings = sampler(nwalkers, ndim, posterior, vectorize=True, seed=0, recycle=recycle).settings
+    chosen = sampler(nwalkers, ndim, posterior, vectorize=True, seed=0, **settings).settings  # checks the arguments
     random = np.random.RandomState(seed)
-    n = max(nwalkers, runs + 1)
-    draws = np.asarray(posterior.sample_prior(n, random), dtype=float)  # as those of the sampler
-    made = time_evaluations(posterior, Draws(draws, lambda: posterior.sample_prior(n, random)), runs)
-    log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in made.points])
-    finite = np.isfinite(made.values)
+    draws = np.asarray(posterior.sample_prior(max(nwalkers, runs + 1), random), dtype=float)  # as the sampler's draws
+    report = getattr(posterior, "report", dict)
+    before = report().get("simulations")
+    queue = posterior.evaluation_queue() if callable(getattr(posterior, "evaluation_queue", None)) else None
+    try:
+        at_once = (queue.workers if queue is not None else None) or 1
+        untimed = max(min(at_once, len(draws) - runs), 1)
+        draws = draws[: untimed + runs]
+        batches = np.split(draws, range(untimed, len(draws), at_once))
+        found = [each for batch in batches for each in _evaluate(posterior, batch, queue)]
+        workers = int(workers or (queue.workers if queue is not None else None) or 1)
+    finally:
+        if queue is not None:
+            queue.close()
+    values, seconds = np.array(found).T
+    seconds, finite = seconds[untimed:], np.isfinite(values)
     if finite.sum() < 2:
         raise ValueError(
             f"{len(finite) - finite.sum()} of {len(finite)} draws of the prior have a log-probability of -inf, and the "
             "estimate needs two finite ones: check the model at these points, or time more with runs="
         )
-    recycling = bool(settings.recycle)
-    beta = first_beta(made.values[finite] - log_prior[finite], recycling)
-    left = expected_left(settings, nwalkers, ndim, recycling, beta)
-    evaluations = Expected(*(nwalkers + value for value in left))
-    workers, seconds = int(workers or made.workers or 1), made.seconds
-    times = _wall_times(settings, evaluations, nwalkers, ndim, seconds, workers, recycling)
+    log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in draws])
+    beta = first_beta(values[finite] - log_prior[finite], bool(chosen.recycle))
+    evaluations = Expected(*(nwalkers + n for n in expected_evaluations(chosen, nwalkers, ndim, beta)))
     return CostEstimate(
-        sampler.__name__,
-        nwalkers,
-        ndim,
+        f"{sampler.__name__}, {nwalkers} walkers, {ndim} parameters",
         workers,
         seconds,
-        len(finite),
+        len(values),
         int((~finite).sum()),
+        0 if before is None else max(len(values) - (report()["simulations"] - before), 0),
         evaluations,
-        times[0],
-        times[1],
-        _of_guide(posterior, float(seconds.mean()), workers),
-        made.cached,
+        Expected(*(float(np.mean(seconds)) / workers * n for n in evaluations)),
     )
 
 
-def _scheduled(lengths: np.ndarray, workers: int) -> float:
-    """Time at which the last of some evaluations with given durations (n,) ends, on a number of workers."""
-    free = [0.0] * workers
-    for length in lengths:
-        heapq.heapreplace(free, free[0] + float(length))
-    return max(free)
+def _evaluate(posterior: Callable, points: np.ndarray, queue: Any) -> list[tuple[float, float]]:
+    """Log-probability and duration [s] of each point (n, ndim), evaluated at the same time with a queue."""
+    start = time.perf_counter()
+    if queue is None:  # one point
+        return [(float(np.ravel(posterior(points[0]))[0]), time.perf_counter() - start)]
+    tickets, found = queue.submit(points), {}
+    while len(found) < len(tickets):
+        found |= {ticket: (float(value), time.perf_counter() - start) for ticket, value in queue.collect()}
+    return [found[ticket] for ticket in tickets]
 
 
-def _wall_times(
-    settings: Settings,
-    evaluations: Expected,
-    nwalkers: int,
-    ndim: int,
-    seconds: np.ndarray,
-    workers: int,
-    recycling: bool,
-) -> tuple[Expected, Expected | None]:
-    """Wall times [s] of a synchronous and of an asynchronous run."""
-    spread = float(np.std(np.log(np.maximum(seconds, 1e-9)), ddof=1))
-    random = np.random.default_rng(0)
-    # the mean of the timed durations has an error of its own
-    error = min(float(np.std(seconds, ddof=1) / np.mean(seconds)) / np.sqrt(len(seconds)), 0.5)
-    factors = (1.0 - error, 1.0, 1.0 + error)
-
-    def of_batch(size: float) -> float:
-        lengths = random.lognormal(-0.5 * spread**2, spread, (REPETITIONS, max(round(size), 1)))
-        return float(np.mean(seconds)) * float(np.mean([_scheduled(row, workers) for row in lengths]))
-
-    if not recycling:
-        batch = of_batch(nwalkers)
-        return Expected(*(f * batch * n / nwalkers for f, n in zip(factors, evaluations, strict=True))), None
-    options = settings.recycling
-    size = options.draws_per_target * max(options.target_share * nwalkers, options.points_per_dimension * (ndim + 1.0))
-    batch, whole = of_batch(size), of_batch(nwalkers)
-    between = [max(n - 2.0 * nwalkers, 0.0) for n in evaluations]  # but the draws of the prior and of the check
-    waiting = (f * (2.0 * whole + batch * n / size) for f, n in zip(factors, between, strict=True))
-    # without barriers, all workers are busy until the check, which waits for all that came before it
-    busy = float(np.mean(seconds)) / workers
-    flowing = (f * (2.0 * whole + busy * n) for f, n in zip(factors, between, strict=True))
-    # never longer than with barriers: `batch` is a mean of random durations, and can be below `busy * size` by chance
-    synchronous = Expected(*waiting)
-    return synchronous, Expected(*map(min, synchronous, flowing))
+def first_beta(log_likelihoods: Sequence[float], recycling: bool) -> float:
+    """Expected beta of the first stage, from finite log-likelihoods of a few draws of the prior."""
+    spread = float(np.std(log_likelihoods, ddof=1))
+    return min(1.0, (3.5 if recycling else 1.3) / spread) if spread > 0.0 else 1.0
 
 
-def _of_guide(posterior: Any, seconds: float, workers: int) -> str:
-    """What can be said of a run with a guide; its number of simulations depends on what the search finds."""
-    if not callable(getattr(posterior, "guide", None)):
-        return ""
-    try:
-        posterior.guide()
-    except ValueError:
-        return ""
-    wall = seconds * SIMULATIONS_OF_A_GUIDE / workers
-    return f"not predicted; {SIMULATIONS_OF_A_GUIDE} simulations take {as_duration(wall, wall)}"
+def expected_evaluations(settings: Settings, nwalkers: int, ndim: int, beta: float) -> Expected:
+    """Number of evaluations that the annealing needs after a stage with exponent `beta` > 0."""
+    if settings.recycle:
+        left = -np.log(beta) / min(1.7, 2.9 * ndim**-0.55)
+        per_stage = DRAWS_PER_STAGE * max(TARGET_SHARE * nwalkers, POINTS_PER_DIMENSION * (ndim + 1.0))
+        stages = left * (per_stage + SEARCH_DRAWS * nwalkers / max(left, 1.0))
+        low, likely, high = ((1.0 + end) * nwalkers for end in AT_THE_END)
+        return Expected(0.65 * stages + low, stages + likely, 1.4 * stages + high)
+    kept = min(max(settings.target(float(nwalkers), nwalkers) / nwalkers, 0.01), 0.99)
+    per_dimension = kept ** (2.0 / ndim)  # per_dimension g^2 - 2 g + 1 = 0
+    growth = np.log((1.0 + np.sqrt(1.0 - per_dimension)) / per_dimension)
+    sweeps = SWEEPS_AT_100 + MORE_SWEEPS * np.log(100.0 * ndim / nwalkers)
+    sweeps = float(np.clip(sweeps, settings.min_moves, settings.max_moves))
+    if settings.chains == "leaders":
+        sweeps = settings.burn_in + 1.0
+    stages = np.ceil(-np.log(beta) / max(growth, 0.01)) * nwalkers * sweeps
+    return Expected(0.65 * stages + nwalkers, stages + nwalkers, 1.8 * stages + 2.0 * nwalkers)

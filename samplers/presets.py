@@ -1,4 +1,4 @@
-"""Settings of published runs, by name: ``SMCSampler(1000, ndim, log_prob_fn, **RAMANCHA_2022_LITERAL)``.
+"""Settings of published runs, by name: ``SMCSampler(1000, ndim, f, **presets.RAMANCHA_2022_LITERAL)``.
 
 `RAMANCHA_2022_CONSTANT` and `RAMANCHA_2022_LITERAL` are for `SMCSampler`. Ramancha, Astroza, Conte, Restrepo & Todd
 (2022) update a bridge column with 1000 particles, multinomial resampling and 10 Metropolis steps per stage, and choose
@@ -43,6 +43,7 @@ CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
         "coefficient_of_variation": 1.0,
         "resampling": "multinomial",
         "chains": "leaders",
+        "burn_in": 0,
         "fast_sweeps": 0,
     }
 )

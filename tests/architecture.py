@@ -54,15 +54,17 @@ ORDER = {
     ),
     "samplers": (
         ("cost",),
-        ("timing",),
         ("smc", "tmcmc"),
         ("tempered",),
+        ("results",),
         ("reporting",),
-        ("storage",),
-        ("presets",),
-        ("tempering",),
-        ("moves",),
-        ("proposals",),
+        ("evaluation", "replay"),
+        ("output", "tempering"),
+        ("judgement",),
+        ("presets", "reports"),
+        ("budget", "estimates", "moves"),
+        ("proposals", "record", "settings"),
+        ("emcee_internals", "interrupts", "resampling"),
     ),
 }
 FOREIGN = ("hasattr", "getattr")

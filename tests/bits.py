@@ -36,7 +36,8 @@ from fe_likelihoods import (
     propagate,
     residual_checks,
 )
-from samplers import CHING_CHEN_2007, RAMANCHA_2022_LITERAL, SMCSampler, TMCMCSampler, compare_models
+from samplers import SMCSampler, TMCMCSampler, compare_models
+from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_LITERAL
 from tests.contract.targets import Gaussian
 
 __all__ = ["results"]
@@ -142,7 +143,7 @@ def of_run(sampler) -> dict[str, np.ndarray]:
         "evidence": np.array([sampler.log_evidence, sampler.log_evidence_error, sampler.log_evidence_ladder]),
         "check": np.array(check if check is not None else [], dtype=float),
         "mean error": sampler.mean_error(),
-        "evaluations": np.array([sampler.evaluations, sampler.coarse_evaluations]),
+        "evaluations": np.array([sampler.evaluations]),
     }
 
 
@@ -156,8 +157,8 @@ def chains() -> Results:
         **{f"SMC, oscillator, {name}": (SMCSampler, 260, p, {}) for name, p in noises().items()},
         "SMC by moves, oscillator": (SMCSampler, 60, oscillator(), {}),
         "TMCMC, oscillator": (TMCMCSampler, 80, oscillator(), {}),
-        "SMC, column, from the coarse model": (SMCSampler, 250, column, {"coarse_log_prob_fn": column.coarse}),
-        "TMCMC, column": (TMCMCSampler, 30, column, {"max_moves": 3}),
+        "SMC, column": (SMCSampler, 250, column, {}),
+        "TMCMC, column": (TMCMCSampler, 30, column, {"chains": "equal", "max_moves": 3}),
         "SMC, isolated bridge": (SMCSampler, 40, bridge, {"max_moves": 3}),
         "SMC, isolated bridge, two modes": (SMCSampler, 40, means, {"max_moves": 3}),
         "SMC, Gaussian": (SMCSampler, 300, target, {}),

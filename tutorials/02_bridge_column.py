@@ -43,6 +43,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import gaussian_kde
 
 from fe_likelihoods import (
     average_predictions,
@@ -54,14 +56,12 @@ from fe_likelihoods import (
     rrmse,
 )
 from samplers import (
-    RAMANCHA_2022_CONSTANT,
-    RAMANCHA_2022_LITERAL,
     SMCSampler,
     compare_models,
     ladder_table,
     plot_corner,
-    plot_ladder,
-    plot_pairs,
+    plot_run,
+    presets,
     summary,
     to_arviz,
 )
@@ -71,8 +71,8 @@ PRESETS = {
     "default": (500, 1, 10, False, {}),
     "reduced": (100, 4, 4, True, {}),
     "fast": (24, 16, 2, False, {"max_moves": 3}),
-    "ramancha2022": (1000, 1, 1, False, RAMANCHA_2022_LITERAL),
-    "ramancha2022-constant": (1000, 1, 1, False, RAMANCHA_2022_CONSTANT),
+    "ramancha2022": (1000, 1, 1, False, presets.RAMANCHA_2022_LITERAL),
+    "ramancha2022-constant": (1000, 1, 1, False, presets.RAMANCHA_2022_CONSTANT),
 }
 
 parser = argparse.ArgumentParser(description="Update the bridge column with SMC; write tables and figures to a folder.")
@@ -160,8 +160,8 @@ figure.savefig(args.out / "fig3_data.png", dpi=150)
 # --------
 #
 # SMC anneals from the prior (beta = 0) to the posterior (beta = 1); the chain contains the draws at beta = 1. Chain and
-# tempering stages are stored in ``chain.h5`` during the run, and every evaluation is stored in a journal next to it. An
-# interrupted run can be continued with ``--resume``, and gives the same result as an uninterrupted one.
+# tempering stages are stored in ``chain.h5``, and every evaluation is stored in a record next to it. An interrupted run
+# goes on with ``--resume``, and gives the same result as an uninterrupted one.
 #
 # With a guide there is no annealing, and hundreds of simulations are enough instead of more than ten thousand. The
 # guide finds the posterior by Gauss-Newton steps on the responses, fits emulators of the responses there, and proposes
@@ -176,14 +176,14 @@ guide = posterior.guide() if guided else None
 sampler = SMCSampler(
     walkers, posterior.ndim, posterior, vectorize=True, backend=backend, seed=args.seed, guide=guide, **dict(settings)
 )
-sampler.run_mcmc(None, sweeps, progress=True)
+sampler.run_mcmc(None, sweeps - sampler.iteration, progress=True)
 seconds = time.perf_counter() - start
 samples = sampler.get_chain(flat=True)
 report = posterior.report()
 print(ladder_table(sampler))
 print(sampler.verdict)
 (args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
-plot_ladder(sampler).savefig(args.out / "ladder.png", dpi=150)
+plot_run(sampler).savefig(args.out / "run.png", dpi=150)
 
 # %%
 # Table 2: reported values and posterior
@@ -251,9 +251,56 @@ print("\n".join(lines))
 # -----------------------
 #
 # First in the form of the paper, then as a corner plot with the prior. The red lines mark the true values of the
-# synthetic data. The grey marks are the reported values; an arrow points to a value outside of a panel and gives it.
+# synthetic data. The grey marks are the reported values; those outside of a panel are written at its edge.
 
-plot_pairs(samples, posterior, truths=truth).savefig(args.out / "fig4_pair.png", dpi=130)
+
+def plot_pairs(most: int = 2000) -> Figure:
+    """Histograms with the coefficient of variation, samples above the diagonal, and contours below it.
+
+    The contours of the kernel density hold 20, 40, 60, 80 and 95 % of the samples; r is the correlation coefficient.
+    """
+    factors, nominal = np.array([(parameter.factor, parameter.nominal) for parameter in posterior.parameters]).T
+    x, marks = samples / factors, {"#8a8f98": nominal / factors, "#b03a48": truth / factors}
+    labels = [parameter.label.replace(" [", "\n[") for parameter in posterior.parameters]
+    k, shown = x.shape[1], x[:: -(-len(x) // most)]
+    limits = np.quantile(x, [0.002, 0.998], axis=0) + 0.12 * np.array([[-1.0], [1.0]]) * np.ptp(x, axis=0)
+    figure, axes = plt.subplots(k, k, figsize=(1.5 * k + 0.8,) * 2, layout="constrained", squeeze=False)
+    for i, j in np.ndindex(k, k):
+        ax, pair = axes[i, j], shown[:, [j, i]].T
+        if i == j:
+            ax.hist(x[:, j], bins=40, range=tuple(limits[:, j]), density=True, color="#1f5a8c", alpha=0.3)
+            places = np.linspace(*limits[:, j], 200)
+            ax.plot(places, gaussian_kde(x[:, j])(places), color="#1f5a8c", linewidth=1.4)
+            ax.set_title(f"CV = {x[:, j].std() / x[:, j].mean():.2e}", fontsize="small", pad=3)
+        elif i < j:
+            ax.plot(*pair, ".", color="#1f5a8c", markersize=2, alpha=0.35, markeredgewidth=0)
+        else:
+            density = gaussian_kde(pair)
+            u, v = np.meshgrid(np.linspace(*limits[:, j], 60), np.linspace(*limits[:, i], 60))
+            height = density(np.stack([u.ravel(), v.ravel()])).reshape(u.shape)
+            levels = np.unique(np.quantile(density(pair), [0.05, 0.2, 0.4, 0.6, 0.8]))
+            ax.contourf(u, v, height, [*levels, 2.0 * height.max()], cmap="Blues")
+            r = np.corrcoef(pair)[0, 1]
+            ax.text(0.05, 0.95, f"r = {r:.2f}", transform=ax.transAxes, va="top", fontsize="small")
+        if i != j:
+            ax.set_ylim(limits[:, i])
+        for row, (colour, values) in enumerate(marks.items()):
+            ax.axvline(values[j], color=colour, linewidth=1.1)
+            if i != j:
+                ax.axhline(values[i], color=colour, linewidth=1.1)
+            elif not limits[0, j] <= values[j] <= limits[1, j]:
+                side, x_text = ("left", 0.03) if values[j] < limits[0, j] else ("right", 0.97)
+                style = {"color": colour, "fontsize": 7, "ha": side, "va": "top"}
+                ax.text(x_text, 0.97 - 0.14 * row, f"{values[j]:.4g}", transform=ax.transAxes, **style)
+        ax.set_xlim(limits[:, j])
+        ax.tick_params(labelbottom=i == k - 1, labelleft=j == 0 and i > 0, labelsize=7)
+        ax.tick_params(axis="x", labelrotation=35)
+        ax.set_xlabel(labels[j] if i == k - 1 else "", fontsize=9)
+        ax.set_ylabel(labels[i] if j == 0 else "", fontsize=9)
+    return figure
+
+
+plot_pairs().savefig(args.out / "fig4_pair.png", dpi=130)
 plot_corner(samples, posterior, truths=truth).savefig(args.out / "corner.png", dpi=110)
 
 # %%

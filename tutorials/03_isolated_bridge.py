@@ -50,15 +50,15 @@ from fe_likelihoods import (
     table_motion,
 )
 from samplers import (
-    CHING_CHEN_2007,
     SamplingWarning,
     SMCSampler,
     TMCMCSampler,
     compare_models,
     ladder_table,
     plot_corner,
-    plot_ladder,
     plot_marginals,
+    plot_run,
+    presets,
     summary,
     to_arviz,
 )
@@ -66,8 +66,8 @@ from samplers import (
 # walkers, sweeps at beta = 1, time step [s], number of propagated samples, settings of the sampler
 PRESETS = {
     "default": (1000, 2, 0.5e-3, 1000, {}),
-    "published": (1000, 1, 0.5e-3, 1000, CHING_CHEN_2007),
-    "fast": (50, 2, 2.5e-3, 30, {"max_moves": 3}),
+    "published": (1000, 1, 0.5e-3, 1000, presets.CHING_CHEN_2007),
+    "fast": (50, 2, 2.5e-3, 30, {}),
 }
 
 parser = argparse.ArgumentParser(
@@ -124,6 +124,8 @@ if not args.resume:
     backend.reset(walkers, posterior.ndim)
 Sampler = TMCMCSampler if args.sampler == "tmcmc" else SMCSampler
 guide = posterior.guide() if args.sampler == "guide" else None
+if args.preset == "fast":
+    settings = {"burn_in": 1} if Sampler is TMCMCSampler else {"max_moves": 3}
 start = time.perf_counter()
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always", SamplingWarning)
@@ -137,7 +139,7 @@ with warnings.catch_warnings(record=True) as caught:
         guide=guide,
         **dict(settings),
     )
-    sampler.run_mcmc(None, sweeps, progress=True)
+    sampler.run_mcmc(None, sweeps - sampler.iteration, progress=True)
 messages = [str(w.message) for w in caught if issubclass(w.category, SamplingWarning)]
 seconds = time.perf_counter() - start
 report = posterior.report()
@@ -158,7 +160,7 @@ for i, name in enumerate(names):
 (args.out / "parameters.txt").write_text("\n".join(lines) + "\n")
 print("\n".join(lines))
 (args.out / "ladder.txt").write_text(ladder_table(sampler) + "\n")
-plot_ladder(sampler).savefig(args.out / "ladder.png", dpi=150)
+plot_run(sampler).savefig(args.out / "run.png", dpi=150)
 
 
 # %%

@@ -44,7 +44,7 @@ def update(pool=None) -> SMCSampler:
     posterior = make_posterior(pool)
     backend = emcee.backends.HDFBackend("run.h5")
     sampler = SMCSampler(WALKERS, posterior.ndim, posterior, vectorize=True, seed=1, backend=backend, asynchronous=True)
-    sampler.run_mcmc(None, 4, progress=True)  # in the output of a job, a line per minute
+    sampler.run_mcmc(None, 4 - sampler.iteration, progress=True)  # in the output of a job, a line per minute
     samples = sampler.get_chain(flat=True)
     print(summary(samples, posterior.parameter_names, mean_error=sampler.mean_error()))
     print(f"log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2f}")

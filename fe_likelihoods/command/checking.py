@@ -118,7 +118,7 @@ def _say_cost(problem: Problem, sampler: object, guided: bool, budget: dict, say
 
     estimate = estimate_cost(problem.posterior, sampler.nwalkers, type(sampler), seed=1)
     if guided:
-        say(f"The run uses a guide: how many simulations it needs is {estimate.guide}")
+        say(f"The run uses a guide: how many simulations it needs is not predicted; 500 take {estimate.time_of(500)}")
     else:
         say(f"Estimated cost until beta = 1:\n{estimate}")
     if "max_simulations" in budget:

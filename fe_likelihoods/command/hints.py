@@ -35,7 +35,6 @@ _TERMS = (
         r'Predict peaks with noise="model"',
         'Compare the peaks with noise = false in [prediction], or in Python noise="model"',
     ),
-    (r"with guide=posterior\.guide\(\)", "with guide = true           "),  # a table: of the same width
 )
 
 

@@ -1,7 +1,7 @@
 """Runs in a folder: one that is new, one that is continued, and the report of a stored one.
 
-A folder has the run itself (``run.h5`` and its journal), the cache of simulations, a copy of the TOML file, and the
-results. A run that was killed goes on from the journal, with the results of an uninterrupted run.
+A folder has the run itself (``run.h5`` and its record of evaluations), the cache of simulations, a copy of the TOML
+file, and the results. A run that was killed goes on from the record, with the results of an uninterrupted run.
 """
 
 import contextlib
@@ -147,9 +147,9 @@ def report_run(path: Path) -> Outcome:
         )
     steps = job.sampler.get("steps", STEPS)
     if not is_emcee(job) and sampler.iteration >= steps:
-        # the journal repeats the run without an evaluation; the chain alone has lost which walkers are copies
-        with _without_messages("samplers.storage.resumption"):
-            sampler.run_mcmc(None, steps, progress=False)
+        # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
+        with _without_messages("samplers.tempered"):
+            sampler.run_mcmc(None, 0, progress=False)
     events = read_events(job, problem)
     file = Path(origin["file"])
     return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
@@ -175,7 +175,7 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 
 def _stored_sampler(job: Job, problem: Problem, folder: Path) -> Any:
-    """The sampler with the chain of a folder; ValueError if emcee's is damaged. Others rebuild it from the journal."""
+    """The sampler with the chain of a folder; ValueError if a chain of emcee is damaged."""
     import emcee
 
     path = folder / CHAIN

@@ -101,8 +101,8 @@ def _make_emcee(job: Job, problem: Problem, backend: Any) -> Any:
 
 def run_sampler(job: Job, problem: Problem, sampler: Any, progress: bool) -> None:
     """Run a sampler, or continue its run, until it has the number of steps of the file."""
-    if not is_emcee(job):
-        sampler.run_mcmc(None, job.sampler.get("steps", STEPS), progress=progress)
+    if not is_emcee(job):  # the annealing of a stored run is made again from its record, also where no step is missing
+        sampler.run_mcmc(None, max(job.sampler.get("steps", STEPS) - sampler.iteration, 0), progress=progress)
         return
     left = job.sampler["steps"] - sampler.iteration
     if left > 0:

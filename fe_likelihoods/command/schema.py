@@ -260,7 +260,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("guide", "yes or no", "find the posterior from the responses, with hundreds of simulations (no)"),
         Key("preset", "text", '"ramancha2022", "ramancha2022-constant" or "ching-chen-2007": settings of papers'),
         Key("runs", "whole number >= 1", "runs of recycling that must agree (1)"),
-        Key("recycle", "yes or no", "reuse every evaluated point; by default with 250 walkers or more"),
+        Key("recycle", "yes or no", "reuse every evaluated point; by default with 150 walkers or more"),
         Key("ess_ratio", "number", "share of effective walkers wanted at each stage, without recycling"),
         Key("min_moves", "whole number", "fewest sweeps per stage"),
         Key("max_moves", "whole number >= 1", "most sweeps per stage"),

@@ -318,7 +318,7 @@ class ResponseTarget:
             reasons = np.frombuffer(json.dumps(list(batch.reasons)).encode(), dtype=np.uint8)
             return [residuals, self._likelihood.statistics(thetas), reasons]
 
-        text = f"residuals of {self.model.fingerprint}".encode()  # earlier journals have responses
+        text = f"residuals of {self.model.fingerprint}".encode()  # files of earlier versions have responses
         if isinstance(self.comparison, Comparison):
             text += self._likelihood.measurements.fingerprint.encode()
         key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()

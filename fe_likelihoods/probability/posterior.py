@@ -43,8 +43,8 @@ class Posterior:
     prior : Prior, or mapping of parameter names to distributions
         It must have exactly the likelihood's parameters, in any order.
     coarse : Posterior, optional
-        A cheaper posterior of the same parameters (for example of the first part of a record), for samplers that anneal
-        on it first: ``SMCSampler(..., coarse_log_prob_fn=posterior.coarse)``.
+        A cheaper posterior of the same parameters (for example of the first part of a record). A first sampler runs on
+        it, and a second one starts from ``first.proposal`` (see docs/parallel, "Fewer simulations").
 
     Raises
     ------

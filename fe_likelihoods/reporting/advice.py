@@ -105,7 +105,7 @@ def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
         text = f"The error of the mean exceeds a fifth of the standard deviation for {', '.join(rough)}."
         found.append(Advice(CAUTION, "Rough means", text, "Make more iterations, or use more walkers."))
     if run.n_modes > 1:
-        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.diagnostics.modes)
+        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
         text = (
             f"The posterior has {run.n_modes} separate regions, with shares {shares}. Mean and standard deviation "
             "describe none of them, and the fit below is that of the best sample."

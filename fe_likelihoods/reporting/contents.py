@@ -160,7 +160,10 @@ def evidence(run: FinishedRun) -> list[str]:
     ]
     own, error = sampler.log_evidence_ladder, sampler.ladder[-1].log_evidence_error
     if check is None and sampler.rounds:
-        draws, shape = sum(each.draws for each in sampler.rounds), run.diagnostics.pareto_shape
+        draws, shape = (
+            sum(each.draws for each in sampler.rounds),
+            None if run.verdict is None else run.verdict.pareto_shape,
+        )
         text = f"It is the mean weight of {draws} draws that a guide proposed."
         if shape is not None:
             good = "so the error can be trusted" if shape < LARGEST_SHAPE else "so the error cannot be trusted"

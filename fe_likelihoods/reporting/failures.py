@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import ks_2samp
 
-from samplers import NearFailures, failures_near
+from samplers.judgement.failures import NearFailures, failures_near
 
 from ..probability.failures import reason_without_numbers
 from ..probability.likelihood import FELikelihood
@@ -191,7 +191,7 @@ def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bo
 
 def _near_the_samples(run: FinishedRun, sources: list[_Source]) -> NearFailures:
     """Failures in the region of the samples: those that the sampler has judged, else those known here."""
-    judged = getattr(run.sampler, "failures_near", None)
+    judged = None if run.verdict is None else run.verdict.near_failures
     if judged is not None:
         return judged
     found = [failures_near(run.samples[:, each.columns], each.failed, each.succeeded) for each in sources]

@@ -6,6 +6,8 @@ from dataclasses import fields, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from samplers.smc import FEWEST_TO_RECYCLE
+
 from ..probability.joint import JointLikelihood
 from .run import FinishedRun
 
@@ -94,7 +96,8 @@ def how_to_repeat(run: FinishedRun) -> str:
     if sampler.max_simulations is not None:
         arguments.append(f"max_simulations={sampler.max_simulations:g}")
     changed = changed_settings(sampler.settings)
-    usual = ("recycle", "False" if name == "TMCMCSampler" else "True")  # None, the default, was replaced by it
+    recycles = name == "SMCSampler" and sampler.nwalkers >= FEWEST_TO_RECYCLE
+    usual = ("recycle", str(recycles))  # None, the default, was replaced by it
     arguments += [f"{key}={text}" for key, text in changed if "." not in key and (key, text) != usual]
     lines = "".join(f"    {each},\n" for each in arguments)
     return f"from {package} import {name}\n\nsampler = {name}(\n{lines})\nsampler.run_mcmc(None, {sampler.iteration})"

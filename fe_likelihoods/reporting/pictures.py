@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from samplers import plot_corner, plot_ladder, plot_marginals, plot_run
+from samplers import plot_corner, plot_marginals, plot_run
 
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
@@ -104,7 +104,7 @@ def draw_posterior(run: FinishedRun) -> list[Picture]:
         _picture(
             "Pairs of parameters",
             "A narrow, inclined cloud: the data determine a combination of two parameters better than each of them. "
-            "Separate clouds: separate explanations of the data. Arrows point to values outside of a panel.",
+            "Separate clouds: separate explanations of the data. Values outside of a panel are written at its edge.",
             f"Posterior samples of each parameter and each pair of {', '.join(run.names)}.",
             lambda: plot_corner(run.samples, **options),
         ),
@@ -145,26 +145,21 @@ def draw_residuals(fit: Fit) -> list[Picture]:
 
 
 def draw_run(run: FinishedRun) -> list[Picture]:
-    """What the sampler did, and its tempering stages."""
+    """What the sampler did, with its tempering stages."""
     if not run.tempered:
         return []
-    pictures = [
+    return [
         _picture(
             "What the sampler did",
-            "The log-probability of the walkers at the end should be level: a trend means that the run has not "
-            "converged. The log-evidence should settle within its error.",
-            "Evaluations of each phase, effective sample size, log-evidence and log-probability of the walkers.",
+            "From the prior (beta near 0) to the posterior (beta = 1). An effective sample size far below the number "
+            "of walkers, or an acceptance near zero, shows a stage that was too hard. The log-evidence should settle "
+            "within its error. The log-probability of the walkers at the end should be level: a trend means that the "
+            "run has not converged.",
+            "Evaluations of each phase, exponent beta, acceptance, effective sample size and log-evidence of each "
+            "tempering stage, and log-probability of the walkers.",
             lambda: plot_run(run.sampler),
         )
     ]
-    if len(run.sampler.ladder) > 1:
-        caption = (
-            "From the prior (beta near 0) to the posterior (beta = 1). An effective sample size far below the number "
-            "of walkers, or an acceptance near zero, shows a stage that was too hard."
-        )
-        alt = "Exponent beta, effective sample size, acceptance and log-evidence of each tempering stage."
-        pictures.append(_picture("From the prior to the posterior", caption, alt, lambda: plot_ladder(run.sampler)))
-    return pictures
 
 
 def draw_prediction(prediction: Prediction, measurements: Any) -> list[Picture]:

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from emcee import EnsembleSampler
 
-from samplers import Diagnostics, EvidenceCheck, Verdict
+from samplers import Verdict
+from samplers.estimates.importance import EvidenceCheck
 
 from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
@@ -51,8 +52,6 @@ class FinishedRun(NamedTuple):
         Iterations that were left out at the beginning of the chain, and of which one in `thin` was kept.
     tempered : bool
         Whether the sampler has a ladder, an evidence and a verdict.
-    diagnostics : Diagnostics or None
-        Of a tempered sampler.
     verdict : Verdict or None
         Of a tempered sampler; None for a chain without one.
     check : EvidenceCheck or None
@@ -74,7 +73,6 @@ class FinishedRun(NamedTuple):
     discard: int
     thin: int
     tempered: bool
-    diagnostics: Diagnostics | None
     verdict: Verdict | None
     check: EvidenceCheck | None
     autocorrelation_time: float
@@ -94,7 +92,7 @@ class FinishedRun(NamedTuple):
     @property
     def n_modes(self) -> int:
         """Number of modes in which the run has points; one where that is not known."""
-        return 1 if self.diagnostics is None else len(self.diagnostics.modes)
+        return 1 if self.verdict is None else len(self.verdict.modes)
 
     @property
     def centre(self) -> np.ndarray:
@@ -176,7 +174,6 @@ def read_run(
         discard=discard,
         thin=thin,
         tempered=tempered,
-        diagnostics=sampler.diagnostics if tempered else None,
         verdict=_verdict(sampler) if tempered else None,
         check=sampler.log_evidence_check if tempered else None,
         autocorrelation_time=autocorrelation,

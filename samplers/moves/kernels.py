@@ -15,26 +15,35 @@ import copy
 import math
 import warnings
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from emcee import State
-from emcee.model import Model
 from emcee.moves import MHMove, Move
 
 from ..proposals.basins import cover_basins
-from ..proposals.covariance import invert_roots, location_and_root
 from ..proposals.mixture import (
     Mixture,
     draw,
     fit_mixture,
     from_component_space,
+    invert_roots,
+    location_and_root,
     log_density,
     log_responsibilities,
     to_component_space,
 )
-from ..proposals.support_bounds import SupportBounds, find_support_bounds, log_abs_det_jacobian
+from ..proposals.transforms import SupportBounds, find_support_bounds, log_abs_det_jacobian
 
-__all__ = ["MixtureMove", "RandomWalkMove", "StudentTMove", "calibrate_move", "describe"]
+__all__ = [
+    "DrawsWithDensity",
+    "GuideMove",
+    "MixtureMove",
+    "RandomWalkMove",
+    "StudentTMove",
+    "calibrate_move",
+    "describe",
+]
 
 # Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
 KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
@@ -128,7 +137,7 @@ def _check_half(coords: np.ndarray) -> None:
 class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points.
 
-    Where it was not calibrated (in a plain EnsembleSampler, or in a run that goes on from a chain without its journal),
+    Where it was not calibrated (in a plain EnsembleSampler, or in a run that goes on from a chain without its record),
     two copies are fitted to one half of the walkers each, and move the other half. A proposal that was fitted to the
     points that it moves would make their tails too light for many sweeps; this one is independent of them. The halves
     and both fits stay as they are until the number of walkers changes: the copies of one point are in one half, and
@@ -150,6 +159,7 @@ class _FittedMove(MHMove):
         raise NotImplementedError
 
     def _draw_all(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        self._fit_halves(coords)
         if not self._halves:
             return self._draw(coords, random)
         proposed, log_ratios = np.empty_like(coords), np.empty(len(coords))
@@ -157,23 +167,15 @@ class _FittedMove(MHMove):
             proposed[rows], log_ratios[rows] = half._draw(coords[rows], random)
         return proposed, log_ratios
 
-    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """Propose a new point for each walker.
-
-        Returns
-        -------
-        state : emcee.State
-            State of the ensemble after the move.
-        accepted : ndarray of bool, shape (nwalkers,)
-            Which proposals were accepted.
-        """
-        if not self._is_fitted and (not self._halves or len(state.coords) != len(self._in_first)):
-            halves, in_first = (copy.deepcopy(self), copy.deepcopy(self)), _first_half(state.coords)
-            for half, others in zip(halves, (state.coords[~in_first], state.coords[in_first]), strict=True):
-                _check_half(others)
-                half.calibrate(others, np.full(len(others), 1.0 / len(others)))
-            self._halves, self._in_first = halves, in_first
-        return super().propose(model, state)
+    def _fit_halves(self, coords: np.ndarray) -> None:
+        """Without a calibration, fit a copy to each half of the walkers (n, ndim)."""
+        if self._is_fitted or (self._halves and len(coords) == len(self._in_first)):
+            return
+        halves, in_first = (copy.deepcopy(self), copy.deepcopy(self)), _first_half(coords)
+        for half, others in zip(halves, (coords[~in_first], coords[in_first]), strict=True):
+            _check_half(others)
+            half.calibrate(others, np.full(len(others), 1.0 / len(others)))
+        self._halves, self._in_first = halves, in_first
 
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """Adapt the scale; nothing by default."""
@@ -218,8 +220,9 @@ class RandomWalkMove(_GaussianFit):
         Factor of the root of the covariance; 2.38 / sqrt(ndim) by default.
     adapt : bool
         Whether ``tune`` adapts the scale to reach the acceptance `target`. The adapted scale is kept for later stages.
-    target : float
-        Desired acceptance; 0.234 is optimal in many dimensions.
+    target : float, optional
+        Desired acceptance; 0.234 is optimal in many dimensions. None: 0.23 + 0.21 / ndim, for any number of dimensions
+        (Gelman, Roberts & Gilks 1996 for its values; Betz, Papaioannou & Straub 2016 for the formula).
 
     References
     ----------
@@ -227,7 +230,7 @@ class RandomWalkMove(_GaussianFit):
     algorithms, Annals of Applied Probability 7(1), doi:10.1214/aoap/1034625254
     """
 
-    def __init__(self, scale: float | None = None, adapt: bool = False, target: float = 0.234):
+    def __init__(self, scale: float | None = None, adapt: bool = False, target: float | None = 0.234):
         if scale is not None and not scale > 0.0:
             raise ValueError(f"scale multiplies the root of the covariance and must be positive; got {scale}")
         super().__init__()
@@ -250,7 +253,8 @@ class RandomWalkMove(_GaussianFit):
         """If `adapt`, increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
         super().tune(state, accepted)
         if self.adapt:
-            self._log_factor += float(np.mean(accepted)) - self.target
+            target = 0.23 + 0.21 / state.coords.shape[1] if self.target is None else self.target
+            self._log_factor += float(np.mean(accepted)) - target
 
 
 class StudentTMove(_GaussianFit):
@@ -389,21 +393,6 @@ class MixtureMove(_FittedMove):
         """
         self._current, self._independence_accepted = 0, True
 
-    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """Make one sweep of one kernel.
-
-        Returns
-        -------
-        state : emcee.State
-            State of the ensemble after the sweep.
-        accepted : ndarray of bool, shape (nwalkers,)
-            Which proposals were accepted.
-        """
-        # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
-        shares = KERNEL_PROBABILITIES_IF_ACCEPTED if self._independence_accepted else KERNEL_PROBABILITIES
-        self._current = 0 if self._current is None else model.random.choice(len(self._kernels), p=shares)
-        return super().propose(model, state)
-
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """Adapt the scale of the kernel used last, or record whether independent draws have a high acceptance."""
         super().tune(state, accepted)
@@ -414,6 +403,10 @@ class MixtureMove(_FittedMove):
             self._log_factors[self._current] += share - self.target
 
     def _draw_all(self, coords, random):
+        # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
+        shares = KERNEL_PROBABILITIES_IF_ACCEPTED if self._independence_accepted else KERNEL_PROBABILITIES
+        self._current = 0 if self._current is None else random.choice(len(self._kernels), p=shares)
+        self._fit_halves(coords)
         for half in self._halves:
             half._current = self._current
         return super()._draw_all(coords, random)
@@ -476,3 +469,45 @@ class MixtureMove(_FittedMove):
         scale[random.uniform(size=n) < UNIT_SCALE_SHARE] = 1.0
         steps = crossed * scale[:, None] * (self._archive[first] - self._archive[second])
         return self._step(coords, steps)
+
+
+class DrawsWithDensity(Protocol):
+    """A distribution with independent draws and a normalised log-density (`samplers.tempering.guide.Guide`)."""
+
+    def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Independent draws (n, ndim)."""
+
+    def log_density(self, coords: np.ndarray) -> np.ndarray:
+        """Log-density (n,) at points (n, ndim); -inf is allowed."""
+
+
+class GuideMove(MHMove):
+    """Propose one independent draw of a guide for each walker: independence Metropolis-Hastings.
+
+    A point x is replaced by a draw y of density q with the probability min(1, [p(y) / q(y)] / [p(x) / q(x)]), where p
+    is the posterior density (Tierney 1994, Annals of Statistics 22(4), doi:10.1214/aos/1176325750, section 2.3.3). This
+    is exact for any density q that does not change, since the normalising constants cancel. A walker at a point where
+    the density of the guide is zero does not move.
+
+    Parameters
+    ----------
+    guide : object with methods draw and log_density
+        The proposal distribution, which must not change.
+    """
+
+    def __init__(self, guide: DrawsWithDensity):
+        super().__init__(self._draw)
+        self._guide = guide
+
+    @property
+    def guide(self) -> DrawsWithDensity:
+        """The proposal distribution."""
+        return self._guide
+
+    def _draw(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        proposed = self._guide.draw(len(coords), random)
+        here, there = self._guide.log_density(coords), self._guide.log_density(proposed)
+        possible = (here > -np.inf) & (there > -np.inf)
+        factors = np.full(len(coords), -np.inf)
+        factors[possible] = here[possible] - there[possible]
+        return proposed, factors

@@ -41,9 +41,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .covariance import invert_roots
-from .mixture import Mixture, log_components, to_component_space
-from .support_bounds import log_abs_det_jacobian
+from .mixture import Mixture, invert_roots, log_components, to_component_space
+from .transforms import log_abs_det_jacobian
 
 __all__ = ["cover_basins", "find_basins", "with_components"]
 

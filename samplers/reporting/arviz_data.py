@@ -1,25 +1,19 @@
-"""Results of runs as data of arviz, for its statistics, its figures and its files.
+"""Results of runs as arviz data, for its statistics, figures and files.
 
-Each run is one chain. The walkers of one run share proposals and ancestors, so they are not independent chains, and
-`arviz.from_emcee`, which makes each walker a chain, gives wrong statistics.
-
-The draws of a chain are in the order of founder, walker and step instead of step and walker. Draws that depend on each
-other are then neighbours, which is what arviz expects: it estimates effective sample sizes from the correlation between
-neighbours. Its ``ess`` and ``mcse`` of the mean then agree with ``sampler.mean_error()``; in emcee's order they count
-copies of a walker as independent draws.
-
-A posterior can have further members, by which it is asked for units, measurements and predictions: `parameters`,
-`sample_prior`, `measured_data` and `predictive_draws`, as those of `fe_likelihoods.Posterior`.
+Each run is one chain, because the walkers of a run share proposals and ancestors (`arviz.from_emcee` makes each walker
+a chain). arviz estimates effective sample sizes from the correlation between neighbours, so the draws are ordered by
+founder, walker and step: dependent draws are neighbours, and ``ess`` and ``mcse`` of the mean agree with
+``sampler.mean_error()``.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .inspection import is_tempered, log_posterior_of, parameter_names_of
-from .summary import names_of_parameters
+from .summary import is_tempered, log_posterior_of, names_of_parameters
 
 if TYPE_CHECKING:
     import xarray
@@ -60,50 +54,25 @@ def to_arviz(
     prediction : fe_likelihoods.Prediction, optional
         The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
     parameter_names : sequence of str, optional
-        One name per parameter; by default those of the posterior, or else theta_0, theta_1, ...
+        One name per parameter; by default the names of the posterior, or else theta_0, theta_1, ...
     discard : int
-        Burn-in to leave out: number of initial steps of each run. Chains of SMC and TMCMC have none.
+        Burn-in of each run, in steps. Chains of SMC and TMCMC have none.
     draws : int
-        Number of samples for the groups that need simulations, evenly spaced in the chains. Equal samples are simulated
-        once, cached responses not at all.
+        Number of samples for the groups that need simulations, evenly spaced in the chains.
     block : float, optional
-        Length of the blocks of the log-likelihood [s]. Default: five correlation times of the residuals. Give models
-        that are compared the same length.
+        Length of the blocks of the log-likelihood [s]. Default: five correlation times of the residuals. Models that
+        are compared need the same length.
     seed : int
         Seed of draws of the prior and of the noise.
 
     Returns
     -------
     arviz.InferenceData
-        A DataTree from arviz 1.0 on. Its method ``to_netcdf(path)`` writes it to a file. The groups are ``posterior``,
+        A DataTree from arviz 1.0 on; ``to_netcdf(path)`` writes it to a file. It has the groups ``posterior``,
         ``sample_stats`` and, where they are known, ``prior``, ``observed_data``, ``constant_data``,
-        ``posterior_predictive``, ``log_likelihood`` and ``predictions``; see Notes.
-
-    Raises
-    ------
-    ValueError
-        If a sampler is given twice, the chains have different shapes or no steps, the number of names is wrong, or the
-        posterior has other parameters than the sampler or no method `predictive_draws`.
-
-    Notes
-    -----
-    ``posterior``: one variable per parameter with its unit, label and nominal value as attributes. Several runs are
-    chains, so that r_hat compares independent runs. arviz gives no r_hat (NaN) for one run.
-
-    ``sample_stats``: the log-probability ``lp``, and step, walker and founder of each draw. The attributes contain the
-    log-evidence and its error, beta of the stages, all stages as JSON (``ladder``), failures, evaluations, simulations,
-    the verdict, and the settings.
-
-    ``prior``: draws from which the annealing began, or else draws of ``sample_prior``; the attribute ``source`` says
-    which.
-
-    ``observed_data`` and ``posterior_predictive``: one variable per measured channel in SI units, over time [s];
-    replicated measurements are simulated responses plus noise. ``constant_data``: the records of the excitation, and
-    time step, display unit and quantity of each channel.
-
-    ``log_likelihood``: one observation per block of time, because single samples have correlated errors and would
-    predict each other. The attribute ``note`` says how long a block is.
+        ``posterior_predictive``, ``log_likelihood`` and ``predictions``; ``docs/arviz`` describes them.
     """
+    import arviz
     import xarray
 
     runs = list(sampler) if isinstance(sampler, Sequence) else [sampler]
@@ -112,11 +81,12 @@ def to_arviz(
             "to_arviz: a sampler is given twice, and its chains would agree without being independent: pass runs of "
             "different seeds"
         )
+    known = log_posterior_of(runs[0])
     if posterior is not None:
         _check_posterior(posterior, runs[0])
-    known = log_posterior_of(runs[0]) if posterior is None else posterior
+        known = posterior
     if parameter_names is None:
-        parameter_names = getattr(known, "parameter_names", None) or parameter_names_of(runs[0])
+        parameter_names = getattr(known, "parameter_names", None)
     names = names_of_parameters(parameter_names, runs[0].ndim)
     if not all(hasattr(run, "get_chain") and run.ndim == len(names) for run in runs):
         raise ValueError(f"expected samplers of {len(names)} parameters; got {[type(run).__name__ for run in runs]}")
@@ -139,17 +109,9 @@ def to_arviz(
         groups |= _predictive_groups(posterior, chains, groups["observed_data"], draws, block, seed)
     if prediction is not None:
         groups["predictions"] = _prediction_group(prediction)
-    return _as_arviz(groups)
-
-
-def _as_arviz(groups: Mapping[str, "xarray.Dataset"]) -> Any:
-    import arviz
-
-    if int(arviz.__version__.split(".")[0]) == 0:
+    if arviz.__version__.startswith("0."):
         return arviz.InferenceData(**groups)
-    import xarray
-
-    return xarray.DataTree.from_dict(dict(groups))
+    return xarray.DataTree.from_dict(groups)
 
 
 def _check_posterior(posterior: Any, run: Any) -> None:
@@ -193,10 +155,10 @@ def _parameter_group(
 
     variables = {}
     for column, name in enumerate(names):
-        parameter = described.get(name)
-        about = {} if parameter is None else {"units": parameter.unit, "factor": parameter.factor}
+        about, parameter = {}, described.get(name)
         if parameter is not None:
-            about |= {"long_name": parameter.label, "nominal": parameter.nominal, "multiple_of": parameter.multiple_of}
+            about = {key: getattr(parameter, key) for key in ("factor", "nominal", "multiple_of")}
+            about |= {"units": parameter.unit, "long_name": parameter.label}
         variables[name] = (("chain", "draw"), samples[:, :, column], about)
     return xarray.Dataset(variables, _coordinates(*samples.shape[:2]), dict(attributes))
 
@@ -216,7 +178,7 @@ def _prior_group(
 
 
 def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
-    """Attributes of ``sample_stats``: numbers of one run, or arrays over the runs; texts one below the other."""
+    """Attributes of ``sample_stats``: arrays over the runs, and texts with one line per run."""
     attributes: dict[str, Any] = {"samplers": "\n".join(type(run).__name__ for run in runs)}
     if not all(is_tempered(run) and run.ladder for run in runs):
         return attributes
@@ -225,28 +187,17 @@ def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
     attributes["ladder"] = json.dumps([[stage._asdict() for stage in run.ladder] for run in runs])
     if len(runs) == 1:
         attributes["beta"] = np.array([stage.beta for stage in runs[0].ladder])
-    texts: dict[str, Callable[[Any], str]] = {
-        "settings": lambda run: repr(run.settings),
-        "verdict": _verdict,
-        "failures": lambda run: json.dumps(_reasons(run.failures)),
-    }
-    for name, text in texts.items():
-        attributes[name] = "\n".join(text(run) for run in runs)
-    return attributes
+    attributes["settings"] = "\n".join(repr(run.settings) for run in runs)
+    attributes["verdict"] = "\n".join(map(_verdict, runs))
+    failures = (Counter(failure["reason"] for failure in run.failures) for run in runs)
+    return attributes | {"failures": "\n".join(map(json.dumps, failures))}
 
 
 def _verdict(run: Any) -> str:
     try:
         return str(run.verdict)
-    except ValueError:  # a file of an earlier version
+    except ValueError:  # of a file without a verdict
         return "The run has no stored verdict."
-
-
-def _reasons(failures: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for failure in failures:
-        counts[failure["reason"]] = counts.get(failure["reason"], 0) + 1
-    return counts
 
 
 def _time_coordinate(times: Mapping[str, np.ndarray]) -> tuple[dict[str, str], dict[str, Any]]:
@@ -268,11 +219,11 @@ def _measured_groups(data: Any) -> dict[str, "xarray.Dataset"]:
             each.name: (dimensions[each.name], each.values, _about(each.channel, each.name)) for each in histories
         }
         groups[group] = xarray.Dataset(variables, coordinates)
-    channels = [each.name for each in data.channels]
     groups["constant_data"] = groups["constant_data"].assign(
-        time_step=xarray.DataArray(list(data.time_steps.values()), {"channel": channels}, attrs={"units": "s"}),
-        display_unit=xarray.DataArray([each.channel.unit for each in data.channels], {"channel": channels}),
-        quantity=xarray.DataArray([each.channel.quantity for each in data.channels], {"channel": channels}),
+        time_step=("channel", list(data.time_steps.values()), {"units": "s"}),
+        display_unit=("channel", [each.channel.unit for each in data.channels]),
+        quantity=("channel", [each.channel.quantity for each in data.channels]),
+        channel=[each.name for each in data.channels],
     )
     return groups
 
@@ -317,18 +268,12 @@ def _prediction_group(prediction: Any) -> "xarray.Dataset":
     """Mean, standard deviation and quantiles of a prediction; the values of each sample where it keeps them."""
     import xarray
 
-    attributes = {
-        "n_samples": prediction.n_samples,
-        "n_failed": prediction.n_failed,
-        "noise": int(prediction.noise),
-        "from_state": prediction.from_state,
-    }
-    histories = prediction.dt is not None
-    columns = {"probability": np.array(prediction.probabilities)}
-    if histories:
-        columns["time"] = ("time", prediction.time, {"units": "s", "long_name": "time [s]"})
+    attributes = {name: getattr(prediction, name) for name in ("n_samples", "n_failed", "from_state")}
+    attributes["noise"] = int(prediction.noise)
+    columns: dict[str, Any] = {"probability": np.array(prediction.probabilities)}
     variables: dict[str, Any] = {}
-    if histories:
+    if prediction.dt is not None:
+        columns["time"] = ("time", prediction.time, {"units": "s", "long_name": "time [s]"})
         for row, channel in enumerate(prediction.channels):
             about = _about(channel, channel.name)
             variables[f"{channel.name}_mean"] = ("time", prediction.mean[row], about)
@@ -336,7 +281,7 @@ def _prediction_group(prediction: Any) -> "xarray.Dataset":
             variables[f"{channel.name}_quantiles"] = (("probability", "time"), prediction.quantiles[:, row], about)
         return xarray.Dataset(variables, columns, attributes)
     dims = tuple(f"quantity_dim_{i}" for i in range(np.ndim(prediction.mean)))
-    variables["mean"], variables["sd"] = (dims, prediction.mean), (dims, prediction.sd)
+    variables |= {"mean": (dims, prediction.mean), "sd": (dims, prediction.sd)}
     variables["quantiles"] = (("probability", *dims), prediction.quantiles)
     if prediction.values is not None:
         variables["values"] = (("sample", *dims), prediction.values)

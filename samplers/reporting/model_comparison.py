@@ -1,14 +1,9 @@
 """Model comparison: posterior probabilities of models from their evidences.
 
-With prior probabilities pi_k and evidences Z_k, the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j. The
-evidences are estimates, and their errors are propagated to first order, which is accurate as long as the errors of the
-log-evidences are well below one. Intervals are computed for the log-odds, for which the first order is more accurate,
-and transformed to probabilities between zero and one. See ``docs/theory/evidence``.
-
-References
-----------
-Kass, R. E. & Raftery, A. E. (1995), Bayes factors, Journal of the American Statistical Association 90(430),
-doi:10.1080/01621459.1995.10476572
+With prior probabilities pi_k and evidences Z_k, the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j
+(Kass & Raftery 1995, Bayes factors, Journal of the American Statistical Association 90(430),
+doi:10.1080/01621459.1995.10476572). Errors of the log-evidences are propagated to first order. Intervals are computed
+for the log-odds, for which the first order is more accurate. See ``docs/theory/evidence``.
 """
 
 import math
@@ -19,7 +14,7 @@ import numpy as np
 from scipy.special import expit, logsumexp
 from scipy.stats import norm
 
-from .inspection import data_fingerprint_of, summary_of
+from .summary import aligned, log_posterior_of, verdict_summary_of
 
 __all__ = ["ModelComparison", "compare_models"]
 
@@ -28,7 +23,7 @@ _LARGE_ERROR = 0.5
 
 
 class ModelComparison(NamedTuple):
-    """Comparison of models, one entry per model, in the order given. ``str`` gives a table.
+    """Comparison of models, one entry per model, in the order given. ``str`` gives `table`.
 
     Attributes
     ----------
@@ -36,23 +31,16 @@ class ModelComparison(NamedTuple):
         Names of the models.
     log_evidence, log_evidence_error : ndarray, shape (n,)
         Log-evidences and their standard errors.
-    prior : ndarray, shape (n,)
-        Prior probabilities of the models.
-    probability : ndarray, shape (n,)
-        Posterior probabilities of the models.
-    probability_error : ndarray, shape (n,)
-        Standard errors of the probabilities, to first order in the errors of the log-evidences.
+    prior, probability, probability_error : ndarray, shape (n,)
+        Prior and posterior probabilities of the models, and standard errors of the posterior probabilities.
     lower, upper : ndarray, shape (n,)
-        95 % intervals of the probabilities, from the log-odds.
-    log_bayes_factor : ndarray, shape (n,)
-        Log-evidence minus that of the best model, the one with the largest evidence.
-    log_bayes_factor_error : ndarray, shape (n,)
-        Standard error of `log_bayes_factor`; zero for the best model itself.
+        95 % intervals of the posterior probabilities, from the log-odds.
+    log_bayes_factor, log_bayes_factor_error : ndarray, shape (n,)
+        Log-evidence minus the largest log-evidence, and its standard error, which is zero for the best model.
     rough : bool
-        Whether the error of any log-odds exceeds 0.5. In that case `probability_error` is only an order of magnitude,
-        and longer runs are needed.
+        Whether the error of any log-odds exceeds 0.5, so that `probability_error` is only an order of magnitude.
     summaries : tuple of str
-        The sentence of ``sampler.diagnostics`` of each model; empty for a pair of numbers.
+        ``sampler.verdict.summary`` of each model; empty for a pair of numbers.
     """
 
     names: tuple[str, ...]
@@ -66,7 +54,7 @@ class ModelComparison(NamedTuple):
     log_bayes_factor: np.ndarray
     log_bayes_factor_error: np.ndarray
     rough: bool
-    summaries: tuple[str, ...] = ()
+    summaries: tuple[str, ...]
 
     @property
     def best(self) -> str:
@@ -79,25 +67,26 @@ class ModelComparison(NamedTuple):
         return dict(zip(self.names, self.probability.tolist(), strict=True))
 
     def table(self) -> str:
-        """Table with one line per model, the most probable first, and what each run says of itself."""
-        width = max(len("model"), *(len(name) for name in self.names))
-        head = f"{'model':<{width}} {'log evidence':>20} {'log Bayes factor':>20} {'prior':>7} "
-        rows = [head + f"{'probability':>22} {'95 % interval':>22}"]
+        """Table with one line per model, the most probable first, and the verdict of each run."""
+        table = [("model", "log evidence", "log Bayes factor", "prior", "probability", "95 % interval")]
         for k in np.argsort(-self.probability, kind="stable"):
-            evidence = f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}"
-            factor = f"{self.log_bayes_factor[k]:.3f} +- {self.log_bayes_factor_error[k]:.3f}"
-            probability = f"{self.probability[k]:.4g} +- {self.probability_error[k]:.2g}"
-            interval = f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}"
-            row = f"{self.names[k]:<{width}} {evidence:>20} {factor:>20} {self.prior[k]:>7.3g} "
-            rows.append(row + f"{probability:>22} {interval:>22}")
+            table.append(
+                (
+                    self.names[k],
+                    f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}",
+                    f"{self.log_bayes_factor[k]:.3f} +- {self.log_bayes_factor_error[k]:.3f}",
+                    f"{self.prior[k]:.3g}",
+                    f"{self.probability[k]:.4g} +- {self.probability_error[k]:.2g}",
+                    f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
+                )
+            )
+        rows = aligned(table)
         if self.rough:
             rows.append("the errors of the log-evidences are large, so the probabilities are rough: make longer runs")
-        named = zip(self.names, self.summaries, strict=False)
-        rows += [f"{name:<{width}} {text}" for name, text in named if text]
+        rows += [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
         return "\n".join(rows)
 
-    def __str__(self) -> str:
-        return self.table()
+    __str__ = table
 
 
 def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None = None) -> ModelComparison:
@@ -107,20 +96,13 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     ----------
     models : mapping of str to (sampler or tuple of float)
         For each name a sampler that has run (any object with ``log_evidence`` and ``log_evidence_error``), or a pair
-        (log-evidence, standard error). The evidence must be that of a normalised prior and a normalised likelihood.
+        (log-evidence, standard error). Prior and likelihood must be normalised, and the measurements the same.
     prior : mapping of str to float, optional
         Prior probabilities of the models, by the same names; equal by default.
 
     Returns
     -------
     ModelComparison
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two models, if a log-evidence or its error is not finite, if the prior has other names
-        or does not sum to one, or if the posteriors have different measurements (evidences of different data cannot be
-        compared).
 
     Examples
     --------
@@ -131,9 +113,14 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")
     names = tuple(models)
-    _check_same_data(models)
-    pairs = [_evidence(name, model) for name, model in models.items()]
-    log_evidence, error = np.array(pairs).T
+    digests = {name: getattr(log_posterior_of(model), "data_fingerprint", None) for name, model in models.items()}
+    known = {name: digest for name, digest in digests.items() if digest is not None}
+    if len(set(known.values())) > 1:
+        raise ValueError(
+            f"the evidences of {', '.join(known)} are of different measurements and cannot be compared: give all "
+            "models the same measurements"
+        )
+    log_evidence, error = np.array([_evidence(name, model) for name, model in models.items()]).T
     before = _prior(names, prior)
     with np.errstate(divide="ignore"):  # a prior of zero excludes a model
         score = np.log(before) + log_evidence
@@ -145,17 +132,13 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     # d logit(p_k) / d log Z_j = delta_kj - (1 - delta_kj) p_j / (1 - p_k)
     odds, odds_error = np.empty((2, len(names)))
     for k in range(len(names)):
-        others = np.delete(np.arange(len(names)), k)
-        rest = logsumexp(score[others])
+        rest = logsumexp(np.delete(score, k))
         odds[k] = score[k] - rest
-        share = np.exp(score[others] - rest) if rest > -np.inf else np.zeros(len(others))
-        odds_error[k] = math.hypot(error[k], *(share * error[others]))
+        share = np.exp(np.delete(score, k) - rest) if rest > -np.inf else 0.0
+        odds_error[k] = math.hypot(error[k], *(share * np.delete(error, k)))
     reach = norm.ppf(0.975) * odds_error
-    lower, upper = expit(odds - reach), expit(odds + reach)
-
     best = int(np.argmax(log_evidence))
     factor_error = np.where(np.arange(len(names)) == best, 0.0, np.hypot(error, error[best]))
-    possible = (before > 0.0) & (before < 1.0)
     return ModelComparison(
         names=names,
         log_evidence=log_evidence,
@@ -163,27 +146,22 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
         prior=before,
         probability=probability,
         probability_error=probability_error,
-        lower=lower,
-        upper=upper,
+        lower=expit(odds - reach),
+        upper=expit(odds + reach),
         log_bayes_factor=log_evidence - log_evidence[best],
         log_bayes_factor_error=factor_error,
-        rough=bool(np.any(odds_error[possible] > _LARGE_ERROR)),
-        summaries=tuple(summary_of(model) for model in models.values()),
+        rough=bool(np.any(odds_error[(before > 0.0) & (before < 1.0)] > _LARGE_ERROR)),
+        summaries=tuple(map(verdict_summary_of, models.values())),
     )
 
 
 def _evidence(name: str, model: Any) -> tuple[float, float]:
-    if hasattr(model, "log_evidence") and hasattr(model, "log_evidence_error"):
-        pair = model.log_evidence, model.log_evidence_error
-    else:
-        pair = model
+    pair = (model.log_evidence, model.log_evidence_error) if hasattr(model, "log_evidence_error") else model
     try:
-        value, error = (float(each) for each in pair)
+        value, error = map(float, pair)
     except (TypeError, ValueError) as reason:
-        raise ValueError(
-            f"model {name!r}: expected a sampler with log_evidence and log_evidence_error, or a pair of numbers; got "
-            f"{model!r}"
-        ) from reason
+        text = "expected a sampler with log_evidence and log_evidence_error, or a pair of numbers"
+        raise ValueError(f"model {name!r}: {text}; got {model!r}") from reason
     if not (math.isfinite(value) and math.isfinite(error) and error >= 0.0):
         raise ValueError(
             f"model {name!r}: the log-evidence and its error must be finite, and the error not negative; got {pair}"
@@ -200,14 +178,3 @@ def _prior(names: tuple[str, ...], prior: Mapping[str, float] | None) -> np.ndar
     if not (np.all(values >= 0.0) and abs(values.sum() - 1.0) < 1e-9):
         raise ValueError(f"prior probabilities must be non-negative and sum to one; got {dict(prior)}")
     return values
-
-
-def _check_same_data(models: Mapping[str, Any]) -> None:
-    """Raise ValueError if the posteriors state different measurements; those that state none are not checked."""
-    fingerprints = {name: data_fingerprint_of(model) for name, model in models.items()}
-    known = {name: fingerprint for name, fingerprint in fingerprints.items() if fingerprint is not None}
-    if len(set(known.values())) > 1:
-        raise ValueError(
-            f"the evidences of {', '.join(known)} are of different measurements and cannot be compared: give all "
-            "models the same measurements"
-        )

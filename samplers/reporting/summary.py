@@ -1,27 +1,77 @@
-"""Results of finished runs as tables.
-
-`summary` gives the moments of the posterior, `ladder_table` the tempering stages of a run, and `comparison_table` the
-cost of several samplers. Figures are in `samplers.reporting.corner_figures`,
-`pair_figures` and `run_figures`, data for arviz in `samplers.reporting.arviz_data`.
-"""
+"""Results of finished runs as tables: moments, tempering stages, and a comparison of samplers."""
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..tempering.population import Stage
-from .inspection import is_tempered, summary_of
+from ..reports import Stage
 
 __all__ = [
     "SamplerComparison",
     "Summary",
+    "aligned",
     "comparison_table",
+    "describe_sampler",
+    "described_parameters_of",
     "finished_ladder",
+    "is_tempered",
     "ladder_table",
+    "log_posterior_of",
     "names_of_parameters",
     "summary",
+    "verdict_summary_of",
 ]
+
+
+class _NamedParameter(NamedTuple):
+    """A parameter of which only the name is known, with the members of ``posterior.parameters``."""
+
+    name: str
+    label: str
+    factor: float = 1.0
+    nominal: float = np.nan
+
+
+def described_parameters_of(posterior: Any, ndim: int) -> Sequence[Any]:
+    """Name, label, unit (``factor``) and nominal value of each of `ndim` parameters; ValueError for another number."""
+    described = getattr(posterior, "parameters", None)
+    if described is None:
+        names = getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(ndim)]
+        described = [_NamedParameter(str(name), str(name)) for name in names]
+    if len(described) != ndim:
+        raise ValueError(
+            f"the posterior has {len(described)} parameters ({', '.join(each.name for each in described)}), but the "
+            f"samples have {ndim} columns"
+        )
+    return described
+
+
+def is_tempered(sampler: Any) -> bool:
+    """Whether a sampler is a `samplers.tempered.TemperedSampler`, with a ladder and an evidence."""
+    return hasattr(sampler, "ladder")
+
+
+def log_posterior_of(sampler: Any) -> Any:
+    """The user's function of a sampler (emcee wraps it); None for an object that is no sampler."""
+    return getattr(getattr(sampler, "log_prob_fn", None), "f", None)
+
+
+def verdict_summary_of(sampler: Any) -> str:
+    """``sampler.verdict.summary``; empty for a pair of numbers, emcee's own sampler, or a sampler without a chain."""
+    if not (is_tempered(sampler) and sampler.ladder and sampler.iteration):
+        return ""
+    return sampler.verdict.summary
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, from its cells: the first column is aligned to the left, others to the right."""
+    columns = []
+    for column in zip(*rows, strict=True):
+        width, side = max(map(len, column)), ">" if columns else "<"
+        columns.append([f"{cell:{side}{width}}" for cell in column])
+    return ["  ".join(row) for row in zip(*columns, strict=True)]
 
 
 class Summary(NamedTuple):
@@ -32,44 +82,33 @@ class Summary(NamedTuple):
     names : tuple of str
         Names of the parameters.
     mean, sd : ndarray, shape (ndim,)
-        Mean and standard deviation, in the units of the parameters.
+        Mean and standard deviation.
     cv : ndarray, shape (ndim,)
         Coefficient of variation ``sd / |mean|`` [-]; inf where the mean is zero and the standard deviation is not.
-    mean_error : ndarray, shape (ndim,), or None
-        Monte Carlo standard error of `mean`, in the units of the parameters; NaN where it is not known.
+    mean_error : ndarray, shape (ndim,)
+        Monte Carlo standard error of `mean`; NaN where it is not known.
     """
 
     names: tuple[str, ...]
     mean: np.ndarray
     sd: np.ndarray
     cv: np.ndarray
-    mean_error: np.ndarray | None = None
+    mean_error: np.ndarray
 
     def __str__(self) -> str:
-        width = max(len("parameter"), *(len(name) for name in self.names))
-        unknown = np.full(len(self.names), np.nan)
-        errors = ["-" if np.isnan(e) else f"{e:.2g}" for e in (unknown if self.mean_error is None else self.mean_error)]
-        rows = [f"{'parameter':<{width}} {'mean':>12} {'MC error':>10} {'sd':>12} {'CV':>10}"]
-        for name, mean, error, sd, cv in zip(self.names, self.mean, errors, self.sd, self.cv, strict=True):
-            rows.append(f"{name:<{width}} {mean:>12.5g} {error:>10} {sd:>12.4g} {cv:>10.3g}")
-        return "\n".join(rows)
+        rows = [("parameter", "mean", "MC error", "sd", "CV")]
+        for name, *values in zip(self.names, self.mean, self.mean_error, self.sd, self.cv, strict=True):
+            cells = (f"{x:{form}}" for x, form in zip(values, (".5g", ".2g", ".4g", ".3g"), strict=True))
+            rows.append((name, *("-" if cell == "nan" else cell for cell in cells)))
+        return "\n".join(aligned(rows))
 
 
 def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
     """The given names, or theta_0, theta_1, ...; ValueError if there is not one per parameter."""
-    names = tuple(f"theta_{i}" for i in range(ndim)) if names is None else tuple(names)
+    names = tuple(names or (f"theta_{i}" for i in range(ndim)))
     if len(names) != ndim:
         raise ValueError(f"expected one name per parameter: {ndim} parameters, but {len(names)} names {names}")
     return names
-
-
-def _samples(samples: np.ndarray) -> np.ndarray:
-    samples = np.asarray(samples, dtype=float)
-    if samples.ndim != 2 or len(samples) < 2:
-        raise ValueError(
-            f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
-        )
-    return samples
 
 
 def summary(
@@ -87,32 +126,24 @@ def summary(
     names : sequence of str, optional
         One name per parameter; theta_0, theta_1, ... by default.
     weights : array_like, shape (n,), optional
-        Non-negative weights of the samples; they need not sum to one.
+        Non-negative weights of the samples, normalised or not.
     mean_error : array_like, shape (ndim,), optional
-        Standard error of the mean, as ``sampler.mean_error()`` returns it for the same chain. It cannot be computed
-        from the samples alone, because copies made by resampling are correlated. NaN says that it is not known, as for
-        a Markov chain that is too short for an estimate of its autocorrelation time.
+        Standard error of the mean, from ``sampler.mean_error()``, since copies made by resampling are correlated; NaN
+        where it is unknown.
 
     Returns
     -------
     Summary
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, or weights or errors are negative.
     """
-    samples = _samples(samples)
-    if mean_error is not None:
-        mean_error = np.asarray(mean_error, dtype=float)
-        if mean_error.shape != samples.shape[1:] or np.any(mean_error < 0.0):
-            raise ValueError(
-                f"mean_error must be {samples.shape[1]} numbers, each non-negative or NaN, as sampler.mean_error() "
-                f"returns; got {mean_error}"
-            )
-    if weights is None:
-        weights = np.full(len(samples), 1.0)
-    weights = np.asarray(weights, dtype=float)
+    samples = np.asarray(samples, dtype=float)
+    if samples.ndim != 2 or len(samples) < 2:
+        raise ValueError(
+            f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
+        )
+    error = np.full(samples.shape[1], np.nan) if mean_error is None else np.asarray(mean_error, dtype=float)
+    if error.shape != samples.shape[1:] or np.any(error < 0.0):
+        raise ValueError(f"mean_error must be {samples.shape[1]} numbers, each non-negative or NaN; got {mean_error}")
+    weights = np.ones(len(samples)) if weights is None else np.asarray(weights, dtype=float)
     if weights.shape != (len(samples),) or not np.all(weights >= 0.0) or not 0.0 < weights.sum() < np.inf:
         raise ValueError(
             f"weights must be {len(samples)} non-negative numbers with a positive sum; got shape {weights.shape}"
@@ -121,7 +152,7 @@ def summary(
     mean = weights @ samples
     sd = np.sqrt(weights @ (samples - mean) ** 2)
     cv = np.divide(sd, np.abs(mean), out=np.where(sd > 0.0, np.inf, 0.0), where=mean != 0.0)
-    return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, mean_error)
+    return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, error)
 
 
 def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
@@ -133,40 +164,30 @@ def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
     return sampler.ladder
 
 
+# columns of `ladder_table`: heading, field of a stage, format
+_STAGE = (
+    ("ESS", "effective_sample_size", ".0f"),
+    ("acceptance", "acceptance", ".3f"),
+    ("sweeps", "moves", ""),
+    ("distinct", "distinct_ancestors", ""),
+    ("d log Z", "log_evidence_increment", ".3f"),
+    ("evaluations", "evaluations", ""),
+    ("time [s]", "seconds", ".3g"),
+)
+
+
 def ladder_table(sampler: Any) -> str:
-    """Table of the tempering stages, then the two estimates of the evidence, and a sentence of the diagnostics.
+    """Table of the tempering stages (`samplers.Stage`), estimates of the evidence, and summary of the verdict.
 
-    The columns are the fields of `samplers.tempering.population.Stage`: exponent, effective sample size, acceptance,
-    sweeps of the ensemble, distinct points after the resampling, increment of the log-evidence, evaluations, and wall
-    time [s].
-
-    Parameters
-    ----------
-    sampler : TemperedSampler
-        A sampler that has run.
-
-    Returns
-    -------
-    str
-        One line per stage.
-
-    Raises
-    ------
-    ValueError
-        If the sampler has no stages.
+    ValueError if the sampler has no stages.
     """
     stages = finished_ladder(sampler)
-    rows = [
-        f"{'stage':>5} {'beta':>10}  {'ESS':>6} {'acceptance':>10} {'sweeps':>6} {'distinct':>8} {'d log Z':>10} "
-        f"{'evaluations':>11} {'time [s]':>9}"
-    ]
-    for number, s in enumerate(stages, start=1):
+    table = [("stage", "beta ", *(heading for heading, _, _ in _STAGE))]
+    for number, stage in enumerate(stages, start=1):
         ended = sampler.ended_at is not None and number == len(stages)
-        beta = f"{sampler.ended_at:.3e}*" if ended else f"{s.beta:.3e} "
-        rows.append(
-            f"{number:>5} {beta:>11} {s.effective_sample_size:>6.0f} {s.acceptance:>10.3f} {s.moves:>6} "
-            f"{s.distinct_ancestors:>8} {s.log_evidence_increment:>10.3f} {s.evaluations:>11} {s.seconds:>9.3g}"
-        )
+        beta = f"{sampler.ended_at:.3e}*" if ended else f"{stage.beta:.3e} "
+        table.append((str(number), beta, *(format(getattr(stage, name), form) for _, name, form in _STAGE)))
+    rows = aligned(table)
     if sampler.ended_at is not None:
         rows.append("* the limit of simulations ended the run here: all points known then, weighted for beta = 1")
     evaluations, seconds = sum(s.evaluations for s in stages), sum(s.seconds for s in stages)
@@ -174,10 +195,6 @@ def ladder_table(sampler: Any) -> str:
         f"log evidence {sampler.log_evidence:.3f} +- {sampler.log_evidence_error:.3f}; "
         f"{evaluations} evaluations in {seconds:.3g} s"
     )
-    if sampler.coarse_evaluations:
-        rows.append(
-            f"{sampler.coarse_evaluations} evaluations of the coarse model, their time included in the first stage"
-        )
     check = sampler.log_evidence_check
     if check is not None:
         rows.append(
@@ -185,7 +202,7 @@ def ladder_table(sampler: Any) -> str:
             f"of {check.evaluations} independent draws {check.log_evidence:.3f} +- {check.error:.3f} "
             f"(effective sample size {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
         )
-    if text := summary_of(sampler):
+    if text := verdict_summary_of(sampler):
         rows.append(text)
     return "\n".join(rows)
 
@@ -193,18 +210,9 @@ def ladder_table(sampler: Any) -> str:
 class SamplerComparison(NamedTuple):
     """Cost and results of several samplers, one entry per sampler. ``str`` gives a table.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the samplers.
-    evaluations : tuple of int
-        Number of points for which ``log_prob_fn`` was called.
-    seconds : tuple of (float or None)
-        Wall time [s]; None if it was not measured.
-    effective_sample_size : tuple of float
-        Number of independent draws with the same error of the mean, for the parameter where it is smallest.
-    log_evidence, log_evidence_error : tuple of (float or None)
-        Log-evidence and its standard error; None for samplers that give no evidence.
+    `evaluations` is the number of points for which ``log_prob_fn`` was called, and `effective_sample_size` the number
+    of independent draws with the same error of the mean, for the worst parameter. `seconds` (wall time) is None where
+    it was not measured; `log_evidence` and its standard error are None for samplers without an evidence.
     """
 
     names: tuple[str, ...]
@@ -214,20 +222,13 @@ class SamplerComparison(NamedTuple):
     log_evidence: tuple[float | None, ...]
     log_evidence_error: tuple[float | None, ...]
 
-    @property
-    def efficiency(self) -> tuple[float, ...]:
-        """Effective sample size per evaluation."""
-        return tuple(ess / n for ess, n in zip(self.effective_sample_size, self.evaluations, strict=True))
-
     def __str__(self) -> str:
-        width = max(len("sampler"), *(len(name) for name in self.names))
-        head = f"{'sampler':<{width}} {'evaluations':>12} {'seconds':>9} {'ESS':>8} {'ESS/evaluation':>15} "
-        rows = [head + f"{'log evidence':>20}"]
+        rows = [("sampler", "evaluations", "seconds", "ESS", "ESS/evaluation", "log evidence")]
         for name, n, seconds, ess, value, error in zip(*self, strict=True):
             time = "-" if seconds is None else f"{seconds:.3g}"
             evidence = "-" if value is None else f"{value:.3f} +- {error:.3f}"
-            rows.append(f"{name:<{width}} {n:>12} {time:>9} {ess:>8.0f} {ess / n:>15.2e} {evidence:>20}")
-        return "\n".join(rows)
+            rows.append((name, str(n), time, f"{ess:.0f}", f"{ess / n:.2e}", evidence))
+        return "\n".join(aligned(rows))
 
 
 def comparison_table(
@@ -235,36 +236,26 @@ def comparison_table(
 ) -> SamplerComparison:
     """Compare the cost and the effective sample size of several samplers on one posterior.
 
-    The effective sample size is that of the parameter for which it is smallest: (standard deviation / Monte Carlo
-    error)^2 for tempered samplers, and the length of the chain divided by its autocorrelation time for emcee's own
-    sampler. The autocorrelation time of a short chain is underestimated. The effective sample size contains no
-    information about modes that were never visited.
+    The effective sample size is the smallest of all parameters: (standard deviation / Monte Carlo error)^2 for tempered
+    samplers, and the length of the chain divided by its autocorrelation time, which is underestimated for short chains,
+    for emcee's sampler. Modes that were never visited have no effect on it.
 
     Parameters
     ----------
     samplers : mapping of str to sampler
-        Samplers that have run in this process, by name. For `emcee.EnsembleSampler`, evaluations are counted as
-        iterations times walkers, which holds for chains that are not thinned and moves with one proposal per walker.
+        Samplers that have run in this process, by name. The evaluations of `emcee.EnsembleSampler` are iterations times
+        walkers, which holds without thinning and for moves with one proposal per walker.
     seconds : mapping of str to float, optional
-        Wall times [s] of samplers that do not measure their own, by name.
+        Wall times [s] of samplers that do not measure them, by name.
     discard : int
-        Burn-in of emcee's own sampler: number of initial iterations that are left out.
-
-    Returns
-    -------
-    SamplerComparison
-
-    Raises
-    ------
-    ValueError
-        If a sampler has not run in this process, or a time is given for an unknown name.
+        Burn-in of emcee's sampler: number of initial iterations that are left out.
     """
     given = {} if seconds is None else dict(seconds)
     if not samplers:
         raise ValueError("no samplers to compare: pass a mapping of names to samplers")
     if unknown := set(given) - set(samplers):
         raise ValueError(f"seconds are given for {sorted(unknown)}, but the samplers are {list(samplers)}")
-    columns = []
+    rows = []
     for name, sampler in samplers.items():
         tempered = is_tempered(sampler)
         evaluations = sampler.evaluations if tempered else sampler.iteration * sampler.nwalkers
@@ -280,14 +271,28 @@ def comparison_table(
             chain = sampler.get_chain(discard=discard)
             time = sampler.get_autocorr_time(discard=discard, tol=0)
             ess = chain.shape[0] * chain.shape[1] / float(np.max(time))
-        columns.append(
-            (
-                name,
-                evaluations,
-                given.get(name, sampler.seconds if tempered else None),
-                ess if np.isfinite(ess) else 0.0,
-                sampler.log_evidence if tempered else None,
-                sampler.log_evidence_error if tempered else None,
-            )
-        )
-    return SamplerComparison(*zip(*columns, strict=True))
+        ess = ess if np.isfinite(ess) else 0.0
+        evidence = (sampler.log_evidence, sampler.log_evidence_error) if tempered else (None, None)
+        rows.append((name, evaluations, given.get(name, sampler.seconds if tempered else None), ess, *evidence))
+    return SamplerComparison(*zip(*rows, strict=True))
+
+
+def describe_sampler(sampler: Any) -> str:
+    """HTML of a tempered sampler before or after runs: size, cost, evidence, verdict and moments of its chain."""
+    lines, moments = [], ""
+    if not sampler.ladder:
+        lines.append("Not run yet: run_mcmc(None, 4) anneals draws of the prior and makes 4 sweeps of the posterior.")
+    else:
+        stages = f"{len(sampler.ladder)} stages to beta = {sampler.ladder[-1].beta:.3g}"
+        failed = f", {sampler.failure_count} failed" if sampler.failure_count else ""
+        lines.append(f"{stages}, {sampler.iteration} sweeps stored, {sampler.evaluations} evaluations{failed}")
+        if sampler.ladder[-1].beta == 1.0:
+            lines.append(f"Log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2g}")
+            lines.append(str(sampler.verdict))
+        if sampler.iteration > 0:
+            described = described_parameters_of(log_posterior_of(sampler), sampler.ndim)
+            labels, factors = [each.label for each in described], np.array([each.factor for each in described])
+            moments = summary(sampler.get_chain(flat=True) / factors, labels, None, sampler.mean_error() / factors)
+    title = f"{type(sampler).__name__} of {sampler.nwalkers} walkers and {sampler.ndim} parameters"
+    text = "".join(f"<div>{escape(line)}</div>" for line in lines)
+    return f"<div><strong>{escape(title)}</strong>{text}<pre>{escape(str(moments))}</pre></div>"

@@ -1,1 +1,1 @@
-"""The annealing from prior to posterior: weights, resampling, mutation, evidence and diagnostics."""
+"""The annealing from prior to posterior: moves, chains from leaders, recycling, rounds of a guide."""

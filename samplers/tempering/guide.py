@@ -15,6 +15,16 @@ __all__ = ["AdaptedGuide", "Guide", "GuideSession", "check_guide", "guide_finger
 
 
 UNKNOWN = "it has no attribute concerns, so it is not known whether the posterior has other modes"
+# The optional members of a guide (see `Guide`) that are not methods of the search, and their defaults. A guide that
+# does not say whether parts of the posterior may be missing is itself a reason for concern.
+DEFAULTS = {
+    "simulations": 0.0,
+    "log_density_error": 0.0,
+    "concerns": (UNKNOWN,),
+    "basis": "",
+    "observe": None,
+    "learns_from_parts": False,
+}
 
 
 class GuideSession(NamedTuple):
@@ -25,15 +35,15 @@ class GuideSession(NamedTuple):
     random : RandomState
         The sampler's random generator.
     remember : callable
-        ``remember(key, compute)`` returns the list of arrays that ``compute()`` returns, and stores it in the journal
-        of the run under `key` (str). Where a run is resumed, the stored arrays are returned, and `compute` is not
-        called. For equal keys, the arrays that were stored first are returned first.
+        ``remember(key, compute)`` returns the list of arrays that ``compute()`` returns, and stores it in the record
+        of the run under `key` (str). A run that is made again gets the stored arrays without a call of `compute`. For
+        equal keys, the arrays that were stored first are returned first.
     fits : callable
-        ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; where
-        it returns False, the guide makes none and returns.
+        ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; if
+        False, the guide makes none and returns.
     remaining : callable
-        ``remaining()``: simulations left, inf without a limit. For information: no decision except to stop may depend
-        on it, otherwise a run that is continued with a larger limit cannot repeat its first part.
+        ``remaining()``: simulations left, inf without a limit. No decision except to stop may depend on it, otherwise a
+        run that is continued with a larger limit cannot repeat its first part.
     asynchronous : bool
         Whether draws arrive in any order, and the next ones are made while some of the last ones run.
     """
@@ -57,12 +67,12 @@ class Guide(Protocol):
         `log_prob_fn` does not return. Requires ``vectorize=True``. In an asynchronous run it is called when they have
         been evaluated, a few at a time.
     ``evaluation_queue()``
-        The queue that points are submitted to in an asynchronous run, in place of that of `log_prob_fn`, for a guide
-        that keeps more of an evaluation than its value.
+        The queue for points in an asynchronous run, in place of the queue of `log_prob_fn`, for a guide that keeps more
+        of an evaluation than its value.
     ``learns_from_parts`` : bool
-        Whether `refine` is to be called in an asynchronous run before all draws of a round have arrived. The first ones
-        are those with short evaluations: a regression may learn from them, an estimate of the density may not, since
-        a part of the posterior with long evaluations would be missing. False by default.
+        Whether `refine` is to be called in an asynchronous run before all draws of a round have arrived. The first
+        draws have short evaluations: a regression may learn from them, an estimate of the density may not. False by
+        default.
     ``check(log_prob_fn)``
         Raises ValueError if the guide is of another density than the sampler.
     ``fresh()``
@@ -74,10 +84,10 @@ class Guide(Protocol):
         Standard error of the logarithm of the normalising constant of the density.
     ``concerns`` : sequence of str
         Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any, the
-        verdict is not better than usable. Without this attribute, that the search is unknown counts as a reason: set
-        it to () if the posterior is known to have no parts that the guide misses.
+        verdict is not better than usable. A missing attribute counts as a reason: set it to () if the guide is known
+        to miss nothing.
     ``basis`` : str
-        What the search for parts of the posterior was, as a clause; it is part of the verdict.
+        How parts of the posterior were searched for, as a clause of the verdict.
     ``fingerprint`` : str
         Identity of the guide: a run is resumed only with an equal one.
     """
@@ -91,14 +101,13 @@ class Guide(Protocol):
     def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Iterator[None] | None:
         """Learn from the latest draws (n, ndim) and their log-probabilities (n,), -inf where an evaluation failed.
 
-        Later draws and densities may change. May be a generator; each item advances the progress bar. In an
-        asynchronous run, the draws may be of an earlier density than the present one, and the next draws may have been
-        made already.
+        May be a generator; each item advances the progress bar. In an asynchronous run, the draws may be from an
+        earlier density, and the next draws may have been made already.
         """
 
 
 class AdaptedGuide:
-    """A user's guide, with defaults for the members that it does not have.
+    """A user's guide, with `DEFAULTS` for the members that it does not have.
 
     Parameters
     ----------
@@ -118,42 +127,15 @@ class AdaptedGuide:
         self.guide = copy.deepcopy(guide) if fresh is None else fresh()
         self._ndim = ndim
 
-    def _optional(self, name: str, default: Any) -> Any:
-        return getattr(self.guide, name, default)
-
-    @property
-    def simulations(self) -> float:
-        """Simulations that the guide made by itself."""
-        return float(self._optional("simulations", 0.0))
-
-    @property
-    def log_density_error(self) -> float:
-        """Standard error of the logarithm of the normalising constant."""
-        return float(self._optional("log_density_error", 0.0))
-
-    @property
-    def concerns(self) -> tuple[str, ...]:
-        """Why parts of the posterior may be missing; a guide that does not say is itself a reason."""
-        return tuple(self._optional("concerns", (UNKNOWN,)))
-
-    @property
-    def basis(self) -> str:
-        """What the search for parts of the posterior was; empty if the guide does not say."""
-        return str(self._optional("basis", ""))
-
-    @property
-    def observe(self) -> Callable[[np.ndarray, GuideSession], None] | None:
-        """The guide's method `observe`, or None."""
-        return self._optional("observe", None)
-
-    @property
-    def learns_from_parts(self) -> bool:
-        """Whether the guide may learn from the first arrivals of a round."""
-        return bool(self._optional("learns_from_parts", False))
+    def __getattr__(self, name: str) -> Any:
+        if name not in DEFAULTS:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        value, default = getattr(self.guide, name, DEFAULTS[name]), DEFAULTS[name]
+        return value if default is None else type(default)(value)
 
     def prepare(self, session: GuideSession) -> Iterator[None]:
         """The search before the first draw."""
-        prepare = self._optional("prepare", None)
+        prepare = getattr(self.guide, "prepare", None)
         yield from () if prepare is None else (prepare(session) or ())
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:

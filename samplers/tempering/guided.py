@@ -1,12 +1,17 @@
 """Start from a guide: rounds of draws that are evaluated, weighted and used to refine the guide.
 
-The density of a round is fixed before its draws are made, and each draw is weighted by it
-(`samplers.tempering.rounds`). The rounds end with one that is *trusted*: its effective share and the Pareto shape of
-its weights are good enough, although its draws had no part in the density that they are weighted with. All rounds
-together must then have an effective sample size of the number of walkers.
+The density of a round is fixed before its draws are made, and each draw is weighted by this density
+(`samplers.estimates.importance`). The rounds end with a *reliable* one: fresh draws with a good effective share and
+Pareto shape. All rounds together must then have an effective sample size of the number of walkers.
 
-A part of the posterior that a guide never proposes is not seen by its own draws. Guides with a share of the prior in
-their density can find it; others rest on their search (`concerns`).
+Draws that are submitted together are a `Batch`; they may arrive in any order. A batch becomes a round when all its
+draws have arrived. Until then, its draws influence no weight, no share of a round and no decision: the first arrivals
+have short evaluations, and are not a fair sample. They may train a guide that says so (`learns_from_parts`), since the
+draws of the next batch are weighted by their own density.
+
+A part of the posterior that a guide never proposes is not seen by its draws. Guides with a share of the prior in their
+density can find it; other guides depend on their search (`concerns`). Constants without a reference were chosen by
+trials on posteriors with known answers.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -14,17 +19,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .adaptive_importance import most_running
-from .archive import StartingDensity
-from .budget import Budget
-from .cohorts import Cohort, let_arrive, submit_cohort
+from ..budget import Budget
+from ..estimates.importance import (
+    FIRST_ROUND_SHARE,
+    LARGEST_SHAPE,
+    USABLE_SHARE,
+    PooledRounds,
+    Round,
+    pool_rounds,
+    tails_are_light,
+    usable,
+)
+from ..reports import GuidedRound, GuideTick, Report
+from .early_stop import StoppedEarly
 from .guide import AdaptedGuide, GuideSession
-from .population import Density, GuidedRound, GuideTick, Population, Report
-from .rounds import PooledRounds, Round, pool_rounds, tails_are_light
-from .settings import GuidedSettings
-from .stopping import LARGEST_SHAPE, StoppedEarly, usable
+from .pending_points import PendingPoints
+from .population import Density, Population
+from .recycling import StartingDensity, most_running
 
 __all__ = [
+    "Batch",
     "Guidance",
     "RoundsOfGuide",
     "better_of",
@@ -32,30 +46,33 @@ __all__ = [
     "lend",
     "start_from_guide",
     "stopped_rounds",
-    "trusted",
+    "reliable",
 ]
 
-FEW_DRAWS = 100
-# mean effective sample size of rounds below which the guide is given up
-FEWEST_OF_ROUND = 1.5
+# Draws of each later round, as a share of the number of walkers. After a reliable round, a round has as many draws as
+# are expected to suffice.
+ROUND_SHARE = 0.6
+# Smallest number of draws of a round. The Pareto shape cannot be estimated from fewer than 25.
+FEWEST_DRAWS = 25
+# A reliable round has at least this effective share, and a Pareto shape below this value, for which the variance of its
+# weights is finite. With fewer than 100 draws, the shape is uncertain, and a larger share is enough.
+RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.5, 0.5
+SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
+# Largest number of rounds.
+MOST_ROUNDS = 20
+# The guide is given up when the mean effective share of the last 4 rounds is below 0.03, or their mean effective sample
+# size below 1.5: a round of few draws has an effective share of at least one over their number.
+HOPELESS_ROUNDS, HOPELESS_SHARE, FEWEST_OF_ROUND = 4, 0.03, 1.5
+# The check of the first values of a run needs some that arrive together.
+FIRST_TOGETHER = 8
 LIGHT_TAILS = (
-    "the weights of the draws grow towards the tails: those of the guide are lighter than those of the posterior, so "
+    "the weights of the draws grow towards the tails: the tails of the guide are lighter than the posterior's, so "
     "standard deviations may be too small. Give the draws of the guide heavier tails, or use no guide"
 )
 
 
 class Guidance(NamedTuple):
-    """A guide, and what it is lent.
-
-    Attributes
-    ----------
-    guide : AdaptedGuide
-        The guide.
-    session : GuideSession
-        What it is lent.
-    budget : Budget
-        Simulations so far, and their limit.
-    """
+    """A guide, what a sampler lends it, and the simulations so far with their limit."""
 
     guide: AdaptedGuide
     session: GuideSession
@@ -69,7 +86,17 @@ def lend(
     budget.begin(guide)
 
     def remember_with_count(key: str, compute: Callable) -> list[np.ndarray]:
-        return remember(key, compute, lambda: budget.of_guides_with_batch)
+        made = False
+
+        def compute_new() -> list[np.ndarray]:
+            nonlocal made
+            made = True
+            return compute()
+
+        arrays = remember(key, compute_new)
+        if made:
+            budget.note()
+        return arrays
 
     session = GuideSession(random, remember_with_count, budget.fits, lambda: budget.remaining, asynchronous)
     return Guidance(guide, session, budget)
@@ -80,7 +107,7 @@ class RoundsOfGuide(NamedTuple):
 
     Attributes
     ----------
-    doubt : str
+    reason : str
         Why the draws cannot be used; empty if they can.
     shortfall : str
         What was not reached although the draws can be used, or that their tails are too light; empty if all was.
@@ -92,20 +119,121 @@ class RoundsOfGuide(NamedTuple):
         Whether the limit of simulations ended the rounds.
     """
 
-    doubt: str
+    reason: str
     shortfall: str
     pooled: PooledRounds | None
     last: Round | None
     stopped: bool = False
 
 
-def trusted(latest: Round, settings: GuidedSettings) -> bool:
+class Batch:
+    """Draws of one density of a guide.
+
+    Parameters
+    ----------
+    pending : PendingPoints
+        The draws.
+    log_density : (n,) float
+        Logarithm of the density that they were drawn from.
+    """
+
+    def __init__(self, pending: PendingPoints, log_density: np.ndarray):
+        self.pending, self._log_density = pending, log_density
+        self._learned = np.zeros(len(pending.coords), dtype=bool)
+        self._observed = pending.arrived.copy()
+
+    def __len__(self) -> int:
+        return len(self.pending.coords)
+
+    @property
+    def running(self) -> int:
+        """Number of draws that have not arrived."""
+        return self.pending.running
+
+    @property
+    def possible(self) -> bool:
+        """Whether a draw with a finite log-probability has arrived."""
+        return bool(np.any(self.pending.arrived_part()[1]["log_prob"] > -np.inf))
+
+    def as_round(self) -> Round:
+        """The round of the draws, which have all arrived."""
+        coords, records = self.pending.arrived_part()
+        log_prob = records["log_prob"]
+        alive = log_prob > -np.inf
+        log_density = self._log_density[self.pending.arrived]
+        log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density, -np.inf)
+        return Round(coords, records, log_weights)
+
+    def take_observable(self) -> np.ndarray:
+        """Draws (m, ndim) that have arrived since the last call or the submission."""
+        new = self.pending.arrived & ~self._observed
+        self._observed |= new
+        return self.pending.coords[new]
+
+    def take_lesson(self, parts: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Draws (m, ndim) for the guide to learn from, and their log-probabilities (m,): each draw is taken once.
+
+        `parts`: whether draws are taken before all of the batch have arrived.
+        """
+        coords, records = self.pending.arrived_part()
+        new = ~self._learned[self.pending.arrived] & (parts or self.pending.complete)
+        self._learned[np.flatnonzero(self.pending.arrived)[new]] = True
+        return coords[new], records["log_prob"][new]
+
+    @property
+    def learned(self) -> bool:
+        """Whether the guide has learned from all draws."""
+        return bool(self._learned.all())
+
+
+def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, session: GuideSession) -> Batch:
+    """Begin to evaluate draws (n, ndim) of the guide, of which a limit of simulations may allow the first few only.
+
+    Raises
+    ------
+    ValueError
+        If the density of the guide is zero at one of its own draws.
+    """
+    log_density = guide.log_density(coords)
+    if np.any(log_density == -np.inf):
+        raise ValueError(
+            f"guide.log_density is -inf at {int(np.sum(log_density == -np.inf))} of {len(coords)} draws of the guide: "
+            "it must return the logarithm of the density that guide.draw draws from"
+        )
+    observe = guide.observe
+    if observe is None or session.asynchronous:
+        pending = density.submit(coords)
+    else:
+        pending = density.submit(coords, lambda points: observe(points, session))
+    return Batch(pending, log_density[: len(pending.coords)])
+
+
+def let_arrive(
+    batches: Sequence[Batch], most: int, density: Density, guide: AdaptedGuide, session: GuideSession
+) -> None:
+    """Wait until at most this number of the latest batch is running, and nothing of the earlier ones.
+
+    The guide observes draws as they arrive, a few at a time, so that a run that is killed has kept nearly all of them.
+    """
+    while batches:
+        running = [batch.running for batch in batches]
+        if sum(running[:-1]) == 0 and running[-1] <= most:
+            return
+        step = 1 if density.evaluations > 0 else FIRST_TOGETHER
+        density.wait(max(sum(running) - step, 0))
+        for batch in batches if guide.observe is not None else ():
+            arrived = batch.take_observable()
+            if len(arrived) > 0:
+                guide.observe(arrived, session)
+
+
+def reliable(latest: Round) -> bool:
     """Whether a fresh round shows that the guide describes the posterior."""
     share = latest.effective_share
-    if share < settings.trusted_share:
+    if share < RELIABLE_SHARE:
         return False
     few = len(latest.log_weights) < FEW_DRAWS
-    return latest.pareto_shape < settings.largest_pareto_shape or (few and share >= settings.short_tail_share)
+    return latest.pareto_shape < LARGEST_RELIABLE_SHAPE or (few and share >= SHORT_TAIL_SHARE)
 
 
 def draw_rounds(
@@ -113,22 +241,15 @@ def draw_rounds(
     density: Density,
     random: np.random.RandomState,
     guidance: Guidance,
-    settings: GuidedSettings,
 ) -> Generator[tuple[Population, Report], None, RoundsOfGuide]:
-    """Let the guide search, then draw, evaluate and refine until a fresh round is trusted.
+    """Let the guide search, then draw, evaluate and refine until a fresh round is reliable.
 
     Parameters
     ----------
     population : Population
         Draws of the prior, as many as there are walkers. They are not evaluated.
-    density : Density
-        The posterior.
-    random : RandomState
-        Source of random numbers.
-    guidance : Guidance
-        The guide.
-    settings : GuidedSettings
-        Constants.
+    density, random, guidance
+        As in `samplers.tempering.anneal.anneal`.
 
     Yields
     ------
@@ -143,8 +264,8 @@ def draw_rounds(
     guide, session, budget = guidance
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
     rounds: list[Round] = []
-    cohorts: list[Cohort] = []  # of which draws are running
-    lessons: list[Cohort] = []  # of which the guide has not learned from all draws
+    batches: list[Batch] = []  # of which draws are running
+    lessons: list[Batch] = []  # of which the guide has not learned from all draws
     refused, pooled = False, None
 
     def tick(phase: str, finished: bool) -> tuple[Population, GuideTick]:
@@ -154,18 +275,18 @@ def draw_rounds(
         """Let draws arrive; returns how the rounds end, or None where another one follows."""
         nonlocal population, pooled
         while True:
-            let_arrive(cohorts, most, density, guide, session)
+            let_arrive(batches, most, density, guide, session)
             outcome = None
-            while cohorts and cohorts[0].flight.complete:
-                rounds.append(cohorts.pop(0).as_round())
+            while batches and batches[0].pending.complete:
+                rounds.append(batches.pop(0).as_round())
                 pooled = pool_rounds(rounds, guide.log_density_error)
                 population = population._replace(effective_sample_size=pooled.effective_sample_size)
                 yield population, _report(rounds[-1], pooled)
                 yield tick(f"round {len(rounds)}", True)
-                outcome = _outcome(rounds, pooled, size, settings)
+                outcome = _outcome(rounds, pooled, size)
             if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
                 outcome = RoundsOfGuide("", "", pooled, rounds[-1] if rounds else None, True)
-            if not cohorts or (outcome is None and _too_few(rounds, cohorts, size, settings, guide)):
+            if not batches or (outcome is None and _too_few(rounds, batches, size, guide)):
                 return outcome
             most = 0  # what was submitted is part of the result
 
@@ -173,13 +294,13 @@ def draw_rounds(
     for _ in guide.prepare(session):
         yield tick("search", True)
     while True:
-        yield tick(f"round {len(rounds) + len(cohorts) + 1}", False)
-        coords = guide.draw(_next_size(rounds, cohorts, size, settings, guide), random)
-        cohort = submit_cohort(coords, density, guide, session)
-        refused = cohort.flight.refused
-        if len(cohort) > 0:
-            cohorts.append(cohort)
-            lessons.append(cohort)
+        yield tick(f"round {len(rounds) + len(batches) + 1}", False)
+        coords = guide.draw(_next_size(rounds, batches, size, guide), random)
+        batch = submit_batch(coords, density, guide, session)
+        refused = batch.pending.refused
+        if len(batch) > 0:
+            batches.append(batch)
+            lessons.append(batch)
         outcome = yield from judge(0 if refused or budget.refused else most_running(density, len(coords)))
         if outcome is not None:
             return outcome
@@ -204,67 +325,61 @@ def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
     )
 
 
-def _outcome(
-    rounds: Sequence[Round], pooled: PooledRounds, size: int, settings: GuidedSettings
-) -> RoundsOfGuide | None:
+def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> RoundsOfGuide | None:
     """How the rounds end; None if they go on."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
-    if enough and trusted(last, settings) and _even(pooled, settings):
-        light = tails_are_light([r for r in rounds if trusted(r, settings)])
+    if enough and reliable(last) and _even(pooled):
+        light = tails_are_light([r for r in rounds if reliable(r)])
         return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, last)
-    if doubt := _impossible(rounds) or _hopeless(rounds, settings):
-        return RoundsOfGuide(doubt, "", pooled, last)
-    if len(rounds) < settings.most_rounds:
+    if reason := _impossible(rounds) or _hopeless(rounds):
+        return RoundsOfGuide(reason, "", pooled, last)
+    if len(rounds) < MOST_ROUNDS:
         return None
-    shortfall = _describe(last, pooled, settings)
-    usable = last.effective_share >= settings.usable_share and pooled.pareto_shape < LARGEST_SHAPE
+    shortfall = _describe(last, pooled)
+    usable = last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
     return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
 
 
-def _too_few(
-    rounds: Sequence[Round], cohorts: Sequence[Cohort], size: int, settings: GuidedSettings, guide: AdaptedGuide
-) -> bool:
+def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> bool:
     """Whether more draws are made while some are running, since these will not be enough.
 
-    A guide that has to learn, and does so from complete rounds only, would repeat draws of the density that it has.
+    A guide that learns from complete rounds only would repeat draws of the same density.
     """
-    if len(rounds) + len(cohorts) >= settings.most_rounds:
+    if len(rounds) + len(batches) >= MOST_ROUNDS:
         return False
-    if rounds and trusted(rounds[-1], settings):
-        return _missing(rounds, cohorts, size, guide) > 0.0
-    return guide.learns_from_parts and (not _all_impossible(rounds) or any(cohort.possible for cohort in cohorts))
+    if rounds and reliable(rounds[-1]):
+        return _missing(rounds, batches, size, guide) > 0.0
+    return guide.learns_from_parts and (not _all_impossible(rounds) or any(batch.possible for batch in batches))
 
 
-def _missing(rounds: Sequence[Round], cohorts: Sequence[Cohort], size: int, guide: AdaptedGuide) -> float:
+def _missing(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> float:
     """Effective draws that are missing, if those that are running have the effective share of the last round."""
-    expected = rounds[-1].effective_share * sum(len(cohort) for cohort in cohorts)
+    expected = rounds[-1].effective_share * sum(len(batch) for batch in batches)
     return size - pool_rounds(rounds, guide.log_density_error).effective_sample_size - expected
 
 
-def _even(pooled: PooledRounds, settings: GuidedSettings) -> bool:
-    """Whether no few weights of all rounds carry the result.
+def _even(pooled: PooledRounds) -> bool:
+    """Whether the result of all rounds does not rest on a few weights.
 
-    The early rounds of a poor guide have weights of heavy tails, and their part in the result is small: the error of
-    the log-evidence takes account of it, so that the shape need only be one for which a mean is useful.
+    The early rounds of a poor guide have heavy-tailed weights but a small part in the result, which the error of the
+    log-evidence accounts for. So it is enough that the shape permits a useful mean.
     """
     n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
-    even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= settings.short_tail_share)
+    even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= SHORT_TAIL_SHARE)
     return even and bool(np.isfinite(pooled.log_evidence_error))
 
 
-def _next_size(
-    rounds: Sequence[Round], cohorts: Sequence[Cohort], size: int, settings: GuidedSettings, guide: AdaptedGuide
-) -> int:
-    """Number of draws of the next cohort; of the `cohorts` that are running, only their number of draws matters."""
-    first = max(settings.fewest_draws, int(np.ceil(settings.first_round_share * size)))
-    if not rounds and not cohorts:
+def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> int:
+    """Number of draws of the next batch; of the `batches` that are running, only their number of draws matters."""
+    first = max(FEWEST_DRAWS, int(np.ceil(FIRST_ROUND_SHARE * size)))
+    if not rounds and not batches:
         return first
     if rounds and _all_impossible(rounds):  # perhaps all simulations fail: find out with few more
-        return settings.fewest_draws
-    if rounds and trusted(rounds[-1], settings):
-        missing = _missing(rounds, cohorts, size, guide)
+        return FEWEST_DRAWS
+    if rounds and reliable(rounds[-1]):
+        missing = _missing(rounds, batches, size, guide)
         return int(np.clip(np.ceil(missing / rounds[-1].effective_share), first, max(size, first)))
-    return max(settings.fewest_draws, int(np.ceil(settings.round_share * size)))
+    return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
 
 
 def _all_impossible(rounds: Sequence[Round]) -> bool:
@@ -279,25 +394,24 @@ def _impossible(rounds: Sequence[Round]) -> str:
     return f"none of their first {sum(len(r.coords) for r in rounds)} has a finite log-probability"
 
 
-def _hopeless(rounds: Sequence[Round], settings: GuidedSettings) -> str:
+def _hopeless(rounds: Sequence[Round]) -> str:
     """Why to give up; empty if there is no reason."""
-    recent = rounds[-settings.hopeless_rounds :]
+    recent = rounds[-HOPELESS_ROUNDS:]
     share = np.mean([r.effective_share for r in recent])
-    # a round of few draws has an effective share of at least one over their number
-    hopeless = share < settings.hopeless_share or np.mean([r.effective_sample_size for r in recent]) < FEWEST_OF_ROUND
-    if len(recent) < settings.hopeless_rounds or not hopeless:
+    hopeless = share < HOPELESS_SHARE or np.mean([r.effective_sample_size for r in recent]) < FEWEST_OF_ROUND
+    if len(recent) < HOPELESS_ROUNDS or not hopeless:
         return ""
     return f"the effective sample size of the last {len(recent)} rounds is {100 * share:.2g} % of their draws"
 
 
-def _describe(last: Round, pooled: PooledRounds, settings: GuidedSettings) -> str:
+def _describe(last: Round, pooled: PooledRounds) -> str:
     """What the rounds have reached, and what they lack."""
     return (
-        f"after {settings.most_rounds} rounds, the effective sample size of fresh draws is "
-        f"{100 * last.effective_share:.2g} % of their number with a Pareto shape of {last.pareto_shape:.2g}, and that "
-        f"of all draws is {pooled.effective_sample_size:.0f} with a shape of {pooled.pareto_shape:.2g} (a share of at "
-        f"least {100 * settings.trusted_share:g} %, as many effective draws as walkers, and shapes below "
-        f"{settings.largest_pareto_shape:g} are needed)"
+        f"after {MOST_ROUNDS} rounds, the effective sample size of fresh draws is "
+        f"{100 * last.effective_share:.2g} % of their number with a Pareto shape of {last.pareto_shape:.2g}, and the "
+        f"effective sample size of all draws is {pooled.effective_sample_size:.0f} with a shape of "
+        f"{pooled.pareto_shape:.2g} (a share of at least {100 * RELIABLE_SHARE:g} %, as many effective draws as "
+        f"walkers, and shapes below {LARGEST_RELIABLE_SHAPE:g} are needed)"
     )
 
 
@@ -309,20 +423,18 @@ def start_from_guide(
     Parameters
     ----------
     last : Round
-        Draws of the guide as it is now.
+        Draws of the guide, which must not change any more.
     prior : Population
         Draws of the prior.
     density : Density
         The posterior.
     guide : AdaptedGuide
-        The guide, which must not change any more.
+        The guide.
 
     Returns
     -------
-    population : Population
-        The points.
-    start : StartingDensity
-        The mixture that they were drawn from.
+    Population, StartingDensity
+        The points, and the mixture that they were drawn from.
     """
     few = prior.coords[: max(len(last.coords), prior.coords.shape[1] + 2)]
     coords = np.concatenate([last.coords, few])
@@ -337,9 +449,9 @@ def start_from_guide(
 
 
 def better_of(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
-    """Of the points known at a stop and the rounds of the guide before it, those that are worth more.
+    """The points known at a stop, or the rounds of the guide before it, whichever are worth more.
 
-    The rounds if they are usable, since each has a proposal of its own, and no mode is lost from one to the next.
+    Usable rounds take precedence: each has an independent proposal, and no mode is lost from one to the next.
     """
     rounds, pooled = stopped_rounds(found), found.pooled
     rounds.log_evidence_of_stages = stop.log_evidence_of_stages

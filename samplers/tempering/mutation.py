@@ -1,40 +1,61 @@
 """Mutation at a fixed beta: moves of the ensemble, and the rule that ends them.
 
 Resampling copies points, and the moves separate the copies. Moving stops once the population is nearly uncorrelated
-with the resampled one it started from (`StartCorrelation`). With ``chains="leaders"``, chains grow from the distinct
-points instead, as in Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816).
+with the resampled one it started from (`StartCorrelation`). The chains of transitional Markov chain Monte Carlo are in
+`samplers.tempering.leaders`.
 """
 
 from collections.abc import Callable, Generator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from emcee import State
 from emcee.model import Model
-from emcee.moves import Move, RedBlueMove
+from emcee.moves import DESnookerMove, Move, RedBlueMove
 
+from ..budget import BudgetExhausted
 from ..moves.fast_parameters import WithFastSweeps
 from ..moves.kernels import MixtureMove, calibrate_move
 from ..proposals.mixture import Mixture
-from .budget import BudgetExhausted
-from .population import Density, Population, Sweep
-from .settings import Settings
+from ..reports import Sweep
+from ..settings import Settings
+from .population import Density, Population
 
 __all__ = [
     "MoveSchedule",
     "Mutated",
     "StartCorrelation",
+    "VisitedPoints",
     "check_moves",
-    "grow_chains",
     "move_together",
+    "needs_many_walkers",
     "tempered_log_prob",
+    "tempered_model",
 ]
 
 STALL_SWEEPS = 3
+MOST_POINTS = 10_000  # kept by `VisitedPoints`
+
+
+def needs_many_walkers(moves: Any) -> bool:
+    """Whether there are red-blue moves of emcee among `moves`: a move, a sequence of moves or of (move, weight)."""
+    each = moves if isinstance(moves, Sequence) else [moves]
+    return any(isinstance(move[0] if isinstance(move, Sequence) else move, RedBlueMove) for move in each)
 
 
 def check_moves(moves: Sequence[Move], chains: str) -> None:
-    """Raise ValueError for moves that cannot move chains from leaders (setting `chains`)."""
+    """Raise ValueError for moves that cannot move chains from leaders (setting `chains`), or do not keep their target.
+
+    The acceptance of ``emcee.moves.DESnookerMove`` (emcee 3.1.6 and earlier) has the exponent (ndim - 1) / 2 in place
+    of ndim - 1 for the ratio of the distances from the third walker (ter Braak & Vrugt 2008, Statistics and Computing
+    18, doi:10.1007/s11222-008-9104-9).
+    """
+    if any(type(move) is DESnookerMove for move in moves):
+        raise ValueError(
+            "emcee.moves.DESnookerMove is refused: its acceptance has half of the exponent that the snooker update "
+            "needs, so its samples are too narrow (variance 0.79 for 1 with three normal parameters), and it divides "
+            "by zero between copies of a point. Use emcee.moves.DEMove or samplers.MixtureMove"
+        )
     red_blue = [type(move).__name__ for move in moves if isinstance(move, RedBlueMove)]
     if red_blue and chains == "leaders":
         raise ValueError(
@@ -124,11 +145,50 @@ def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
     return np.where(outside, -np.inf, (1.0 - beta) * log_prior + beta * records["log_prob"])
 
 
-def _model(density: Density, beta: float, random: np.random.RandomState) -> Model:
+class VisitedPoints:
+    """Possible points that the annealing has evaluated, as far as they may still show a part of the target.
+
+    While beta is small, a narrow mode has few points, and the next resampling replaces most of them. They are kept
+    here, with proposals that were not accepted, so that `samplers.proposals.basins` can propose draws there, and so
+    that the result can be compared with them.
+    """
+
+    def __init__(self) -> None:
+        self._coords: list[np.ndarray] = []
+        self._records: list[np.ndarray] = []
+
+    def add(self, coords: np.ndarray, records: np.ndarray) -> None:
+        """Add points (n, ndim) with their records (n,), of which log_prior and log_prob are kept."""
+        possible = records["log_prob"] > -np.inf
+        kept = np.empty(np.count_nonzero(possible), [("log_prior", float), ("log_prob", float)])
+        for name in kept.dtype.names:
+            kept[name] = records[name][possible]
+        self._coords.append(coords[possible])
+        self._records.append(kept)
+
+    def at(self, beta: float) -> tuple[np.ndarray, np.ndarray]:
+        """The points (n, ndim) and the logarithm (n,) of the tempered target there, not normalised.
+
+        If there are more than 10 000 points, those with the lowest target are dropped.
+        """
+        coords, records = np.concatenate(self._coords), np.concatenate(self._records)
+        log_target = tempered_log_prob(records, beta)
+        if len(coords) > MOST_POINTS:
+            highest = np.sort(np.argpartition(-log_target, MOST_POINTS)[:MOST_POINTS])
+            coords, records, log_target = coords[highest], records[highest], log_target[highest]
+        self._coords, self._records = [coords], [records]
+        return coords, log_target
+
+
+def tempered_model(
+    density: Density, beta: float, random: np.random.RandomState, visited: VisitedPoints | None
+) -> Model:
     """The tempered density as emcee's moves evaluate it; the records of the points are its blobs."""
 
     def compute_log_prob(coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         records = density.evaluate(coords)
+        if visited is not None:
+            visited.add(coords, records)
         return tempered_log_prob(records, beta), records
 
     return Model(density.evaluate, compute_log_prob, density.map, random)
@@ -186,6 +246,7 @@ def move_together(
     random: np.random.RandomState,
     schedule: MoveSchedule,
     settings: Settings,
+    visited: VisitedPoints | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move all points equally often, until they are nearly uncorrelated with their start.
 
@@ -200,7 +261,9 @@ def move_together(
     schedule : MoveSchedule
         The moves.
     settings : Settings
-        Of these, `min_moves`, `max_moves` and `max_correlation`.
+        Length of the moves: `min_moves`, `max_moves` and `max_correlation`.
+    visited : VisitedPoints, optional
+        Points that are evaluated are added to it.
 
     Yields
     ------
@@ -212,7 +275,7 @@ def move_together(
     Mutated
     """
     beta, records = population.beta, population.records
-    model = _model(density, beta, random)
+    model = tempered_model(density, beta, random, visited)
     correlation = StartCorrelation(population.coords, records)
     state = State(population.coords, log_prob=tempered_log_prob(records, beta), blobs=records)
     acceptance = []
@@ -229,64 +292,3 @@ def move_together(
         population = population._replace(coords=state.coords, records=state.blobs)
         yield population, Sweep(acceptance[-1])
     return Mutated(population, float(np.mean(acceptance)), len(acceptance), correlation.values[-1])
-
-
-def grow_chains(
-    population: Population,
-    ancestors: np.ndarray,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    settings: Settings,
-) -> Generator[tuple[Population, Sweep], None, Mutated]:
-    """Grow a chain from each distinct point (leader), one step per copy of it (Ching & Chen 2007).
-
-    All chains first make ``settings.burn_in`` steps; then every step of a chain is a point of the new population.
-    Chains of the same length move together, so the moves must be able to move any number of points.
-
-    Parameters
-    ----------
-    population : Population
-        Resampled points, with the beta at which they are moved.
-    ancestors : (n,) int
-        Index of each point before the resampling; equal for copies.
-    density, random, schedule, settings
-        As in `move_together`.
-
-    Yields
-    ------
-    Population, Sweep
-        After each step of the chains; points that their chain has not reached yet are those of the start.
-
-    Returns
-    -------
-    Mutated
-    """
-    beta, coords, records = population.beta, population.coords, population.records
-    model = _model(density, beta, random)
-    _, first, owner, counts = np.unique(ancestors, return_index=True, return_inverse=True, return_counts=True)
-    place = np.argsort(owner, kind="stable")
-    start = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    chains = State(coords[first], log_prob=tempered_log_prob(records[first], beta), blobs=records[first])
-    correlation = StartCorrelation(coords, records)
-    coords, records = coords.copy(), records.copy()
-    population = population._replace(coords=coords, records=records)
-    accepted_steps, steps = 0, 0
-    for length in range(-settings.burn_in, int(counts.max())):
-        growing = np.flatnonzero(counts > length)
-        move = schedule.choose(random)
-        state = State(chains.coords[growing], log_prob=chains.log_prob[growing], blobs=chains.blobs[growing])
-        try:
-            state, accepted = move.propose(model, state)
-        except BudgetExhausted:
-            return Mutated(population, accepted_steps / max(steps, 1), 0, 1.0, True)
-        move.tune(state, accepted)
-        chains.coords[growing], chains.log_prob[growing] = state.coords, state.log_prob
-        chains.blobs[growing] = state.blobs
-        if length >= 0:
-            rows = place[start[growing] + length]
-            coords[rows], records[rows] = state.coords, state.blobs
-        accepted_steps, steps = accepted_steps + int(np.sum(accepted)), steps + len(growing)
-        yield population, Sweep(float(np.mean(accepted)))
-    correlation.update(coords, records)
-    return Mutated(population, accepted_steps / steps, settings.burn_in + 1, correlation.values[-1])

@@ -1,4 +1,4 @@
-"""How well the expected number of evaluations predicts runs (`samplers.tempering.expected_cost`).
+"""How well the expected number of evaluations predicts runs (`samplers.cost.expected_evaluations`).
 
 The constants of the model were chosen by Gaussian posteriors; the others are those of `tests.benchmarks.truth_targets`.
 A prediction is made before the run, from the log-likelihoods of three
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
-from samplers.tempering.expected_cost import expected_left, first_beta
+from samplers.cost import expected_evaluations, first_beta
 
 from . import truth_targets as targets
 from .rows import Row
@@ -45,10 +45,10 @@ def predictions(posterior: Any, sampler_type: type, nwalkers: int, seed: int) ->
         warnings.simplefilter("ignore", SamplingWarning)
         sampler.run_mcmc(None, 0)
     recycling, ladder = bool(sampler.settings.recycle), sampler.ladder
-    choice = sampler.settings, nwalkers, posterior.ndim, recycling
+    choice = sampler.settings, nwalkers, posterior.ndim
     for known in range(len(ladder)):
         beta = ladder[known - 1].beta if known else first_beta(values, recycling)
-        range_ = expected_left(*choice, beta, ladder[:known])
+        range_ = expected_evaluations(*choice, beta)
         left = sampler.evaluations - (sum(stage.evaluations for stage in ladder[:known]) if known else nwalkers)
         yield known == 0, range_.low <= left <= range_.high, left / range_.likely
 

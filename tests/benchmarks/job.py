@@ -21,7 +21,7 @@ import numpy as np
 
 from .rows import Row
 
-__all__ = ["EVERY", "LIMIT", "compare_settings", "job", "memory", "stage_reached"]
+__all__ = ["EVERY", "LIMIT", "compare_settings", "job", "evaluations_made", "memory"]
 
 ROOT = Path(__file__).resolve().parents[2]
 EVERY, LIMIT = 16, 900.0
@@ -44,7 +44,8 @@ def _run(setting: str, every: int, path: str) -> dict:
     from emcee.backends import HDFBackend
 
     from fe_likelihoods.problems import bridge_column
-    from samplers import RAMANCHA_2022_LITERAL, SMCSampler
+    from samplers import SMCSampler
+    from samplers.presets import RAMANCHA_2022_LITERAL
 
     walkers, sweeps, settings = {"default": (500, 4, {}), "paper": (1000, 1, RAMANCHA_2022_LITERAL)}[setting]
     posterior = bridge_column(every=every)
@@ -96,18 +97,11 @@ def _ask(*arguments: str, limit: float | None = None) -> dict | None:
     return json.loads(run.stdout.splitlines()[-1])
 
 
-def stage_reached(path: Path) -> str:
-    """Stage and evaluations reached by a run that was killed, read from its file."""
-    from emcee.backends import HDFBackend
+def evaluations_made(path: Path) -> str:
+    """Number of evaluations of a run that was killed, read from its record."""
+    from samplers.record import Record
 
-    from samplers import read_ladder
-    from samplers.storage.backends import JournaledBackend
-
-    ladder = read_ladder(JournaledBackend.of(HDFBackend(str(path)))) if path.exists() else ()
-    if not ladder:
-        return "before the end of its first stage"
-    evaluations = sum(stage.evaluations for stage in ladder)
-    return f"after {len(ladder)} stages and {evaluations} evaluations, at beta = {ladder[-1].beta:.3g}"
+    return f"after {Record(path.with_name(f'{path.name}.mcmc.record')).count} evaluations"
 
 
 def job(repeats: int, every: int = EVERY, limit: float = LIMIT) -> list[Row]:
@@ -118,7 +112,7 @@ def job(repeats: int, every: int = EVERY, limit: float = LIMIT) -> list[Row]:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "chain.h5"
             found = _ask(setting, str(every), str(path), limit=limit or None)
-            note = "" if found else f"stopped at {limit:g} s, {stage_reached(path)}"
+            note = "" if found else f"stopped at {limit:g} s, {evaluations_made(path)}"
         case = f"{what}, {kept}"
         if found is None:
             rows.append(Row("job: simulations", case, None, "", note))

@@ -7,14 +7,8 @@ size of half the walkers, and everything else is the same.
 import time
 import warnings
 
-from samplers import (
-    CHING_CHEN_2007,
-    RAMANCHA_2022_CONSTANT,
-    RAMANCHA_2022_LITERAL,
-    SamplingWarning,
-    SMCSampler,
-    TMCMCSampler,
-)
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 
 from .rows import Row
 from .targets import as_row, errors, target_named, target_names

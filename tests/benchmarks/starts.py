@@ -1,4 +1,4 @@
-"""Power and false alarms of the tests of the initial state (`samplers.tempering.starts`).
+"""Power and false alarms of the tests of the initial state (`samplers.evaluation.starts`).
 
 The power is the share of balls that are refused: points with a standard deviation of 0.001 to 0.5 times that of the
 prior, half of them about the centre of the prior, half about a draw of it. A false alarm is a start that consists of
@@ -26,7 +26,7 @@ def starts(repeats: int) -> list[Row]:
         if by == "density" and n < 50:
             continue
         found = [
-            bool(refused(ball(make(ndim), n, scale, random, k % 2 == 0), make(ndim), by, seed=k).reason)
+            bool(refused(ball(make(ndim), n, scale, random, k % 2 == 0), make(ndim), by, seed=k))
             for make, k in itertools.product((Prior, Uniform, LogNormal), range(8 * repeats))
         ]
         case = f"ball of {scale:g} sd, {n} walkers, {ndim} parameters, {NAMES[by]}"
@@ -35,6 +35,6 @@ def starts(repeats: int) -> list[Row]:
         found = []
         for make, ndim, n, k in itertools.product(PRIORS, (2, 7), (24, 60, 100, 250), range(5 * repeats)):
             prior = make(ndim)
-            found.append(bool(refused(prior.draw(n, random), prior, by, seed=k).reason))
+            found.append(bool(refused(prior.draw(n, random), prior, by, seed=k)))
         rows.append(Row("false alarms", NAMES[by], float(np.sum(found)), "starts", f"of {len(found)}"))
     return rows

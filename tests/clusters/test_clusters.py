@@ -19,7 +19,7 @@ import pytest
 from fe_likelihoods import DaskExecutor
 from fe_likelihoods.simulation import dask_workers
 from samplers import SMCSampler
-from samplers.storage.journal_contents import read_journal
+from samplers.record import Record
 from tests.clusters import noted, slurm_machine
 from tests.clusters.slurm_machine import SlurmMachine
 from tests.faults.treacherous import Treacherous, posterior_of
@@ -95,15 +95,16 @@ def check_result(place, interruptions, unwritten=0):
     """Every simulation that ended is kept, and the evidence is that of one machine without interruptions.
 
     No evaluation has failed, so that none was given up because of the ends of its workers. Every simulation that ended
-    is in the journal. `unwritten` of them may not be in the cache, whose rows of the last second are lost by
+    is in the record. `unwritten` of them may not be in the cache, whose rows of the last second are lost by
     ``kill -9``. Each of the interruptions, the ends of worker processes, has repeated one group of simulations at most.
     """
     text = (place / "output.txt").read_text()
     estimate, error = map(float, PRINTED.search(text).groups())
     assert abs(estimate - LOG_EVIDENCE) < 4.0 * np.hypot(error, 0.01) + 0.01, text  # printed with two digits
-    evaluated = read_journal(place / "run.h5.mcmc.journal").evaluated
-    assert sum(len(batch.coords) for batch in evaluated) >= WALKERS
-    assert all(np.isfinite(batch.log_prob).all() and not batch.reasons for batch in evaluated)
+    record = Record(place / "run.h5.mcmc.record")
+    evaluated = record.latest(record.count)
+    assert record.count >= WALKERS
+    assert np.isfinite(evaluated.log_prob).all() and not record.failed
     starts, ends = Counter(lines(place, "starts.txt")), Counter(lines(place, "ends.txt"))
     assert set(starts) == set(ends)  # what was interrupted was simulated again
     repeated = starts.total() - len(starts)
@@ -111,7 +112,7 @@ def check_result(place, interruptions, unwritten=0):
     with contextlib.closing(sqlite3.connect(place / "simulations.db")) as cache:
         rows = cache.execute("select count(*) from simulations").fetchone()[0]
     # the measurements are a simulation of the function that is not one of the likelihood
-    known = {tuple(row[:2]) for batch in evaluated for row in batch.coords}
+    known = {tuple(row[:2]) for row in evaluated.coords}
     assert len({tuple(map(float, re.findall(r"[-+.e\d]{3,}(?=\))", line))) for line in ends} - known) == 1
     assert 0 <= len(ends) - 1 - rows <= unwritten
     return repeated

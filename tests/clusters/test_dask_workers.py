@@ -8,7 +8,7 @@ import pytest
 
 from fe_likelihoods.simulation import dask_workers
 from fe_likelihoods.simulation.executors import DaskExecutor
-from samplers.storage.pool_queue import PoolQueue
+from samplers.evaluation.pool_queue import PoolQueue
 from tests.clusters.noted import Gate
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
 

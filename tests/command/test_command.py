@@ -340,7 +340,7 @@ def test_check_warns_of_what_is_likely_wrong(folder):
     output = call("check", "oscillator.toml")
     assert "displacement: 291 samples, 10 missing" in output
     assert "larger than every measured value of displacement" in output and output.count("this noise is") == 1
-    assert "will probably end before beta = 1" in output and "posterior.guide()" not in output
+    assert "will probably end before beta = 1" in output
 
 
 def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
@@ -358,10 +358,9 @@ def test_messages_are_in_the_words_of_the_file():
     told = "99.25; give missing=(-9999, -999,) to read it as NaN, or missing=() if"
     assert in_toml_terms(told) == "99.25; give missing = [-9999, -999] to read it as NaN, or missing = [] if"
     sources = {
-        "samplers/tempering/verdict.py": "set the attribute max_simulations of the sampler to a larger number",
+        "samplers/judgement/verdict.py": "set the attribute max_simulations of the sampler to a larger number",
         "fe_likelihoods/signals/channels.py": "leave these channels out with Measurements.select",
         "fe_likelihoods/models/validation.py": "(fe_likelihoods.units.to_si converts)",
-        "samplers/cost.py": "with guide=posterior.guide()",
     }
     for file, words in sources.items():
         assert words in (ROOT / file).read_text(encoding="utf-8"), file

@@ -29,9 +29,9 @@ def start(out: str, file: str = "oscillator.toml") -> subprocess.Popen:
 
 
 def wait_for_steps(run: subprocess.Popen, out: str) -> None:
-    """Wait until the journal of a run has more than its first lines."""
-    journal = Path(out) / "run.h5.mcmc.journal"
-    while not (journal.exists() and journal.stat().st_size > 20_000):
+    """Wait until the record of a run has more than its first blocks."""
+    record = Path(out) / "run.h5.mcmc.record"
+    while not (record.exists() and record.stat().st_size > 20_000):
         assert run.poll() is None, run.communicate()
         time.sleep(0.01)
 

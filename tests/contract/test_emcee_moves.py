@@ -6,7 +6,6 @@ import pytest
 from emcee import moves
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.moves.snooker import SnookerMove, with_snooker_moves
 from tests.contract.targets import Gaussian
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
@@ -21,17 +20,14 @@ MOVES = {
     "StretchMove": moves.StretchMove(),
     "WalkMove": moves.WalkMove(s=8),
     "DEMove": moves.DEMove(),
-    "DESnookerMove": moves.DESnookerMove(),
     "KDEMove": moves.KDEMove(),
     "GaussianMove": moves.GaussianMove(0.01),
     "MHMove": moves.MHMove(jump),
-    "de and snooker": [(moves.DEMove(), 0.8), (moves.DESnookerMove(), 0.2)],
-    "stretch and snooker": [moves.StretchMove(), moves.DESnookerMove()],
+    "stretch and de": [(moves.StretchMove(), 0.8), (moves.DEMove(), 0.2)],
     "all": [
         moves.StretchMove(),
         moves.WalkMove(s=8),
         moves.DEMove(),
-        moves.DESnookerMove(),
         moves.KDEMove(),
         moves.GaussianMove([0.01, 0.02, 0.03], mode="random"),
         moves.MHMove(jump),
@@ -52,24 +48,25 @@ def test_all_moves_of_emcee_are_here():
     exported = {getattr(moves, name) for name in moves.__all__}
     abstract = {moves.Move, moves.RedBlueMove}
     used = {type(move) for move in MOVES.values() if not isinstance(move, list)}
-    assert exported - abstract == used
+    assert exported - abstract - {moves.DESnookerMove} == used  # which is refused
 
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler], ids=lambda s: s.__name__)
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "WalkMove" else n for n in MOVES])
 def test_every_move_of_emcee(name, Sampler, seed):
-    samplers = runs(POSTERIOR, seed, count=6, nwalkers=100, Sampler=Sampler, moves=MOVES[name], max_moves=12)
+    settings = {"max_moves": 12} | ({"chains": "equal"} if Sampler is TMCMCSampler else {})
+    samplers = runs(POSTERIOR, seed, count=6, nwalkers=100, Sampler=Sampler, moves=MOVES[name], **settings)
     assert is_right(samplers)
     assert all(0.0 < sampler.acceptance_fraction.mean() <= 1.0 for sampler in samplers)
 
 
 def test_a_wrong_move_is_caught(seed):
-    """Negative control: a snooker move without its factor in the acceptance probability."""
+    """Negative control: a stretch move without its factor in the acceptance probability."""
 
-    class Unbalanced(SnookerMove):
+    class Unbalanced(moves.StretchMove):
         def get_proposal(self, s, c, random):
             proposed, factors = super().get_proposal(s, c, random)
-            return proposed, 0.0 * np.where(np.isfinite(factors), factors, 0.0)
+            return proposed, np.zeros_like(factors)
 
     assert not is_right(runs(POSTERIOR, seed, count=6, nwalkers=100, moves=Unbalanced(), max_moves=25, min_moves=25))
 
@@ -87,15 +84,8 @@ def variances(move, ndim, start, nsteps=600):
     return sampler.get_chain(discard=nsteps // 5, flat=True).var(axis=0)
 
 
-@pytest.mark.parametrize("ndim", [1, 3])
-def test_the_snooker_move_keeps_its_target(ndim, rng):
-    start = rng.standard_normal((80, ndim))
-    start[40:] = start[:40]  # copies, as after resampling
-    assert np.allclose(variances(SnookerMove(), ndim, start), 1.0, atol=0.15)
-
-
-def test_why_emcees_snooker_move_is_replaced(rng):
-    """Fails with a version of emcee that has corrected it; then the replacement is no longer needed."""
+def test_why_the_snooker_move_of_emcee_is_refused(rng):
+    """Fails with a version of emcee that has corrected it; then it need not be refused."""
     start = rng.standard_normal((80, 3))
     assert np.all(variances(moves.DESnookerMove(), 3, start) < 0.9)
     start[40:] = start[:40]
@@ -103,11 +93,8 @@ def test_why_emcees_snooker_move_is_replaced(rng):
         variances(moves.DESnookerMove(), 3, start)
 
 
-def test_the_replacement_has_the_same_settings():
-    class Own(moves.DESnookerMove):
-        pass
-
-    given = [moves.DESnookerMove(gammas=1.2, randomize_split=False, live_dangerously=True), Own(), moves.DEMove()]
-    replaced = with_snooker_moves(given)
-    assert type(replaced[0]) is SnookerMove and vars(replaced[0]) == vars(given[0])
-    assert replaced[1:] == given[1:]
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_the_snooker_move_of_emcee_is_refused_by_name(Sampler):
+    for given in (moves.DESnookerMove(), [(moves.DEMove(), 0.8), (moves.DESnookerMove(), 0.2)]):
+        with pytest.raises(ValueError, match="DESnookerMove is refused.*DEMove"):
+            Sampler(40, 3, POSTERIOR, vectorize=True, moves=given)

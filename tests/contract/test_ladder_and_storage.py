@@ -9,25 +9,16 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import (
-    CHING_CHEN_2007,
-    RAMANCHA_2022_CONSTANT,
-    RAMANCHA_2022_LITERAL,
-    RecyclingSettings,
-    SamplingWarning,
-    Settings,
-    SMCSampler,
-    TemperedSampler,
-    TMCMCSampler,
-    read_ladder,
-)
+from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from samplers.moves.kernels import RandomWalkMove
+from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
+from samplers.record import Record
 from samplers.reporting.arviz_data import to_arviz
-from samplers.reporting.pair_figures import plot_pairs
-from samplers.reporting.run_figures import plot_ladder
+from samplers.reporting.run_figure import plot_run
 from samplers.reporting.summary import comparison_table, ladder_table, summary
-from samplers.tempering.resampling import stratified
-from samplers.tempering.results import AnnealingResult
+from samplers.reports import AnnealingResult
+from samplers.resampling import stratified
+from samplers.settings import Settings
 from tests.contract.targets import Box, Gaussian
 
 N = 40
@@ -50,7 +41,8 @@ def test_stages_account_for_everything():
     assert betas == sorted(set(betas)) and betas[-1] == 1.0
     check = sampler.log_evidence_check
     assert check.evaluations == N
-    assert sum(s.evaluations for s in sampler.ladder) + N == sampler.evaluations == posterior.calls
+    asked = sum(s.evaluations for s in sampler.ladder) + N
+    assert 0.98 * asked < sampler.evaluations == posterior.calls <= asked  # a point that is proposed again is known
     assert all(
         s.evaluations == N * s.moves for s in sampler.ladder[1:]
     )  # the prior is unbounded, so all proposals are evaluated
@@ -73,10 +65,7 @@ def test_recycling_accounts_for_everything():
     assert abs(check.log_evidence - posterior.log_evidence) < 4 * check.error
     assert abs(sampler.log_evidence_ladder - posterior.log_evidence) < 4 * sampler.ladder[-1].log_evidence_error
     assert sampler.log_evidence in (check.log_evidence, sampler.log_evidence_ladder)
-    moved = annealed(Gaussian(sd=0.02), nsteps=0, recycle=False)
-    closed = annealed(Gaussian(sd=0.02), nsteps=0, recycle=True, recycling=RecyclingSettings(closing_sweeps=True))
-    assert sampler.evaluations < closed.evaluations < moved.evaluations
-    assert closed.ladder[-1].moves >= 2 and closed.ladder[-1].evaluations > sampler.ladder[-1].evaluations
+    assert sampler.evaluations < annealed(Gaussian(sd=0.02), nsteps=0, recycle=False).evaluations
 
 
 @pytest.mark.parametrize("recycle", [False, True])
@@ -102,7 +91,7 @@ def test_two_estimates_that_disagree_widen_the_error():
 def test_recycling_needs_walkers():
     """By default, since with few walkers a mode can be lost unnoticed."""
     posterior = Gaussian()
-    assert [SMCSampler(n, 3, posterior).settings.recycle for n in (249, 250)] == [False, True]
+    assert [SMCSampler(n, 3, posterior).settings.recycle for n in (149, 150)] == [False, True]
     assert SMCSampler(N, 3, posterior, recycle=True).settings.recycle
     assert not SMCSampler(500, 3, posterior, moves=emcee.moves.StretchMove()).settings.recycle
 
@@ -117,10 +106,11 @@ def test_recycling_that_fails_falls_back_to_moves(caplog):
     posterior = Box(np.zeros(8), np.ones(8), log_likelihood)
     with caplog.at_level("INFO", logger="samplers"):
         sampler = annealed(posterior, nsteps=0, recycle=True)
-    assert "recycling is not trusted here, because" in caplog.text
+    assert "the result of recycling is not reliable, because" in caplog.text
     assert all(s.moves >= 2 for s in sampler.ladder)
     check = sampler.log_evidence_check
-    assert sum(s.evaluations for s in sampler.ladder) + check.evaluations == sampler.evaluations
+    asked = sum(s.evaluations for s in sampler.ladder) + check.evaluations
+    assert 0.98 * asked < sampler.evaluations <= asked
 
 
 def test_presets_targets_and_moves():
@@ -155,7 +145,7 @@ def test_annealing_is_done_once():
     assert sampler.ladder == ladder
     assert posterior.calls == calls + 2 * N
     sampler.reset()
-    assert sampler.ladder == ladder == read_ladder(sampler.backend)
+    assert sampler.ladder == ladder == sampler._output.result.ladder
 
 
 def test_annealing_without_steps_then_steps():
@@ -174,7 +164,7 @@ def test_a_state_with_log_prob_saves_evaluations():
     spared = SMCSampler(N, 3, posterior, vectorize=True, seed=1)
     spared.run_mcmc(emcee.State(draws, log_prob=posterior(draws)), 1)
     assert np.array_equal(plain.get_chain(), spared.get_chain())
-    assert spared.evaluations == plain.evaluations - N
+    assert spared.report()["new_evaluations"] == plain.report()["new_evaluations"] - N
 
 
 def test_samplers_without_a_seed_have_different_streams():
@@ -211,7 +201,8 @@ def test_published_tmcmc_grows_chains_from_leaders():
 
 def test_points_of_a_chain_follow_each_other():
     """Every point of the new population is one step away from the previous point of its chain."""
-    from samplers.tempering.mutation import MoveSchedule, grow_chains
+    from samplers.tempering.leaders import grow_chains
+    from samplers.tempering.mutation import MoveSchedule
     from samplers.tempering.population import Population
 
     random = np.random.RandomState(0)
@@ -230,7 +221,8 @@ def test_points_of_a_chain_follow_each_other():
     move = RandomWalkMove(scale=1.0)
     move.calibrate(random.standard_normal((100, 2)), np.full(100, 0.01))
     population = Population(1.0, founders[ancestors], records, 30.0)
-    steps = grow_chains(population, ancestors, Flat(), random, MoveSchedule([move], [1.0]), Settings(chains="leaders"))
+    settings = Settings(chains="leaders", burn_in=0)
+    steps = grow_chains(population, ancestors, Flat(), random, MoveSchedule([move], [1.0]), settings)
     *_, (last, sweep) = steps
     assert sweep.acceptance == 1.0
     grown = last.coords
@@ -248,10 +240,8 @@ def test_ladder_beside_the_chain(tmp_path):
 
     path = str(tmp_path / "run.h5")
     sampler = annealed(backend=emcee.backends.HDFBackend(path, name="column"))
-    assert read_ladder(emcee.backends.HDFBackend(path, name="column", read_only=True)) == sampler.ladder
-    assert read_ladder(emcee.backends.HDFBackend(path, name="nothing")) == ()
     with h5py.File(path) as file:
-        assert file["column/ladder"].dtype["beta"] == np.float64
+        assert {"tempering", "chain"} <= set(file["column"]) and "nothing" not in file
         assert file["column/chain"].shape == (3, N, 3)
     again = SMCSampler(N, 3, Gaussian(), backend=emcee.backends.HDFBackend(path, name="column"), vectorize=True)
     assert again.ladder == sampler.ladder
@@ -268,7 +258,7 @@ def test_a_new_annealing_replaces_the_ladder(tmp_path):
     backend.reset(N, 3)
     sampler = SMCSampler(N, 3, Gaussian(sd=0.5), backend=backend, vectorize=True)
     sampler.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 1)
-    assert read_ladder(backend) == sampler.ladder
+    assert SMCSampler(N, 3, Gaussian(sd=0.5), backend=backend, vectorize=True).ladder == sampler.ladder
     assert len(sampler.ladder) < long
 
 
@@ -293,7 +283,6 @@ def test_an_exception_leaves_the_finished_stages(tmp_path, error):
     with pytest.raises(type(error)):
         sampler.run_mcmc(None, 5)
     assert 0 < len(sampler.ladder) and sampler.ladder[-1].beta < 1
-    assert read_ladder(backend) == sampler.ladder
     with pytest.raises(ValueError, match="the ladder ends at beta"):
         _ = sampler.log_evidence
     posterior.after = np.inf
@@ -310,7 +299,7 @@ from tests.contract.targets import Gaussian
 class Slow(Gaussian):
     def __call__(self, x):
         time.sleep(0.005)
-        if self.calls == 20 * {N}:
+        if self.calls >= 20 * {N}:
             print("under way", flush=True)
         return super().__call__(x)
 SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, recycle=False,
@@ -320,10 +309,9 @@ SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, recycle=False,
     with subprocess.Popen([sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "under way\n"
         process.kill()
-    ladder = read_ladder(emcee.backends.HDFBackend(str(path), read_only=True))
-    assert len(ladder) >= 1
-    assert ladder[-1].beta < 1
-    assert all(s.moves <= 7 and s.evaluations >= 2 * N for s in ladder)
+    assert Record(tmp_path / "run.h5.mcmc.record").count >= 19 * N
+    backend = emcee.backends.HDFBackend(str(path), read_only=True)
+    assert backend.iteration == 0 and SMCSampler(N, 3, Gaussian(sd=1e-6), vectorize=True, backend=backend).ladder == ()
 
 
 # ---------------------------------------------------------------- errors, warnings
@@ -412,7 +400,7 @@ def test_a_chain_of_another_sampler_is_no_start():
     emcee.EnsembleSampler(N, 3, posterior, backend=backend).run_mcmc(
         posterior.sample_prior(N, np.random.default_rng(0)), 3
     )
-    with pytest.raises(ValueError, match="without a finished ladder"):
+    with pytest.raises(ValueError, match="not annealed"):
         SMCSampler(N, 3, posterior, backend=backend).run_mcmc(None, 1)
 
 
@@ -575,18 +563,12 @@ def test_table_and_figures():
     assert f"{sampler.log_evidence:.3f}" in table[-3]
     assert f"{sampler.log_evidence_ladder:.3f}" in table[-2]
     assert f"{sampler.log_evidence_check.log_evidence:.3f}" in table[-2]
-    assert table[-1] == sampler.diagnostics.summary
-    figure = plot_ladder(sampler)
-    assert len(figure.axes[0].lines[0].get_xdata()) == len(sampler.ladder)
-    samples = sampler.get_chain(flat=True)
-    figure = plot_pairs(samples, labels=["a", "b", "c"], truths=[0.7, 0.7, 0.7])
-    titles = [figure.axes[4 * i].get_title() for i in range(3)]
-    assert titles == [f"CV = {cv:.2e}" for cv in summary(samples).cv]
-    assert figure.axes[3].texts[0].get_text() == f"r = {np.corrcoef(samples[:, 0], samples[:, 1])[0, 1]:.2f}"
-    plot_pairs(np.column_stack([samples[:, 0], np.ones(len(samples))]))  # a parameter without spread
+    assert table[-1] == sampler.verdict.summary
+    figure = plot_run(sampler)
+    assert len(figure.axes[1].lines[0].get_xdata()) == len(sampler.ladder)
     plt.close("all")
     with pytest.raises(ValueError, match="call run_mcmc first"):
-        plot_ladder(SMCSampler(N, 3, Gaussian()))
+        plot_run(SMCSampler(N, 3, Gaussian()))
 
 
 def test_summary_with_weights():
@@ -594,7 +576,7 @@ def test_summary_with_weights():
     result = summary(values, ["a", "b"], weights=[1, 1, 0])
     assert np.array_equal(result.mean, [1, 1]) and np.array_equal(result.sd, [1, 0])
     assert np.array_equal(result.cv, [1, 0])
-    assert "a" in str(result)
+    assert str(result).splitlines()[1].split() == ["a", "1", "-", "1", "1"]
     for weights in ([1, 1], [0, 0, 0], [1, -1, 1]):
         with pytest.raises(ValueError, match="weights"):
             summary(values, weights=weights)
@@ -629,7 +611,6 @@ def test_samplers_side_by_side():
     # the autocorrelation time of the stretch move in three dimensions is some 30 to 50 sweeps
     assert 500 * N / 80 < table.effective_sample_size[2] < 500 * N / 15
     assert table.log_evidence == (samplers["SMC"].log_evidence, tmcmc.log_evidence, None)
-    assert table.efficiency[0] == table.effective_sample_size[0] / table.evaluations[0]
     rows = str(table).splitlines()
     assert len(rows) == 4 and len({len(row) for row in rows}) == 1
     assert rows[3].split()[0] == "emcee" and rows[3].split()[-1] == "-"

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler, TemperedSampler, TMCMCSampler
-from samplers.storage.user_functions import UserFunctions
+from samplers.evaluation.user_functions import UserFunctions
 from tests.contract.targets import Box, Gaussian, WithBlobs
 from tests.statistics.test_posteriors import deviations, evidence_deviation, within
 from tests.tempering.guides import SearchingGuide
@@ -225,11 +225,10 @@ def test_a_start_density_on_a_bounded_prior(seed):
     assert within(evidence_deviation(made, truth), made)
 
 
-@pytest.mark.parametrize("how", ["coarse", "guide", "likelihood", "blobs"])
+@pytest.mark.parametrize("how", ["guide", "likelihood", "blobs"])
 def test_a_start_density_with_other_arguments(how):
     start, posterior = Start(), WithBlobs() if how == "blobs" else Gaussian()
     kwargs = {
-        "coarse": {"coarse_log_prob_fn": Gaussian(sd=0.15)},
         "guide": {"guide": SearchingGuide(posterior)},
         "likelihood": {"log_likelihood_fn": posterior.log_likelihood, "log_prior_fn": posterior.log_prior},
         "blobs": {},

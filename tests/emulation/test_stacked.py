@@ -151,7 +151,7 @@ def guided(posterior, limit=700, seed=1, **options):
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the limit ends the steps at beta = 1
-        sampler.run_mcmc(None, 1)
+        sampler.run_mcmc(None, 1 - sampler.iteration)
     return sampler
 
 
@@ -202,7 +202,7 @@ def test_control_one_event_alone_has_another_posterior():
 def test_a_run_that_goes_on_is_the_long_run(tmp_path):
     whole = guided(joint())
     path = str(tmp_path / "run.h5")
-    guided(joint(), limit=420, backend=emcee.backends.HDFBackend(path)).backend.close()
+    guided(joint(), limit=420, backend=emcee.backends.HDFBackend(path))
     again = joint()
     sampler = guided(again, backend=emcee.backends.HDFBackend(path))
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
@@ -227,7 +227,7 @@ def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
     sampler.max_simulations = 700
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        sampler.run_mcmc(None, 1)
+        sampler.run_mcmc(None, 0)  # the step of the limited run is replaced
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.log_evidence == whole.log_evidence
     assert len(set(calls)) == len(calls) == 2 * sampler.simulations == posterior.likelihood.simulations
     assert whole.simulations < sampler.simulations < whole.simulations + 50

@@ -1,23 +1,21 @@
-"""Kills by signal 9 at every write, and what the same script makes of what they leave.
+"""Kills by signal 9, after which the same script is started again until it ends: ``python -m tests.faults.kills``.
 
-``python -m tests.faults.kills --kills 1000`` prints a table of the kills by window.
-
-A script runs in a forked process, in which every write, truncation and renaming is counted: those of the journal, of
-the lock, and those that HDF5 makes, which go through a Python file. At a chosen one the process kills itself, before
-it, in the middle of the written bytes, or after it. The same script is then started again, perhaps killed again, and at
-last left to end. Its chain, ladder, evidence, counts and failures must be those of a run that was not killed, and a
-further start must add nothing.
+Most kills come at a chosen event of a forked process: before, within or after a write to the record or to the HDF5 file
+(whose writes go through a Python file), or in an evaluation. Pools, threads and the console command are killed at
+random times, with their workers. Chain, log-probabilities, blobs, counts, failures, ladder, evidence and verdict must
+be those of a run that was not killed, and no evaluation may be made again but those that were running.
 """
 
 import argparse
 import contextlib
-import itertools
+import io
 import logging
 import os
 import pickle
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -25,212 +23,85 @@ import traceback
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
 
-import emcee
 import h5py
-import numpy as np
 
-import samplers.storage.journal as journal_module
-from samplers import SMCSampler, TMCMCSampler
-from tests.contract.targets import WithBlobs
+import samplers.evaluation.evaluator
+import samplers.record
+from tests.faults.resumable_run import BURN_IN, SAMPLERS, STEPS, WAYS, N, calls, go_on, make, outcome
 
-MODES = ("before", "within", "after")
-WINDOWS = {
-    "_replace": "file created or rebuilt",
-    "append_steps": "steps into the file",
-    "grow": "room for steps, blobs",
-    "write_stage": "stage into the file",
-    "write_check": "check into the file",
-    "write_verdict": "verdict into the file",
-    "drop_last_step": "shown step removed",
-    "write_marks": "marks into the file",
-    "_mark": "marks into the file",
-    "create": "journal created",
-    "_write": "block into the journal",
-    "_acquire": "lock",
-    "release": "lock",
-    "begin": "journal set aside",
-    "set_aside": "file set aside",
-}
+AT_RANDOM_TIMES = ("pool", "threads")
+WORKERS = 2
+KINDS = (*SAMPLERS, *WAYS, "command")
+COMPARED = 2  # points by which a new sampler compares its function with the record
 
 
-class Fragile(WithBlobs):
-    """Raises an exception for some points; takes a point or a batch."""
+class Events:
+    """Counts the writes and evaluations of a process, and kills it at one of them."""
 
-    def __call__(self, x):
-        if np.ndim(x) == 2:
-            return np.array([self(row) for row in x]) if np.all(x[:, 0] >= 0.1) else self._fail()
-        return super().__call__(x) if x[0] >= 0.1 else self._fail()
+    def __init__(self, at=None, mode="before"):
+        self.at, self.mode, self.count = at, mode, 0
 
-    @staticmethod
-    def _fail():
-        raise ArithmeticError("no equilibrium")
-
-
-def _sampler(path, Sampler=SMCSampler, n=6, **settings):
-    settings = {"seed": 5, "max_failure_share": 0.98, **settings}
-    backend = emcee.backends.HDFBackend(str(path))
-    return Sampler(n, 1, Fragile(ndim=1, sd=0.2), backend=backend, **settings)
-
-
-def burn_in(path):
-    """Moves, a burn-in, a reset, and the steps that count."""
-    sampler = _sampler(path, recycle=False, min_moves=1, max_moves=1)
-    state = sampler.run_mcmc(None, 2)
-    sampler.reset()
-    sampler.run_mcmc(state, 3)
-    return sampler
-
-
-def recycling(path):
-    """Recycling, batches, and two calls."""
-    sampler = _sampler(path, n=12, recycle=True, vectorize=True)
-    sampler.run_mcmc(None, 1)
-    sampler.run_mcmc(None, 2)
-    return sampler
-
-
-def two_annealings(path):
-    """TMCMC from two starts in one file."""
-    sampler = _sampler(path, TMCMCSampler, min_moves=1, max_moves=1)
-    sampler.run_mcmc(np.random.default_rng(1).standard_normal((6, 1)), 1)
-    sampler.run_mcmc(np.random.default_rng(2).standard_normal((6, 1)), 2)
-    return sampler
-
-
-def limited(path):
-    """A limit of simulations that ends the annealing; its state is shown by a step."""
-    sampler = _sampler(path, recycle=False, min_moves=1, max_moves=1, max_simulations=14)
-    sampler.run_mcmc(None, 3)
-    return sampler
-
-
-def limited_steps(path):
-    """A limit of simulations that ends the steps at beta = 1."""
-    sampler = _sampler(path, recycle=False, min_moves=1, max_moves=1, max_simulations=32)
-    sampler.run_mcmc(None, 9)
-    return sampler
-
-
-SCRIPTS = (burn_in, recycling, two_annealings, limited, limited_steps)
-
-
-# ---------------------------------------------------------------------- the writes of a process
-
-
-class Writes:
-    """Counts what a process writes, and kills it at the chosen place.
-
-    Parameters
-    ----------
-    number : int, optional
-        The write at which to kill; never by default.
-    mode : {"before", "within", "after"}
-        When.
-    report : int, optional
-        Descriptor to which the window of the kill is written.
-    """
-
-    def __init__(self, number=None, mode="before", report=None):
-        self.number, self.mode, self.report, self.count = number, mode, report, 0
-
-    def do(self, function, data=None):
-        """Call ``function(data)``, or ``function()`` without data, and die where it was chosen."""
+    def __call__(self, function=None, data=None):
+        """Do ``function(data)``, and die where it was chosen."""
         self.count += 1
-        if self.count != self.number:
-            return function() if data is None else function(data)
-        if self.mode == "within" and data is not None:
-            function(bytes(data)[: len(data) // 2])
-        elif self.mode == "after":
-            function() if data is None else function(data)
-        names, frame = [], sys._getframe()
-        while frame is not None:
-            names.append(frame.f_code.co_name)
-            frame = frame.f_back
-        window = next((WINDOWS[name] for name in names if name in WINDOWS), "close of the file")
-        os.write(self.report, window.encode())
+        arguments = () if data is None else (data,)
+        if self.count != self.at:
+            return None if function is None else function(*arguments)
+        if function is not None and self.mode == "within" and data is not None:
+            function(data[: len(data) // 2])
+        elif function is not None and self.mode == "after":
+            function(*arguments)
         os.kill(os.getpid(), signal.SIGKILL)
 
     def install(self):
         """Count the writes of this process from now on."""
-        plain_open, File, replace, unlink = open, h5py.File, os.replace, os.unlink
-        pwrite, write_bytes = os.pwrite, Path.write_bytes
-        counted = self
+        events, plain_open, File, replace = self, open, h5py.File, os.replace
 
-        class Counted:
+        class Counted(io.RawIOBase):
             """A file whose writes are counted."""
 
             def __init__(self, file):
                 self._file = file
 
-            def __getattr__(self, name):
+            def __getattribute__(self, name):
+                if name in ("write", "truncate", "_file"):
+                    return object.__getattribute__(self, name)
                 return getattr(self._file, name)
 
             def write(self, data):
-                return counted.do(self._file.write, bytes(data))
+                return events(self._file.write, bytes(data))
 
             def truncate(self, *size):
-                return counted.do(lambda: self._file.truncate(*size))
+                return events(lambda: self._file.truncate(*size))
 
         class CountedFile(File):
-            """An HDF5 file that HDF5 reads and writes through a counted file."""
+            """An HDF5 file that is written through a counted file."""
 
             def __init__(self, name, mode="r", **kwargs):
-                if mode == "r+":
-                    name = Counted(name)
+                if isinstance(name, str | Path) and mode != "r":
+                    kept = mode == "a" and Path(name).exists()
+                    name, mode = Counted(plain_open(name, "r+b" if kept else "w+b", buffering=0)), "r+" if kept else "w"
                 super().__init__(name, mode, **kwargs)
 
         h5py.File = CountedFile
-        journal_module.open = lambda *args, **kwargs: Counted(plain_open(*args, **kwargs))
-        os.replace = lambda *args: self.do(lambda: replace(*args))
-        os.unlink = lambda *args: self.do(lambda: unlink(*args))
-        os.pwrite = lambda file, data, place: self.do(lambda part: pwrite(file, part, place), data)
-        Path.write_bytes = lambda path, data: self.do(lambda part: write_bytes(path, part), data)
-
-
-# ---------------------------------------------------------------------- runs
-
-
-class Outcome(NamedTuple):
-    """What a run ended with, to be compared with another one."""
-
-    chain: tuple
-    ladder: tuple
-    counts: tuple
-    failures: tuple
-    adds: str
-
-
-def outcome(script, path):
-    """Run a script to its end, and once more."""
-    sampler = script(path)
-    chain = [sampler.get_chain(), sampler.get_log_prob(), sampler.get_blobs(), sampler.backend.accepted]
-    chain.append(sampler.random_state[1])
-    stages = [stage._replace(seconds=0) for stage in sampler.ladder]
-    ladder = tuple(repr(v) for v in (stages, sampler.log_evidence, sampler.log_evidence_error, sampler.verdict))
-    failures = tuple((f["parameters"].tobytes(), f["reason"]) for f in sampler.failures)
-    counts = sampler.evaluations, sampler.simulations, sampler.failure_count
-    sampler.backend.close()
-    before = sampler.iteration, sampler.backend.journal_path.read_bytes().count(b"EVAL")
-    again = script(path)
-    after = again.iteration, again.backend.journal_path.read_bytes().count(b"EVAL")
-    adds = "" if before == after else f"{before} became {after}"
-    return Outcome(tuple(values.tobytes() for values in chain), ladder, counts, failures, adds)
+        samplers.record.open = lambda *args, **kwargs: Counted(plain_open(*args, **kwargs))
+        os.replace = lambda *args: self(lambda: replace(*args))
 
 
 def fork(function):
-    """Exit status and what a function returned or wrote, run in a forked process."""
+    """Exit status, and what a function returned or wrote, in a forked process that leads its own group."""
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:
         status = 1
         with contextlib.suppress(BaseException):
+            os.setsid()
             os.close(read)
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)
             try:
-                data = function(write) or b""
+                data = function() or b""
                 while data:
                     data = data[os.write(write, data) :]
                 status = 0
@@ -238,141 +109,229 @@ def fork(function):
                 os.write(write, traceback.format_exc().encode()[-1500:])
         os._exit(status)
     os.close(write)
+    return pid, read
+
+
+def end(pid, read, after=None):
+    """Status and output of a forked process, which is killed with its group after some seconds."""
+    if after is not None:
+        time.sleep(after)
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(pid, signal.SIGKILL)
     with os.fdopen(read, "rb") as stream:
         said = stream.read()
-    return os.waitpid(pid, 0)[1], said
+    status = os.waitpid(pid, 0)[1]
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # workers of a process that was killed
+        os.killpg(pid, signal.SIGKILL)
+    return status, said
 
 
-def run_killed(script, path, number, mode):
-    """Run a script that is killed at a write: the window, or None if it ended before."""
-
-    def child(report):
-        Writes(number, mode, report).install()
-        script(path)
-
-    status, said = fork(child)
-    if os.WIFSIGNALED(status):
-        return said.decode()
-    if status != 0:
-        raise RuntimeError(said.decode())
-    return None
+def script(kind, path, events=None, limit=None):
+    """The script that is killed; returns its outcome."""
+    samplers.evaluation.evaluator.SECONDS_BETWEEN_NOTES = 0.0  # so that no time of the machine decides
+    log = path.with_name("log")
+    changes = {} if kind != "limit" else {"max_simulations": limit}
+    if kind == "threads":
+        changes["seconds"] = 0.001  # or both threads evaluate more points than the sampler can enter
+    sampler = go_on(make(path, kind, log=log, event=events, **changes), kind)
+    if kind in AT_RANDOM_TIMES:
+        sampler.pool.shutdown()
+    return pickle.dumps((outcome(sampler), sampler.iteration))
 
 
-def count_writes(script, path):
-    """Number of writes of a script that is not killed."""
+def whole_outcomes(kind, folder):
+    """Outcomes of runs that are not killed, number of events, and seconds."""
+    events = Events()
 
-    def child(_):
-        writes = Writes()
-        writes.install()
-        script(path)
-        return str(writes.count).encode()
+    def counted():
+        events.install()
+        return pickle.dumps((script(kind, folder / "run.h5", events), events.count))
 
-    status, said = fork(child)
+    folder.mkdir()
+    start = time.perf_counter()
+    status, said = end(*fork(counted if kind not in AT_RANDOM_TIMES else lambda: script(kind, folder / "run.h5")))
+    seconds = time.perf_counter() - start
     assert status == 0, said.decode()
-    return int(said)
+    first, count = pickle.loads(said) if kind not in AT_RANDOM_TIMES else (said, 0)
+    found = [pickle.loads(first)[0]]
+    if kind == "reset":
+        # a kill in the burn-in is taken for one after the reset, and one directly after the reset repeats the burn-in
+        found.append(pickle.loads(end(*fork(lambda: script("moves", folder / "moves.h5")))[1])[0])
+        for repeated in (2, 3, 4):
+
+            def longer(times=repeated):
+                sampler = make(folder / f"{times}.h5", kind)
+                sampler.run_mcmc(None, times * BURN_IN)
+                sampler.reset()
+                sampler.run_mcmc(None, STEPS)
+                return pickle.dumps(outcome(sampler))
+
+            found.append(pickle.loads(end(*fork(longer))[1]))
+    return found, count, seconds
 
 
-def kill(number_of_kills, seed=1, show=None):
-    """Make kills and compare the outcomes.
+def evaluated_again(log, kind):
+    """Points that were evaluated again although they were known: each process may repeat what ran, and compare."""
+    by_process: dict[int, list[list[bytes]]] = {}
+    for process, points in calls(log):
+        by_process.setdefault(process, []).append(points)
+    seen, running, lost = set(), set(), 0
+    for made in by_process.values():
+        points = {point for call in made for point in call}
+        lost += max(len((points & seen) - running) - COMPARED, 0)
+        # all points of a submission, or those that have ended while the sampler computed proposals
+        last = {"asynchronous": 4 * N, "threads": N, "map": 4 * WORKERS}.get(kind, 1)
+        last = 2 if last == 1 and len(made[-1]) == COMPARED else last  # a first batch is stored after its check
+        running |= {point for call in made[-last:] for point in call}
+        seen |= points
+    return lost
 
-    Parameters
-    ----------
-    number_of_kills : int
-        At least so many; first one at every write of every script, in all modes, then two or three per run at random.
-    seed : int
-        Of the choice.
-    show : callable, optional
-        Called with a line of progress.
+
+def trial(kind, folder, whole, count, seconds, choose, number):
+    """One run with its kills: how many there were, and what went wrong."""
+    folder.mkdir()
+    path, kills = folder / "run.h5", 0
+    limits = [choose.randint(20, 400) for _ in range(number)]
+    for attempt in range(number):
+        events = Events(choose.randint(1, max(count, 1)), choose.choice(("before", "within", "after")))
+
+        def child(events=events, attempt=attempt):
+            if kind not in AT_RANDOM_TIMES:
+                events.install()
+            hook = None if kind in AT_RANDOM_TIMES else events
+            return script(kind, path, hook, sorted(limits)[attempt])
+
+        after = choose.uniform(0.0, seconds) if kind in AT_RANDOM_TIMES else None
+        status, said = end(*fork(child), after)
+        if os.WIFSIGNALED(status):
+            kills += 1
+        elif status != 0:
+            return kills, f"stuck: {said.decode()}"
+    status, said = end(*fork(lambda: script(kind, path)))
+    if status != 0:
+        return kills, f"stuck: {said.decode()}"
+    found, steps = pickle.loads(said)
+    lost = 0 if kind == "pool" else evaluated_again(folder / "log", kind)  # its workers write the log
+    if lost > 0:
+        return kills, f"lost: {lost} evaluations were made again"
+    if kind == "threads":  # another order of arrival is another run: it is compared with its repetition
+        path.unlink()
+        whole = [pickle.loads(end(*fork(lambda: script("threads", path)))[1])[0]]
+    if kind == "reset":  # evaluations of a burn-in that was given up count, and so in the verdict
+        found, whole = found[:5], [each[:5] for each in whole]
+    if found not in whole:
+        places = [place for place, (one, other) in enumerate(zip(found, whole[0], strict=True)) if one != other]
+        return kills, f"wrong: {steps} steps, parts {places} of the outcome differ"
+    return kills, ""
+
+
+# ---------------------------------------------------------------------- the console command
+
+
+def command_trial(folder, expected, seconds, choose, number):
+    """Kill ``fe-likelihoods run`` and start it again."""
+    kills = 0
+    for _ in range(number):
+        process = start_command(folder)
+        try:
+            process.wait(choose.uniform(0.3 * seconds, seconds))
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            kills += 1
+        process.communicate()
+    process = start_command(folder)
+    said = process.communicate()[0]
+    if process.returncode != 0:
+        return kills, f"stuck: {said[-1500:]}"
+    return kills, "" if chain_of(folder) == expected else "wrong: another chain"
+
+
+def start_command(folder):
+    """The command in a folder with its template."""
+    folder.mkdir(exist_ok=True)
+    if not (folder / "run.toml").exists():
+        from tests.command.test_command import OSCILLATOR
+        from tests.faults.command_data import write_data
+
+        write_data(folder)
+        (folder / "run.toml").write_text(OSCILLATOR)
+    code = "from fe_likelihoods.command.main import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "run", str(folder / "run.toml"), "--out", str(folder / "out")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def chain_of(folder):
+    """Chain and ladder that the command has stored."""
+    with h5py.File(folder / "out" / "run.h5") as file:
+        group = file["mcmc"]
+        steps = group.attrs["iteration"]
+        return steps, group["chain"][:steps].tobytes(), group["log_prob"][:steps].tobytes()
+
+
+# ---------------------------------------------------------------------- the campaign
+
+
+def kill(number, kinds=KINDS, seed=1, show=print):
+    """Make kills of each kind of run.
 
     Returns
     -------
-    kills : Counter
-        Number of kills by window.
-    bad : Counter
-        What went wrong, by "could not go on", "failures lost", "chains wrong", "counts wrong", "added when repeated".
+    counts : Counter
+        By (kind, "kills"), (kind, "runs"), and (kind, "stuck" | "wrong" | "lost").
     messages : list of str
-        The first lines of what went wrong.
+        What went wrong.
     """
-    choose, kills, bad, messages = random.Random(seed), Counter(), Counter(), []
+    choose, counts, messages = random.Random(seed), Counter(), []
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
     try:
-        whole, writes = {}, {}
-        for script in SCRIPTS:
-            status, said = fork(lambda _, s=script: pickle.dumps(outcome(s, folder / f"whole_{s.__name__}.h5")))
-            assert status == 0, said.decode()
-            whole[script] = pickle.loads(said)
-            assert not whole[script].adds, (script.__name__, whole[script].adds)
-            writes[script] = count_writes(script, folder / f"counted_{script.__name__}.h5")
-        every = [(script, n, mode) for script in SCRIPTS for n in range(1, writes[script] + 1) for mode in MODES]
-        choose.shuffle(every)
-        plans = [(script, [(n, mode)]) for script, n, mode in every]
-        for plan in itertools.chain(plans, iter(lambda: None, 0)):
-            if sum(kills.values()) >= number_of_kills:
-                break
-            if plan is None:
-                script = choose.choice(SCRIPTS)
-                places = [choose.randint(1, writes[script]) for _ in range(choose.choice((2, 3)))]
-                plan = script, [(place, choose.choice(MODES)) for place in places]
-            known = len(messages)
-            trial(plan, folder / "trial", whole, kills, bad, messages)
-            if show is not None:
-                for message in messages[known:]:
-                    show(message)
-                if sum(kills.values()) % 200 == 0:
-                    show(f"{sum(kills.values())} kills, wrong: {dict(bad)}")
+        for kind in kinds:
+            if kind == "command":
+                start = time.perf_counter()
+                process = start_command(folder / "whole")
+                said = process.communicate()[0]  # also empties the pipe
+                assert process.returncode == 0, said
+                seconds = time.perf_counter() - start
+                whole, count = chain_of(folder / "whole"), 0
+            else:
+                whole, count, seconds = whole_outcomes(kind, folder / f"whole {kind}")
+            while counts[kind, "kills"] < number:
+                where = folder / "trial"
+                plan = choose.randint(1, 3)
+                if kind == "command":
+                    kills, wrong = command_trial(where, whole, seconds, choose, plan)
+                else:
+                    kills, wrong = trial(kind, where, whole, count, seconds, choose, plan)
+                counts[kind, "kills"] += kills
+                counts[kind, "runs"] += 1
+                if wrong:
+                    counts[kind, wrong.split(":")[0]] += 1
+                    messages.append(f"{kind}: {wrong}")
+                    show(messages[-1])
+                    if counts[kind, "runs"] > 20 + 3 * number:
+                        break
+                shutil.rmtree(where)
+            show(kind, *(f"{counts[kind, what]} {what}" for what in ("kills", "runs", "stuck", "wrong", "lost")))
     finally:
         shutil.rmtree(folder)
-    return kills, bad, messages
-
-
-def trial(plan, folder, whole, kills, bad, messages):
-    """One run with its kills."""
-    script, places = plan
-    folder.mkdir()
-    path, windows = folder / "run.h5", []
-    try:
-        for number, mode in places:
-            window = run_killed(script, path, number, mode)
-            if window is None:
-                break
-            windows.append(f"{window}, {mode}")
-            kills[window] += 1
-        status, said = fork(lambda _: pickle.dumps(outcome(script, path)))
-        if status != 0:
-            raise RuntimeError(said.decode())
-    except RuntimeError as error:
-        bad["could not go on"] += 1
-        messages.append(f"{script.__name__}, {windows}: {error}")
-    else:
-        found, right = pickle.loads(said), whole[script]
-        wrong = {
-            "chains wrong": found.chain != right.chain or found.ladder != right.ladder,
-            "failures lost": found.failures != right.failures,
-            "counts wrong": found.counts != right.counts,
-            "added when repeated": bool(found.adds),
-        }
-        bad.update(name for name, is_wrong in wrong.items() if is_wrong)
-        if any(wrong.values()):
-            messages.append(
-                f"{script.__name__}, {places}, {windows}: {[n for n, w in wrong.items() if w]} {found.adds}"
-            )
-    finally:
-        shutil.rmtree(folder)
+    return counts, messages
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("kinds", nargs="*", default=KINDS, help=", ".join(KINDS))
+    parser.add_argument("--kills", type=int, default=60, help="of each kind")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     start = time.perf_counter()
-    kills, bad, _ = kill(args.kills, args.seed, print)
-    for window, count in sorted(kills.items()):
-        print(f"{window:32s}{count:6d}")
-    print(f"{'kills':32s}{sum(kills.values()):6d}   in {time.perf_counter() - start:.0f} s")
-    for name in ("could not go on", "failures lost", "chains wrong", "counts wrong", "added when repeated"):
-        print(f"{name:32s}{bad[name]:6d}")
-    return 1 if bad else 0
+    counts, messages = kill(args.kills, args.kinds, args.seed, lambda *words: print(*words, flush=True))
+    total = {what: sum(n for (_, w), n in counts.items() if w == what) for what in ("kills", "stuck", "wrong", "lost")}
+    print(f"{total} in {time.perf_counter() - start:.0f} s")
+    return 1 if messages else 0
 
 
 if __name__ == "__main__":

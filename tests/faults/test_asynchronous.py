@@ -1,4 +1,4 @@
-"""Asynchronous runs: killed anywhere, they go on; the journal repeats them to the last bit without an evaluation."""
+"""Asynchronous runs: killed anywhere, they go on; the record repeats them to the last bit without an evaluation."""
 
 import importlib.util
 import multiprocessing
@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler
-from samplers.storage import pool_queue
-from samplers.storage.journal import MAGIC
 from tests.contract.targets import Gaussian, WithBlobs
-from tests.faults.test_prefixes import ends, journal_of
+from tests.faults.records import blocks, cut, record_of
 from tests.simulated_cluster import SimulatedCluster
 
 N, NDIM, STEPS = 40, 2, 2
-COMPARED = N + 1  # evaluations by which a run that is continued compares the posterior with that of the file
+COMPARED = 2  # evaluations by which a new sampler compares the posterior with that of the file
 
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
@@ -44,8 +42,8 @@ def make(path, workers=5, order=0, **settings):
 
 def finished(path, **settings):
     sampler, cluster = make(path, **settings)
-    sampler.run_mcmc(None, STEPS)
-    sampler.backend.close()
+    sampler.run_mcmc(None, STEPS - sampler.iteration)
+    sampler._record.close()
     return sampler, cluster
 
 
@@ -57,19 +55,10 @@ def state_of(sampler):
     return sampler.get_chain().tobytes(), blobs, ladder, sampler.log_evidence, sampler.evaluations, failures
 
 
-def kinds(data):
-    """Kind and start of every block of a journal."""
-    places = [len(MAGIC), *ends(data)]
-    return [(data[place : place + 4], place) for place in places[1:-1]]
-
-
-def replayed(path, folder, order):
-    """The run of a journal that is cut before its first step, and the number of evaluations that it took."""
-    data = journal_of(path).read_bytes()
-    first = next(place for kind, place in kinds(data) if kind == b"STEP")
-    copy = folder / "replayed.h5"
-    journal_of(copy).write_bytes(data[:first])
-    copy.unlink(missing_ok=True)
+def repeated(path, folder, order):
+    """The run of a record without its HDF5 file, and the number of evaluations that it took."""
+    copy = folder / "repeated.h5"
+    cut(path, None, copy)
     return finished(copy, order=order)
 
 
@@ -79,32 +68,27 @@ def test_a_run_depends_on_the_order_of_arrival_and_on_nothing_else(tmp_path):
     assert np.array_equal(chains[0], chains[1]) and not np.array_equal(chains[0], chains[2])
 
 
-def test_killed_anywhere_a_run_goes_on_and_its_journal_repeats_it(tmp_path):
+def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(tmp_path):
     """Cut after every seventh block, and continued with other lengths: nothing known is evaluated again."""
     whole, cluster = finished(tmp_path / "whole.h5", order=1)
     assert whole.failures and cluster.evaluations == whole.evaluations
-    data = journal_of(tmp_path / "whole.h5").read_bytes()
-    places = [place for _, place in kinds(data)][::7]
-    assert len(places) > 15
+    places = [place for _, place in blocks(tmp_path / "whole.h5")][::7]
+    assert len(places) > 10
     for number, place in enumerate(places):
         path = tmp_path / "killed.h5"
-        journal_of(path).write_bytes(data[:place])
-        path.unlink(missing_ok=True)
+        cut(tmp_path / "whole.h5", place, path)
         resumed, cluster = finished(path, order=number)
-        again, nothing = replayed(path, tmp_path, order=99)
-        assert state_of(again) == state_of(resumed)
-        assert nothing.evaluations == COMPARED + (STEPS - 1) * N  # of the sweeps after the first step
-    assert state_of(replayed(tmp_path / "whole.h5", tmp_path, order=98)[0]) == state_of(whole)
+        again, nothing = repeated(path, tmp_path, order=99)
+        assert state_of(again) == state_of(resumed) and nothing.evaluations <= COMPARED
+    assert state_of(repeated(tmp_path / "whole.h5", tmp_path, order=98)[0]) == state_of(whole)
 
 
 def test_one_worker_goes_on_as_if_it_had_not_been_killed(tmp_path):
     """Points of one worker arrive in the order of their submission, so that the run can be compared to the last bit."""
     whole, _ = finished(tmp_path / "whole.h5", workers=1)
-    data = journal_of(tmp_path / "whole.h5").read_bytes()
-    for _, place in kinds(data)[::40]:
+    for _, place in blocks(tmp_path / "whole.h5")[::40]:
         path = tmp_path / "killed.h5"
-        journal_of(path).write_bytes(data[:place])
-        path.unlink(missing_ok=True)
+        cut(tmp_path / "whole.h5", place, path)
         assert state_of(finished(path, workers=1)[0]) == state_of(whole)
 
 
@@ -122,7 +106,8 @@ def run_with_threads(path):
         posterior = Waits(NDIM, sd=0.05)
         settings = {"seed": 5, "recycle": True, "asynchronous": True}
         sampler = SMCSampler(N, NDIM, posterior, pool=pool, backend=backend, **settings)
-        sampler.run_mcmc(None, STEPS)
+        sampler.run_mcmc(None, STEPS - sampler.iteration)
+        sampler._record.close()
     return sampler
 
 
@@ -133,14 +118,14 @@ def test_killed_by_signal_9(tmp_path, rng):
     for size in sizes:
         process = context.Process(target=run_with_threads, args=(path,))
         process.start()
-        while not journal_of(path).exists() or journal_of(path).stat().st_size < size:
+        while not record_of(path).exists() or record_of(path).stat().st_size < size:
             assert process.is_alive()
             time.sleep(0.002)
         process.kill()
         process.join()
-    known = journal_of(path).stat().st_size
+    known = record_of(path).stat().st_size
     sampler = run_with_threads(path)
-    assert sampler.iteration == STEPS and journal_of(path).stat().st_size > known
+    assert sampler.iteration == STEPS and record_of(path).stat().st_size > known
     assert abs(sampler.log_evidence - Gaussian(NDIM, sd=0.05).log_evidence) < 4 * sampler.log_evidence_error
 
 
@@ -155,10 +140,10 @@ needs_loky = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes", "pool", pytest.param("loky", marks=needs_loky)])
+@pytest.mark.parametrize("kind", ["threads", "processes", pytest.param("loky", marks=needs_loky)])
 def test_pools_that_take_single_points(kind):
     """Each point goes to the pool by itself; the result is that of the posterior."""
-    opened = {"threads": lambda: ThreadPoolExecutor(2), "pool": lambda: multiprocessing.get_context("spawn").Pool(2)}
+    opened = {"threads": lambda: ThreadPoolExecutor(2)}
     opened["processes"] = lambda: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))
     opened["loky"] = open_loky
     posterior = Gaussian(NDIM, sd=0.05)
@@ -177,7 +162,7 @@ def test_a_limit_of_simulations_counts_points_that_are_running(tmp_path):
     assert cluster.evaluations == 150 == sampler.simulations
     more, further = make(tmp_path / "run.h5", max_simulations=5000, order=3)
     more.run_mcmc(None, 1)
-    assert more.verdict.status != "not usable" and further.evaluations == COMPARED + more.evaluations - 150
+    assert more.verdict.status != "not usable" and further.evaluations <= COMPARED + more.evaluations - 150
 
 
 def test_what_cannot_be_asynchronous_is_refused():
@@ -216,42 +201,18 @@ def killed_run(folder, pool, asynchronous=True):
 
 
 @pytest.mark.parametrize(
-    "kind", ["pool", pytest.param("executor", marks=pytest.mark.slow), pytest.param("loky", marks=needs_loky)]
+    "kind", [pytest.param("executor", marks=pytest.mark.slow), pytest.param("loky", marks=needs_loky)]
 )
-def test_a_process_of_a_pool_that_is_killed_ends_the_run_with_advice(kind, tmp_path, monkeypatch):
-    """multiprocessing.Pool loses the point without a word; ProcessPoolExecutor gives up. Both runs go on afterwards."""
-    monkeypatch.setattr(pool_queue, "SECONDS_BETWEEN_CHECKS", 0.05)
+def test_a_process_of_a_pool_that_is_killed_ends_the_run_with_advice(kind, tmp_path):
+    """The pool gives up; the run goes on afterwards with a new one."""
     (tmp_path / "points").mkdir()
     context = multiprocessing.get_context("spawn")
-    opened = {"pool": lambda: context.Pool(2), "executor": lambda: ProcessPoolExecutor(2, mp_context=context)}
-    opened["loky"] = open_loky
-    messages = {"pool": r"a process of the multiprocessing.Pool has died \(exit code -9\)"}
-    messages |= {"executor": "BrokenProcessPool", "loky": "TerminatedWorkerError"}
-    with (
-        opened[kind]() as pool,
-        pytest.raises(RuntimeError, match=f"(?s){messages[kind]}.*start the same script again"),
-    ):
+    opened = {"executor": lambda: ProcessPoolExecutor(2, mp_context=context), "loky": open_loky}
+    message = {"executor": "BrokenProcessPool", "loky": "TerminatedWorkerError"}[kind]
+    with opened[kind]() as pool, pytest.raises(RuntimeError, match=f"(?s){message}.*start the same script again"):
         killed_run(tmp_path, pool)
     known = len(list((tmp_path / "points").iterdir()))
     with opened[kind]() as pool:
         sampler = killed_run(tmp_path, pool)
     assert sampler.iteration == 1 and known > 60
     assert sampler.report()["new_evaluations"] < sampler.evaluations - 50
-
-
-def test_a_synchronous_run_ends_with_the_same_advice(tmp_path, monkeypatch):
-    monkeypatch.setattr(pool_queue, "SECONDS_BETWEEN_CHECKS", 0.05)
-    (tmp_path / "points").mkdir()
-    message = r"a process of the multiprocessing.Pool has died \(exit code -9\)"
-    with multiprocessing.get_context("spawn").Pool(2) as pool, pytest.raises(RuntimeError, match=message):
-        killed_run(tmp_path, pool, asynchronous=False)
-
-
-def test_processes_that_a_pool_replaces_after_a_number_of_tasks_are_not_taken_for_dead(monkeypatch):
-    monkeypatch.setattr(pool_queue, "SECONDS_BETWEEN_CHECKS", 0.01)
-    with multiprocessing.get_context("fork").Pool(2, maxtasksperchild=4) as pool:
-        queue = pool_queue.PoolQueue(np.negative, pool, list)
-        values, tickets = {}, queue.submit(range(30))
-        while len(values) < 30:
-            values.update(queue.collect())
-    assert [values[ticket] for ticket in tickets] == [-number for number in range(30)]

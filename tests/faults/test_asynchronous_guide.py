@@ -1,4 +1,4 @@
-"""Asynchronous runs with a guide: killed anywhere they go on, and the journal repeats them without a simulation."""
+"""Asynchronous runs with a guide: killed anywhere they go on, and the record repeats them without a simulation."""
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -9,11 +9,10 @@ import pytest
 
 from fe_likelihoods.simulation.executors import as_executor
 from samplers import SMCSampler, TMCMCSampler
-from samplers.tempering.stopping import NothingToReport
+from samplers.tempering.early_stop import NothingToReport
 from tests.contract.targets import Gaussian
 from tests.emulation.problems import symmetric
-from tests.faults.test_asynchronous import kinds
-from tests.faults.test_prefixes import journal_of
+from tests.faults.records import blocks, cut
 from tests.simulated_cluster import SimulatedPool
 from tests.tempering.guides import FixedGuide
 
@@ -31,8 +30,8 @@ def finished(path, order=0, workers=WORKERS, **settings):
     backend = emcee.backends.HDFBackend(str(path))
     sampler = SMCSampler(N, 2, posterior, vectorize=True, backend=backend, **settings)
     with pool.clock():
-        sampler.run_mcmc(None, 1)
-    sampler.backend.close()
+        sampler.run_mcmc(None, 1 - sampler.iteration)
+    sampler._record.close()
     return sampler, pool
 
 
@@ -42,16 +41,9 @@ def state_of(sampler):
     return chain, sampler.rounds, sampler.log_evidence, sampler.evaluations, sampler.simulations, sampler.verdict
 
 
-def cut(path, place, copy):
-    """A copy of a journal up to a place, as a kill leaves it."""
-    journal_of(copy).write_bytes(journal_of(path).read_bytes()[:place])
-    copy.unlink(missing_ok=True)
-
-
 def repeated(path, folder, order):
-    """The run of a journal that is cut before its last step."""
-    last = [place for kind, place in kinds(journal_of(path).read_bytes()) if kind == b"STEP"][-1]
-    cut(path, last, folder / "repeated.h5")
+    """The run of a record without its HDF5 file."""
+    cut(path, None, folder / "repeated.h5")
     return finished(folder / "repeated.h5", order)
 
 
@@ -68,7 +60,7 @@ def test_nothing_is_simulated_twice_and_the_order_of_arrival_decides(whole, tmp_
     assert state_of(finished(tmp_path / "other.h5", order=2)[0]) != state_of(sampler)
 
 
-def test_the_journal_repeats_a_run_without_a_simulation(whole, tmp_path):
+def test_the_record_repeats_a_run_without_a_simulation(whole, tmp_path):
     path, sampler, _ = whole
     again, pool = repeated(path, tmp_path, order=3)
     assert state_of(again) == state_of(sampler) and pool.simulations == 0.0
@@ -77,10 +69,10 @@ def test_the_journal_repeats_a_run_without_a_simulation(whole, tmp_path):
 @pytest.mark.parametrize(
     "share", [0.1, 0.5, 0.9, *(pytest.param(s, marks=pytest.mark.slow) for s in np.arange(0.04, 1.0, 0.07).round(2))]
 )
-def test_killed_anywhere_a_run_goes_on_and_its_journal_repeats_it(whole, tmp_path, share):
+def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(whole, tmp_path, share):
     """In the search and in the rounds; continued with other lengths, of which a later replay takes no account."""
     path, sampler, pool = whole
-    places = [place for _, place in kinds(journal_of(path).read_bytes())]
+    places = [place for _, place in blocks(path)]
     cut(path, places[int(share * len(places))], tmp_path / "killed.h5")
     resumed, rest = finished(tmp_path / "killed.h5", order=4)
     assert rest.simulations < (1.4 - share) * pool.simulations + WORKERS
@@ -132,7 +124,7 @@ def test_what_cannot_be_asynchronous_is_refused():
     guide = FixedGuide(posterior, posterior.mean, [np.diag(posterior.sd**2)])
     with pytest.raises(ValueError, match="evaluation_queue"):
         SMCSampler(N, 2, posterior, vectorize=True, guide=guide, asynchronous=True)
-    with pytest.raises(ValueError, match="use SMCSampler"), ThreadPoolExecutor(1) as pool:
+    with pytest.raises(TypeError, match="asynchronous"), ThreadPoolExecutor(1) as pool:
         TMCMCSampler(N, 2, posterior, pool=pool, guide=guide, asynchronous=True)
     emulated = symmetric()
     emulated.likelihood.response_memory.max_bytes = 1000

@@ -1,4 +1,4 @@
-"""Ctrl-C in asynchronous runs with a file: what has been evaluated is in the journal, and the same script goes on."""
+"""Ctrl-C in asynchronous runs with a file: what has been evaluated is in the record, and the same script goes on."""
 
 import signal
 import sys
@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler
-from samplers.storage import asynchronous, pool_queue
-from samplers.storage.journal_contents import read_journal
+from samplers.evaluation import asynchronous, pool_queue
 from tests.contract.targets import Gaussian
-from tests.faults.test_prefixes import journal_of
+from tests.faults.records import points_of
 from tests.faults.treacherous import Treacherous, posterior_of
 
 N, NDIM, WORKERS = 40, 2, 3
@@ -61,12 +60,6 @@ def make(path, posterior, pool=None, **settings):
     return SMCSampler(N, posterior.ndim, posterior, pool=pool, backend=backend, **settings)
 
 
-def stored(path):
-    """The points of a journal."""
-    contents = read_journal(journal_of(path)) if journal_of(path).exists() else None
-    return [] if contents is None else [row.tobytes() for batch in contents.evaluated for row in batch.coords]
-
-
 def interrupted_when_all_has_ended(sampler, pool, monkeypatch, before, method="submit"):
     """Raise KeyboardInterrupt in the parent, at a call of its evaluator, when all that it has submitted has ended."""
     called = getattr(type(sampler._evaluator), method)
@@ -89,8 +82,8 @@ def test_points_of_a_pool_that_have_ended_are_kept(before, tmp_path, monkeypatch
     with Threads() as pool:
         sampler = make(path, posterior, pool)
         interrupted_when_all_has_ended(sampler, pool, monkeypatch, before)
-        sampler.backend.close()
-        known = stored(path)
+        sampler._record.close()
+        known = points_of(path)
         assert sorted(known) == sorted(posterior.evaluated) and len(known) >= max(before, N)
         again = make(path, posterior, pool)
         again.run_mcmc(None, 1)
@@ -106,8 +99,8 @@ def test_points_of_a_posterior_that_have_ended_are_kept(tmp_path, monkeypatch):
         posterior = posterior_of(Treacherous(), pool=pool)
         sampler = make(path, posterior, vectorize=True)
         interrupted_when_all_has_ended(sampler, pool, monkeypatch, 2 * N, "wait")
-        sampler.backend.close()
-        known = stored(path)
+        sampler._record.close()
+        known = points_of(path)
     assert len(known) == len(set(known)) >= len(pool.futures)
 
 
@@ -163,16 +156,16 @@ def test_ctrl_c_at_any_line_keeps_what_has_ended(tmp_path):
                     sampler.run_mcmc(None, 0)
             except KeyboardInterrupt:
                 lines += 1
-        sampler.backend.close()
+        sampler._record.close()
         if interrupt.known is not None:
-            known = stored(path)
+            known = points_of(path)
             assert len(known) == len(set(known))
             assert len(set(interrupt.known) - set(known)) <= WORKERS, (line, len(interrupt.known), len(known))
     assert lines > 100
 
 
 def test_first_values_that_were_kept_without_a_check_are_checked_by_the_next_run(tmp_path, monkeypatch):
-    """A log-likelihood that is given as log-posterior is refused, although its values are in the journal."""
+    """A log-likelihood that is given as log-posterior is refused, although its values are in the record."""
 
     class Mistaken(Noted):
         def __call__(self, x):
@@ -183,8 +176,8 @@ def test_first_values_that_were_kept_without_a_check_are_checked_by_the_next_run
     with Threads() as pool:
         sampler = make(path, posterior, pool)
         interrupted_when_all_has_ended(sampler, pool, monkeypatch, 1, "wait")
-        sampler.backend.close()
-        assert len(stored(path)) == N
+        sampler._record.close()
+        assert len(points_of(path)) == N
         with pytest.raises(ValueError, match="without the log-prior"):
             make(path, posterior, pool).run_mcmc(None, 1)
 
@@ -199,8 +192,8 @@ def test_values_that_the_check_refuses_are_not_kept(tmp_path):
         sampler = make(path, Mistaken(), pool)
         with pytest.raises(ValueError, match="without the log-prior"):
             sampler.run_mcmc(None, 1)
-        sampler.backend.close()
-        assert stored(path) == []
+        sampler._record.close()
+        assert points_of(path) == []
         make(path, Noted(), pool).run_mcmc(None, 0)
 
 
@@ -221,7 +214,7 @@ def test_points_beside_one_that_ends_the_run_are_kept(kind, tmp_path):
         sampler = make(path, posterior, pool)
         with pytest.raises(RuntimeError, match=f"the pool cannot go on: {kind}"):
             sampler.run_mcmc(None, 1)
-        sampler.backend.close()
-        known = stored(path)
+        sampler._record.close()
+        known = points_of(path)
     # points that still ran have ended since
     assert 2 * N - WORKERS <= len(known) and set(known) <= set(posterior.evaluated)

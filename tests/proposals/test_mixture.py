@@ -7,11 +7,13 @@ from scipy.special import logsumexp
 
 from samplers import MixtureMove
 from samplers.proposals.mixture import draw, fit_mixture, log_density, log_responsibilities
-from samplers.proposals.shears import apply_shears, find_shears, invert_shears
-from samplers.proposals.support_bounds import (
+from samplers.proposals.transforms import (
     SupportBounds,
+    apply_shears,
+    find_shears,
     find_support_bounds,
     from_unbounded,
+    invert_shears,
     log_abs_det_jacobian,
     near_bounds,
     to_unbounded,

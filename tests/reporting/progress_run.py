@@ -1,40 +1,32 @@
-"""A run with a progress bar in a process of its own: ``python -m tests.reporting.progress_run [log|talking]``.
+"""A run with a progress bar in a process of its own: ``python -m tests.reporting.progress_run [talking]``.
 
-Prints the numbers that the bar must have shown at the end. With ``log``, the log shows INFO. With ``talking``, the
-posterior writes messages to the terminal.
+Prints the numbers that the bar must have shown at the end. With ``talking``, the posterior writes a message to the log,
+which is shown in the terminal.
 """
 
 import json
 import logging
 import sys
-import warnings
 
 from samplers import SMCSampler
 from tests.contract.targets import Gaussian
 
 
 class Talking(Gaussian):
-    """A posterior that warns, logs and prints between its values."""
+    """A posterior that logs between its values."""
 
     batches = 0
 
     def __call__(self, x):
         """The log-density."""
         self.batches += 1
-        if self.batches == 2:
-            warnings.warn("warned", stacklevel=1)
-        elif self.batches == 3:
-            logging.getLogger("some.model").warning("logged without one")  # by the handler of last resort
+        if self.batches == 3:
             logging.getLogger("fe_likelihoods").warning("logged by a handler")
-        elif self.batches == 4:
-            print("printed", file=sys.stderr)
         return super().__call__(x)
 
 
 def main() -> None:
     """Run."""
-    if "log" in sys.argv:
-        logging.basicConfig(level=logging.INFO, format="%(name)s|%(message)s")
     if "talking" in sys.argv:
         logging.getLogger("fe_likelihoods").addHandler(logging.StreamHandler())
     posterior = (Talking if "talking" in sys.argv else Gaussian)(3, 0.02)

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, LocalPool, Measurements
-from samplers import SMCSampler, TMCMCSampler, estimate_cost, timing
-from samplers.cost import _scheduled, _wall_times
-from samplers.tempering.expected_cost import Expected
-from samplers.tempering.settings import Settings
+from samplers import SMCSampler, TMCMCSampler, estimate_cost
+from samplers.cost import as_duration
 from tests.contract.targets import Gaussian
 from tests.reporting.test_progress import oscillating, posterior_of
 from tests.simulated_cluster import SimulatedCluster
@@ -61,7 +59,7 @@ def test_the_start_of_the_workers_is_not_timed(slow, tmp_path):
     assert (estimate.seconds >= 1.5).sum() == slow - 4
 
 
-def test_long_points_are_timed_at_once(monkeypatch):
+def test_workers_are_started_and_points_timed_at_the_same_time():
     def made(workers, runs=3):
         cluster = SimulatedCluster(Gaussian(), workers, lambda x: np.ones(len(x)))
         sizes, submit = [], cluster.submit
@@ -69,11 +67,9 @@ def test_long_points_are_timed_at_once(monkeypatch):
         assert estimate_cost(cluster, 40, runs=runs, seed=1).evaluated == sum(sizes)
         return sizes
 
-    # cheap points start all workers, after the first ones have shown that they are cheap
-    assert made(1) == [1, 1, 1, 1] and made(4) == [4, 1, 1, 1] and made(20) == [8, 20, 1, 1, 1]
-    assert made(64) == [8, 29, 1, 1, 1]  # as many as the run has draws of the prior
-    monkeypatch.setattr(timing, "LONG", -1.0)
-    assert made(64) == [8, 3] and made(4) == [4, 3] and made(2) == [2, 1, 1, 1] and made(64, 9) == [8, *[1] * 9]
+    assert made(1) == [1, 1, 1, 1] and made(2) == [2, 2, 1] and made(20) == [20, 3]
+    assert made(64) == [37, 3]  # as many as the run has draws of the prior
+    assert made(4, 9) == [4, 4, 4, 1]
 
 
 def test_the_run_begins_with_the_timed_points():
@@ -89,103 +85,46 @@ def test_the_run_begins_with_the_timed_points():
     assert posterior.report()["simulations"] == 128
 
 
-@pytest.mark.parametrize(("pool", "on_disk"), [(None, True), (2, False), pytest.param(2, True, marks=pytest.mark.slow)])
-def test_points_that_are_cached_are_not_timed(pool, on_disk, tmp_path):
-    """A second estimate with the same seed, in the same process or with the same file; and one after a whole run."""
-
-    def make():
-        likelihood = FELikelihood(*slow, pool=pool, cache=tmp_path / "cache.db" if on_disk else None)
-        return posterior_of(likelihood)
-
-    slow = sleeping(0.03)
-    first = posterior = make()
-    earlier = estimate_cost(first, 20, seed=4)
-    assert earlier.cached == 0 and "cached" not in str(earlier)
-    for n in (0, 20):
-        posterior = make() if on_disk else first
-        if n:
-            posterior(posterior.sample_prior(n, np.random.RandomState(4)))  # all draws of a sampler
-        before = posterior.report()["simulations"]
-        estimate = estimate_cost(posterior, 20, seed=4)
-        made = posterior.report()["simulations"] - before
-        assert made == estimate.evaluated - estimate.cached >= 4 and estimate.cached >= (n or 4)
-        assert len(estimate.seconds) == 3 and estimate.seconds.min() >= 0.03
-        assert f"{estimate.cached} cached, 3 timed" in str(estimate) and estimate.any_simulated
-
-
-def sleeping(seconds):
-    """A model that takes a time [s], and its measurements."""
-    channels = (Channel("top", "displacement", "mm"),)
-    model = FunctionModel(Sleeping(seconds), ("a", "b"), channels, dt=0.01, n_steps=3, version="1")
-    return model, Measurements(channels, 0.01, np.ones((1, 3)))
-
-
-@dataclass(frozen=True)
-class Sleeping:
-    seconds: float
-
-    def __call__(self, theta):
-        time.sleep(self.seconds)
-        return 0.01 * np.array([theta[0], theta[1], theta[0] * theta[1]])[None]
-
-
-def test_a_posterior_that_never_simulates_is_timed_and_says_so():
-    class Recalled(Gaussian):
-        def report(self):
-            return {"simulations": 0}
-
-    estimate = estimate_cost(Recalled(), 20, seed=1)
-    assert not estimate.any_simulated and len(estimate.seconds) == 3 and estimate.evaluated == 40
-    assert "no point needed a simulation: the times are those of cached points" in str(estimate)
+def test_cached_points_are_told(tmp_path):
+    """A second estimate with the same seed."""
+    posterior = posterior_of(oscillating())
+    assert estimate_cost(posterior, 20, seed=4).cached == 0
+    again = estimate_cost(posterior, 20, seed=4)
+    assert again.cached == again.evaluated == 4 and "4 points were cached" in str(again)
 
 
 def test_the_table():
-    posterior = posterior_of(oscillating())
-    estimate = estimate_cost(posterior, 250, workers=16, seed=4)
-    lines = str(estimate).splitlines()
-    assert repr(estimate) == str(estimate) and lines[0] == "SMCSampler, 250 walkers, 3 parameters"
-    for word in (
-        "one evaluation (4 made, 3 timed)",
-        "evaluations",
-        "wall time, 16 workers",
-        "asynchronous=True",
-        "guide",
-    ):
-        assert any(word in line for line in lines), word
-    assert "guide" not in str(estimate_cost(Gaussian(), 250, seed=1))
+    estimate = estimate_cost(posterior_of(oscillating()), 250, workers=16, seed=4)
+    first, *rows = str(estimate).splitlines()
+    assert repr(estimate) == str(estimate) and first == "SMCSampler, 250 walkers, 3 parameters"
+    starts = ("one evaluation (4 made, 3 timed)  ", "evaluations  ", "wall time, 16 workers  ")
+    assert all(row.startswith(start) for row, start in zip(rows, starts, strict=True))
 
 
-def test_without_recycling_the_table_says_why_no_asynchronous_time():
-    few = estimate_cost(Gaussian(), 100, seed=1)
-    assert few.asynchronous is None and "only with recycling" in str(few).splitlines()[-1]
-    assert estimate_cost(Gaussian(), 100, seed=1, recycle=True).asynchronous is not None
-    assert estimate_cost(Gaussian(), 250, seed=1, recycle=False).asynchronous is None
-    with pytest.raises(ValueError, match="recycle=True cannot act here"):
+def test_the_wall_time_is_the_range_of_evaluations_by_the_mean_duration():
+    estimate = estimate_cost(Gaussian(), 100, workers=5, seed=1)
+    expected = np.array(estimate.evaluations) * estimate.seconds.mean() / 5
+    np.testing.assert_allclose(estimate.wall_time, expected)
+    assert as_duration(estimate.wall_time.low, estimate.wall_time.high) in str(estimate)
+    assert estimate.time_of(500) == as_duration(*[100.0 * estimate.seconds.mean()] * 2)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'recycle'"):
         estimate_cost(Gaussian(), 250, TMCMCSampler, recycle=True)
+    recycled, moved = (estimate_cost(Gaussian(), 250, seed=1, recycle=choice).evaluations for choice in (True, False))
+    assert recycled != moved
 
 
-def test_lists_are_scheduled_in_order():
-    assert _scheduled(np.array([3.0, 1.0, 1.0, 2.0]), 2) == 4.0
-    assert _scheduled(np.array([3.0, 1.0, 1.0, 2.0]), 1) == 7.0
-    assert _scheduled(np.array([3.0, 1.0]), 8) == 3.0
-
-
-def test_uneven_durations_cost_a_synchronous_run_more():
-    choice = Settings(recycle=True), Expected(4000.0, 5000.0, 6000.0), 500, 5
-    uneven, even = np.array([0.2, 1.0, 5.0]) / 6.2 * 3.0, np.array([1.0, 1.0, 1.0])
-    for workers, least in ((1, 0.9), (64, 1.2)):
-        waiting, flowing = _wall_times(*choice, uneven, workers, True)
-        assert waiting.likely > least * flowing.likely
-    waiting, flowing = _wall_times(*choice, even, 50, True)
-    assert waiting.likely == pytest.approx(100.0) and flowing.likely == pytest.approx(100.0)  # 5000 / 50 workers
-    assert waiting.low == pytest.approx(80.0) and waiting.high == pytest.approx(120.0)
-    assert _wall_times(*choice, even, 50, False)[1] is None
-
-
-def test_an_asynchronous_run_never_takes_longer():
-    for seconds in np.random.default_rng(1).lognormal(0.0, 1.0, (30, 3)):
-        waiting, flowing = _wall_times(Settings(recycle=True), Expected(4e3, 5e3, 6e3), 500, 5, seconds, 1, True)
-        assert np.all(np.array(flowing) <= np.array(waiting))
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (2.1 * 3600, 3.4 * 3600, "about 2.1 to 3.4 h"),
+        (5.0, 5.0, "about 5 s"),
+        (30.0, 150.0, "about 0.5 to 2.5 min"),
+        (40 * 3600, 300 * 3600, "about 1.7 to 12 d"),
+        (0.0, 100.0, "about 0 to 100 s"),
+    ],
+)
+def test_durations_as_text(low, high, text):
+    assert as_duration(low, high) == text
 
 
 def test_what_cannot_be_estimated_is_refused():

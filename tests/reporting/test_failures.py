@@ -63,8 +63,11 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     note = notes_of(contents)["Failures border on the samples"]
     assert note.level == "severe" and contents.status == "not usable"
     # one place decides: the sampler
-    assert sampler.verdict.status == "not usable" and contents.failures.near is sampler.failures_near
-    assert f"{sampler.failures_near.failed} of {sampler.failures_near.evaluated} simulated points failed" in note.text
+    assert sampler.verdict.status == "not usable" and contents.failures.near == sampler.verdict.near_failures
+    assert (
+        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} simulated points failed"
+        in note.text
+    )
     assert "Do not use these numbers" in contents.summary[2]
     bad = int((sampler.prior_draws[:, 0] > 1.1).sum())
     assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].text

@@ -38,7 +38,7 @@ from fe_likelihoods.reporting.fits import fit_data_sets
 from fe_likelihoods.reporting.report import _like
 from fe_likelihoods.reporting.run import read_run
 from fe_likelihoods.reporting.table import parameter_rows
-from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_ladder
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
 from tests.contract.targets import Gaussian
 from tests.reporting.report_page import Page, read_page
 
@@ -137,7 +137,7 @@ def test_a_run_that_the_limit_ended_shows_the_exponent_that_it_reached():
     assert f"{sampler.ended_at:.3e}*" in last and "1.000e+00" not in last
     text = " ".join(evidence(read_run(sampler, posterior)))
     assert "check_draws" not in text and "limit of simulations ended the run at beta" in text
-    figure = plot_ladder(sampler)
+    figure = plot_run(sampler)
     assert "ended by the limit" in figure.axes[0].get_title()
     plt.close(figure)
     assert run(vibration(), walkers=20, steps=1).ended_at is None
@@ -152,7 +152,7 @@ def test_what_a_reader_has_to_know_is_said(page, vibrating):
     assert sampler.verdict.status in page.text
     for digest in (posterior.fingerprint, posterior.data_fingerprint, posterior.likelihood.model.fingerprint):
         assert digest in page.text
-    assert "SMCSampler( 60, posterior.ndim, posterior, vectorize=True, seed=1, recycle=False, )" in page.text
+    assert "SMCSampler( 60, posterior.ndim, posterior, vectorize=True, seed=1, )" in page.text
     assert ["simulations for this report", "2"] in [row for table in page.tables for row in table]
     assert "Free vibration" in page.text and "Peaks" in page.text and "95 % quantile" in page.text
     assert "CRPS" in page.text and "of 3 true values are within their 90 % intervals" in page.text

@@ -5,7 +5,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from samplers import SMCSampler, ladder_table, plot_ladder, plot_run
+from samplers import SMCSampler, ladder_table, plot_run
 from tests.contract.targets import Gaussian
 from tests.tempering.test_guided import laplace
 
@@ -38,61 +38,41 @@ def guided():
     return sampler
 
 
-def test_ladder_shows_every_stage_at_its_cost(run):
-    beta, sizes, moves, evidence, acceptance = plot_ladder(run).axes
+def test_run_shows_every_stage_at_its_cost(run):
+    phases, beta, sizes, evidence, chain, acceptance = plot_run(run).axes
     stages = run.ladder
     ends = np.cumsum([stage.evaluations for stage in stages])
     assert beta.get_ylabel() == r"exponent $\beta$ [-]" and beta.get_yscale() == "log"
-    np.testing.assert_array_equal(beta.lines[0].get_xdata(), ends)
     assert list(beta.lines[0].get_ydata()) == [stage.beta for stage in stages]
-    assert f"{len(stages)} stages" in beta.get_title() and f"{run.log_evidence:.2f}" in beta.get_title()
+    assert list(acceptance.lines[0].get_ydata()) == [stage.acceptance for stage in stages]
+    for line in (beta.lines[0], sizes.lines[0], acceptance.lines[0], evidence.containers[0].lines[0]):
+        np.testing.assert_array_equal(line.get_xdata(), ends)
+    assert f"{len(stages)} stages" in phases.get_title() and f"{run.log_evidence:.2f}" in phases.get_title()
     assert legend(sizes) == ["effective sample size", "distinct points", "walkers"]
     assert list(sizes.lines[0].get_ydata()) == [stage.effective_sample_size for stage in stages]
-    assert [bar.get_height() for bar in moves.patches] == [stage.moves for stage in stages]
-    assert [bar.get_width() for bar in moves.patches] == [stage.evaluations for stage in stages]
-    assert list(acceptance.lines[0].get_ydata()) == [stage.acceptance for stage in stages]
+    assert list(sizes.lines[1].get_ydata()) == [stage.distinct_ancestors for stage in stages]
     so_far = evidence.containers[0].lines[0].get_ydata()
     assert so_far[-1] == pytest.approx(run.log_evidence_ladder) and len(so_far) == len(stages)
     assert evidence.get_xlabel() == "evaluations of the log-probability"
 
 
-def test_ladder_shows_an_effective_sample_size_above_the_number_of_walkers(guided):
-    """As of the weighted draws of a guide."""
-    beta, sizes, moves, *_ = plot_ladder(guided).axes
-    assert beta.get_title().startswith("1 stage, ") and moves.get_ylim() == (0, 1.05)
-    assert 100 < guided.ladder[0].effective_sample_size < sizes.get_ylim()[1]
-
-
-def test_stages_without_evaluations_are_drawn_against_their_number(run):
-    class Read:
-        """As read from a file of an earlier version."""
-
-        ladder = tuple(stage._replace(evaluations=0) for stage in run.ladder)
-        ended_at = None
-        nwalkers, log_evidence, log_evidence_error = run.nwalkers, run.log_evidence, run.log_evidence_error
-
-    *_, evidence, _ = plot_ladder(Read()).axes
-    assert evidence.get_xlabel() == "stage"
-    assert list(evidence.containers[0].lines[0].get_xdata()) == [*range(1, len(run.ladder) + 1)]
-
-
-def test_an_unfinished_ladder_says_so(run):
+def test_an_unfinished_run_says_so(run):
     class Unfinished:
-        ladder, nwalkers, ended_at = run.ladder[:2], run.nwalkers, None
+        ladder, nwalkers, ended_at, rounds = run.ladder[:2], run.nwalkers, None, ()
+        evaluations, iteration = sum(stage.evaluations for stage in run.ladder[:2]), 0
 
-    title = plot_ladder(Unfinished()).axes[0].get_title()
+    title = plot_run(Unfinished()).axes[0].get_title()
     assert "not finished" in title and f"{run.ladder[1].beta:.3g}" in title
 
 
 def test_run_shows_where_the_evaluations_went(run):
-    phases, sizes, evidence, chain = plot_run(run).axes
+    phases, _, _, evidence, chain, _ = plot_run(run).axes
     widths = {text.rpartition(": ")[0]: int(text.rpartition(": ")[2]) for text in legend(phases)}
     assert sum(widths.values()) == run.evaluations
     assert widths["tempering"] == sum(stage.evaluations for stage in run.ladder)
-    assert widths["sweeps at beta = 1"] == 5 * 40
+    assert 0.9 * 5 * 40 <= widths["sweeps at beta = 1"] <= 5 * 40  # a point that is proposed again is known
     assert widths["check of the evidence"] == run.log_evidence_check.evaluations
     assert [bar.get_width() for bar in phases.patches] == list(widths.values())
-    assert legend(sizes) == ["tempering stages", "walkers"]
     assert "result of the run" in legend(evidence)
     median = next(line for line in chain.lines if line.get_label() == "median").get_ydata()
     np.testing.assert_allclose(median, np.median(run.get_log_prob(), axis=1))
@@ -102,7 +82,8 @@ def test_run_shows_where_the_evaluations_went(run):
 def test_run_shows_the_rounds_of_a_guide(guided):
     phases, sizes, evidence, chain = plot_run(guided).axes
     assert legend(phases)[0] == f"draws of the guide: {sum(r.draws for r in guided.rounds)}"
-    assert legend(sizes) == ["rounds of the guide", "walkers"]
+    assert legend(sizes) == ["effective sample size, guide", "walkers"]
+    assert sizes.get_ylim()[1] > max(r.effective_sample_size for r in guided.rounds)
     assert list(sizes.lines[0].get_ydata()) == [r.effective_sample_size for r in guided.rounds]
     assert evidence.containers[0].lines[0].get_ydata()[-1] == guided.rounds[-1].log_evidence
     assert legend(chain) == ["median and 90 % of the walkers"]
@@ -111,11 +92,11 @@ def test_run_shows_the_rounds_of_a_guide(guided):
 def test_run_without_steps_says_so():
     sampler = SMCSampler(40, 3, Gaussian(), vectorize=True, seed=1)
     sampler.run_mcmc(None, 0)
-    chain = plot_run(sampler).axes[3]
+    chain = plot_run(sampler).axes[4]
     assert [text.get_text() for text in chain.texts] == ["no steps at beta = 1 were made"]
 
 
-@pytest.mark.parametrize("function", [plot_ladder, plot_run, ladder_table])
+@pytest.mark.parametrize("function", [plot_run, ladder_table])
 def test_other_samplers_are_refused(function):
     with pytest.raises(ValueError, match="expected a tempered sampler.*got EnsembleSampler"):
         function(emcee.EnsembleSampler(40, 3, Gaussian()))

@@ -9,8 +9,8 @@ from scipy import stats
 
 from fe_likelihoods import FELikelihood, JointLikelihood, LocalPool, Posterior
 from samplers import SMCSampler
-from samplers.tempering.cohorts import Cohort
-from samplers.tempering.flights import Flight
+from samplers.tempering.guided import Batch
+from samplers.tempering.pending_points import PendingPoints
 from tests.benchmarks import truth_targets
 from tests.contract.targets import Gaussian
 from tests.probability.linear_gaussian import KnownNoise, exact_log_evidence, likelihood_of
@@ -120,13 +120,15 @@ def test_rounds_of_a_guide_do_not_prefer_short_runs(monkeypatch, parts):
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_control_rounds_of_early_arrivals_prefer_short_runs(monkeypatch):
     """Negative control: rounds are judged when 60 % of their draws have arrived, and consist of these."""
-    monkeypatch.setattr(Flight, "complete", property(lambda flight: np.mean(flight.arrived) > 0.6))
-    monkeypatch.setattr(Flight, "landed_part", lambda flight: (flight.coords[flight.arrived], records_of(flight)))
-    running = Cohort.running.fget
-    monkeypatch.setattr(Cohort, "running", property(lambda cohort: 0 if cohort.flight.complete else running(cohort)))
+    monkeypatch.setattr(PendingPoints, "complete", property(lambda points: np.mean(points.arrived) > 0.6))
+    monkeypatch.setattr(
+        PendingPoints, "arrived_part", lambda points: (points.coords[points.arrived], records_of(points))
+    )
+    running = Batch.running.fget
+    monkeypatch.setattr(Batch, "running", property(lambda batch: 0 if batch.pending.complete else running(batch)))
     evidence, mean, _ = deviations_with_a_guide()
     assert evidence < -3.0 and mean < -6.0
 
 
-def records_of(flight):
-    return flight.base[:0] if flight._records is None else flight._records[flight.arrived]
+def records_of(points):
+    return points.base[:0] if points._records is None else points._records[points.arrived]

@@ -137,15 +137,11 @@ def test_smc_agrees_with_importance_sampling(run, make):
 def test_a_start_on_the_coarse_posterior_agrees(run):
     """Mean, sd and evidence of the fine posterior; half the work, counted in samples of the record simulated."""
     alone, posterior = run(bundled_reduced), bundled_reduced(None)
-    sampler = SMCSampler(
-        WALKERS,
-        posterior.ndim,
-        posterior,
-        vectorize=True,
-        seed=int(os.environ.get("SEED", "1")),
-        coarse_log_prob_fn=posterior.coarse,
-    )
-    sampler.run_mcmc(None, SWEEPS)
+    options = {"vectorize": True, "seed": int(os.environ.get("SEED", "1"))}
+    first = SMCSampler(WALKERS, posterior.ndim, posterior.coarse, **options)
+    first.run_mcmc(None, 0)
+    sampler = SMCSampler(WALKERS, posterior.ndim, posterior, start_density=first.proposal.logpdf, **options)
+    sampler.run_mcmc(first.proposal.rvs(WALKERS, 1), SWEEPS)
     samples = sampler.get_chain(flat=True)
     sd = samples.std(axis=0)
     assert np.all(

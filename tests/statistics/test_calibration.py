@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers import RAMANCHA_2022_LITERAL, SMCSampler, TMCMCSampler
+from samplers import SMCSampler, TMCMCSampler
+from samplers.presets import RAMANCHA_2022_LITERAL
 
 SAMPLERS = {
     "SMC": (SMCSampler, {}),

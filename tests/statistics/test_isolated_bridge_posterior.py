@@ -22,8 +22,8 @@ from fe_likelihoods.models.isolated_bridge import IsolatedBridge
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.noise import SharedGaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
-from samplers import CHING_CHEN_2007, SMCSampler, TMCMCSampler
-from samplers.tempering.diagnostics import SamplingWarning
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.presets import CHING_CHEN_2007
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,9 @@ import pytest
 from emcee.moves import StretchMove
 from scipy.stats import multivariate_normal
 
-from samplers import RecyclingSettings, SMCSampler, TMCMCSampler
+from samplers import SMCSampler, TMCMCSampler
 from samplers.moves.kernels import MixtureMove
+from samplers.tempering import recycling
 from tests.benchmarks import truth, truth_targets
 
 NDIM = 10
@@ -48,12 +49,9 @@ class OneMode(TwoModes):
         return self.parts(x)[1] + np.log(2.0)
 
 
-def run(seed, target=TwoModes, moves=None, **settings):
+def run(seed, target=TwoModes, moves=None):
     posterior = target(seed)
-    recycling = RecyclingSettings(**settings)
-    sampler = SMCSampler(
-        500, NDIM, posterior, vectorize=True, seed=seed, moves=moves, recycle=True, recycling=recycling
-    )
+    sampler = SMCSampler(500, NDIM, posterior, vectorize=True, seed=seed, moves=moves, recycle=True)
     return finish(sampler, posterior)
 
 
@@ -72,16 +70,18 @@ def test_the_narrow_mode_is_kept(seed):
     assert share == pytest.approx(0.5, abs=0.1)
 
 
-def test_without_components_for_basins_it_is_lost():
+def test_without_components_for_basins_it_is_lost(monkeypatch):
     """Negative control: the target is one that the plain mixture gets wrong."""
-    sampler, share = run(2, max_basins=0)
+    monkeypatch.setattr(recycling, "MOST_BASINS", 0)
+    sampler, share = run(2)
     assert share < 0.05 and sampler.log_evidence == pytest.approx(np.log(0.5), abs=0.1)
 
 
 @pytest.mark.parametrize(("target", "lost"), [(TwoModes, True), (OneMode, False)])
-def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, lost):
+def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, lost, monkeypatch):
     """Recycling finds both modes, is not trusted, and the stretch moves after it find one."""
-    sampler, share = run(2, target, moves=StretchMove(), trusted_yield=1.0, closing_sweeps=True)
+    monkeypatch.setattr(recycling, "RELIABLE_EFFICIENCY", 1.0)
+    sampler, share = run(2, target, moves=StretchMove())
     assert share < 0.05
     reported = any("a mode has been lost" in reason for reason in sampler.verdict.reasons)
     assert reported == lost
@@ -104,19 +104,20 @@ def test_moves_without_components_for_basins_lose_it(monkeypatch):
 
 
 @pytest.mark.parametrize(("rounds", "found"), [(4, True), (0, False)])
-def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found):
+def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found, monkeypatch):
     """One draw of the last round before the check hits the flank of the narrow mode."""
-    recycling = RecyclingSettings(search_draws=0.0, max_basin_rounds=rounds)
-    result = truth.run(truth.Cell("two", 100.0, "SMC", 500), 4, 1, {"recycling": recycling})
+    monkeypatch.setattr(recycling, "SEARCH_DRAWS", 0.0)
+    monkeypatch.setattr(recycling, "MOST_BASIN_ROUNDS", rounds)
+    result = truth.run(truth.Cell("two", 100.0, "SMC", 500), 4, 1, {})
     assert (min(result["shares"]) > 0.15) == found
 
 
-def test_search_draws_are_spread_over_the_stages():
+def test_search_draws_are_spread_over_the_stages(monkeypatch):
     posterior = truth_targets.gaussian(1)
     runs = []
     for share in (0.0, 3.0):
-        recycling = RecyclingSettings(search_draws=share)
-        sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True, seed=1, recycling=recycling)
+        monkeypatch.setattr(recycling, "SEARCH_DRAWS", share)
+        sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True, seed=1)
         sampler.run_mcmc(None, 0)
         runs.append((len(sampler.ladder), sampler.evaluations))
     (stages, evaluations), (more_stages, more_evaluations) = runs

@@ -5,14 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
-from samplers import (
-    CHING_CHEN_2007,
-    RAMANCHA_2022_CONSTANT,
-    RAMANCHA_2022_LITERAL,
-    SamplingWarning,
-    SMCSampler,
-    TMCMCSampler,
-)
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ import hashlib
 import numpy as np
 from scipy import stats
 
+from samplers.estimates.weights import coarse_weights, effective_sample_size
 from samplers.proposals.mixture import draw, fit_mixture, log_density
-from samplers.tempering.weights import coarse_weights, effective_sample_size
 
 
 class FixedGuide:

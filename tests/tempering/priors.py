@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from samplers.tempering.starts import Comparison, compare_with_draws, draws_to_compare, spread_by_metropolis
+from samplers.evaluation.starts import compare_with_draws, draws_to_compare, spread_by_metropolis
 
 __all__ = ["PRIORS", "Cauchy", "Correlated", "LogNormal", "Prior", "Uniform", "ball", "refused"]
 
@@ -78,8 +78,8 @@ class Cauchy(Prior):
 PRIORS = [Correlated, Uniform, LogNormal, Cauchy]
 
 
-def refused(points: np.ndarray, prior: Prior, by: str = "draws", seed: int = 1) -> Comparison:
-    """What the test by fresh draws, or by the density, finds."""
+def refused(points: np.ndarray, prior: Prior, by: str = "draws", seed: int = 1) -> str:
+    """What the test by fresh draws, or by the density, finds; empty where it finds nothing."""
     if by == "density":
         return spread_by_metropolis(points, prior.log_density)
     return compare_with_draws(points, prior.draw(draws_to_compare(len(points)), np.random.RandomState(seed)))

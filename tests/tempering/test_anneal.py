@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
+from samplers.estimates.importance import EvidenceCheck
 from samplers.moves.fast_parameters import WithFastSweeps
 from samplers.moves.kernels import MixtureMove
-from samplers.tempering.adaptive_importance import recycle
+from samplers.reports import AnnealingResult, Concern, Restart, Stage, Sweep
+from samplers.settings import Settings
+from samplers.tempering import recycling
 from samplers.tempering.anneal import anneal
-from samplers.tempering.evidence_check import EvidenceCheck
-from samplers.tempering.flights import Flight
 from samplers.tempering.mutation import MoveSchedule
-from samplers.tempering.population import Doubt, Population, Restart, Stage, Sweep
-from samplers.tempering.results import AnnealingResult
-from samplers.tempering.settings import RecyclingSettings, Settings
+from samplers.tempering.pending_points import PendingPoints
+from samplers.tempering.population import Population
+from samplers.tempering.recycling import recycle
 from tests.contract.targets import Gaussian
 
 N = 100
@@ -36,19 +37,19 @@ class CountedDensity:
         return records
 
     def submit(self, coords):
-        return Flight.landed(coords, self.evaluate(coords))
+        return PendingPoints.known(coords, self.evaluate(coords))
 
     def wait(self, most):
         pass
 
 
-def steps_of(settings, coarse=None, n=N, seed=1):
+def steps_of(settings, n=N, seed=1):
     """Steps of a seeded annealing of a sharp Gaussian, and its density."""
     posterior, random = Gaussian(3, sd=0.02), np.random.RandomState(seed)
     density = CountedDensity(posterior)
     start = Population(0.0, posterior.sample_prior(n, random), None, float(n))
     schedule = MoveSchedule([MixtureMove()], np.ones(1))
-    return anneal(start, density, random, schedule, settings, coarse), density
+    return anneal(start, density, random, schedule, settings), density
 
 
 @pytest.mark.parametrize("recycle", [False, True])
@@ -102,7 +103,7 @@ def test_sweeps_after_recycling_use_its_last_proposal(monkeypatch):
     start = Population(0.0, posterior.sample_prior(250, random), None, 250.0)
     moves = WithFastSweeps(move, [2])
     list(anneal(start, CountedDensity(posterior), random, MoveSchedule([moves], np.ones(1)), Settings(recycle=True)))
-    assert found[0].trusted and move.mixture is found[0].proposals[-1][1]
+    assert found[0].reliable and move.mixture is found[0].proposals[-1][1]
 
 
 def test_the_weights_of_recycling_estimate_the_evidence():
@@ -112,7 +113,7 @@ def test_the_weights_of_recycling_estimate_the_evidence():
         random = np.random.RandomState(seed)
         density = CountedDensity(posterior)
         flight = density.submit(posterior.sample_prior(250, random))
-        found = finished(recycle(flight, density, random, RecyclingSettings()))
+        found = finished(recycle(flight, density, random))
         deviations.append(np.logaddexp.reduce(found.log_weights) - posterior.log_evidence)
     error = np.std(deviations, ddof=1) / np.sqrt(len(deviations))
     assert error < 0.02 and abs(np.mean(deviations)) < 4.0 * error
@@ -135,10 +136,10 @@ def test_nothing_runs_ahead_of_its_consumer():
     steps.close()
 
 
-def test_a_restart_makes_earlier_stages_void():
+def test_a_restart_makes_earlier_stages_void(monkeypatch):
     """Here no check can ever agree, so recycling gives up at beta = 1, and moves start from the prior again."""
-    settings = Settings(recycle=True, recycling=RecyclingSettings(max_evidence_difference=0.0))
-    reports = [report for _, report in steps_of(settings)[0] if not isinstance(report, Sweep)]
+    monkeypatch.setattr(recycling, "LARGEST_DIFFERENCE", 0.0)
+    reports = [report for _, report in steps_of(Settings(recycle=True))[0] if not isinstance(report, Sweep)]
     (place,) = [i for i, report in enumerate(reports) if isinstance(report, Restart)]
     assert "fresh draws change the log-evidence" in reports[place].reason
     before, after = reports[:place], [report for report in reports[place:] if isinstance(report, Stage)]
@@ -146,21 +147,12 @@ def test_a_restart_makes_earlier_stages_void():
     assert after[0].beta < 1.0 and after[-1].beta == 1.0 and all(stage.moves > 0 for stage in after)
 
 
-def test_stages_on_the_coarse_model_are_shown_but_not_reported():
-    n = 250
-    coarse = CountedDensity(Gaussian(3, sd=0.03))
-    steps, _ = steps_of(Settings(recycle=True), coarse, n)
-    kinds = [type(report) for _, report in steps]
-    assert kinds[0] is Sweep and coarse.evaluations > 0
-    assert kinds.count(Stage) < kinds.count(Sweep)
-
-
 def test_the_last_population_is_at_beta_1_where_runs_disagree(monkeypatch):
-    """A doubt about the runs comes with the result, not with the draws of the prior that they began with."""
-    doubt = Doubt("the runs disagree", True)
-    monkeypatch.setattr("samplers.tempering.anneal.check_agreement", lambda *_: [doubt])
+    """A concern about the runs comes with the result, not with the draws of the prior that they began with."""
+    concern = Concern("the runs disagree", True)
+    monkeypatch.setattr("samplers.tempering.anneal.check_agreement", lambda *_: [concern])
     steps, _ = steps_of(Settings(recycle=True, runs=2))
-    population, report = list(steps)[-1]
-    assert report is doubt and population.beta == 1.0
+    (population,) = [population for population, report in steps if report is concern]
+    assert population.beta == 1.0
     z = (population.coords - Gaussian(3, sd=0.02).mean) / Gaussian(3, sd=0.02).sd
     assert np.max(np.abs(z)) < 6.0

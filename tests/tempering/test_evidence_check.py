@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from samplers.tempering.evidence_check import evidence_from_weights
+from samplers.estimates.importance import evidence_from_weights
 
 
 def covered(log_weights, true):

@@ -47,9 +47,14 @@ def make(path, limit, file=None, seed=4):
     return Sampler(N, 3, posterior, vectorize=True, **kwargs)
 
 
+def until(sampler, steps):
+    """Make the steps that are missing."""
+    sampler.run_mcmc(None, steps - sampler.iteration)
+
+
 def halted(sampler, steps):
     with pytest.warns(SamplingWarning, match="max_simulations=.* (ended the run|allowed)"):
-        sampler.run_mcmc(None, steps)
+        until(sampler, steps)
 
 
 def same(sampler, whole):
@@ -69,14 +74,14 @@ def same(sampler, whole):
 def test_a_run_that_goes_on_is_the_long_run(path, where, tmp_path):
     """Several limits, one after the other; the last one is never reached."""
     whole = make(path, None)
-    whole.run_mcmc(None, 6)
+    until(whole, 6)
     total = whole.simulations
     file = None if where == "memory" else tmp_path / "run.h5"
     sampler = make(path, 0.15 * total, file)
     for share in (0.15, 0.4, 0.4, 0.7, 0.93):
         limit = share * total
         if where == "new process":
-            sampler.backend.close()
+            sampler._record.close()
             sampler = make(path, limit, file, seed=4 if share == 0.15 else 77)
         sampler.max_simulations = limit
         halted(sampler, 6)
@@ -88,12 +93,12 @@ def test_a_run_that_goes_on_is_the_long_run(path, where, tmp_path):
         assert sampler.verdict.simulations == sampler.simulations
     made = sampler.log_prob_fn.f.calls
     if where == "new process":
-        sampler.backend.close()
+        sampler._record.close()
         sampler = make(path, total, file, seed=77)
     sampler.max_simulations = total
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        sampler.run_mcmc(None, 6)
+        until(sampler, 6)
     assert same(sampler, whole)
     if where == "memory" and path != "searching guide":
         assert sampler.log_prob_fn.f.calls <= whole.log_prob_fn.f.calls and made > 0
@@ -107,7 +112,7 @@ def test_a_run_that_goes_on_is_the_long_run(path, where, tmp_path):
 def test_a_limited_run_is_the_beginning_of_the_long_run(path):
     """The same limit, reached at once or in two parts."""
     whole = make(path, None)
-    whole.run_mcmc(None, 6)
+    until(whole, 6)
     limit = 0.6 * whole.simulations
     once, twice = make(path, limit), make(path, 0.3 * whole.simulations)
     halted(once, 6)
@@ -119,11 +124,11 @@ def test_a_limited_run_is_the_beginning_of_the_long_run(path):
 
 def test_steps_that_fit_are_kept():
     sampler = make("guide", None)
-    sampler.run_mcmc(None, 0)
+    until(sampler, 0)
     annealing = sampler.simulations
     sampler = make("guide", annealing + 2.5 * N)
     with pytest.warns(SamplingWarning, match="allowed 2 of 5 steps at beta = 1"):
-        sampler.run_mcmc(None, 5)
+        until(sampler, 5)
     assert sampler.iteration == 2 and sampler.simulations == annealing + 2 * N
     sampler = make("guide", annealing + 0.5 * N)
     halted(sampler, 5)
@@ -134,11 +139,11 @@ def test_steps_that_fit_are_kept():
 
 def test_the_warning_of_a_converged_run_is_calm():
     plain = make("guide", None)
-    plain.run_mcmc(None, 0)
+    until(plain, 0)
     annealing = plain.simulations
     sampler = make("guide", annealing)
     with pytest.warns(SamplingWarning) as caught:
-        sampler.run_mcmc(None, 5)
+        until(sampler, 5)
     message = str(caught[0].message)
     assert len(caught) == 1 and message == (
         f"max_simulations={annealing:g} allowed 0 of 5 steps at beta = 1. The chain holds draws of the posterior: no "
@@ -146,7 +151,7 @@ def test_the_warning_of_a_converged_run_is_calm():
     )
     sampler = make("guide", 0.5 * annealing)  # control
     with pytest.warns(SamplingWarning, match="ended the run. .*sable: .*To go on from here"):
-        sampler.run_mcmc(None, 5)
+        until(sampler, 5)
 
 
 def test_the_verdict_says_of_what_the_effective_sample_size_is():
@@ -210,23 +215,23 @@ def test_the_count_is_that_of_the_model(guide, where, tmp_path):
         )
 
     whole = make(set(), None)
-    whole.run_mcmc(None, 2)
+    until(whole, 2)
     chain, evidence, total = whole.get_chain(), whole.log_evidence, whole.simulations
     assert total == len(whole.log_prob_fn.f.points)
     if where == "file":
-        whole.backend.close()
+        whole._record.close()
         (tmp_path / "run.h5").unlink()
-        (tmp_path / "run.h5.mcmc.journal").unlink()
+        (tmp_path / "run.h5.mcmc.record").unlink()
     points = set()
     sampler, counted = make(points, 13), []
     for limit in (13, 22, 60, 150, None):
         if where == "file":
-            sampler.backend.close()
+            sampler._record.close()
             sampler = make(points, limit, seed=4 + len(points))
         sampler.max_simulations = limit
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            sampler.run_mcmc(None, 2)
+            until(sampler, 2)
         assert sampler.simulations == sampler.verdict.simulations == len(points) <= (limit or np.inf)
         counted.append(len(points))
     assert counted[:2] == [13, 22] and sampler.verdict.status == "converged"
@@ -279,7 +284,7 @@ def test_the_count_is_that_of_a_model_with_responses(where, tmp_path):
         made.append(len(runs))
         assert sampler.simulations == sampler.verdict.simulations == len(runs) <= (limit or np.inf)
         if where == "file":
-            sampler.backend.close()
+            sampler._record.close()
     assert made[:2] == [100, 250] and made[-1] >= whole.simulations
     assert sum(runs.values()) <= 1.02 * len(runs)  # without a cache on disk, a few points are run again
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
@@ -292,19 +297,16 @@ def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
     """Simulations in the file cost nothing."""
     file = tmp_path / "run.h5"
     whole = make(path, None, tmp_path / "whole.h5")
-    whole.run_mcmc(None, 2)
+    until(whole, 2)
     limit = np.ceil(0.6 * whole.simulations)
     sampler = make(path, None if first == "finished" else limit, file)
     if first == "finished":
-        sampler.run_mcmc(None, 2)
+        until(sampler, 2)
     else:
         halted(sampler, 2)
     chain, evidence, made = sampler.get_chain(), sampler.log_evidence, sampler.simulations
-    sampler.backend.close()
+    sampler._record.close()
     if first == "killed":
-        journal = file.with_name("run.h5.mcmc.journal")
-        data = journal.read_bytes()
-        journal.write_bytes(data[: data.rindex(b"HALT")])
         file.unlink()
     sampler = make(path, 10, file, seed=77)
     halted(sampler, 3)
@@ -314,11 +316,11 @@ def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
     assert np.array_equal(sampler.get_chain()[: len(chain)], chain)
     assert len(sampler.get_chain()) == len(chain)  # no copy is stored in place of a step that the limit does not allow
     assert sampler.max_simulations == 10
-    sampler.backend.close()
+    sampler._record.close()
     sampler = make(path, None, file, seed=78)
-    sampler.run_mcmc(None, 2)
+    until(sampler, 2)
     if first == "finished":
-        whole.run_mcmc(None, 2)
+        until(whole, 2)
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.simulations == whole.simulations
 
 
@@ -328,7 +330,7 @@ def test_a_smaller_limit_in_memory():
     chain, verdict = sampler.get_chain(), sampler.verdict
     sampler.max_simulations = 30
     with pytest.warns(SamplingWarning, match="stored run has made 200 simulations, which are kept"):
-        sampler.run_mcmc(None, 2)
+        until(sampler, 2)
     assert np.array_equal(sampler.get_chain(), chain) and sampler.verdict == verdict
 
 
@@ -340,7 +342,7 @@ def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
     sampler.run_mcmc(sampler.log_prob_fn.f.sample_prior(N, np.random.default_rng(3)), 1)
     made = sampler.simulations
     assert made == sampler.log_prob_fn.f.calls and made > first + searched
-    sampler.backend.close()
+    sampler._record.close()
     sampler = make("searching guide", None, file)
     sampler.run_mcmc(None, 2)
     assert sampler.simulations == made + 2 * N
@@ -351,9 +353,9 @@ def test_no_step_is_stored_where_none_was_wanted():
     halted(sampler, 0)
     assert sampler.iteration == 0 and sampler.verdict.status == "not usable"
     sampler.max_simulations = 10_000
-    sampler.run_mcmc(None, 3)
+    until(sampler, 3)
     whole = make("guide", None)
-    whole.run_mcmc(None, 3)
+    until(whole, 3)
     assert same(sampler, whole)
 
 
@@ -361,32 +363,15 @@ def test_no_step_is_stored_where_none_was_wanted():
 def test_reset_after_a_limit(where, tmp_path):
     """The chain is discarded, and the run goes on."""
     whole = make("guide", None)
-    whole.run_mcmc(None, 3)
+    until(whole, 3)
     sampler = make("guide", 100, None if where == "memory" else tmp_path / "run.h5")
     halted(sampler, 3)
     sampler.compute_log_prob(sampler.get_last_sample().coords)
     sampler.reset()
     assert sampler.iteration == 0
     sampler.max_simulations = None
-    sampler.run_mcmc(None, 3)
+    until(sampler, 3)
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
-
-
-def test_killed_while_the_state_is_stored(tmp_path):
-    """The journal says that a step is only shown before it holds this step."""
-    file = tmp_path / "run.h5"
-    whole, sampler = make("guide", None), make("guide", 100, file)
-    whole.run_mcmc(None, 3)
-    halted(sampler, 3)
-    sampler.backend.close()
-    journal = file.with_name("run.h5.mcmc.journal")
-    data = journal.read_bytes()
-    for cut in (data.rindex(b"STEP"), data.rindex(b"STEP") + 100, data.rindex(b"HALT"), data.rindex(b"CALL")):
-        journal.write_bytes(data[:cut])
-        sampler = make("guide", None, file)
-        sampler.run_mcmc(None, 3)
-        assert np.array_equal(sampler.get_chain(), whole.get_chain())
-        sampler.backend.close()
 
 
 def test_the_states_of_a_generator_end_where_the_limit_is():
@@ -429,7 +414,7 @@ def test_the_verdict_is_stored_with_the_chain(tmp_path):
     with pytest.raises(ValueError, match="no verdict before a run"):
         sampler.verdict  # noqa: B018
     halted(sampler, 2)
-    sampler.backend.close()
+    sampler._record.close()
     again = make("guide", 60, tmp_path / "run.h5")
     assert again.verdict == sampler.verdict and isinstance(again.verdict, Verdict)
     assert json.dumps(again.verdict)
@@ -441,13 +426,3 @@ def test_the_verdict_is_stored_with_the_chain(tmp_path):
 def test_impossible_limits(limit):
     with pytest.raises(ValueError, match="max_simulations must be a positive number"):
         make("moves", limit)
-
-
-def test_a_limit_that_comes_too_late():
-    sampler = make("guide", None)
-    sampler.max_simulations = 10_000
-    sampler.run_mcmc(None, 1)
-    sampler = make("guide", None)
-    sampler.run_mcmc(None, 1)
-    with pytest.raises(ValueError, match="set after a run without it"):
-        sampler.max_simulations = 10_000

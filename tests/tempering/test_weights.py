@@ -5,10 +5,7 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from samplers.moves.kernels import RandomWalkMove, StudentTMove
-from samplers.proposals.covariance import location_and_root
-from samplers.tempering.resampling import RESAMPLING
-from samplers.tempering.weights import (
+from samplers.estimates.weights import (
     EvidenceError,
     coarse_weights,
     effective_sample_size,
@@ -16,6 +13,9 @@ from samplers.tempering.weights import (
     next_beta,
     normalised_weights,
 )
+from samplers.moves.kernels import RandomWalkMove, StudentTMove
+from samplers.proposals.mixture import location_and_root
+from samplers.resampling import RESAMPLING
 
 
 @pytest.mark.parametrize("offset", [-5000.0, 0.0, 5000.0, 1e8])

@@ -1,0 +1,37 @@
+from . import presets
+from .cost import estimate_cost
+from .judgement.verdict import Verdict
+from .moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
+from .reporting.arviz_data import to_arviz
+from .reporting.figures import plot_corner, plot_marginals
+from .reporting.model_comparison import compare_models
+from .reporting.run_figure import plot_run
+from .reporting.summary import comparison_table, ladder_table, summary
+from .reports import SamplingWarning, Stage
+from .smc import SMCSampler
+from .tempered import TemperedSampler
+from .tempering.guide import Guide
+from .tmcmc import TMCMCSampler
+
+__all__ = [
+    "Guide",
+    "MixtureMove",
+    "RandomWalkMove",
+    "SMCSampler",
+    "SamplingWarning",
+    "Stage",
+    "StudentTMove",
+    "TMCMCSampler",
+    "TemperedSampler",
+    "Verdict",
+    "compare_models",
+    "comparison_table",
+    "estimate_cost",
+    "ladder_table",
+    "plot_corner",
+    "plot_marginals",
+    "plot_run",
+    "presets",
+    "summary",
+    "to_arviz",
+]

@@ -1,0 +1,152 @@
+"""Simulations of a run: how many there were, and whether more fit into a limit.
+
+An evaluation needs a simulation unless only fast parameters differ from an evaluated point. The points are those of the
+record of the run (`samplers.record`), and the simulations that a guide made by itself are added.
+
+A limit never changes what a run does: the limit only ends the run. So a run that is continued with a larger limit
+repeats the same steps from the record, which costs no simulation, and goes on.
+"""
+
+from numbers import Real
+from typing import Any, Protocol
+
+import numpy as np
+
+from .record import Record
+
+__all__ = ["Budget", "BudgetExhausted", "CountsSimulations", "as_limit"]
+
+# Guides count parts of a simulation as fractions: their sums, in another order, differ by less.
+ROUNDING = 1e-6
+OF_GUIDES = "simulations of guides"  # key in the record
+
+
+class BudgetExhausted(Exception):
+    """A batch does not fit into the limit of simulations.
+
+    Parameters
+    ----------
+    records : (m,) structured array
+        Records of the first m points of the batch, which were evaluated.
+
+    Attributes
+    ----------
+    records : (m,) structured array
+        See above.
+    """
+
+    def __init__(self, records: np.ndarray):
+        super().__init__("the limit of simulations (max_simulations) does not allow this batch")
+        self.records = records
+
+
+def as_limit(value: Any) -> float | None:
+    """A limit of simulations as float, or None for no limit; ValueError for anything but a positive number."""
+    if value is None:
+        return None
+    if isinstance(value, bool | str) or not isinstance(value, Real) or not value > 0.0:
+        raise ValueError(f"max_simulations must be a positive number, or None for no limit; got {value!r}")
+    return float(value)
+
+
+class CountsSimulations(Protocol):
+    """An object that makes simulations by itself, such as a guide.
+
+    Attributes
+    ----------
+    simulations : float
+        Simulations made so far.
+    """
+
+    simulations: float
+
+
+class Budget:
+    """Counts simulations and compares them with a limit.
+
+    Parameters
+    ----------
+    record : Record
+        The evaluated points.
+    limit : float, optional
+        Largest number of simulations; no limit by default.
+
+    Attributes
+    ----------
+    limit : float, or None
+        The limit.
+    refused : bool
+        Whether `fits` has returned False for the guide in use.
+    """
+
+    def __init__(self, record: Record, limit: float | None = None):
+        self._record, self.limit = record, limit
+        self._allowed = 0.0
+        self._running: set[bytes] = set()  # points that were submitted, and may not be in the record yet
+        self.restart(0.0)
+
+    def restart(self, of_earlier_guides: float) -> None:
+        """An annealing begins, after guides have made this number of simulations by themselves."""
+        self._of_earlier_guides = of_earlier_guides
+        self._guide: CountsSimulations | None = None
+        self.refused = False
+        noted = self._record.noted(OF_GUIDES)
+        self._of_record = 0.0 if noted is None else float(noted[0])
+        self._running.clear()
+
+    def note(self) -> None:
+        """Note in the record how many simulations guides have made, with the batch that was allowed last."""
+        self._record.note(OF_GUIDES, np.array([max(self.of_guides, self._allowed)]))
+
+    def begin(self, guide: CountsSimulations) -> None:
+        """Count the simulations of a new guide from now on, besides those of earlier guides."""
+        self._of_earlier_guides = self.of_guides
+        self._guide, self.refused = guide, False
+
+    @property
+    def of_guides(self) -> float:
+        """Simulations that guides have made by themselves."""
+        return self._of_earlier_guides + (0.0 if self._guide is None else self._guide.simulations)
+
+    @property
+    def simulations(self) -> float:
+        """Distinct points in the slow parameters, and the simulations of guides."""
+        running = sum(not self._record.is_simulated(key) for key in self._running)
+        return self._record.simulations + running + self.of_guides
+
+    @property
+    def remaining(self) -> float:
+        """Simulations left; inf without a limit."""
+        return np.inf if self.limit is None else max(self.limit - self.simulations, 0.0)
+
+    def fits(self, simulations: float) -> bool:
+        """Whether that many more simulations of the guide fit; `refused` notes a refusal.
+
+        Simulations that the guide makes again from the record cost nothing, and always fit.
+        """
+        fit = self.of_guides + simulations <= self._of_record + ROUNDING or simulations <= self.remaining + ROUNDING
+        self.refused = self.refused or not fit
+        if fit:
+            self._allowed = self.of_guides + simulations
+        return fit
+
+    def submitted(self, coords: np.ndarray) -> None:
+        """Points (n, ndim) begin to be evaluated, and count from now on."""
+        self._running = {key for key in self._running if not self._record.is_simulated(key)}
+        self._running.update(self._record.keys(coords))
+
+    def closed(self) -> None:
+        """Points that were running, and are not in the record, have been given up."""
+        self._running.clear()
+
+    def fitting(self, coords: np.ndarray) -> int:
+        """How many of the first points (n, ndim) fit."""
+        if self.limit is None:
+            return len(coords)
+        remaining, new = self.remaining, set()
+        for number, key in enumerate(self._record.keys(coords)):
+            if not self._record.is_simulated(key) and key not in self._running:
+                new.add(key)
+                if len(new) > remaining:
+                    return number
+        return len(coords)

@@ -1,0 +1,84 @@
+"""The parts of emcee that are not its public interface: private attributes of a sampler, and the HDF5 schema.
+
+They are used in this module only, and pinned by `tests.contract.test_emcee_contract`, which says what to change if a
+later version of emcee (``emcee>=3.1.4,<4``) differs.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from emcee import EnsembleSampler, State
+from emcee.backends import Backend, HDFBackend
+from emcee.moves import Move
+
+__all__ = [
+    "cut_chain",
+    "get_moves",
+    "get_previous_state",
+    "get_random",
+    "restore_counts",
+    "set_moves",
+    "set_previous_state",
+    "trim_chain",
+]
+
+
+def get_random(sampler: EnsembleSampler) -> np.random.RandomState:
+    """The random generator of a sampler."""
+    return sampler._random
+
+
+def get_moves(sampler: EnsembleSampler) -> tuple[Sequence[Move], np.ndarray]:
+    """The moves of a sampler, and the probability of each to be chosen."""
+    return sampler._moves, sampler._weights
+
+
+def set_moves(sampler: EnsembleSampler, moves: Sequence[Move], probabilities: np.ndarray) -> None:
+    """Replace the moves of a sampler, and the probability of each to be chosen."""
+    sampler._moves, sampler._weights = moves, probabilities
+
+
+def get_previous_state(sampler: EnsembleSampler) -> State | None:
+    """The state from which ``run_mcmc(None, ...)`` continues."""
+    return sampler._previous_state
+
+
+def set_previous_state(sampler: EnsembleSampler, state: State | None) -> None:
+    """Set the state from which ``run_mcmc(None, ...)`` continues; emcee sets it in some cases only."""
+    sampler._previous_state = state
+
+
+def cut_chain(backend: Backend, steps: int) -> None:
+    """Keep the first `steps` steps of a chain; with 0, the counts of accepted proposals begin anew."""
+    if isinstance(backend, HDFBackend):
+        with backend.open("a") as file:
+            group = file[backend.name]
+            group.attrs["iteration"] = steps
+            if steps == 0:
+                group["accepted"][...] = 0.0
+        return
+    backend.iteration = steps
+    if steps == 0:
+        backend.accepted = np.zeros_like(backend.accepted)
+    trim_chain(backend)
+
+
+def trim_chain(backend: Backend) -> None:
+    """Drop the room for steps that were not made, which emcee's backend in memory cannot grow from."""
+    if not isinstance(backend, HDFBackend):
+        for name in ("chain", "log_prob", "blobs"):
+            values = vars(backend)[name]
+            if values is not None:
+                setattr(backend, name, values[: backend.iteration])
+
+
+def restore_counts(backend: Backend, steps: int, accepted: np.ndarray) -> None:
+    """Set the number of steps of a chain and the counts of accepted proposals (nwalkers,), if they differ."""
+    if backend.iteration == steps and np.array_equal(backend.accepted, accepted):
+        return
+    if isinstance(backend, HDFBackend):
+        with backend.open("a") as file:
+            file[backend.name].attrs["iteration"] = steps
+            file[backend.name]["accepted"][...] = accepted
+    else:
+        backend.iteration, backend.accepted = steps, accepted.copy()

@@ -1,0 +1,1 @@
+"""Estimates from weighted points: pure functions of numbers."""

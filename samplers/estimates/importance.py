@@ -1,0 +1,481 @@
+r"""Importance sampling: the evidence from weighted draws, and whether their weights are reliable.
+
+One proposal
+------------
+A mixture fitted to a population is a proposal for independent points inside the support of the prior. The mean of
+posterior / proposal over the draws estimates the evidence without tempering, and without bias as long as the proposal
+was not fitted to the draws. The largest weights have a generalised Pareto distribution. Where its shape exceeds 0.7,
+points that were not drawn dominate the mean.
+
+Rounds
+------
+Where the proposal changes from round to round, round r has :math:`n_r` independent draws of a density :math:`q_r` that
+was fixed before they were made. Each draw has the weight :math:`w_i = \pi(\theta_i) / q_r(\theta_i)` with the
+unnormalised posterior density :math:`\pi`. The mean of these weights, :math:`\hat Z_r`, is an unbiased estimate of the
+evidence whatever the earlier rounds were like. The rounds are combined as
+:math:`\hat Z = \sum_r \alpha_r \hat Z_r`.
+
+The shares :math:`\alpha_r` must not depend on the weights of the same round: a round with one very large weight has a
+small effective sample size, and a smaller share for it would bias the evidence. Therefore :math:`\alpha_r` is
+proportional to the number of draws times the effective share (effective sample size / number of draws) of the
+*previous* round. The first round uses its own effective share.
+
+The equations are in ``docs/theory/guided`` and ``docs/theory/evidence``.
+
+References
+----------
+Owen, A. B. & Zhou, Y. (2020), The square root rule for adaptive importance sampling, ACM Transactions on Modeling and
+Computer Simulation 30(2), doi:10.1145/3350426 (unbiased combinations of rounds)
+Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72) (Pareto shape)
+Zhang & Stephens (2009), Technometrics 51(3), doi:10.1198/tech.2009.08017 (estimation of the shape)
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+from scipy.special import gammaln
+
+from ..proposals.mixture import Mixture, draw
+from .weights import effective_sample_size, log_mean_weight, normalised_weights
+
+__all__ = [
+    "EvidenceCheck",
+    "PooledRounds",
+    "Round",
+    "draw_inside",
+    "LARGEST_ERROR",
+    "LARGEST_SHAPE",
+    "efficiencies",
+    "evidence_from_weights",
+    "expected_efficiency",
+    "fewest_points",
+    "fits_poorly",
+    "pareto_shape",
+    "pool_rounds",
+    "round_shares",
+    "tail_growth",
+    "tail_shape",
+    "tail_variance",
+    "tails_are_light",
+    "usable",
+]
+
+# Levels of a normal distribution one and two standard deviations above its median.
+ONE_AND_TWO_SD = (0.8413, 0.9772)
+# Weights of a larger Pareto shape have no useful mean (Vehtari et al. 2024).
+LARGEST_SHAPE = 0.7
+# Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
+LARGEST_ERROR = 0.35
+# Fewer effective points, or fewer per parameter (and one more), do not determine means and covariances.
+FEWEST_POINTS, POINTS_PER_DIMENSION = 20.0, 3.0
+# Efficiency of a fitted proposal divided by the efficiency expected for Gaussian modes, below which the fit misses a
+# part: nearly Gaussian posteriors, also at bounds or with several modes, have 0.9 to 1.1, bent posteriors without a
+# shear 0.4 to 0.93.
+POOR_FIT = 0.85
+FEW_WEIGHTS = 10.0
+ROUNDS = 50
+# points of the quadrature over the squared radius of a Gaussian
+QUANTILES = 2000
+
+
+class EvidenceCheck(NamedTuple):
+    """The evidence by importance sampling, independent of the tempering stages.
+
+    Attributes
+    ----------
+    log_evidence : float
+        Logarithm of the evidence.
+    error : float
+        Standard error of `log_evidence`; meaningless unless `reliable`.
+    effective_sample_size : float
+        Effective sample size of the weights.
+    pareto_shape : float
+        Shape of the distribution of the largest weights; below 0.7 the error of the mean is finite in practice.
+    evaluations : int
+        Points for which ``log_prob_fn`` was called.
+    """
+
+    log_evidence: float
+    error: float
+    effective_sample_size: float
+    pareto_shape: float
+    evaluations: int
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the weights are even enough for the estimate and its error to be meaningful."""
+        return self.pareto_shape < LARGEST_SHAPE and self.effective_sample_size >= FEW_WEIGHTS
+
+
+def fewest_points(ndim: int) -> float:
+    """Smallest effective sample size of weighted points from which a population is usable."""
+    return max(FEWEST_POINTS, POINTS_PER_DIMENSION * (ndim + 1.0))
+
+
+def usable(effective_sample_size: float, pareto_shape: float, error: float, ndim: int) -> bool:
+    """Whether weighted points give means and an evidence with errors that can be stated."""
+    enough = effective_sample_size >= fewest_points(ndim)
+    return enough and pareto_shape < LARGEST_SHAPE and error <= LARGEST_ERROR
+
+
+def draw_inside(
+    mixture: Mixture, n: int, random: np.random.RandomState, inside: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, int]:
+    """At most `n` draws of a mixture that lie inside a region, and the number of draws made.
+
+    Parameters
+    ----------
+    mixture : Mixture
+        What to draw from.
+    n : int
+        Number of draws wanted.
+    random : RandomState
+        Source of random numbers.
+    inside : callable
+        Function of points (m, ndim) that returns whether each lies inside (m,); called up to 50 times.
+
+    Returns
+    -------
+    coords : (at most n, ndim) float
+        The draws inside.
+    made : int
+        Number of draws made to obtain them.
+    """
+    kept, found, made = [], 0, 0
+    for _ in range(ROUNDS):
+        coords = draw(mixture, n, random)
+        good = np.flatnonzero(inside(coords))[: n - found]
+        kept.append(coords[good])
+        found += len(good)
+        if found == n:
+            return np.concatenate(kept), made + int(good[-1]) + 1
+        made += n
+    return np.concatenate(kept), made
+
+
+def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
+    """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws.
+
+    The sample variance of n weights is too small where n draws rarely contain the largest ones. Rough likelihoods have
+    nearly log-normal weights, whose variance follows from the spread s of their logarithms, exp(s²) - 1 in units of the
+    squared mean. The error follows from the larger variance. The spread is the distance between the quantiles one and
+    two standard deviations above the median of a normal distribution, so small weights of draws in the tails of the
+    proposal do not count.
+    """
+    full = np.full(made, -np.inf)
+    full[: len(log_weights)] = log_weights
+    effective = effective_sample_size(full)
+    log_evidence = log_mean_weight(full)
+    if effective == 0.0:
+        return EvidenceCheck(log_evidence, float("inf"), effective, pareto_shape(log_weights), len(log_weights))
+    one, two = np.quantile(full, ONE_AND_TWO_SD, method="lower")
+    # one effective point has the relative variance 1, which no set of weights exceeds
+    log_normal = np.expm1(min((two - one) ** 2, np.log1p(made))) / made if one > -np.inf else 0.0
+    error = float(np.sqrt(max(1.0 / effective - 1.0 / made, log_normal)))
+    return EvidenceCheck(log_evidence, error, effective, pareto_shape(log_weights), len(log_weights))
+
+
+def pareto_shape(log_weights: np.ndarray) -> float:
+    """Shape of the generalised Pareto distribution of the largest weights, given by their logarithms (n,).
+
+    The largest min(n / 5, 3 sqrt(n)) weights are used. The shape is -inf for weights without a tail, and inf for too
+    few weights.
+    """
+    finite = log_weights[log_weights > -np.inf]
+    n = len(log_weights)
+    count = int(min(n / 5.0, 3.0 * np.sqrt(n)))
+    if count < 5 or len(finite) <= count:
+        return float("inf")
+    ordered = np.sort(np.exp(finite - finite.max()))
+    tail = ordered[-count:] - ordered[-count - 1]
+    if tail[-1] <= 1e-9:
+        return float("-inf")
+    tail = tail[tail > 0.0]
+    count = len(tail)
+    if count < 5:
+        return float("inf")
+    grid = 30 + int(np.sqrt(count))
+    quartile = tail[max(int(count / 4.0 + 0.5) - 1, 0)]
+    theta = 1.0 / tail[-1] + (1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3.0 * quartile)
+    shapes = np.mean(np.log1p(-theta[:, None] * tail), axis=1)
+    profile = count * (np.log(-theta / shapes) - shapes - 1.0)
+    posterior = np.exp(profile - profile.max())
+    theta = float(theta @ posterior / posterior.sum())
+    shape = float(np.mean(np.log1p(-theta * tail)))
+    # a weak prior towards 0.5 stabilises the estimate from few weights (Vehtari et al. 2024)
+    return (count * shape + 5.0) / (count + 10.0)
+
+
+def expected_efficiency(ndim: int, dof: float, components: int, points: float) -> float:
+    r"""Effective sample size per draw of a mixture that is fitted to draws of a mixture of as many Gaussians.
+
+    Without the noise of the fit it is :math:`1 / \mathrm{E}[p / q]` for a Gaussian p and the Student t q with the same
+    degrees of freedom as the mixture that maximises the likelihood. With K components of d dimensions and n points,
+    each fitted number costs about 1 / n: the efficiency is divided by :math:`1 + K d (d + 3) / (2 n)`.
+
+    Parameters
+    ----------
+    ndim : int
+        Number of parameters.
+    dof : float
+        Degrees of freedom of the mixture.
+    components : int
+        Number of components.
+    points : float
+        Effective number of points that the mixture was fitted to.
+
+    Returns
+    -------
+    float
+        Between 0 and 1.
+    """
+    return _efficiency_without_noise(ndim, dof) / (1.0 + components * ndim * (ndim + 3) / (2.0 * points))
+
+
+def efficiencies(check: EvidenceCheck, mixture: Mixture, points: float) -> tuple[float, float]:
+    """Effective share of fresh draws of a mixture fitted to `points` effective points, and the expected share."""
+    components, ndim = mixture.means.shape
+    expected = expected_efficiency(ndim, mixture.dof, components, points)
+    return check.effective_sample_size / max(check.evaluations, 1), expected
+
+
+def fits_poorly(check: EvidenceCheck, mixture: Mixture, points: float) -> bool:
+    """Whether the effective share of fresh draws is below 85 % of the expected share for Gaussian modes."""
+    found, expected = efficiencies(check, mixture, points)
+    return found < POOR_FIT * expected
+
+
+@lru_cache
+def _efficiency_without_noise(ndim: int, dof: float) -> float:
+    """1 / E[p / q] for a standard Gaussian p and the Student t q of maximum likelihood."""
+    radii = stats.chi2.ppf((np.arange(QUANTILES) + 0.5) / QUANTILES, ndim)  # squared
+    scale = 1.0  # squared
+    for _ in range(100):  # expectation-maximisation
+        scale = float(np.mean((dof + ndim) / (dof + radii / scale) * radii)) / ndim
+    log_p = -0.5 * (ndim * np.log(2.0 * np.pi) + radii)
+    log_q = gammaln(0.5 * (dof + ndim)) - gammaln(0.5 * dof) - 0.5 * ndim * np.log(dof * np.pi * scale)
+    log_q -= 0.5 * (dof + ndim) * np.log1p(radii / (dof * scale))
+    return float(1.0 / np.mean(np.exp(log_p - log_q)))
+
+
+# ---------------------------------------------------------------- rounds
+
+# Draws of the first round of a guide, as a share of the number of walkers: few, since the guide may still be poor.
+FIRST_ROUND_SHARE = 0.3
+# After the last round of a guide, the draws are used in spite of rounds that were not reliable if the last one has at
+# least this effective share, all rounds together have an effective sample size of the number of walkers, and the Pareto
+# shape of their weights is below 0.7 (Vehtari et al. 2024).
+USABLE_SHARE = 0.1
+# Pareto shape that is assumed for fewer weights than an estimate needs
+SHAPE_OF_FEW = 0.7
+FEWEST_EFFECTIVE = 5.0
+# part of the sum of all weights by which the largest must exceed the others for their shape to matter
+SMALLEST_EXCESS = 0.05
+# Growth of the weights towards the tails from which on the tails of a proposal are too light, for each part of the
+# draws with the lowest posterior. Normal proposals with half the variance of a Student t (3 to 5 degrees of freedom)
+# have 0.11 to 0.5, 0.3 to 0.7 and 0.6 to 0.85; with 3 degrees the weights first fall, and grow among the outermost
+# draws only. Harmless proposals have less: with 6 degrees on 4, 0.03, 0.08 and 0.12.
+LARGE_GROWTH = {0.5: 0.1, 0.25: 0.3, 0.125: 0.3}
+SIGNIFICANT = 4.0  # in errors
+FEWEST_FOR_GROWTH = 8
+
+
+class Round(NamedTuple):
+    """Draws of one proposal density.
+
+    Attributes
+    ----------
+    coords, records : (n, ndim) float, (n,) structured array
+        The draws and their records (log_prob, log_prior and, where there are any, blobs).
+    log_weights : (n,) float
+        Log-probability minus log-density of the proposal; -inf for impossible points.
+    """
+
+    coords: np.ndarray
+    records: np.ndarray
+    log_weights: np.ndarray
+
+    @property
+    def effective_sample_size(self) -> float:
+        """Effective sample size of the weights."""
+        return effective_sample_size(self.log_weights)
+
+    @property
+    def effective_share(self) -> float:
+        """Effective sample size divided by the number of draws."""
+        return self.effective_sample_size / len(self.log_weights)
+
+    @property
+    def pareto_shape(self) -> float:
+        """`tail_shape` of the weights; inf for too few of them."""
+        return tail_shape(self.log_weights)
+
+
+class PooledRounds(NamedTuple):
+    """All draws of several rounds.
+
+    Attributes
+    ----------
+    coords, records : (n, ndim) float, (n,) structured array
+        The draws and their records.
+    log_weights : (n,) float
+        Log-weights, whose sum of exponentials is the evidence.
+    log_evidence, log_evidence_error : float
+        Log-evidence and its standard error.
+    effective_sample_size, pareto_shape : float
+        Effective sample size and `tail_shape` of the weights.
+    """
+
+    coords: np.ndarray
+    records: np.ndarray
+    log_weights: np.ndarray
+    log_evidence: float
+    log_evidence_error: float
+    effective_sample_size: float
+    pareto_shape: float
+
+
+def round_shares(sizes: Sequence[int], effective_shares: Sequence[float]) -> np.ndarray:
+    """Share of each round in the evidence, with sum 1.
+
+    Parameters
+    ----------
+    sizes : sequence of int
+        Number of draws per round.
+    effective_shares : sequence of float
+        Effective sample size of each round divided by its number of draws. The last one has no effect unless it is the
+        only one.
+    """
+    lagged = [effective_shares[0], *effective_shares[:-1]]
+    # a round after one without a single effective draw still counts as one point
+    shares = np.maximum(np.asarray(sizes) * np.asarray(lagged), 1.0)
+    return shares / shares.sum()
+
+
+def tail_shape(log_weights: np.ndarray) -> float:
+    """Pareto shape of the largest weights where these have a part in the mean; 0 where they have none.
+
+    The weights of a guide that describes the posterior nearly exactly are equal except for small errors, whose shape
+    says nothing about the mean. The shape is used only if the largest weights exceed the next one by at least 5 % of
+    the sum of all weights together.
+
+    Parameters
+    ----------
+    log_weights : (n,) float
+        Logarithms of the weights, at least one of them finite.
+    """
+    shape = pareto_shape(log_weights)
+    if not np.isfinite(shape):
+        return max(shape, 0.0)
+    ordered = np.sort(normalised_weights(log_weights))
+    n = len(ordered)
+    count = int(min(n / 5.0, 3.0 * np.sqrt(n)))
+    excess = float((ordered[-count:] - ordered[-count - 1]).sum())
+    return shape if excess >= SMALLEST_EXCESS else 0.0
+
+
+def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, float]:
+    r"""Slope of the log-weights over minus the log-posterior, among the draws with the lowest posterior.
+
+    Where the posterior :math:`\pi` is proportional to a power :math:`q^c` of the proposal density, the slope is
+    :math:`(1 - c) / c`, which is positive if the proposal has lighter tails than the posterior. Draws of light tails do
+    not reach the places where weights are large, so the weights themselves may all be small. Errors of a proposal, and
+    jumps of a likelihood, do not make the slope positive on average.
+
+    Parameters
+    ----------
+    rounds : sequence of Round
+        Draws of proposals that were fixed before them.
+    part : float
+        The part of the draws that is used, those with the lowest posterior.
+
+    Returns
+    -------
+    slope, error : float
+        The slope and its error, by least squares; (0, inf) for fewer than 8 draws in the part. The error is the
+        standard error times a factor above 1 for few draws: 4 errors have the same probability for any number of them.
+    """
+    log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
+    log_weights = np.concatenate([r.log_weights for r in rounds])
+    possible = np.isfinite(log_weights) & np.isfinite(log_prob)
+    depth, log_weights = -log_prob[possible], log_weights[possible]
+    if part * len(depth) < FEWEST_FOR_GROWTH:
+        return 0.0, float("inf")
+    outer = depth >= np.quantile(depth, 1.0 - part)
+    depth, log_weights = depth[outer] - depth[outer].mean(), log_weights[outer] - log_weights[outer].mean()
+    squares = float(depth @ depth)
+    if squares == 0.0:
+        return 0.0, float("inf")
+    slope = float(depth @ log_weights) / squares
+    left = log_weights - slope * depth
+    error = float(np.sqrt(left @ left / (len(depth) - 2) / squares))
+    few = float(stats.t.isf(stats.norm.sf(SIGNIFICANT), len(depth) - 2)) / SIGNIFICANT
+    return slope, few * error
+
+
+def tails_are_light(rounds: Sequence[Round]) -> bool:
+    """Whether the weights of rounds grow significantly towards the tails (`tail_growth`), in one of the outer parts."""
+    found = [(*tail_growth(rounds, part), large) for part, large in LARGE_GROWTH.items()]
+    return any(slope > max(large, SIGNIFICANT * error) for slope, error, large in found)
+
+
+def tail_variance(log_weights: np.ndarray) -> float:
+    r"""Variance of the log-evidence due to weights larger than all that were drawn.
+
+    If the largest weights have a Pareto shape :math:`0 < k < 1`, the mean excess over the largest normalised weight
+    :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error. It is infinite for
+    :math:`k \ge 1`. Where there are too few weights for an estimate, k is 0.7. With an effective sample size below 5,
+    points that were not drawn may have any weight, and the variance is infinite.
+
+    Parameters
+    ----------
+    log_weights : (n,) float
+        Logarithms of the weights, at least one of them finite.
+    """
+    shape = tail_shape(log_weights)
+    shape = SHAPE_OF_FEW if shape == np.inf else shape
+    if shape >= 1.0 or effective_sample_size(log_weights) < FEWEST_EFFECTIVE:
+        return float("inf")
+    largest = float(np.max(normalised_weights(log_weights)))
+    return (largest * max(shape, 0.0) / (1.0 - shape)) ** 2
+
+
+def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> PooledRounds:
+    r"""Combine rounds.
+
+    The variance of the log-evidence is the sum of three parts: the variance of the mean weights of the rounds,
+    :math:`\sum_r \alpha_r^2 s_r^2 / (n_r \hat Z^2)` with the sample variance :math:`s_r^2` of the weights, or the
+    variance between the rounds, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, where that is larger;
+    `tail_variance`; and the squared error of the normalising constant of the proposal density.
+
+    Parameters
+    ----------
+    rounds : sequence of Round
+        At least one, in order.
+    log_density_error : float
+        Standard error of the logarithm of the normalising constant of the proposal density.
+
+    Returns
+    -------
+    PooledRounds
+    """
+    sizes = [len(r.log_weights) for r in rounds]
+    shares = round_shares(sizes, [r.effective_share for r in rounds])
+    parts = [r.log_weights + np.log(share / n) for r, share, n in zip(rounds, shares, sizes, strict=True)]
+    log_weights = np.concatenate(parts)
+    log_evidence = float(log_mean_weight(log_weights) + np.log(len(log_weights)))
+    shape = tail_shape(log_weights)
+    coords, records = np.concatenate([r.coords for r in rounds]), np.concatenate([r.records for r in rounds])
+    if log_evidence == -np.inf:
+        return PooledRounds(coords, records, log_weights, log_evidence, float("inf"), 0.0, shape)
+    within, between = 0.0, 0.0
+    for part, n, share in zip(parts, sizes, shares, strict=True):
+        weights = np.exp(part - log_evidence)
+        within += n * float(np.var(weights, ddof=1)) if n > 1 else np.inf
+        between += float(weights.sum() - share) ** 2  # a round that missed the posterior has small weights only
+    variance = max(within, between) + tail_variance(log_weights) + log_density_error**2
+    effective = effective_sample_size(log_weights)
+    return PooledRounds(coords, records, log_weights, log_evidence, float(np.sqrt(variance)), effective, shape)

@@ -1,0 +1,195 @@
+"""Tempering by weights: pure functions on log-weights.
+
+Between the prior (beta = 0) and the posterior (beta = 1) lies the family
+
+    log pi_beta(theta) = (1 - beta) log prior(theta) + beta log posterior(theta)
+                       = log prior(theta) + beta log likelihood(theta) + constant.
+
+A population at beta is carried to beta' by the incremental weights w_i = likelihood(theta_i) ^ (beta' - beta), whose
+effective sample size is (sum w)^2 / sum w^2. The product of the mean weights of all stages estimates the evidence.
+Weights are kept as logarithms until their maximum has been subtracted: log-likelihoods of finite-element models have
+magnitudes of thousands, and a constant added to them must not change anything.
+
+References
+----------
+Del Moral, Doucet & Jasra (2006), J. R. Stat. Soc. B 68(3), doi:10.1111/j.1467-9868.2006.00553.x
+Chan & Lai (2013), Ann. Stat. 41(6), doi:10.1214/13-AOS1172 (standard error of the evidence from one run)
+"""
+
+import numpy as np
+
+__all__ = [
+    "WHERE_TO_LOOK",
+    "EvidenceError",
+    "coarse_weights",
+    "effective_sample_size",
+    "log_mean_weight",
+    "next_beta",
+    "normalised_weights",
+]
+
+WHERE_TO_LOOK = (
+    "check the model and the prior, and see the failures that log_prob_fn reports (posterior.report() for a posterior "
+    "of fe_likelihoods)"
+)
+BISECTIONS = 20
+WEIGHT_GRID = 4096.0
+
+
+def _scaled(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weights divided by their maximum, and the logarithm of the maximum."""
+    top = float(np.max(log_weights))
+    if top == -np.inf:
+        return np.zeros(len(log_weights)), top
+    return np.exp(log_weights - top), top
+
+
+def normalised_weights(log_weights: np.ndarray) -> np.ndarray:
+    """Weights with sum 1.
+
+    Parameters
+    ----------
+    log_weights : (n,) float
+        Logarithms of the weights, with any offset; -inf is allowed.
+
+    Returns
+    -------
+    (n,) float
+        Normalised weights.
+
+    Raises
+    ------
+    ValueError
+        If all weights are zero.
+    """
+    weights, top = _scaled(log_weights)
+    if top == -np.inf:
+        raise ValueError(f"every weight is zero: no point has a finite log-likelihood; {WHERE_TO_LOOK}")
+    return weights / weights.sum()
+
+
+def coarse_weights(log_weights: np.ndarray) -> np.ndarray:
+    """Normalised weights from log-weights rounded to 1/4096, for fitting proposals.
+
+    A proposal may be fitted to slightly different weights without harm. Rounded weights stay the same to the last bit
+    when a constant is added to the log-likelihood, and so do all draws from the fitted proposal.
+    """
+    top = np.max(log_weights)
+    return normalised_weights(np.round((log_weights - top) * WEIGHT_GRID) / WEIGHT_GRID)
+
+
+def effective_sample_size(log_weights: np.ndarray) -> float:
+    """(sum w)^2 / sum w^2 of weights given by their logarithms (n,); 0 if all weights are zero."""
+    weights, top = _scaled(log_weights)
+    if top == -np.inf:
+        return 0.0
+    return float(weights.sum() ** 2 / (weights @ weights))
+
+
+def log_mean_weight(log_weights: np.ndarray) -> float:
+    """Logarithm of the mean of weights given by their logarithms (n,); -inf if all weights are zero."""
+    weights, top = _scaled(log_weights)
+    return top if top == -np.inf else top + float(np.log(weights.mean()))
+
+
+def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.ndarray | None = None) -> float:
+    """Largest next exponent whose incremental weights keep the effective sample size at `target`.
+
+    Points of zero likelihood are lost at any larger exponent, so the target refers to the other points: it is
+    multiplied by the share of finite log-likelihoods. The step is halved until the target is met, and then bisected to
+    a relative tolerance of 1e-6. The bisection uses a fixed dyadic grid, so that rounding errors of the log-likelihood
+    do not change the exponent.
+
+    Parameters
+    ----------
+    log_likelihood : (n,) float
+        At the points of the population; -inf is allowed.
+    beta : float
+        Exponent of the population, 0 <= beta < 1.
+    target : float
+        Effective sample size wanted, 0 < target < n.
+    base : (n,) float, optional
+        Log-weights of the points at `beta`; equal by default. If given, the target is not scaled, and it must be met at
+        `beta`.
+
+    Returns
+    -------
+    float
+        In (beta, 1]; 1 if the full step keeps the target, as with a flat likelihood.
+
+    Raises
+    ------
+    ValueError
+        If no log-likelihood is finite.
+    """
+    top = np.max(log_likelihood)
+    if top == -np.inf:
+        raise ValueError(f"no point of the population has a finite log-likelihood; {WHERE_TO_LOOK}")
+    alive = log_likelihood > -np.inf
+    relative = log_likelihood[alive] - top
+    if base is None:
+        carried = 0.0
+        target = target * len(relative) / len(log_likelihood)
+    else:
+        carried = base[alive]
+
+    def meets(step: float) -> bool:
+        return effective_sample_size(carried + step * relative) >= target
+
+    step = 1.0 - beta
+    if meets(step):
+        return 1.0
+    while step > 0.0 and not meets(step):
+        step *= 0.5
+    low, high = step, 2.0 * step
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if meets(middle):
+            low = middle
+        else:
+            high = middle
+    # a step smaller than the rounding error of beta becomes the next representable number, so that annealing ends
+    return min(max(beta + low, float(np.nextafter(beta, 2.0))), 1.0)
+
+
+class EvidenceError:
+    r"""Standard error of the log-evidence, accumulated during one run.
+
+    Points are grouped by their founder. With :math:`W_{ij}` the normalised weight of point i at stage j, group k
+    contributes :math:`A_k = \sum_j \sum_{i \in k} (W_{ij} - 1/N)` to the log-evidence, without the noise of
+    resampling. Groups are independent, thus :math:`\mathrm{Var}(\log Z) \approx \sum_k A_k^2` (Chan & Lai 2013). If
+    moves mix well, it tends to the sum over the stages of the variances of the mean weights. If points never move, it
+    is the error of plain importance sampling: poor mixing is not hidden.
+
+    The sum is unreliable with few groups. Once fewer founders than `min_founder_share` times the number of points are
+    left, the sums are closed and every point becomes a founder. Closed sums are treated as independent of later ones.
+
+    Parameters
+    ----------
+    n_points : int
+        Number of points.
+    min_founder_share : float
+        Share of `n_points` below which the groups are formed anew.
+    """
+
+    def __init__(self, n_points: int, min_founder_share: float = 0.1):
+        self.n_points = n_points
+        self.min_founder_share = min_founder_share
+        self._closed = 0.0
+        self._start_groups()
+
+    def _start_groups(self) -> None:
+        self._founder = np.arange(self.n_points)
+        self._sums = np.zeros(self.n_points)
+
+    def weigh(self, weights: np.ndarray) -> float:
+        """Enter the normalised weights (n_points,) of a stage; returns the standard error so far."""
+        self._sums += np.bincount(self._founder, weights=weights - 1.0 / self.n_points, minlength=self.n_points)
+        return float(np.sqrt(self._closed + self._sums @ self._sums))
+
+    def resample(self, ancestors: np.ndarray) -> None:
+        """Follow a resampling: `ancestors` (n_points,) int is the previous index of each point."""
+        self._founder = self._founder[ancestors]
+        if len(np.unique(self._founder)) < self.min_founder_share * self.n_points:
+            self._closed += float(self._sums @ self._sums)
+            self._start_groups()

@@ -1,0 +1,1 @@
+"""Evaluation of the user's functions: how they are called, what they return, in which order points arrive."""

@@ -1,0 +1,432 @@
+"""Evaluation of a log-density at batches of points: calls, failures, and the records that travel with the points.
+
+`Evaluator` calls a user's function as emcee does (batch, pool or map; dictionaries for named parameters). Points
+outside the support of the prior are not evaluated. A point for which the function raises an exception or returns NaN
+counts as -inf, and its reason is recorded.
+
+A batch is entered in the record of the run (`samplers.record`) when it is finished. Where a function takes one point at
+a time, finished points are entered every 0.05 s, so that a process that is killed loses the points of that time.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from emcee.ensemble import ndarray_to_list_of_dicts
+
+from ..budget import Budget, BudgetExhausted
+from ..record import EvaluatedBatch, Record, merge_batches
+from ..tempering.pending_points import PendingPoints
+from .first_values import POINTS
+from .pool_queue import map_in
+from .returned_values import ErrorCapturing, log_densities, outcomes
+
+__all__ = ["CallingConvention", "Evaluator", "FailureLimit", "Observer", "most_common_reasons"]
+
+SECONDS_BETWEEN_NOTES = 0.05
+
+
+def most_common_reasons(failed: Sequence[tuple[np.ndarray, str]], number: int = 3) -> str:
+    """The most frequent reasons of failed evaluations (point, reason) as text."""
+    reasons = Counter(reason for _, reason in failed)
+    return "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common(number))
+
+
+class FailureLimit(NamedTuple):
+    """When failures stop a run.
+
+    Attributes
+    ----------
+    share : float
+        Largest share of the evaluations that may fail.
+    nwalkers, ndim : int
+        The share applies after `nwalkers` evaluations; a batch of ndim + 2 points or more may not fail as a whole.
+    """
+
+    share: float
+    nwalkers: int
+    ndim: int
+
+    def check(
+        self, batch: EvaluatedBatch, evaluations: int, failures: int, running: int = 0, whole: bool = True
+    ) -> None:
+        """Raise RuntimeError if the limit is exceeded by a batch that comes after the given numbers.
+
+        Failures may be quicker or slower than successes. So points that are running count as successes, and a batch
+        may fail as a whole if it is not `whole`.
+        """
+        n, count = len(batch.coords), failures + len(batch.reasons)
+        total = evaluations + n + running
+        all_failed = whole and len(batch.reasons) == n >= self.ndim + 2
+        if all_failed or (total >= self.nwalkers and count > self.share * total):
+            what = f"all {n} evaluations of a batch" if all_failed else f"{count} of {total} evaluations"
+            first = min(batch.reasons)
+            raise RuntimeError(
+                f"{what} failed, where max_failure_share={self.share:g} of the run is allowed: {batch.reasons[first]} "
+                f"at {batch.coords[first]}. Earlier evaluations are kept (see failures), and a run with a backend in a "
+                "file goes on from there after the cause is fixed"
+            )
+
+
+class CallingConvention(NamedTuple):
+    """How functions of points are called, as in emcee.
+
+    Attributes
+    ----------
+    vectorize : bool
+        Whether functions take a batch of points instead of one.
+    parameter_names : dict, optional
+        Names and indices of the parameters; functions then take dictionaries.
+    blobs_dtype : dtype, optional
+        dtype of the blobs.
+    """
+
+    vectorize: bool
+    parameter_names: Mapping[str, Any] | None = None
+    blobs_dtype: Any = None
+
+    @property
+    def argument(self) -> str:
+        """What functions are called with, in words."""
+        points = "an array (n, ndim) of points" if self.vectorize else "an array (ndim,), one point"
+        if self.parameter_names is None:
+            return f"{points} (vectorize={self.vectorize})"
+        return f"a {'list of dictionaries' if self.vectorize else 'dictionary'} of parameters by name (parameter_names)"
+
+    def as_points(self, coords: np.ndarray) -> Any:
+        """Points (n, ndim) as functions take them: rows of an array, or dictionaries."""
+        named = self.parameter_names
+        return coords if named is None else ndarray_to_list_of_dicts(coords, named)
+
+    def call(
+        self,
+        function: Callable,
+        coords: np.ndarray,
+        pool: Any = None,
+        note: Callable[[list], None] | None = None,
+        observer: "Observer | None" = None,
+    ) -> Any:
+        """Results of a function for points (n, ndim); `note` is called with the first of them every 0.05 s.
+
+        The observer hears of every result. A function of a batch has no first results, and neither has a pool whose
+        ``map`` returns a list.
+        """
+        points = self.as_points(coords)
+        if self.vectorize:
+            return function(points)
+        results, noted = [], time.perf_counter()
+        try:
+            for result in map_in(pool)(function, points):
+                results.append(result)
+                if observer is not None:
+                    observer.finished(1)
+                if note is not None and time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
+                    note(results)
+                    noted = time.perf_counter()
+        except BaseException:  # Ctrl-C, or a pool that cannot go on
+            if note is not None:
+                note(results)
+            raise
+        return results
+
+
+class Observer(Protocol):
+    """What is told of points while they are evaluated, such as `samplers.reporting.progress.Progress`."""
+
+    def repeated(self, points: int) -> None:
+        """Points were found in the record of the run."""
+
+    def submitted(self, points: int) -> None:
+        """Points begin to be evaluated."""
+
+    def finished(self, points: int) -> None:
+        """Points have been evaluated."""
+
+    def settled(self) -> None:
+        """All points that were submitted have been evaluated."""
+
+
+class Evaluator:
+    """A posterior density that is evaluated and recorded (a `samplers.tempering.population.Density`).
+
+    Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs: a walker
+    carries all three through moves and resampling. The field log_prior is the log-density at beta = 0, which is the
+    `start_density` if there is one.
+
+    Parameters
+    ----------
+    function : ErrorCapturing
+        The log-density, or the log-likelihood.
+    log_prior_fn : callable
+        The log-prior.
+    convention : CallingConvention
+        How both are called.
+    record : Record, optional
+        Where evaluations are entered and looked up; a new one in memory by default.
+    limit : FailureLimit, optional
+        When failures stop the run; never by default.
+    budget : Budget, optional
+        Limits simulations; no limit by default.
+    name : str
+        Name of the function in messages. The log-prior is added to the values of a "log_likelihood_fn".
+    check : callable, optional
+        Called with this object and the first batch that it evaluates; raises ValueError for a wrong function.
+    start_density : callable, optional
+        Log-density at beta = 0, which takes the place of the log-prior in the records; the log-prior by default.
+
+    Attributes
+    ----------
+    record, budget
+        See above.
+    evaluates_parts : bool
+        Whether the first points of a batch that does not fit into the limit of simulations are evaluated.
+    evaluations : int
+        Number of points that were asked for, evaluated by this object or found in the record.
+    new_evaluations : int
+        Number of points that this object has evaluated itself.
+    pool : object with a method map, optional
+        Where functions of one point are called; set by the sampler.
+    observer : Observer, optional
+        Told of points while they are evaluated.
+    asynchronous : bool
+        Whether `submit` returns without waiting.
+    """
+
+    asynchronous = False
+
+    def __init__(
+        self,
+        function: ErrorCapturing,
+        log_prior_fn: Callable,
+        convention: CallingConvention,
+        record: Record | None = None,
+        limit: FailureLimit | None = None,
+        budget: Budget | None = None,
+        name: str = "log_prob_fn",
+        check: Callable[["Evaluator", EvaluatedBatch], None] | None = None,
+        start_density: Callable | None = None,
+    ):
+        self._name, self._check, self._start_density = name, check, start_density
+        self._function, self._log_prior_fn, self._convention = function, log_prior_fn, convention
+        self.record, self._limit = Record() if record is None else record, limit
+        self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
+        self.budget = Budget(self.record) if budget is None else budget
+        self.evaluates_parts = True
+        self.pool: Any = None
+        self.observer: Observer | None = None
+        self.evaluations = self.new_evaluations = 0
+
+    def __getstate__(self):
+        return {**self.__dict__, "pool": None, "observer": None}
+
+    def __deepcopy__(self, memo):
+        return self  # moves that are copied go on with the same density
+
+    @property
+    def map(self) -> Callable:
+        """Python's ``map``, or the ``map`` of the pool."""
+        return map_in(self.pool)
+
+    def log_prior(self, coords: np.ndarray) -> np.ndarray:
+        """Log-prior (n,) of points (n, ndim), always computed in this process; -inf for NaN."""
+        results = self._convention.call(self._log_prior_fn, coords)
+        log_prior = log_densities(results, len(coords), "log_prior_fn")
+        return np.where(np.isnan(log_prior), -np.inf, log_prior)
+
+    def log_base(self, coords: np.ndarray) -> np.ndarray:
+        """Log-density (n,) at beta = 0 of points (n, ndim): of the prior, unless a `start_density` is given."""
+        return self._with_start_density(coords, self.log_prior(coords))
+
+    def _with_start_density(self, coords: np.ndarray, log_prior: np.ndarray) -> np.ndarray:
+        inside = log_prior > -np.inf
+        if self._start_density is None or not inside.any():
+            return log_prior
+        values = self._convention.call(self._start_density, coords[inside])
+        log_start = log_densities(values, int(np.sum(inside)), "start_density")
+        if not np.all(np.isfinite(log_start)):
+            first = np.flatnonzero(~np.isfinite(log_start))[0]
+            raise ValueError(
+                "start_density must be finite wherever the log-prior is, since annealing cannot reach other points; "
+                f"got {log_start[first]} at {coords[inside][first]}. Mix it with the prior: "
+                "numpy.logaddexp(log(0.95) + start_density, log(0.05) + log_prior), for draws of this mixture"
+            )
+        log_base = np.full(len(coords), -np.inf)
+        log_base[inside] = log_start
+        return log_base
+
+    def log_base_of_start(self, coords: np.ndarray) -> np.ndarray:
+        """`log_base` (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the prior."""
+        try:
+            log_prior = self.log_prior(coords)
+        except Exception as error:
+            raise ValueError(
+                f"log_prior_fn failed with {error!r}. It is called as log_prob_fn is: with {self._convention.argument}"
+            ) from error
+        outside = np.flatnonzero(log_prior == -np.inf)
+        if len(outside) > 0:
+            raise ValueError(
+                f"{len(outside)} of {len(coords)} initial points lie outside the prior's support (log_prior -inf or "
+                f"NaN), the first of them {coords[outside[0]]}: pass draws of the prior"
+            )
+        return self._with_start_density(coords, log_prior)
+
+    def inside(self, coords: np.ndarray) -> np.ndarray:
+        """Whether each of the points (n, ndim) lies in the support of the prior."""
+        return self.log_prior(coords) > -np.inf
+
+    @property
+    def workers(self) -> int:
+        """0: `submit` waits for its points."""
+        return 0
+
+    def submit(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> PendingPoints:
+        """Evaluate points (n, ndim), of which the limit of simulations may allow the first few only."""
+        try:
+            return PendingPoints.known(coords, self.evaluate(coords, observe))
+        except BudgetExhausted as stop:
+            return PendingPoints.known(coords[: len(stop.records)], stop.records, refused=True)
+
+    def wait(self, most: int) -> None:
+        """Nothing runs after `submit`."""
+
+    def close(self) -> None:
+        """Nothing runs after `submit`."""
+
+    def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
+        """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
+
+        Parameters
+        ----------
+        coords : (n, ndim) float
+            The points.
+        observe : callable, optional
+            Called with points directly before they are evaluated, and with points of the record in the same parts as
+            when they were evaluated.
+
+        Raises
+        ------
+        ValueError
+            If a coordinate is not finite.
+        BudgetExhausted
+            If the points do not fit into the limit of simulations. With `evaluates_parts`, the first of them that fit
+            are evaluated.
+        """
+        if not np.all(np.isfinite(coords)):
+            raise ValueError("At least one parameter value was infinite or NaN")
+        log_base = self.log_base(coords)
+        inside = log_base > -np.inf
+        if not inside.any():
+            return self._pack(log_base, inside, None)
+        points = coords[inside]
+        batches: list[EvaluatedBatch] = []
+        for rows, known in self.record.find(points):
+            part = points[rows] if known is not None else self._fitting(points[rows])
+            if observe is not None and len(part) > 0:
+                observe(part)
+            if known is not None:
+                self._check = None  # the first batch of the run was checked when it was evaluated
+                if self.observer is not None:
+                    self.observer.repeated(len(part))
+                batches.append(known)
+            elif len(part) > 0:
+                batches.append(self._compute_and_store(part))
+            self.evaluations += len(part)
+            if len(part) < rows.stop - rows.start:
+                raise BudgetExhausted(self._first_records(log_base, inside, batches))
+        return self._pack(log_base, inside, merge_batches(batches))
+
+    def _fitting(self, coords: np.ndarray) -> np.ndarray:
+        """The points (n, ndim), or the first of them that the limit of simulations allows."""
+        fitting = self.budget.fitting(coords)
+        return coords if fitting == len(coords) else coords[: fitting if self.evaluates_parts else 0]
+
+    def _compute_and_store(self, coords: np.ndarray) -> EvaluatedBatch:
+        stored, failed = 0, []
+
+        def store_first(results: list) -> None:
+            """Store the first results of a long batch except failures, which may yet end the run."""
+            nonlocal stored
+            if len(results) == stored:
+                return
+            part = self._as_batch(coords[stored : len(results)], results[stored:])
+            if self._check is not None:
+                if np.isfinite(part.log_prob).sum() < POINTS:
+                    return
+                self._check(self, part)
+                self._check = None
+            failed.extend(stored + row for row in part.reasons)
+            self._enter(_successes(part))
+            stored = len(results)
+
+        if self.observer is not None:
+            self.observer.submitted(len(coords))
+        results = self._convention.call(self._function, coords, self.pool, store_first, self.observer)
+        if self.observer is not None:
+            self.observer.settled()
+        batch = self._as_batch(coords, results)
+        if self._check is not None:
+            self._check(self, batch)
+            self._check = None
+        new = batch.rows([*failed, *range(stored, len(coords))])
+        self._check_failures(new, whole=stored == 0)
+        self._enter(new)
+        return batch
+
+    def _check_failures(self, batch: EvaluatedBatch, whole: bool) -> None:
+        """Raise RuntimeError if too many evaluations have failed; what has not failed is kept."""
+        if self._limit is None:
+            return
+        try:
+            self._limit.check(batch, self.record.count, len(self.record.failed), whole=whole)
+        except RuntimeError:
+            self._enter(_successes(batch))
+            raise
+
+    def _enter(self, batch: EvaluatedBatch) -> None:
+        if len(batch.coords) > 0:
+            self.record.evaluated(batch)
+            self.new_evaluations += len(batch.coords)
+
+    def _pack(self, log_base: np.ndarray, inside: np.ndarray, batch: EvaluatedBatch | None) -> np.ndarray:
+        """Records of points with log-density (n,) at beta = 0, of which those `inside` (n,) are evaluated."""
+        if batch is not None and batch.blobs is not None and len(self._fields) == 2:
+            self._fields.append(("blobs", batch.blobs.dtype, batch.blobs.shape[1:]))
+        records = np.zeros(len(log_base), dtype=self._fields)
+        records["log_prob"], records["log_prior"] = -np.inf, log_base
+        if batch is not None:
+            records["log_prob"][inside] = np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)
+            if batch.blobs is not None:
+                records["blobs"][inside] = batch.blobs
+        return records
+
+    def _first_records(self, log_base: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
+        """Records of the points before the first one that was not evaluated."""
+        done = sum(len(batch.coords) for batch in batches)
+        first = slice(0, int(np.flatnonzero(inside)[done]))
+        batch = merge_batches(batches) if batches else None
+        return self._pack(log_base[first], inside[first], batch)
+
+    def call(self, function: Callable, coords: np.ndarray) -> np.ndarray:
+        """Values (n,) of another function of points (n, ndim) that is called like the log-density."""
+        return log_densities(self._convention.call(function, coords, self.pool), len(coords), "the function")
+
+    def compute(self, coords: np.ndarray) -> EvaluatedBatch:
+        """Call the function for points (n, ndim), without counting or storing."""
+        return self._as_batch(coords, self._convention.call(self._function, coords, self.pool))
+
+    def _as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
+        log_prob, blobs, reasons = outcomes(results, len(coords), self._convention.blobs_dtype, self._name)
+        if self._name == "log_likelihood_fn":
+            log_prob = log_prob + self.log_prior(coords)
+        return EvaluatedBatch(coords, log_prob, blobs, reasons)
+
+    def unpack(self, records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """log_prob and blobs (or None), as emcee takes them."""
+        return records["log_prob"].copy(), records["blobs"].copy() if "blobs" in records.dtype.names else None
+
+
+def _successes(batch: EvaluatedBatch) -> EvaluatedBatch:
+    """The points of a batch that have not failed."""
+    return batch.rows([row for row in range(len(batch.coords)) if row not in batch.reasons])

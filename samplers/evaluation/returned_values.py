@@ -1,0 +1,227 @@
+"""Arrays of log-probabilities and blobs from what a user's function returned, or an error that says what is wrong.
+
+emcee's conventions hold: one number per point, or a sequence of the number and blobs; blobs of several points are
+stacked; text and blobs of different lengths become objects. Unlike in emcee, NaN is left to the caller to judge, and
+anything that is not a number is refused with an explanation.
+"""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+__all__ = ["ErrorCapturing", "Failed", "log_densities", "log_probabilities", "outcomes"]
+
+logger = logging.getLogger(__name__)
+
+
+def _is_row(value: Any) -> bool:
+    """Whether a value is a sequence or an array with items; text and single numbers are not."""
+    if isinstance(value, np.ndarray):
+        return value.ndim > 0
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes) and len(value) > 0
+
+
+def _number(value: Any, name: str) -> float:
+    """One log-density as a float; ValueError for text, None and anything else that is not one number."""
+    if isinstance(value, str | bytes) or value is None:
+        raise ValueError(f"{name} must return a number (a log-density); got {value!r}")
+    try:
+        return float(np.asarray(value).item())
+    except (TypeError, ValueError):
+        shape = np.shape(value)
+        raise ValueError(
+            f"{name} must return one number per point; got {type(value).__name__} of shape {shape}. "
+            "A function of a whole batch needs vectorize=True"
+        ) from None
+
+
+def _stack(blobs: list, dtype: Any) -> np.ndarray:
+    """Blobs of several points as one array (n, ...), as emcee stores them."""
+    if dtype is None:
+        try:
+            dtype = np.atleast_1d(blobs[0]).dtype
+        except ValueError:
+            dtype = np.dtype(object)
+        if dtype.kind in "US":  # a string type would truncate longer text
+            dtype = np.dtype(object)
+    try:
+        stacked = np.array(blobs, dtype=dtype)
+    except ValueError:
+        # rows of different lengths: each becomes one object
+        stacked = np.empty(len(blobs), dtype=object)
+        stacked[:] = blobs
+    single = tuple(axis for axis in range(1, stacked.ndim) if stacked.shape[axis] == 1)
+    return np.squeeze(stacked, single) if single else stacked
+
+
+def log_probabilities(
+    results: Any, n: int, name: str = "log_prob_fn", blobs_dtype: Any = None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Log-densities and blobs of `n` points.
+
+    Parameters
+    ----------
+    results : array or sequence
+        What the function returned: (n,) numbers, or n sequences (number, blob, ...).
+    n : int
+        Number of points for which the function was called.
+    name : str
+        Name of the function in messages.
+    blobs_dtype : dtype, optional
+        dtype of the blobs, as in emcee; by default the dtype of the first blobs.
+
+    Returns
+    -------
+    log_prob : (n,) float
+        Log-densities; NaN is kept.
+    blobs : (n, ...) array, or None
+        None without blobs.
+
+    Raises
+    ------
+    ValueError
+        If the number of results is not `n`, or a result is not a number or is +inf.
+    """
+    if hasattr(results, "__array__"):
+        results = np.asarray(results)
+    if n == 1 and isinstance(results, np.ndarray) and results.ndim == 0:
+        results = results.reshape(1)  # functions of SciPy drop the axis of a batch of one point
+    if not _is_row(results):
+        raise ValueError(
+            f"{name} must return {n} numbers for {n} points with vectorize=True; got {type(results).__name__}. "
+            "A function of one point needs vectorize=False"
+        )
+    if len(results) != n:
+        raise ValueError(f"{name} must return {n} numbers for {n} points; got {len(results)}")
+
+    blobs = None
+    if isinstance(results, np.ndarray) and results.ndim == 1 and results.dtype.kind in "fiu":
+        log_prob = results.astype(float)
+    else:
+        log_prob = np.array([_number(row[0] if _is_row(row) else row, name) for row in results])
+        tails = [row[1:] for row in results if _is_row(row) and len(row) > 1]
+        if tails and len(tails) != n:
+            raise ValueError(f"{name} must return blobs with every point or with none; got {len(tails)} of {n}")
+        if tails:
+            blobs = _stack(tails, blobs_dtype)
+    if np.any(log_prob == np.inf):
+        raise ValueError(f"{name} returned +inf for {np.sum(log_prob == np.inf)} of {n} points: no density is infinite")
+    return log_prob, blobs
+
+
+def log_densities(results: Any, n: int, name: str) -> np.ndarray:
+    """Log-densities (n,) of `n` points from a function that must return one number per point, without blobs.
+
+    Parameters and errors as in `log_probabilities`.
+    """
+    values, blobs = log_probabilities(results, n, name)
+    if blobs is not None:
+        row = next(row for row in results if _is_row(row) and len(row) > 1)
+        raise ValueError(
+            f"{name} must return one number per point; got {type(row).__name__} of shape {np.shape(row)} for a point. "
+            "If these are the log-densities of the single parameters, return their sum, np.sum(..., axis=-1)"
+        )
+    return values
+
+
+class Failed:
+    """Takes the place of a result where a function raised an exception, or reports a fault.
+
+    Parameters
+    ----------
+    error : Exception or str
+        What was raised, or the reason.
+
+    Attributes
+    ----------
+    reason : str
+        Type and message of the exception, or the reason.
+    """
+
+    def __init__(self, error: Exception | str):
+        self.reason = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
+
+
+def _lost_in_pool(result: Any) -> bool:
+    """Whether a pool returned (None, reason) for a point, because every process that evaluated it died."""
+    return isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
+
+
+class ErrorCapturing:
+    """A function that returns `Failed` instead of raising; it can be sent to a worker if the function can.
+
+    A function of one point, or the object of a method, may have a method ``fault(point)``, which returns the reason why
+    the point could not be evaluated by a fault of the infrastructure (a process that was killed, a full disk), or an
+    empty string. Such a point has `Failed` as well, because the records of a function in a worker are not seen in this
+    process.
+
+    An exception whose attribute ``ends_run`` is true is raised: the function cannot be used for any point, such as a
+    posterior whose model has changed.
+
+    Parameters
+    ----------
+    function, args, kwargs
+        Called as ``function(points, *args, **kwargs)``.
+    vectorize : bool
+        Whether the function takes a batch of points instead of one.
+    """
+
+    def __init__(
+        self,
+        function: Callable,
+        args: Sequence = (),
+        kwargs: Mapping[str, Any] | None = None,
+        vectorize: bool = False,
+    ):
+        self.function, self.args, self.kwargs, self.vectorize = function, args, kwargs or {}, vectorize
+
+    def __call__(self, points: Any) -> Any:
+        try:
+            result = self.function(points, *self.args, **self.kwargs)
+            owner = getattr(self.function, "__self__", self.function)  # of a method such as log_likelihood
+            fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
+            return Failed(fault) if fault else result
+        except Exception as error:
+            if getattr(error, "ends_run", False):
+                raise
+            if not self.vectorize:
+                return Failed(error)
+            if len(points) == 1:
+                return [Failed(error)]
+            logger.warning(
+                "log_prob_fn raised an exception for a batch of %d points: evaluating each point alone",
+                len(points),
+                exc_info=True,
+            )
+        results = [self(points[i : i + 1]) for i in range(len(points))]
+        # a result that is not a sequence of one item stays as it is: `log_probabilities` refuses it with a message
+        return [result[0] if _is_row(result) and len(result) == 1 else result for result in results]
+
+
+def outcomes(
+    results: Any, n: int, blobs_dtype: Any = None, name: str = "log_prob_fn"
+) -> tuple[np.ndarray, np.ndarray | None, dict[int, str]]:
+    """Log-probabilities and blobs as in `log_probabilities`, and the reasons of failures by row.
+
+    A point fails by an exception or a fault (`ErrorCapturing`), by NaN, or where a pool lost every process that
+    evaluated it. Its log-probability is NaN; its blobs are zero or empty.
+    """
+    reasons = {}
+    if isinstance(results, list):
+        results = [Failed(result[1]) if _lost_in_pool(result) else result for result in results]
+        reasons = {row: result.reason for row, result in enumerate(results) if isinstance(result, Failed)}
+    if not reasons:
+        log_prob, blobs = log_probabilities(results, n, name, blobs_dtype)
+    else:
+        good = [row for row in range(len(results)) if row not in reasons]
+        log_prob, blobs = np.full(n, np.nan), None
+        if good:
+            log_prob[good], found = log_probabilities([results[row] for row in good], len(good), name, blobs_dtype)
+            if found is not None:
+                blobs = np.zeros((n, *found.shape[1:]), dtype=found.dtype)
+                blobs[good] = found
+    for row in np.flatnonzero(np.isnan(log_prob)):
+        reasons.setdefault(int(row), f"{name} returned NaN")
+    return log_prob, blobs, reasons

@@ -1,0 +1,230 @@
+"""The functions of a user: the posterior as one function or as prior and likelihood, and what belongs to it."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
+
+__all__ = ["OptionalAttributes", "UserFunctions"]
+
+logger = logging.getLogger(__name__)
+
+
+class OptionalAttributes(NamedTuple):
+    """What a user's log-posterior or log-likelihood may offer besides being callable.
+
+    Attributes
+    ----------
+    log_prior : callable, optional
+        Log-prior of a point or a batch.
+    sample_prior : callable, optional
+        Function of (n, random) that returns n draws of the prior.
+    report : callable, optional
+        Function that returns a dictionary, such as ``{"simulations": 120}``.
+    possible : callable, optional
+        Function of points (n, ndim), always an array, that returns whether each of them (n,) may have a positive
+        density, as far as is known without a simulation. A value of -inf elsewhere is no failed simulation.
+    fast_parameters : sequence of int
+        Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
+    ndim : int, optional
+        Number of parameters.
+    parameter_names : sequence of str
+        Names of the parameters.
+    """
+
+    log_prior: Callable | None
+    sample_prior: Callable | None
+    report: Callable[[], Mapping[str, Any]] | None
+    possible: Callable[[np.ndarray], np.ndarray] | None
+    fast_parameters: Sequence[int]
+    ndim: int | None
+    parameter_names: Sequence[str]
+
+    @classmethod
+    def of(cls, function: Callable) -> "OptionalAttributes":
+        """Read the attributes of a function."""
+        found = (getattr(function, name, None) for name in ("log_prior", "sample_prior", "report", "possible"))
+        return cls(
+            *found,
+            getattr(function, "fast_parameters", ()),
+            getattr(function, "ndim", None),
+            getattr(function, "parameter_names", ()),
+        )
+
+    def slow_parameters(self, ndim: int) -> list[int]:
+        """Indices of the parameters that a simulation depends on; all where none is slow."""
+        fast = set(self.fast_parameters)
+        return [j for j in range(ndim) if j not in fast] or list(range(ndim))
+
+    @property
+    def counts_failures(self) -> bool:
+        """Whether the function counts failed simulations by itself, so that -inf at a possible point is a failure."""
+        found = self.report() if callable(self.report) else None
+        return isinstance(found, Mapping) and "failure_count" in found
+
+    def may_be_positive(self, coords: np.ndarray) -> np.ndarray:
+        """Whether points (n, ndim) may have a positive density, as bool (n,), by `possible`; True if unknown."""
+        unknown = np.ones(len(coords), dtype=bool)
+        if not callable(self.possible) or len(coords) == 0:
+            return unknown
+        try:
+            found = np.asarray(self.possible(coords))
+        except Exception as error:
+            logger.warning("the verdict takes all points as possible, since the method possible failed: %r", error)
+            return unknown
+        if found.shape != (len(coords),) or found.dtype != bool:
+            logger.warning(
+                "the verdict takes all points as possible: the method possible must return bool of shape (%d,); got "
+                "%s of shape %s",
+                len(coords),
+                found.dtype,
+                found.shape,
+            )
+            return unknown
+        return found
+
+    def check_ndim(self, ndim: int, name: str) -> None:
+        """Raise ValueError if the function states another number of parameters than `ndim`."""
+        if isinstance(self.ndim, Integral) and self.ndim != ndim:
+            names = f" ({', '.join(map(str, self.parameter_names))})" if self.parameter_names else ""
+            raise ValueError(f"ndim is {ndim}, but {name} has {self.ndim} parameters{names}: pass ndim={self.ndim}")
+
+
+class UserFunctions(NamedTuple):
+    """The functions that a user gave to a sampler.
+
+    Attributes
+    ----------
+    name : str
+        "log_prob_fn" or "log_likelihood_fn": which of them was given.
+    function : callable
+        That function.
+    log_prior : callable
+        Log-density of the prior.
+    optional : OptionalAttributes
+        What `function` offers besides being callable.
+    start_density : callable, optional
+        Log-density that the initial state is drawn from; the log-prior by default.
+    """
+
+    name: str
+    function: Callable
+    log_prior: Callable
+    optional: OptionalAttributes
+    start_density: Callable | None = None
+
+    @classmethod
+    def of(
+        cls,
+        log_prob_fn: Callable | None,
+        log_likelihood_fn: Callable | None,
+        log_prior_fn: Callable | None,
+        start_density: Callable | None = None,
+    ) -> "UserFunctions":
+        """Check and combine the arguments of a sampler.
+
+        Raises
+        ------
+        ValueError
+            Unless exactly one of `log_prob_fn` and `log_likelihood_fn` is given, and a log-prior is known.
+        """
+        if (log_prob_fn is None) == (log_likelihood_fn is None):
+            given = "neither" if log_prob_fn is None else "both"
+            raise ValueError(
+                "exactly one of log_prob_fn (log-prior plus log-likelihood) and log_likelihood_fn must be given; got "
+                f"{given}. To pass a log-likelihood, use SMCSampler(nwalkers, ndim, None, log_likelihood_fn=..., "
+                "log_prior_fn=...)"
+            )
+        name = "log_likelihood_fn" if log_prob_fn is None else "log_prob_fn"
+        function = log_likelihood_fn if log_prob_fn is None else log_prob_fn
+        for label, value in ((name, function), ("start_density", start_density)):
+            if not callable(value) and value is not None:
+                raise ValueError(f"{label} must be callable; got {value!r}")
+        optional = OptionalAttributes.of(function)
+        log_prior = optional.log_prior if log_prior_fn is None else log_prior_fn
+        if not callable(log_prior):
+            raise ValueError(
+                f"annealing starts from the prior: pass log_prior_fn, or a {name} with a method log_prior (a posterior "
+                f"object itself, not its bound method); got {log_prior!r}"
+            )
+        return cls(name, function, log_prior, optional, start_density)
+
+    @property
+    def is_likelihood(self) -> bool:
+        """Whether the log-prior must be added to what `function` returns."""
+        return self.name == "log_likelihood_fn"
+
+    def described(self) -> dict:
+        """Entries in the header of a run besides fingerprints; None for functions that are not used."""
+        return {
+            "log_likelihood_fn": "used" if self.is_likelihood else None,
+            "start_density": None if self.start_density is None else "used",
+        }
+
+    def draw_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (n, ndim) of the prior; ValueError without `sample_prior`, or where there is a `start_density`."""
+        if self.start_density is not None:
+            raise ValueError(f"initial_state is None, but start_density is given: pass {n} draws of it")
+        if self.optional.sample_prior is None:
+            raise ValueError(
+                f"initial_state is None and {self.name} has no method sample_prior(n, random): pass {n} draws of the "
+                "prior"
+            )
+        return np.asarray(self.optional.sample_prior(n, random), dtype=float)
+
+    def check_start(self, coords: np.ndarray, log_base: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Raise ValueError for points that cannot be draws of their density (`samplers.evaluation.starts`).
+
+        Parameters
+        ----------
+        coords : (n, ndim) float
+            The points.
+        log_base : callable
+            Function of points (n, ndim) that returns the log-density (n,) that they are said to be drawn from.
+        """
+        fresh, names = self._fresh_draws(*coords.shape), list(self.optional.parameter_names or ())
+        if fresh is None:
+            reason, compared = spread_by_metropolis(coords, log_base), ""
+        else:
+            reason, compared = compare_with_draws(coords, fresh, names), f"compared with {len(fresh)} fresh draws, "
+        if not reason:
+            return
+        density, remedy = "start_density", "Pass the log-density that they were drawn from"
+        if self.start_density is None:
+            known = "None, so that the sampler draws the prior" if fresh is not None else "draws of the prior"
+            density = "the prior"
+            remedy = (
+                f"Pass {known}, not points near the posterior; or declare what they were drawn from: "
+                "start_density=log_density"
+            )
+        raise ValueError(
+            f"initial_state must consist of draws of {density}; got points that cannot be: {compared}{reason}. "
+            f"The evidence would be wrong. {remedy}"
+        )
+
+    def _fresh_draws(self, n: int, ndim: int) -> np.ndarray | None:
+        """Draws of the prior to compare n points with; None if there are none."""
+        if self.start_density is not None or self.optional.sample_prior is None:
+            return None
+        state, count = np.random.get_state(), draws_to_compare(n)  # noqa: NPY002
+        try:
+            fresh = np.asarray(self.optional.sample_prior(count, np.random.RandomState(SEED)), dtype=float)
+        except Exception as error:
+            logger.warning("initial_state is tested without fresh draws, since sample_prior failed: %r", error)
+            return None
+        finally:
+            np.random.set_state(state)  # noqa: NPY002  a sample_prior that uses the global generator changes no run
+        if fresh.shape != (count, ndim) or not np.all(np.isfinite(fresh)):
+            logger.warning(
+                "initial_state is tested without fresh draws: sample_prior(%d, random) must return finite numbers of "
+                "shape %s; got shape %s",
+                count,
+                (count, ndim),
+                fresh.shape,
+            )
+            return None
+        return fresh

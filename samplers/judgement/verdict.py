@@ -1,0 +1,395 @@
+"""What the result of a run is worth, in words: converged, usable or not usable, with reasons.
+
+``converged``
+    Nothing that the run can observe speaks against the result.
+``usable``
+    Means and evidence have the errors that are stated, but something was not reached or could not be checked.
+``not usable``
+    The numbers may be far from the posterior, by more than their stated errors.
+
+No run can see a part of the posterior in which it has no points. The reasons say what the verdict rests on.
+"""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ..estimates.genealogy import standard_error_of_mean, worst_effective_sample_size
+from ..estimates.importance import (
+    FIRST_ROUND_SHARE,
+    LARGEST_ERROR,
+    LARGEST_SHAPE,
+    USABLE_SHARE,
+    fewest_points,
+    usable,
+)
+from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound
+from .failures import NearFailures, check_failed_region
+from .modes import Mode, find_modes
+
+__all__ = [
+    "CONVERGED",
+    "NOT_USABLE",
+    "USABLE",
+    "EvidenceEstimate",
+    "RunParts",
+    "Verdict",
+    "describe_early_stop",
+    "independent_points",
+    "judge",
+]
+
+CONVERGED = "converged"
+USABLE = "usable"
+NOT_USABLE = "not usable"
+STATUSES = (CONVERGED, USABLE, NOT_USABLE)
+
+
+class EvidenceEstimate(NamedTuple):
+    """One of the estimates of the evidence in a run.
+
+    Attributes
+    ----------
+    source : {"stages", "check", "guide"}
+        The tempering stages (with recycling, all evaluated points), fresh draws after the annealing, or a guide.
+    log_evidence, error : float
+        Log-evidence and its standard error.
+    reliable : bool
+        Whether the weights are even enough for the error to be meaningful.
+    """
+
+    source: str
+    log_evidence: float
+    error: float
+    reliable: bool
+
+
+class RunParts(NamedTuple):
+    """What `Verdict` computes its attributes from.
+
+    `get_chain`, called without arguments, returns the chain (nsteps, nwalkers, ndim) at beta = 1. `near` are the
+    failures in the region of the last walkers, or None for a chain that was read from a file.
+    """
+
+    result: AnnealingResult
+    get_chain: Callable[[], np.ndarray]
+    nwalkers: int
+    evaluations: int
+    failures: int
+    near: NearFailures | None
+
+
+class _Stored(NamedTuple):
+    """The part of a verdict that is stored with the chain."""
+
+    status: str
+    reasons: tuple[str, ...]
+    simulations: float
+    more_simulations: float | None
+    effective_sample_size: float
+    sample: str
+
+
+class Verdict(_Stored):
+    """What the result of a run is worth. ``str`` gives the reasons in sentences, `summary` the results in one sentence.
+
+    The attributes listed here are the judgement, which is stored, compared and pickled. The others are computed on
+    first use from the run of the sampler that returned the verdict. A verdict without a sampler raises a ValueError for
+    them; so do `modes`, `worst_effective_sample_size` and `summary` for an empty chain.
+
+    Attributes
+    ----------
+    status : {"converged", "usable", "not usable"}
+        The judgement.
+    reasons : tuple of str
+        The reasons for it.
+    simulations : float
+        Simulations made (`samplers.budget`).
+    more_simulations : float, optional
+        About how many more simulations a converged result takes; 0 if it is converged, None if that is not known.
+    effective_sample_size : float
+        Effective sample size of the points that `sample` names, when beta = 1 was reached.
+    sample : str
+        Which points these are: the walkers, or weighted ones that the walkers were resampled from.
+    """
+
+    _run: RunParts | None = None
+
+    def of(self, run: RunParts) -> "Verdict":
+        """This verdict with the run that its other attributes are computed from."""
+        verdict = Verdict(*self)
+        verdict._run = run
+        return verdict
+
+    def __reduce__(self):
+        return Verdict, tuple(self)
+
+    @property
+    def _parts(self) -> RunParts:
+        if self._run is None:
+            raise ValueError("this verdict has no run: read it from a sampler, as sampler.verdict")
+        return self._run
+
+    @cached_property
+    def _chain(self) -> np.ndarray:
+        self._parts.result.require_finished()
+        chain = self._parts.get_chain()
+        if len(chain) == 0:
+            raise ValueError("modes are found in a chain, which is empty: call run_mcmc with one step or more")
+        return chain
+
+    @property
+    def _founders(self) -> np.ndarray:
+        """Founder of each walker; each walker has its own where the record of the resampling is lost."""
+        founders = self._parts.result.founders
+        return np.arange(self._parts.nwalkers) if founders is None else founders
+
+    @cached_property
+    def unknown(self) -> tuple[str, ...]:
+        """What the run cannot know."""
+        return tuple(_unknown(self._parts))
+
+    @cached_property
+    def evidences(self) -> tuple[EvidenceEstimate, ...]:
+        """The independent estimates of the evidence."""
+        return tuple(_evidences(self._parts.result))
+
+    @property
+    def pareto_shape(self) -> float | None:
+        """Largest Pareto shape of the weights of the check and of the draws of a guide; None without either.
+
+        Weights of a shape above 0.7 have no useful mean.
+        """
+        result = self._parts.result
+        shapes = [] if result.check is None else [result.check.pareto_shape]
+        if result.start is not None and result.start.used:
+            shapes.append(result.start.pareto_shape)
+        return max(shapes, default=None)
+
+    @property
+    def near_failures(self) -> NearFailures | None:
+        """Failures in the region of the last walkers, which the verdict depends on; None for a chain of a file.
+
+        Values of -inf inside the support of the prior are failures if ``log_prob_fn.report()`` has a "failure_count",
+        except where ``log_prob_fn.possible(points)`` is False: parameters that need no simulation are impossible there.
+        """
+        return self._parts.near
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """Modes in which the run has points, with shares and their standard errors, the largest first."""
+        return find_modes(self._chain, self._founders)
+
+    @cached_property
+    def worst_effective_sample_size(self) -> float:
+        """Smallest effective sample size of any linear combination of the parameters in the chain."""
+        return worst_effective_sample_size(self._chain, self._founders)
+
+    @property
+    def summary(self) -> str:
+        """One sentence: status, modes, evidence, effective sample size and failures."""
+        if len(self.modes) == 1:
+            found = "one mode"
+        else:
+            shares = ", ".join(f"{mode.share:.2f} +- {mode.share_error:.2g}" for mode in self.modes)
+            found = f"{len(self.modes)} modes with shares {shares}"
+        estimates = ", ".join(
+            f"{estimate.source} {estimate.log_evidence:.2f} +- {estimate.error:.2g}"
+            + ("" if estimate.reliable else " (uneven weights)")
+            for estimate in self.evidences
+        )
+        run = self._parts
+        failed = f"{run.failures} of {run.evaluations} evaluations failed" if run.failures else "no failures"
+        return (
+            f"{self.status.capitalize()}: {found}; log-evidence by {estimates}; effective sample size "
+            f"{self.worst_effective_sample_size:.0f} in the worst direction; {failed}."
+        )
+
+    def __str__(self) -> str:
+        first = (
+            f"{self.status.capitalize()}: effective sample size {self.effective_sample_size:.0f} ({self.sample}) from "
+            f"{self.simulations:.0f} simulations."
+        )
+        more = []
+        if self.more_simulations is None:
+            more = ["How many more simulations are needed is not known."]
+        elif self.more_simulations > 0.0:
+            more = [f"About {self.more_simulations:.0f} more simulations are needed."]
+        return " ".join([first, *(f"{reason[0].upper()}{reason[1:]}." for reason in self.reasons), *more])
+
+
+def judge(
+    result: AnnealingResult,
+    nwalkers: int,
+    ndim: int,
+    simulations: float,
+    missing_steps: int = 0,
+    failures: str = "",
+    searched: float = 0.0,
+    near: NearFailures | None = None,
+) -> Verdict:
+    """Judge an annealing that has reached beta = 1.
+
+    Parameters
+    ----------
+    result : AnnealingResult
+        What the annealing has found.
+    nwalkers, ndim : int
+        Size of the ensemble.
+    simulations, searched : float
+        Simulations made, and how many of them the guide made by itself.
+    missing_steps : int
+        Steps at beta = 1 that the limit of simulations did not allow.
+    failures : str
+        How many evaluations failed, for the reasons; empty if none did.
+    near : NearFailures, optional
+        Failures in the region of the final points; None where they are not known.
+    """
+    stage = result.ladder[-1]
+    found = [*result.findings, *(() if near is None else check_failed_region(near))]
+    reasons: list[str] = []
+    if searched > 0.0:
+        reasons.append(f"the guide used {searched:.0f} of the {simulations:.0f} simulations for its search")
+    more: float | None = 0.0
+    stop = result.early_stop
+    if stop is not None and not stop.complete:
+        found += _of_early_stop(stop, stage.log_evidence_error, ndim)
+        more = _missing_draws(result.rounds, nwalkers) if stop.from_guide else None
+    elif stop is not None:
+        found.append(Concern("the limit of simulations ended the run at beta = 1, before its last check", False))
+        more = None
+    if result.start is not None and result.start.used:
+        last = result.rounds[-1]
+        reasons.append(
+            f"the latest {last.draws} draws of the guide, which it was not fitted to, have an "
+            f"effective sample size of {100 * last.effective_share:.0f} % of their number; the Pareto shape of all "
+            f"weights is {result.start.pareto_shape:.2f}"
+        )
+        if result.start.shortfall:
+            found.append(Concern(result.start.shortfall, False))
+    elif result.start is not None:
+        found.append(Concern(f"the draws of the guide were not used ({result.start.reason})", False))
+    if result.start is not None or (stop is not None and stop.from_guide):
+        found += [Concern(f"concern of the guide: {concern}", False) for concern in result.concerns]
+        if not result.concerns:
+            reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")
+    if stage.log_evidence_error > LARGEST_ERROR and not result.has_better_check:
+        found.append(
+            Concern(f"the standard error of the log-evidence is {stage.log_evidence_error:.2g}", stop is not None)
+        )
+    if missing_steps > 0:
+        reasons.append(
+            f"{missing_steps} of the steps at beta = 1 {'was' if missing_steps == 1 else 'were'} not made, which takes "
+            f"up to {missing_steps * nwalkers} simulations"
+        )
+    if failures:
+        reasons.append(f"{failures} failed and count as impossible")
+    status = STATUSES[max((1 + concern.grave for concern in found), default=0)]
+    if status == CONVERGED:
+        more = 0.0
+    elif stop is None:
+        more = None
+    return Verdict(
+        status,
+        (*(concern.message.rstrip(".") for concern in found), *reasons),
+        float(simulations),
+        None if more is None else float(more),
+        float(stage.effective_sample_size if result.independent_points is None else result.independent_points),
+        _sample(result, nwalkers),
+    )
+
+
+def _sample(result: AnnealingResult, nwalkers: int) -> str:
+    """The points whose effective sample size is `independent_points`."""
+    if result.early_stop is not None and not result.early_stop.complete:
+        return f"of {result.early_stop.points} weighted points, resampled to {nwalkers} walkers"
+    if result.start is not None and result.start.used:
+        return f"of {sum(r.draws for r in result.rounds)} weighted draws, resampled to {nwalkers} walkers"
+    return f"of {nwalkers} walkers"
+
+
+def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
+    """Effective sample size of the walkers (n, ndim) when beta = 1 was reached.
+
+    For walkers resampled from weighted draws and not moved, the effective sample size of the weights. Otherwise the
+    smallest squared ratio, over the parameters, of standard deviation and standard error of the mean, at most n.
+    """
+    if result.early_stop is not None and not result.early_stop.complete:
+        return result.early_stop.effective_sample_size
+    if result.start is not None and result.start.used:
+        return result.ladder[-1].effective_sample_size
+    founders = np.arange(len(coords)) if result.founders is None else result.founders
+    spread, error = coords.std(axis=0), standard_error_of_mean(coords[None], founders)
+    return float(np.min((spread / error)[error > 0.0] ** 2, initial=len(coords)))
+
+
+def describe_early_stop(verdict: Verdict, limit: float, result: AnnealingResult, made: int, missing: int) -> str:
+    """The warning when the limit has ended a call: `made` steps at beta = 1 were made, `missing` steps were not."""
+    if result.early_stop is not None:
+        ended = f"max_simulations={limit:g} ended the run"
+    else:
+        ended = f"max_simulations={limit:g} allowed {made} of {made + missing} steps at beta = 1"
+    if verdict.simulations > limit:
+        ended += f" (the stored run has made {verdict.simulations:.0f} simulations, which are kept)"
+    if verdict.status == CONVERGED:
+        return f"{ended}. The chain holds draws of the posterior: no further simulation is necessary"
+    return (
+        f"{ended}. {verdict} To go on from here, set the attribute max_simulations of the sampler to a larger number, "
+        "or make a new sampler with the same file, and call run_mcmc again"
+    )
+
+
+def _of_early_stop(stop: EarlyStop, error: float, ndim: int) -> list[Concern]:
+    """Concerns about a population that was made from the points known when the limit of simulations was reached."""
+    where = f"at beta = {stop.beta:.3g} " if stop.beta < 1.0 else ""
+    text = (
+        f"the limit of simulations ended the run {where}with {stop.points} weighted points, whose effective sample "
+        f"size is {stop.effective_sample_size:.2g} and whose weights have a Pareto shape of {stop.pareto_shape:.2g}"
+    )
+    if usable(stop.effective_sample_size, stop.pareto_shape, error, ndim):
+        return [Concern(text, False)]
+    wanted = f"an effective sample size of {fewest_points(ndim):.0f} and a shape below {LARGEST_SHAPE:g} are needed"
+    return [Concern(f"{text} ({wanted})", True)]
+
+
+def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int) -> float | None:
+    """Draws that the guide still needs if its later rounds are like the last one; None if that one says nothing."""
+    last = rounds[-1]
+    if last.effective_share < USABLE_SHARE:
+        return None
+    missing = max(nwalkers - last.effective_sample_size, FIRST_ROUND_SHARE * nwalkers)
+    return float(np.ceil(missing / last.effective_share))
+
+
+def _evidences(result: AnnealingResult) -> list[EvidenceEstimate]:
+    """The estimates of the evidence that a run has made."""
+    found = [EvidenceEstimate("stages", result.log_evidence_ladder, result.ladder[-1].log_evidence_error, True)]
+    check = result.check
+    if check is not None:
+        found.append(EvidenceEstimate("check", check.log_evidence, check.error, check.reliable))
+    if result.rounds and result.start is not None and not result.start.used:
+        last = result.rounds[-1]
+        found.append(EvidenceEstimate("guide", last.log_evidence, last.log_evidence_error, False))
+    return found
+
+
+def _unknown(run: RunParts) -> list[str]:
+    """What a run cannot know."""
+    result = run.result
+    missing = [
+        f"modes that none of the points came near, above all modes much narrower than those found and modes in a part "
+        f"of the prior that holds less than about {3.0 / run.nwalkers:.2g} of its probability (3 / walkers); a run "
+        "with another seed and more walkers is the test"
+    ]
+    if result.check is None:
+        missing.append("whether the evidence is right, since there was no check by independent draws")
+    if result.founders is None:
+        missing.append(
+            "which walkers are copies, since the chain was read from a file: errors and effective sample size treat "
+            "them as independent"
+        )
+    if run.failures:
+        missing.append("the posterior where evaluations failed, which counts as impossible")
+    return missing

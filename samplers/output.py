@@ -1,0 +1,269 @@
+"""What is stored with a chain: the run that it belongs to, the ladder, the check of the evidence, the verdict.
+
+The chain itself is written by emcee's own backend. In an HDF5 file, the group of the chain has the attribute ``run``,
+the dataset ``tempering`` (JSON), and the group ``restart``, the state from which a chain goes on that was reset. In
+memory, these are attributes of the backend.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import zlib
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from emcee import State
+from emcee.backends import Backend, HDFBackend
+
+from .emcee_internals import cut_chain, restore_counts, trim_chain
+from .estimates.importance import EvidenceCheck
+from .judgement.verdict import Verdict
+from .record import Record
+from .reports import AnnealingResult, Stage
+
+__all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file"]
+
+logger = logging.getLogger(__name__)
+
+DAMAGED = "damaged"
+STORED = "stored step"  # key of the checksum of the last step that was stored as a whole
+
+
+class Output:
+    """What is stored with the chain of a backend.
+
+    Parameters
+    ----------
+    backend : emcee Backend or HDFBackend
+        Initialised.
+    record : Record
+        Where a checksum of each stored step is noted.
+
+    Attributes
+    ----------
+    result : AnnealingResult
+        The stored ladder and evidence; empty if there are none.
+    verdict : Verdict, or None
+        The stored verdict.
+    first_step : int
+        Number of steps that were stored before the last annealing.
+    provisional : bool
+        Whether the last step is the estimate of a run that the limit of simulations ended, and is replaced when the
+        run goes on.
+    """
+
+    def __init__(self, backend: Backend, record: Record):
+        self._backend, self._record = backend, record
+        self._counts = int(backend.iteration), np.array(backend.accepted)
+        stored = self._read()
+        ladder = tuple(Stage(*values) for values in stored.get("ladder", ()))
+        check, founders, verdict = (stored.get(name) for name in ("check", "founders", "verdict"))
+        self.result = AnnealingResult(
+            ladder,
+            None if check is None else EvidenceCheck(*check),
+            None if founders is None else np.array(founders),
+        )
+        self.verdict = None if verdict is None else Verdict(verdict[0], tuple(verdict[1]), *verdict[2:])
+        self.first_step = stored.get("first_step", 0)
+        # a kill may have come when the provisional step was removed, and the note of it was not
+        self.provisional = stored.get("provisional", False) and int(backend.iteration) > self.first_step
+
+    def _read(self) -> dict[str, Any]:
+        backend = self._backend
+        if not isinstance(backend, HDFBackend):
+            return getattr(backend, "tempering", {})
+        with backend.open() as file:
+            group = file[backend.name]
+            return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+
+    def begin(self, run: str) -> None:
+        """A new annealing begins: nothing is known of it."""
+        self.result, self.verdict, self.first_step = AnnealingResult(), None, int(self._backend.iteration)
+        self._write(run)
+        self.step_stored()
+
+    def step_stored(self) -> None:
+        """Note in the record what the chain ends with, since a process that is killed may store half of a step."""
+        self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
+        if isinstance(self._backend, HDFBackend):
+            self._record.note(STORED, np.array([_checksum(self._backend)]))
+
+    def undo_half_a_step(self) -> None:
+        """Leave no step that was not stored as a whole, after an error or Ctrl-C in the middle of it."""
+        try:
+            restore_counts(self._backend, *self._counts)
+        except Exception as error:  # the error that has ended the step is raised
+            logger.warning("the chain may end with half of a step (%s)", error)
+
+    def write(self, result: AnnealingResult, verdict: Verdict | None) -> None:
+        """Store a result. Where the file cannot be written, the log says so, and the next call stores it."""
+        self.result, self.verdict = result, verdict
+        try:
+            self._write()
+        except OSError as error:
+            logger.warning("ladder and verdict are not stored (%s): the next call of run_mcmc stores them", error)
+
+    def _write(self, run: str | None = None) -> None:
+        result, backend = self.result, self._backend
+        contents = {
+            "ladder": result.ladder,
+            "check": result.check,
+            "founders": None if result.founders is None else np.asarray(result.founders).tolist(),
+            "verdict": self.verdict,
+            "first_step": self.first_step,
+            "provisional": self.provisional,
+        }
+        if not isinstance(backend, HDFBackend):
+            backend.tempering = contents
+            return
+        data = np.frombuffer(json.dumps(contents).encode(), dtype=np.uint8)
+        with backend.open("a") as file:
+            group = file[backend.name]
+            if run is not None:
+                group.attrs["run"] = run
+                group.pop("restart", None)
+            group.pop("tempering", None)
+            group.create_dataset("tempering", data=data)
+
+    # ------------------------------------------------------------------ the state that a chain goes on from
+
+    def last_state(self) -> State | None:
+        """The last stored state at beta = 1 of the last annealing; None without any."""
+        backend = self._backend
+        if backend.iteration > self.first_step:
+            return backend.get_last_sample()
+        if not isinstance(backend, HDFBackend):
+            return None
+        with backend.open() as file:
+            group = file[backend.name].get("restart")
+            if group is None:
+                return None
+            values = {name: dataset[...] for name, dataset in group.items()}
+        return State(values.pop("coords"), **values, random_state=backend.random_state)
+
+    def clear_chain(self, state: State | None) -> None:
+        """Remove all steps; the chain goes on from `state`."""
+        backend = self._backend
+        cut_chain(backend, 0)
+        self.first_step, self.provisional = 0, False
+        self._write()
+        if isinstance(backend, HDFBackend):
+            with backend.open("a") as file:
+                file[backend.name].pop("restart", None)
+        if isinstance(backend, HDFBackend) and state is not None and state.log_prob is not None:
+            with backend.open("a") as file:
+                group = file[backend.name].create_group("restart")
+                for name in ("coords", "log_prob", "blobs"):
+                    if (values := getattr(state, name)) is not None:
+                        group.create_dataset(name, data=values)
+                for i, value in enumerate(state.random_state or ()):
+                    file[backend.name].attrs[f"random_state_{i}"] = value
+        self.step_stored()
+
+    def store_provisional_step(self, state: State) -> None:
+        """Store the estimate of a run that the limit of simulations ended, as a step that is replaced later."""
+        trim_chain(self._backend)
+        self._backend.grow(1, state.blobs)
+        self._backend.save_step(state, np.zeros(len(state.coords), dtype=bool))
+        self.provisional = True
+        self._write()
+        self.step_stored()
+
+    def drop_provisional_step(self) -> None:
+        """Remove the last step if it is provisional."""
+        if self.provisional:
+            cut_chain(self._backend, int(self._backend.iteration) - 1)
+            self.provisional = False
+            self._write()
+            self.step_stored()
+
+
+def _checksum(backend: HDFBackend) -> int:
+    """CRC-32 of what a chain ends with: counts, last step, state to go on from, random state."""
+    with backend.open() as file:
+        group, checksum = file[backend.name], 0
+        steps = int(group.attrs["iteration"])
+        stored = json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+        parts = [steps, stored.get("first_step"), stored.get("provisional"), group["accepted"][...]]
+        parts += [group.attrs[name] for name in sorted(group.attrs) if name.startswith("random_state_")]
+        parts += [group[name][steps - 1] for name in ("chain", "log_prob", "blobs") if steps > 0 and name in group]
+        parts += [dataset[...] for _, dataset in sorted(group.get("restart", {}).items())]
+        for part in parts:
+            data = part.tobytes() if isinstance(part, np.ndarray | np.generic) else repr(part).encode()
+            checksum = zlib.crc32(data, checksum)
+    return checksum
+
+
+def is_whole(backend: HDFBackend, record: Record) -> bool:
+    """Whether a chain ends with a step that was stored as a whole, or is empty and has never had a step."""
+    try:
+        with backend.open() as file:
+            group = file[backend.name]
+            if group.attrs["iteration"] == 0 and "restart" not in group and not np.any(group["accepted"]):
+                return True
+        noted = record.noted(STORED)
+        return noted is not None and int(noted[0]) == _checksum(backend)
+    except BlockingIOError:  # another process writes to it
+        raise
+    except Exception:  # HDF5 raises nearly anything
+        return False
+
+
+def run_of_file(backend: HDFBackend) -> str | None:
+    """The run that the file of a backend belongs to.
+
+    Returns
+    -------
+    str or None
+        "damaged" for a chain that cannot be read as a whole, the empty string for a chain without a run, None if there
+        is no file or an empty one, or no chain of this name in it.
+    """
+    if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
+        return None
+    try:
+        with h5py.File(backend.filename, "r") as file:
+            group = file.get(backend.name)
+            if group is None:
+                return None
+            group.visititems(_read_object)
+            if "tempering" in group:
+                json.loads(group["tempering"][...].tobytes())
+            complete = {"chain", "log_prob", "accepted"} <= set(group) and "iteration" in group.attrs
+            return group.attrs.get("run", "") if complete else DAMAGED
+    except BlockingIOError:  # another process writes to it
+        raise
+    except Exception:  # HDF5 raises nearly anything
+        return DAMAGED
+
+
+def _read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:
+    """Read an object of a file as a whole."""
+    dict(node.attrs)
+    if isinstance(node, h5py.Dataset):
+        node[...]
+
+
+def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
+    """Make the file of a backend, with an empty chain of a run, in one piece; other groups that can be read stay."""
+    path = Path(backend.filename)
+    new = path.with_name(f"{path.name}.new")
+    new.unlink(missing_ok=True)
+    options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
+    made = HDFBackend(str(new), backend.name, dtype=backend.dtype if backend.dtype_set else None, **options)
+    made.reset(nwalkers, ndim)
+    with made.open("a") as file:
+        file[made.name].attrs["run"] = run
+        try:
+            with h5py.File(path, "r") as present:
+                for name in present:
+                    if name not in file:
+                        with contextlib.suppress(OSError, RuntimeError, KeyError):  # it cannot be read
+                            present.copy(name, file)
+        except BlockingIOError:  # another process writes to it
+            raise
+        except OSError as error:
+            logger.debug("no group is copied from %s: %s", path, error)
+    os.replace(new, path)

@@ -1,0 +1,340 @@
+"""Transformations that make a population nearly Gaussian: maps without bounds, and shears without curvature.
+
+Bounds
+------
+A posterior that is concentrated at a bound, such as a damping ratio near zero, is truncated there, and a mixture of
+bell-shaped components cannot follow it in many dimensions. For a single bound, a map that is the logarithm of the
+distance near the bound and linear far from it has no bound, and makes an exponential posterior symmetric. Between two
+bounds it is the logit.
+
+The bounds are found numerically, because a sampler knows only whether a point lies in the support. Evaluating that
+needs no simulation. For each parameter the bounds are bracketed and bisected along lines through several points. Where
+the lines disagree, the support is not a box, and the parameter is treated as unbounded. Equations and choices are in
+``docs/theory/proposals``.
+
+Shears
+------
+If the data determine only a combination of parameters, such as the product of two stiffnesses, the posterior is a
+curved ridge that a small number of ellipsoids cannot cover. A shear
+
+    x_target <- x_target - a t - b t^2,   t = (x_source - mean) / sd,
+
+removes the curvature. It is a triangular map with unit Jacobian determinant, and its inverse adds what was subtracted.
+Densities therefore carry over without a correction, and a step that is symmetric in the transformed points is symmetric
+in the original ones.
+
+The maps are those by which Haario, Saksman & Tamminen (1999) construct banana-shaped targets from Gaussians, applied in
+the opposite direction. Parno & Marzouk (2018) describe triangular maps as preconditioners for sampling in general. The
+greedy selection of pairs by the Bayesian information criterion is a choice of this project; see
+``docs/theory/proposals``.
+
+References
+----------
+Haario, H., Saksman, E. & Tamminen, J. (1999), Adaptive proposal distribution for random walk Metropolis algorithm,
+Computational Statistics 14, doi:10.1007/s001800050022
+
+Parno, M. D. & Marzouk, Y. M. (2018), Transport map accelerated Markov chain Monte Carlo, SIAM/ASA Journal on
+Uncertainty Quantification 6(2), doi:10.1137/17M1134640
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import expit
+
+__all__ = [
+    "Shear",
+    "SupportBounds",
+    "apply_shears",
+    "find_shears",
+    "find_support_bounds",
+    "from_unbounded",
+    "invert_shears",
+    "log_abs_det_jacobian",
+    "near_bounds",
+    "to_unbounded",
+]
+
+# Number of points through which the lines are laid.
+PROBES = 3
+# The search for a bound starts at the range of the points and doubles the distance; a factor of 2^30 means no bound.
+DOUBLINGS = 30
+# Halvings of the bracket, down to the rounding of a double.
+BISECTIONS = 55
+# Largest disagreement of the lines, as a share of the range of the points.
+AGREEMENT = 1e-9
+# A bound matters if it lies within so many standard deviations of the mean of the population.
+NEAR = 4.0
+
+
+class SupportBounds(NamedTuple):
+    """Bounds of the parameters.
+
+    Attributes
+    ----------
+    low, high : ndarray, shape (ndim,)
+        Lower and upper bounds; -inf and inf where there is none.
+    span : ndarray, shape (ndim,)
+        Length scale of each parameter. For a single bound, the distance at which the map changes from the logarithm to
+        a linear one.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    span: np.ndarray
+
+
+def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -> SupportBounds:
+    """Find the bounds of the support from points in it.
+
+    Parameters
+    ----------
+    inside : callable
+        Function of points (m, ndim) that returns which of them (m,) lie in the support. It is called about 85 times.
+    coords : ndarray, shape (n, ndim)
+        Points in the support, for example draws from the prior.
+
+    Returns
+    -------
+    SupportBounds
+        Each finite bound lies at most one bisection step outside the support, never inside it.
+    """
+    ndim = coords.shape[1]
+    span = np.ptp(coords, axis=0)
+    rows = coords[np.linspace(0, len(coords) - 1, PROBES).astype(int)]
+    # one search for each combination of row, parameter and direction
+    row, parameter, side = (a.ravel() for a in np.meshgrid(range(PROBES), range(ndim), (-1.0, 1.0), indexing="ij"))
+    start = rows[row, parameter]
+
+    def reaches(which: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        probes = rows[row[which]]
+        probes[np.arange(len(which)), parameter[which]] = start[which] + side[which] * distance
+        return inside(probes)
+
+    within, beyond = np.zeros(len(row)), np.full(len(row), np.inf)
+    distance = span[parameter]
+    for _ in range(DOUBLINGS):
+        searching = np.flatnonzero(np.isinf(beyond))
+        if len(searching) == 0:
+            break
+        found = reaches(searching, distance[searching])
+        within[searching[found]] = distance[searching[found]]
+        beyond[searching[~found]] = distance[searching[~found]]
+        distance = 2.0 * distance
+    bounded = np.isfinite(beyond)
+    which = np.flatnonzero(bounded)
+    for _ in range(BISECTIONS if len(which) else 0):
+        middle = 0.5 * (within[which] + beyond[which])
+        found = reaches(which, middle)
+        within[which[found]] = middle[found]
+        beyond[which[~found]] = middle[~found]
+
+    bounds = np.where(bounded, start + side * beyond, side * np.inf).reshape(PROBES, ndim, 2)
+    with np.errstate(invalid="ignore"):
+        agree = np.ptp(bounds, axis=0) <= AGREEMENT * span[:, None]
+    low = np.where(agree[:, 0], bounds[:, :, 0].min(axis=0), -np.inf)
+    high = np.where(agree[:, 1], bounds[:, :, 1].max(axis=0), np.inf)
+    return SupportBounds(low, high, np.where(span > 0.0, span, 1.0))
+
+
+def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
+    """Keep the bounds that lie within four standard deviations of the mean of a weighted population (n, ndim), (n,).
+
+    A single bound gets as scale the variance of the parameter divided by the distance of the mean from the bound.
+    """
+    mean = weights @ coords
+    reach = NEAR * np.sqrt(weights @ (coords - mean) ** 2)
+    low = np.where(mean - bounds.low < reach, bounds.low, -np.inf)
+    high = np.where(bounds.high - mean < reach, bounds.high, np.inf)
+    distance = np.where(np.isfinite(low), mean - low, high - mean)
+    one_sided = (np.isfinite(low) != np.isfinite(high)) & (reach > 0.0) & (distance > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = (reach / NEAR) ** 2 / distance
+    return SupportBounds(low, high, np.where(one_sided, scale, bounds.span))
+
+
+def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, bool, bool]]:
+    """List the bounded parameters: index, whether bounded below, whether bounded above."""
+    below, above = np.isfinite(bounds.low), np.isfinite(bounds.high)
+    return [(int(j), bool(below[j]), bool(above[j])) for j in np.flatnonzero(below | above)]
+
+
+def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) to the whole real line.
+
+    ``log(exp((x - low) / span) - 1)`` for a lower bound, likewise for an upper one, and the logit between two bounds.
+    Points on or beyond a bound are mapped to zero; `log_abs_det_jacobian` is -inf for them.
+    """
+    coords = coords.copy()
+    for j, below, above in _bounded_parameters(bounds):
+        x = coords[:, j]
+        from_low = np.maximum((x - bounds.low[j]) / bounds.span[j], 0.0) if below else 1.0
+        from_high = np.maximum((bounds.high[j] - x) / bounds.span[j], 0.0) if above else 1.0
+        good = (from_low > 0.0) & (from_high > 0.0)
+        from_low, from_high = np.where(good, from_low, 1.0), np.where(good, from_high, 1.0)
+        if below and above:
+            coords[:, j] = np.log(from_low) - np.log(from_high)
+        elif below:
+            coords[:, j] = _stretch(from_low)
+        else:
+            coords[:, j] = -_stretch(from_high)
+    return coords
+
+
+def _stretch(distance: np.ndarray) -> np.ndarray:
+    """log(exp(t) - 1) for positive numbers t: near log(t) for small ones, near t for large ones."""
+    return distance + np.log(-np.expm1(-distance))
+
+
+def from_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) back: the inverse of `to_unbounded`."""
+    coords = coords.copy()
+    for j, below, above in _bounded_parameters(bounds):
+        z = coords[:, j]
+        if below and above:
+            width = bounds.high[j] - bounds.low[j]
+            # measured from the nearer bound, to keep the last digits
+            coords[:, j] = np.where(z < 0.0, bounds.low[j] + width * expit(z), bounds.high[j] - width * expit(-z))
+        elif below:
+            coords[:, j] = bounds.low[j] + bounds.span[j] * np.logaddexp(0.0, z)
+        else:
+            coords[:, j] = bounds.high[j] - bounds.span[j] * np.logaddexp(0.0, -z)
+    return coords
+
+
+def log_abs_det_jacobian(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
+    """Logarithm of the absolute Jacobian determinant of `to_unbounded`.
+
+    Parameters
+    ----------
+    bounds : SupportBounds
+        Bounds of the parameters.
+    coords : ndarray, shape (n, ndim)
+        Points in the original parameters.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        ``log |dz / dx|``; -inf on and beyond a bound.
+    """
+    total = np.zeros(len(coords))
+    for j, below, above in _bounded_parameters(bounds):
+        from_low = np.maximum(coords[:, j] - bounds.low[j], 0.0) if below else 1.0
+        from_high = np.maximum(bounds.high[j] - coords[:, j], 0.0) if above else 1.0
+        good = (from_low > 0.0) & (from_high > 0.0)
+        from_low, from_high = np.where(good, from_low, 1.0), np.where(good, from_high, 1.0)
+        if below and above:
+            slope = np.log(bounds.high[j] - bounds.low[j]) - np.log(from_low) - np.log(from_high)
+        else:
+            distance = from_low if below else from_high
+            slope = -np.log(bounds.span[j]) - np.log(-np.expm1(-distance / bounds.span[j]))
+        total = np.where(good, total + slope, -np.inf)
+    return total
+
+
+# ---------------------------------------------------------------- shears
+
+# Smallest share of the variance left by the linear term that the quadratic term must explain.
+MIN_CURVATURE = 0.1
+# Share of its standard deviation below which nothing is left of a target: the points are too few to show a curvature.
+DEGENERATE = 1e-6
+
+
+class Shear(NamedTuple):
+    """A map that subtracts ``linear t + quadratic t^2`` from one parameter, where ``t = (x[source] - mean) / sd``.
+
+    Attributes
+    ----------
+    target : int
+        Index of the parameter that is changed.
+    source : int
+        Index of the parameter that the change depends on.
+    mean, sd : float
+        Mean and standard deviation of the source, in its unit.
+    linear, quadratic : float
+        Coefficients, in the unit of the target.
+    """
+
+    target: int
+    source: int
+    mean: float
+    sd: float
+    linear: float
+    quadratic: float
+
+
+def _shift(shear: Shear, coords: np.ndarray) -> np.ndarray:
+    t = (coords[:, shear.source] - shear.mean) / shear.sd
+    return (shear.linear + shear.quadratic * t) * t
+
+
+def apply_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim): remove the curvature."""
+    coords = coords.copy()
+    for shear in shears:
+        coords[:, shear.target] -= _shift(shear, coords)
+    return coords
+
+
+def invert_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
+    """Transform points (n, ndim) back: the inverse of `apply_shears`."""
+    coords = coords.copy()
+    for shear in reversed(shears):
+        coords[:, shear.target] += _shift(shear, coords)
+    return coords
+
+
+def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
+    """Find shears that remove the curvature of a population, greedily: the most curved pair of parameters first.
+
+    A pair is curved if the square of the source explains at least a tenth of the variance of the target that its linear
+    term leaves, and if the gain in likelihood exceeds the penalty of the Bayesian information criterion. The penalty
+    includes the number of pairs that were searched.
+
+    Parameters
+    ----------
+    coords : ndarray, shape (n, ndim)
+        Points.
+    weights : ndarray, shape (n,)
+        Non-negative weights with sum 1.
+
+    Returns
+    -------
+    tuple of Shear
+        At most ``2 ndim`` shears, in the order of application; empty if nothing is curved.
+    """
+    effective = 1.0 / (weights @ weights)
+    ndim = coords.shape[1]
+    cost = math.log(max(effective, 2.0)) + 2.0 * math.log(max(ndim * (ndim - 1), 1))
+    shears = []
+    while len(shears) < 2 * ndim:
+        mean = weights @ coords
+        sd = np.sqrt(weights @ (coords - mean) ** 2)
+        if not np.all(sd > 0.0):
+            break
+        t = (coords - mean) / sd
+        weighted = t * weights[:, None]
+        third, fourth = weighted.T @ t**2, weights @ t**4
+        correlation = weighted.T @ t
+        own = np.diagonal(third)
+        # covariance of the target (rows) with the square of the source (columns), after removal of the linear term
+        covariance = third - correlation * own
+        left = np.maximum(fourth - 1.0 - own**2, 1e-12) * np.maximum(1.0 - correlation**2, 1e-12)
+        explained = covariance**2 / left
+        np.fill_diagonal(explained, 0.0)
+        target, source = (int(i) for i in np.unravel_index(explained.argmax(), explained.shape))
+        share = min(float(explained[target, source]), 1.0 - 1e-12)
+        if share < MIN_CURVATURE or -effective * math.log1p(-share) < cost:
+            break
+        quadratic = covariance[target, source] / max(fourth[source] - 1.0 - own[source] ** 2, 1e-12)
+        linear = correlation[target, source] - quadratic * own[source]
+        shear = Shear(target, source, mean[source], sd[source], sd[target] * linear, sd[target] * quadratic)
+        straight = apply_shears([shear], coords)
+        rest = straight[:, target] - weights @ straight[:, target]
+        if not weights @ rest**2 > (DEGENERATE * sd[target]) ** 2:  # few different points lie on any parabola
+            break
+        shears.append(shear)
+        coords = straight
+    return tuple(shears)

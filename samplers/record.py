@@ -1,0 +1,416 @@
+"""The record of a run: what the user's function returned, in one file that is only appended to.
+
+A run is a deterministic function of its start, its settings and these values. A run that was killed is therefore made
+again from its start: every point that the record contains is looked up, and nothing is evaluated twice. Counts,
+failures and the limit of simulations are computed from the record.
+
+The file is a sequence of blocks: kind, length, two CRC-32, arrays in NumPy's format. There are three kinds:
+
+``RUN``
+    An annealing begins: its settings (JSON), the starting points and the state of the random generator.
+``EVAL``
+    Points that were evaluated, with their log-probabilities, blobs and reasons of failure.
+``MEMO``
+    Arrays under a key: what a guide computed, or in which order points of an asynchronous run arrived.
+
+A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a path, the record is kept
+in memory only.
+"""
+
+import io
+import json
+import logging
+import os
+import shutil
+import struct
+import weakref
+import zlib
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from .interrupts import deferred_interrupts
+
+try:
+    from fcntl import LOCK_EX, LOCK_NB, flock
+except ImportError:  # Windows has no such locks: two runs on one file are not detected there
+    flock = None
+
+__all__ = ["EvaluatedBatch", "Record", "RunStart", "merge_batches"]
+
+logger = logging.getLogger(__name__)
+
+MAGIC, BLOCK = b"samplers record 1\n", struct.Struct("<4sQII")  # kind, length, checksums of the content and of both
+# a record in memory keeps the latest points of a long chain only: those that a repeated step or the verdict need
+KEPT_IN_MEMORY = 20_000
+_open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
+
+
+class EvaluatedBatch(NamedTuple):
+    """Points that were evaluated.
+
+    Attributes
+    ----------
+    coords : (n, ndim) float
+        The points.
+    log_prob : (n,) float
+        Their log-probabilities; NaN where the evaluation failed.
+    blobs : (n, ...) array, or None
+        Their blobs.
+    reasons : dict of int to str
+        Reason of each failure, by row.
+    """
+
+    coords: np.ndarray
+    log_prob: np.ndarray
+    blobs: np.ndarray | None
+    reasons: dict[int, str]
+
+    def rows(self, rows: Sequence[int]) -> "EvaluatedBatch":
+        """The batch of some rows."""
+        reasons = {new: self.reasons[old] for new, old in enumerate(rows) if old in self.reasons}
+        blobs = None if self.blobs is None else self.blobs[rows]
+        return EvaluatedBatch(self.coords[rows], self.log_prob[rows], blobs, reasons)
+
+
+def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
+    """Several batches as one; at least one is needed. Points of a batch without blobs get blobs of zeros."""
+    blobs = next((batch.blobs for batch in batches if batch.blobs is not None), None)
+    if blobs is not None:
+        shape, dtype = blobs.shape[1:], blobs.dtype
+        filled = [np.zeros((len(b.coords), *shape), dtype) if b.blobs is None else b.blobs for b in batches]
+        blobs = np.concatenate(filled)
+    first = np.cumsum([0, *(len(batch.coords) for batch in batches)]).tolist()
+    reasons = {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b.reasons.items()}
+    coords, log_prob = (np.concatenate([batch[column] for batch in batches]) for column in (0, 1))
+    return EvaluatedBatch(coords, log_prob, blobs, reasons)
+
+
+class RunStart(NamedTuple):
+    """What an annealing begins with.
+
+    Attributes
+    ----------
+    header : dict
+        Settings and identity of the run, as JSON returns them.
+    coords : (nwalkers, ndim) float
+        Draws of the prior, or of the start density.
+    random_state : tuple
+        State of the random generator, as `numpy.random.RandomState.get_state` returns it.
+    """
+
+    header: dict
+    coords: np.ndarray
+    random_state: tuple
+
+
+class Record:
+    """What a run has evaluated and remembered.
+
+    Parameters
+    ----------
+    path : Path, optional
+        The file, which is read if it exists. It is written and locked from `begin` or `open` on.
+    slow : sequence of int, optional
+        Indices of the parameters that a simulation depends on; all by default.
+
+    Attributes
+    ----------
+    start : RunStart, or None
+        Start of the last annealing.
+    count : int
+        Number of evaluated points.
+    failed : list of (point, reason)
+        Failed evaluations, the first ones first.
+    """
+
+    def __init__(self, path: Path | None = None, slow: Sequence[int] | None = None):
+        self.path, self._slow, self._file = path, None if slow is None else list(slow), None
+        self._clear()
+        if path is not None and path.exists():
+            self._read()
+
+    def _clear(self) -> None:
+        self.start: RunStart | None = None
+        self.count = 0
+        self.failed: list[tuple[np.ndarray, str]] = []
+        self.used: Counter[str] = Counter()  # how many arrays of each key the run has asked for
+        self._batches: list[EvaluatedBatch] = []
+        self._first: list[int] = []  # number of the first point of each batch
+        self._dropped = 0
+        self._place: dict[bytes, int] = {}
+        self._simulated: set[bytes] = set()
+        self._arrays: dict[str, list[list[np.ndarray]]] = {}
+        self._whole = 0  # bytes of the file that were read
+
+    def __getstate__(self):
+        return {**self.__dict__, "_file": None}
+
+    # ------------------------------------------------------------------ evaluations
+
+    def find(self, coords: np.ndarray) -> list[tuple[slice, EvaluatedBatch | None]]:
+        """Consecutive parts of points (n, ndim), each with its evaluations, or None where they are not known."""
+        found = [self._place.get(row.tobytes()) for row in np.ascontiguousarray(coords)]
+        batch = [None if number is None else bisect_right(self._first, number) - 1 for number in found]
+        parts = []
+        for number, group in groupby(range(len(found)), batch.__getitem__):
+            rows = list(group)
+            known = None
+            if number is not None:
+                known = self._batches[number].rows([found[row] - self._first[number] for row in rows])
+            parts.append((slice(rows[0], rows[-1] + 1), known))
+        return parts
+
+    def evaluated(self, batch: EvaluatedBatch) -> None:
+        """Enter evaluated points; they are in the file when this returns. ValueError for blobs that it cannot hold."""
+        if self._file is not None and batch.blobs is not None:
+            try:
+                h5py.h5t.py_create(batch.blobs.dtype, logical=True)
+            except TypeError as error:
+                raise ValueError(
+                    f"blobs of dtype {batch.blobs.dtype} cannot be stored in a file ({error}): return numbers, or pass "
+                    "blobs_dtype, as for text blobs_dtype='S20'"
+                ) from None
+        blobs = [] if batch.blobs is None else [batch.blobs]
+        with deferred_interrupts():
+            self._write(b"EVAL", [batch.coords, batch.log_prob, _text(batch.reasons), *blobs])
+            self._enter(batch)
+
+    def _enter(self, batch: EvaluatedBatch) -> None:
+        self._first.append(self.count)
+        self._batches.append(batch)
+        coords = np.ascontiguousarray(batch.coords)
+        for number, point in enumerate(coords, self.count):
+            self._place.setdefault(point.tobytes(), number)
+        self._simulated.update(self.keys(coords))
+        self.count += len(coords)
+        self.failed += [(coords[row].copy(), reason) for row, reason in batch.reasons.items()]
+
+    def keys(self, coords: np.ndarray) -> list[bytes]:
+        """The slow parameters of points (n, ndim) as bytes: points with the same key share a simulation."""
+        slow = np.ascontiguousarray(coords if self._slow is None else coords[:, self._slow])
+        return [row.tobytes() for row in slow]
+
+    def is_simulated(self, key: bytes) -> bool:
+        """Whether a point with this key has been evaluated."""
+        return key in self._simulated
+
+    @property
+    def simulations(self) -> int:
+        """Number of evaluated points that differ in their slow parameters."""
+        return len(self._simulated)
+
+    def latest(self, most: int = KEPT_IN_MEMORY) -> EvaluatedBatch | None:
+        """At least the latest `most` evaluated points, in the order of their evaluation; None without any."""
+        first = max(bisect_right(self._first, self.count - most) - 1, 0)
+        return merge_batches(self._batches[first:]) if self._batches else None
+
+    def best_and_first(self) -> EvaluatedBatch | None:
+        """One or two evaluated points that did not fail, by which the function is compared; None without any."""
+        points = merge_batches(self._batches) if self._batches else None
+        finite = np.flatnonzero(np.isfinite(points.log_prob)) if points is not None else ()
+        if len(finite) == 0:
+            return None
+        best = int(finite[np.argmax(points.log_prob[finite])])
+        return points.rows(sorted({int(finite[0]), best}))
+
+    def drop_old_points(self) -> None:
+        """Forget old points of a record in memory, which no repeated step can ask for."""
+        while self._file is None and self.count - self._dropped > 2 * KEPT_IN_MEMORY and len(self._batches) > 1:
+            batch = self._batches.pop(0)
+            self._dropped = self._first.pop(0) + len(batch.coords)
+            for point in np.ascontiguousarray(batch.coords):
+                self._place.pop(point.tobytes(), None)
+
+    # ------------------------------------------------------------------ arrays under a key
+
+    def remember(self, key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
+        """Arrays that ``compute()`` returns, or those that it returned when the run was made before.
+
+        For equal keys, the arrays that were stored first are returned first.
+        """
+        known = self._arrays.setdefault(key, [])
+        if self.used[key] == len(known):
+            arrays = [np.asarray(array) for array in compute()]
+            with deferred_interrupts():
+                self._write(b"MEMO", [_text(key), *arrays])
+                known.append(arrays)
+        self.used[key] += 1
+        return known[self.used[key] - 1]
+
+    def note(self, key: str, array: np.ndarray) -> None:
+        """Store an array of which only the last one of a key counts (`noted`)."""
+        with deferred_interrupts():
+            self._write(b"MEMO", [_text(key), array])
+            self._arrays[key] = [[array]]
+
+    def noted(self, key: str) -> np.ndarray | None:
+        """The last array that was noted under a key since the annealing began; None without any."""
+        return self._arrays[key][-1][0] if key in self._arrays else None
+
+    def rewind(self) -> None:
+        """The run is made again from its start: `remember` returns the stored arrays from the first one on."""
+        self.used.clear()
+
+    # ------------------------------------------------------------------ the file
+
+    def begin(self, start: RunStart) -> None:
+        """Enter the start of an annealing, with which the record of a new run begins."""
+        start = start._replace(header=json.loads(json.dumps(start.header)))
+        kind, keys, *rest = start.random_state
+        arrays = [_text([start.header, kind, *rest]), start.coords, keys]
+        if self.path is not None and self._file is None:
+            with open(self.path, "ab"):
+                pass
+            self.open()
+        with deferred_interrupts():
+            self._write(b"RUN ", arrays)
+            self._begin(start)
+
+    def _begin(self, start: RunStart) -> None:
+        self.start, self._arrays = start, {}
+        self.used.clear()
+
+    def open(self) -> None:
+        """Open the file for writing, and lock it. ValueError if another process writes to it."""
+        if self.path is None or self._file is not None:
+            return
+        if (earlier := _open_records.get(self.path.resolve())) is not None:  # the last sampler of a process owns it
+            earlier.close()
+        self._file = open(self.path, "r+b", buffering=0)  # noqa: SIM115  open during the run
+        try:
+            if flock is not None:
+                flock(self._file, LOCK_EX | LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise ValueError(f"another run is writing to {self.path}: wait for its end, or use another file") from None
+        except OSError as error:
+            logger.info("%s cannot be locked (%s): do not start two runs on it", self.path, error.strerror)
+        _open_records[self.path.resolve()] = self
+        if self.path.stat().st_size != self._whole:  # an incomplete block, or another process has written since
+            self._clear()
+            self._read()
+        if self._whole == 0:
+            self._file.truncate(0)
+            self._file.write(MAGIC)
+            self._whole = len(MAGIC)
+        self._file.truncate(self._whole)
+        self._file.seek(self._whole)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def set_aside(self, ending: str) -> Path:
+        """Rename the file, and begin with an empty record; returns the new name."""
+        self.close()
+        aside, number = self.path.with_name(f"{self.path.name}.{ending}"), 2
+        while aside.exists():  # simulations are never overwritten
+            aside, number = self.path.with_name(f"{self.path.name}.{ending}.{number}"), number + 1
+        os.replace(self.path, aside)
+        self._clear()
+        return aside
+
+    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> None:
+        if self._file is None:
+            return
+        data, start = memoryview(_block(kind, arrays)), self._whole
+        try:
+            written = 0
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:  # a block that is not whole would hide those after it
+            self._file.truncate(start)
+            self._file.seek(start)
+            raise OSError(
+                error.errno,
+                f"the record of the run cannot be written ({error.strerror}). Everything before is kept: make space, "
+                "and call run_mcmc again",
+                str(self.path),
+            ) from error
+        self._whole = start + len(data)
+
+    def _read(self) -> None:
+        data, place = self.path.read_bytes(), len(MAGIC)
+        if data[:place] != MAGIC[: len(data)]:
+            raise ValueError(f"{self.path} is not the record of a run: move it away, or use another file")
+        while place + BLOCK.size <= len(data):
+            kind, length, checksum, of_both = BLOCK.unpack_from(data, place)
+            end, known = place + BLOCK.size + length, of_both == _of_both(kind, length)
+            content = data[place + BLOCK.size : end]
+            if known and len(content) < length:
+                break  # the process was killed while it wrote this block
+            if not known or zlib.crc32(content) != checksum or not self._read_block(kind, content):
+                aside = self.path.with_name(f"{self.path.name}.damaged")
+                shutil.copyfile(self.path, aside)
+                logger.warning(
+                    "%s is damaged after %d of %d bytes, with %d evaluations before: the rest is not used, and a copy "
+                    "of the file is kept as %s",
+                    self.path,
+                    place,
+                    len(data),
+                    self.count,
+                    aside,
+                )
+                break
+            place = end
+        self._whole = place if len(data) >= len(MAGIC) else 0
+
+    def _read_block(self, kind: bytes, content: bytes) -> bool:
+        """Enter a block of the file; False if its content is of another form."""
+        try:
+            first, *arrays = _arrays_of(content)
+            if kind == b"EVAL":
+                log_prob, reasons, *blobs = arrays
+                reasons = {int(row): text for row, text in json.loads(reasons.tobytes()).items()}
+                self._enter(EvaluatedBatch(first, log_prob, blobs[0] if blobs else None, reasons))
+            elif kind == b"RUN ":
+                header, name, *rest = json.loads(first.tobytes())
+                self._begin(RunStart(header, arrays[0], (name, arrays[1], *rest)))
+            else:
+                self._arrays.setdefault(json.loads(first.tobytes()), []).append(arrays)
+        except ValueError:
+            return False
+        return True
+
+
+def _close_in_child() -> None:
+    """Close the files of a process in one that was forked from it, which would keep their locks after its end."""
+    for record in list(_open_records.values()):
+        record.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_in_child)
+
+
+def _block(kind: bytes, arrays: Sequence[np.ndarray]) -> bytes:
+    content = io.BytesIO()
+    for array in arrays:
+        np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
+    data = content.getvalue()
+    return BLOCK.pack(kind, len(data), zlib.crc32(data), _of_both(kind, len(data))) + data
+
+
+def _of_both(kind: bytes, length: int) -> int:
+    """CRC-32 of kind and length, without which a damaged length would look like the end of a file."""
+    return zlib.crc32(kind + length.to_bytes(8, "little"))
+
+
+def _text(value: Any) -> np.ndarray:
+    return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
+
+
+def _arrays_of(content: bytes) -> list[np.ndarray]:
+    stream, arrays = io.BytesIO(content), []
+    while stream.tell() < len(content):
+        arrays.append(np.lib.format.read_array(stream, allow_pickle=False))
+    return arrays

@@ -1,0 +1,163 @@
+"""How a run is made again from its record: the files of a run, and whether they belong to the sampler.
+
+Durable are the record of evaluations (`samplers.record`) and emcee's own HDF5 file. Where a sampler is made for the
+file of a run, the annealing is made again from the record without an evaluation, and the chain goes on from its last
+stored step, as in emcee. A chain that is damaged or missing is made again as well.
+"""
+
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from emcee import State
+from emcee.backends import Backend, HDFBackend
+from emcee.moves import Move
+
+from .moves.kernels import describe
+from .output import DAMAGED, is_whole, make_group, run_of_file
+from .record import EvaluatedBatch, Record
+from .settings import Settings
+from .tempering.guide import Guide, guide_fingerprint
+
+__all__ = ["compare", "describe_run", "differences", "open_record", "points_to_compare"]
+
+logger = logging.getLogger(__name__)
+
+CLOSE = {"rtol": 1e-9, "atol": 1e-9}
+# entries of a header in which runs may differ
+NOT_COMPARED = ("run", "seed", "of_earlier_guides", "log_prior")
+
+
+def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequence[int]) -> Record:
+    """The record of the run in the file of a backend, and its HDF5 file where that is missing or damaged.
+
+    Parameters
+    ----------
+    backend : emcee Backend or HDFBackend, optional
+        Without a file that can be written, the record is kept in memory.
+    nwalkers, ndim : int
+        Size of the ensemble.
+    slow : sequence of int
+        Indices of the parameters that a simulation depends on.
+    """
+    if not isinstance(backend, HDFBackend) or backend.read_only:
+        return Record(slow=slow)
+    record = Record(Path(f"{backend.filename}.{backend.name.replace('/', '.')}.record"), slow)
+    stored = run_of_file(backend)
+    if record.start is None:
+        if stored == DAMAGED:
+            raise ValueError(f"{backend.filename} is damaged, and has no record {record.path}: move it away")
+        if stored is None:
+            make_group(backend, nwalkers, ndim, "")  # in one piece, which emcee does not
+        return record
+    run, shape = record.start.header["run"], record.start.coords.shape
+    if stored in (run, None, DAMAGED) and shape != (nwalkers, ndim):
+        raise ValueError(
+            f"{backend.filename} contains a run of {shape[0]} walkers in {shape[1]} dimensions; got "
+            f"nwalkers={nwalkers}, ndim={ndim}. Use another file, or backend.reset(nwalkers, ndim)"
+        )
+    if stored == run and is_whole(backend, record):
+        return record
+    if stored in (run, None, DAMAGED):
+        if stored is not None:
+            aside = f"{backend.filename}.damaged"
+            shutil.copyfile(backend.filename, aside)
+            logger.warning(
+                "%s does not end with a step that this run has stored: it is damaged, its writer was killed, or "
+                "another program has added steps. A copy of it is kept as %s",
+                backend.filename,
+                aside,
+            )
+        logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
+        make_group(backend, *record.start.coords.shape, run)
+        return record
+    aside = record.set_aside("before_reset")
+    logger.warning(
+        "%s was reset, or replaced by the chain of another run: a new record begins, the earlier one is kept as %s",
+        backend.filename,
+        aside,
+    )
+    return record
+
+
+def describe_run(
+    function: Callable,
+    described: dict,
+    settings: Settings,
+    moves: Sequence[Move],
+    probabilities: Sequence[float],
+    guide: Guide | None,
+) -> dict:
+    """What a run is started with, as plain data.
+
+    Parameters
+    ----------
+    function : callable
+        The log-density; identified by its attribute ``fingerprint``, if it has one.
+    described : dict
+        Further entries.
+    settings : Settings
+        Settings of the sampler.
+    moves : sequence of Move
+        The moves.
+    probabilities : sequence of float
+        Probability of each move to be chosen.
+    guide : Guide, optional
+        The guide; identified by its attribute ``fingerprint``, or else by its class.
+    """
+    plain = {name: _plain(value) for name, value in asdict(settings).items()}
+    return {
+        "log_prob_fn": getattr(function, "fingerprint", None),
+        **described,
+        **plain,
+        "moves": [describe(move) for move in moves],
+        "probabilities": [float(probability) for probability in probabilities],
+        "guide": None if guide is None else guide_fingerprint(guide),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A setting in a form that JSON accepts: a function by its name."""
+    return f"{value.__module__}.{value.__qualname__}" if callable(value) else value
+
+
+def differences(stored: dict, ours: dict) -> list[str]:
+    """What differs between the headers of two runs, as text."""
+    if stored["sampler"] != ours["sampler"]:  # most of their settings differ as well
+        return [f"it was written by {stored['sampler']}, and this is a {ours['sampler']}"]
+    names = [name for name in ours if name not in NOT_COMPARED and stored.get(name) != ours[name]]
+    return [f"{name} was {stored.get(name)}, is {ours[name]}" for name in names]
+
+
+def points_to_compare(record: Record, last: State | None) -> EvaluatedBatch | None:
+    """One or two points by which a log-density without a fingerprint is compared with a stored run; None without any.
+
+    Parameters
+    ----------
+    record : Record
+        The record of the run.
+    last : State, optional
+        The last stored step, for a chain without a record.
+    """
+    if record.count > 0 or last is None:
+        return record.best_and_first()
+    few = np.argsort(last.log_prob)[[0, -1]]
+    return EvaluatedBatch(last.coords[few], last.log_prob[few], None if last.blobs is None else last.blobs[few], {})
+
+
+def compare(known: EvaluatedBatch, compute: Callable[[np.ndarray], EvaluatedBatch]) -> list[str]:
+    """How a log-density differs from what it was at known points, as text; empty if it does not."""
+    found = compute(known.coords)
+    if (known.blobs is None) != (found.blobs is None):
+        return [
+            "log_prob_fn returned blobs, and returns none" if found.blobs is None else "log_prob_fn returns blobs now"
+        ]
+    now = found.log_prob
+    for coords, before, after in zip(known.coords, known.log_prob, now, strict=True):
+        if not np.isclose(before, after, **CLOSE, equal_nan=True):
+            return [f"log_prob_fn was {before:.10g} at {coords}, is {after:.10g}"]
+    return []

@@ -1,0 +1,294 @@
+"""What an annealing reports while it runs, and the result that its reports add up to.
+
+`samplers.tempering.anneal.anneal` yields reports. `samplers.tempering.recording.Recording` collects them in an
+`AnnealingResult`, and `samplers.judgement` judges this result.
+"""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .estimates.importance import EvidenceCheck
+
+__all__ = [
+    "AnnealingResult",
+    "Concern",
+    "EarlyStop",
+    "GuideTick",
+    "GuidedRound",
+    "GuidedStart",
+    "Report",
+    "Restart",
+    "SamplingWarning",
+    "Stage",
+    "Sweep",
+    "warn",
+]
+
+OUR_PACKAGES = ("samplers", "emcee")
+
+
+class SamplingWarning(UserWarning):
+    """The result of a run may be wrong; the message says why and what to do."""
+
+
+def warn(message: str) -> None:
+    """Issue a `SamplingWarning` that points at the line of the user's code that called the sampler."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in OUR_PACKAGES:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, SamplingWarning, stacklevel=level)
+
+
+class Concern(NamedTuple):
+    """A reason why the result may be wrong.
+
+    Attributes
+    ----------
+    message : str
+        What was found, and what to do.
+    grave : bool
+        Whether the numbers may be wrong by more than their stated errors.
+    """
+
+    message: str
+    grave: bool
+
+
+class Stage(NamedTuple):
+    """A finished tempering stage.
+
+    Attributes
+    ----------
+    beta : float
+        Tempering exponent of the stage, 0 < beta <= 1.
+    effective_sample_size : float
+        Effective sample size of the incremental weights that led to this stage.
+    acceptance : float
+        Share of the proposals of this stage that were accepted.
+    moves : int
+        Sweeps of the whole ensemble made at this beta, without sweeps over fast parameters; 0 for recycling.
+    distinct_ancestors : int
+        Number of different points that survived the resampling.
+    log_evidence_increment : float
+        Logarithm of the mean incremental weight.
+    log_evidence_error : float
+        Standard error of the sum of the increments so far.
+    evaluations : int
+        Points for which ``log_prob_fn`` was called in this stage (the first stage includes the draws of the prior).
+        Sweeps over fast parameters count, so this can exceed the number of simulations. Entered by the sampler.
+    seconds : float
+        Wall time of the stage [s]. Entered by the sampler.
+    """
+
+    beta: float
+    effective_sample_size: float
+    acceptance: float
+    moves: int
+    distinct_ancestors: int
+    log_evidence_increment: float
+    log_evidence_error: float
+    evaluations: int = 0
+    seconds: float = 0.0
+
+
+class Sweep(NamedTuple):
+    """One sweep of the ensemble, or one stage of recycling: a tick of the progress bar.
+
+    Attributes
+    ----------
+    acceptance : float
+        Share of the proposals that were accepted; with recycling, the efficiency of the latest draws.
+    """
+
+    acceptance: float
+
+
+class Restart(NamedTuple):
+    """Annealing starts again: the stages reported so far are void.
+
+    Attributes
+    ----------
+    reason : str
+        Why their result is not reliable.
+    """
+
+    reason: str
+
+
+class GuideTick(NamedTuple):
+    """A tick of the progress bar while a guide is in use.
+
+    Attributes
+    ----------
+    phase : str
+        What the guide does: "search", "round 3", or "after round 3" while it learns.
+    simulations : float
+        Simulations so far.
+    target : int
+        Effective sample size wanted of all rounds; the population has the present one.
+    finished : bool
+        Whether a batch is finished; False where a phase begins.
+    """
+
+    phase: str
+    simulations: float
+    target: int
+    finished: bool
+
+
+class GuidedRound(NamedTuple):
+    """A round of draws of a guide.
+
+    Attributes
+    ----------
+    draws : int
+        Number of draws.
+    effective_share : float
+        Effective sample size of their weights divided by their number.
+    pareto_shape : float
+        Pareto shape of their largest weights; inf for too few weights.
+    log_evidence, log_evidence_error : float
+        Log-evidence of all rounds so far, and its standard error.
+    effective_sample_size : float
+        Effective sample size of all rounds so far.
+    """
+
+    draws: int
+    effective_share: float
+    pareto_shape: float
+    log_evidence: float
+    log_evidence_error: float
+    effective_sample_size: float
+
+
+class GuidedStart(NamedTuple):
+    """Result of the rounds of a guide.
+
+    Attributes
+    ----------
+    reason : str
+        Why the draws of the guide are not used as draws of the posterior; empty if they are.
+    shortfall : str
+        What the rounds did not reach although their draws are used, or that the tails of the guide are too light; empty
+        for neither.
+    pareto_shape : float
+        Pareto shape of the largest weights of all rounds.
+    """
+
+    reason: str
+    shortfall: str
+    pareto_shape: float
+
+    @property
+    def used(self) -> bool:
+        """Whether the population consists of draws of the guide."""
+        return not self.reason
+
+
+class EarlyStop(NamedTuple):
+    """The limit of simulations ended the annealing.
+
+    Attributes
+    ----------
+    beta : float
+        Tempering exponent of the points from which the population was made; 1 after a complete annealing.
+    points : int
+        Number of these points.
+    effective_sample_size, pareto_shape : float
+        Effective sample size of their weights at beta = 1, and the Pareto shape of the largest weights.
+    complete : bool
+        Whether the annealing was complete; only moves or a check at beta = 1 are then missing.
+    from_guide : bool
+        Whether the points are the draws of a guide.
+    """
+
+    beta: float
+    points: int
+    effective_sample_size: float
+    pareto_shape: float
+    complete: bool = False
+    from_guide: bool = False
+
+
+Report = Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | EarlyStop | Concern
+
+
+class AnnealingResult(NamedTuple):
+    """What annealing has found so far.
+
+    Attributes
+    ----------
+    ladder : tuple of Stage
+        The sequence of tempering stages.
+    check : EvidenceCheck, optional
+        The independent estimate of the evidence.
+    founders : (nwalkers,) int, optional
+        Founder of each walker (`samplers.estimates.genealogy`); None where it is not known.
+    rounds : tuple of GuidedRound
+        Rounds of the guide.
+    start : GuidedStart, optional
+        Result of these rounds; None without a guide.
+    early_stop : EarlyStop, optional
+        Where the limit of simulations ended the annealing; None if it did not.
+    concerns : tuple of str
+        Reasons of the guide why parts of the posterior may be missing.
+    basis : str
+        How the guide searched for parts of the posterior; empty if it does not say.
+    findings : tuple of Concern
+        What the checks found.
+    independent_points : float, optional
+        Effective sample size of the walkers when beta = 1 was reached; None for a result that was read from a backend.
+    """
+
+    ladder: tuple[Stage, ...] = ()
+    check: EvidenceCheck | None = None
+    founders: np.ndarray | None = None
+    rounds: tuple[GuidedRound, ...] = ()
+    start: GuidedStart | None = None
+    early_stop: EarlyStop | None = None
+    concerns: tuple[str, ...] = ()
+    basis: str = ""
+    findings: tuple[Concern, ...] = ()
+    independent_points: float | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether beta = 1 has been reached."""
+        return bool(self.ladder) and self.ladder[-1].beta == 1.0
+
+    def require_finished(self) -> Sequence[Stage]:
+        """The stages, or ValueError before beta = 1 is reached."""
+        if not self.finished:
+            reached = f"the ladder ends at beta = {self.ladder[-1].beta:.3g}" if self.ladder else "there is no ladder"
+            raise ValueError(f"the evidence is known at beta = 1, and {reached}: call run_mcmc first")
+        return self.ladder
+
+    @property
+    def log_evidence_ladder(self) -> float:
+        """Log-evidence by tempering: the sum of the increments of all stages."""
+        return float(sum(stage.log_evidence_increment for stage in self.require_finished()))
+
+    @property
+    def has_better_check(self) -> bool:
+        """Whether the check of the evidence is reliable and has a smaller error than the stages."""
+        check = self.check
+        return check is not None and check.reliable and check.error < self.ladder[-1].log_evidence_error
+
+    @property
+    def evidence(self) -> tuple[float, float]:
+        """Log-evidence and its standard error, by tempering or by the check, whichever has the smaller error.
+
+        If the two differ by more than three times their joint error, the error is at least half their difference.
+        """
+        value, error = self.log_evidence_ladder, self.ladder[-1].log_evidence_error
+        check = self.check
+        if check is None or not check.reliable:
+            return value, error
+        difference, joint = abs(value - check.log_evidence), np.hypot(error, check.error)
+        if check.error < error:
+            value, error = check.log_evidence, check.error
+        return value, max(error, 0.5 * difference) if difference > 3.0 * joint else error

@@ -1,0 +1,200 @@
+"""Results of a tempered run: evaluations, failures, the stages, the evidence and Monte Carlo errors."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.special import ndtri, stdtrit
+
+from .budget import Budget, as_limit
+from .estimates.genealogy import standard_error_of_mean
+from .estimates.importance import EvidenceCheck
+from .evaluation.evaluator import Evaluator
+from .judgement.failures import NearFailures
+from .judgement.verdict import RunParts, Verdict
+from .record import Record
+from .reports import AnnealingResult, GuidedRound, Stage
+from .tempering.guide import AdaptedGuide, Guide
+
+__all__ = ["RunResults"]
+
+KEPT_FAILURES = 1000
+
+
+class RunResults:
+    """Base class of `samplers.tempered.TemperedSampler`: what a user reads after a run, and the limit to go on with."""
+
+    nwalkers: int
+    iteration: int
+    get_chain: Callable[..., np.ndarray]
+    _evaluator: Evaluator
+    _budget: Budget
+    _record: Record
+    _guide: AdaptedGuide | None
+    _result: AnnealingResult
+    _verdict: Verdict | None
+    _seed: list[int] | None
+    _near: NearFailures | None = None
+    _prior_draws: np.ndarray | None = None
+
+    @property
+    def evaluations(self) -> int:
+        """Points for which `log_prob_fn` was called, by this object and by the interrupted run that it continues.
+
+        Includes those of sweeps over fast parameters.
+        """
+        return self._record.count
+
+    def report(self) -> dict[str, float]:
+        """Counts of this object, and of the run in all, which may have been continued from a file.
+
+        Returns
+        -------
+        dict
+            ``new_evaluations``, made by this object; ``evaluations``, ``simulations``, ``failures`` and ``steps`` of
+            the run in all.
+        """
+        return {
+            "new_evaluations": self._evaluator.new_evaluations,
+            "evaluations": self.evaluations,
+            "simulations": self.simulations,
+            "failures": self.failure_count,
+            "steps": int(self.iteration),
+        }
+
+    @property
+    def failure_count(self) -> int:
+        """Number of evaluations that failed, by an exception or by NaN, and counted as -inf."""
+        return len(self._record.failed)
+
+    @property
+    def failures(self) -> list[dict]:
+        """``{"parameters": array (ndim,), "reason": str}`` of the first thousand failures."""
+        failed = self._record.failed[:KEPT_FAILURES]
+        return [{"parameters": parameters, "reason": reason} for parameters, reason in failed]
+
+    @property
+    def ladder(self) -> tuple[Stage, ...]:
+        """Sequence of tempering stages of the last annealing; empty before it."""
+        return self._result.ladder
+
+    @property
+    def ended_at(self) -> float | None:
+        """Exponent beta at which the limit of simulations ended the annealing; None if it did not end it.
+
+        The last stage of `ladder` is then that of all points known at that time, weighted for beta = 1.
+        """
+        stop = self._result.early_stop
+        return None if stop is None or stop.complete or stop.beta >= 1.0 else stop.beta
+
+    @property
+    def log_evidence(self) -> float:
+        """Log-evidence: of `log_evidence_ladder` and `log_evidence_check` the one with the smaller error."""
+        return self._result.evidence[0]
+
+    @property
+    def log_evidence_error(self) -> float:
+        """Standard error of `log_evidence`, from this run alone.
+
+        At least half the difference of the two estimates if they differ by more than three times their joint error.
+        """
+        return self._result.evidence[1]
+
+    @property
+    def log_evidence_ladder(self) -> float:
+        """Log-evidence by tempering: the sum of the increments of all stages."""
+        return self._result.log_evidence_ladder
+
+    @property
+    def log_evidence_check(self) -> EvidenceCheck | None:
+        """The evidence by importance sampling after the annealing; None with ``check_draws=0``."""
+        self._result.require_finished()
+        return self._result.check
+
+    @property
+    def founders(self) -> np.ndarray:
+        """Founder (nwalkers,) of each walker: walkers with the same number are copies that have been moved since.
+
+        See `samplers.estimates.genealogy`. The file of a run stores them with the chain; where they are not known, each
+        walker has its own.
+        """
+        founders = self._result.founders
+        return np.arange(self.nwalkers) if founders is None else founders
+
+    @property
+    def prior_draws(self) -> np.ndarray | None:
+        """Draws of the prior (nwalkers, ndim) from which this object annealed; None if they are not known.
+
+        They are not known in a run that was read from a file, and where the annealing began with a `start_density`.
+        """
+        return self._prior_draws
+
+    def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
+        """Monte Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
+
+        Copies made by the latest resamplings and the autocorrelation of the chain are accounted for
+        (`samplers.estimates.genealogy`). The variance of a mean is estimated from as many groups of walkers as there
+        are `founders`. With few founders, it is itself uncertain, so the errors are multiplied by a quantile of
+        Student's t: two errors then contain the true mean with 95 % probability. Where `founders` are not known, each
+        walker counts as independent. The dependence between walkers that some moves introduce, such as emcee's stretch
+        move, is not accounted for. A single run cannot detect a mode that it lost, or moves that did not move: after a
+        `SamplingWarning` the errors are too small.
+        """
+        groups = len(np.unique(self.founders))
+        errors = standard_error_of_mean(self.get_chain(discard=discard, thin=thin), self.founders)
+        return errors if groups == 1 else errors * stdtrit(groups - 1.0, 0.975) / ndtri(0.975)
+
+    def _repr_html_(self) -> str:
+        """In notebooks: what the run has done and found, or how to start it."""
+        from .reporting.summary import describe_sampler
+
+        return describe_sampler(self)
+
+    @property
+    def guide(self) -> Guide | None:
+        """The guide in use, a copy of the given one that has learned from this run; None before it or without one."""
+        return None if self._guide is None else self._guide.guide
+
+    @property
+    def rounds(self) -> tuple[GuidedRound, ...]:
+        """Rounds of the guide in the last annealing of this object; empty without a guide."""
+        return self._result.rounds
+
+    @property
+    def max_simulations(self) -> float | None:
+        """Largest number of simulations; None for no limit.
+
+        Where a run is continued, a number below that of the simulations it has made acts as their number.
+        """
+        return self._budget.limit
+
+    @max_simulations.setter
+    def max_simulations(self, value: float | None) -> None:
+        self._budget.limit = as_limit(value)
+
+    @property
+    def simulations(self) -> float:
+        """Simulations of this run: distinct evaluated points in the slow parameters, and those made by the guide.
+
+        Points that differ only in ``log_prob_fn.fast_parameters`` count once. Includes the interrupted run that is
+        continued. A cache of `log_prob_fn` can make some of them unnecessary.
+        """
+        return self._budget.simulations
+
+    @property
+    def seed(self) -> int | list[int] | None:
+        """The seed that this object was given; None if it was given none."""
+        return self._seed[0] if self._seed is not None and len(self._seed) == 1 else self._seed
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the result is worth, and why; ``print(sampler.verdict)`` gives sentences.
+
+        Its attributes `modes`, `evidences`, `worst_effective_sample_size` and `unknown` are computed on first use, from
+        the chain as it is then.
+        """
+        if self._verdict is None:
+            raise ValueError("there is no verdict before a run: call run_mcmc first")
+        near = None if self._result.independent_points is None else self._near
+        get_chain = self.get_chain if self.iteration > 0 else lambda: np.empty((0, self.nwalkers, 0))
+        run = self._result, get_chain, self.nwalkers, self.evaluations, self.failure_count, near
+        return self._verdict.of(RunParts(*run))

@@ -1,0 +1,170 @@
+"""Settings of the annealing from the prior to the posterior, checked when they are made.
+
+Every default is written here, once. Each sampler has the settings that can act on its way to beta = 1: `MOVES` are the
+settings of annealing by moves, which both have. Constants that no user changes are beside their use, with the reason
+for their value (`samplers.tempering.recycling`, `samplers.tempering.guided`).
+"""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+
+from .resampling import RESAMPLING
+
+__all__ = ["MOVES", "Settings", "as_whole_number", "choose_settings", "refuse_unused"]
+
+# settings of annealing by moves that every sampler has
+MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "check_draws", "max_failure_share")
+
+
+def as_whole_number(name: str, value: Any) -> int:
+    """A value as int, so that it can be stored as JSON; ValueError for a bool and for floats such as 60.0."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise ValueError(f"{name} must be a whole number (int); got {value!r}")
+    return int(value)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a tempered sampler.
+
+    Attributes
+    ----------
+    ess_ratio : float
+        Effective sample size wanted of each stage, as a share of the number of walkers (`ess_rule` "constant") or of
+        the previous stage's target ("declining"); between 0 and 1.
+    ess_rule : {"constant", "declining"}
+        What `ess_ratio` refers to.
+    ess_floor : float
+        Lower limit of the declining target.
+    coefficient_of_variation : float, optional
+        Coefficient of variation wanted of the incremental weights of each stage. It takes the place of `ess_ratio`: n
+        weights with this coefficient have an effective sample size of n / (1 + coefficient²).
+    resampling : str or callable
+        Name of a scheme in `samplers.resampling`, or a function of (weights, random) that returns indices.
+    min_moves, max_moves : int
+        Smallest and largest number of sweeps of the ensemble per stage; equal for a fixed number.
+    max_correlation : float
+        Between these two numbers, moving stops once the correlation of every parameter and of the log-likelihood with
+        their values after the resampling is below this value, or decreases no further.
+    chains : {"equal", "leaders"}
+        With "equal", every resampled point is moved equally often. With "leaders", a chain grows from each distinct
+        resampled point, one step per copy of it; each point is then moved `burn_in` + 1 times.
+    burn_in : int
+        With "leaders", steps of a chain before its points count.
+    fast_sweeps : int
+        Sweeps over the fast parameters after every move, where `log_prob_fn` has an attribute ``fast_parameters``
+        (`samplers.moves.fast_parameters`); 0 for none.
+    recycle : bool, optional
+        Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.recycling`), and
+        by moves only where its result cannot be trusted. None leaves the choice to the sampler.
+    runs : int
+        Number of runs of recycling from the same draws of the prior, whose points are used together at the end. A
+        difference between them is reported: one of them has then lost a part of the posterior.
+    check_draws : int, optional
+        Evaluations for an estimate of the evidence that is independent of the annealing. None: as many as there are
+        walkers; 0: no such estimate.
+    max_failure_share : float
+        The run stops with an error when more than this share of the evaluations have failed by an exception or by NaN
+        (a returned -inf is not a failure); 0 stops at the first failure.
+    asynchronous : bool
+        Whether points are evaluated without waiting for the slowest of each batch, for long runs of unequal length on
+        many workers. Recycling, or a guide, then proposes the next points while the last ones run. The result depends
+        on the order of arrival, in the choice of the proposals; every estimate is made of complete batches. Moves wait
+        as before.
+    """
+
+    ess_ratio: float = 0.5
+    ess_rule: str = "constant"
+    ess_floor: float = 0.0
+    coefficient_of_variation: float | None = None
+    resampling: str | Callable = "systematic"
+    min_moves: int = 2
+    max_moves: int = 7
+    max_correlation: float = 0.15
+    chains: str = "equal"
+    burn_in: int = 0
+    fast_sweeps: int = 2
+    recycle: bool | None = None
+    runs: int = 1
+    check_draws: int | None = None
+    max_failure_share: float = 0.5
+    asynchronous: bool = False
+
+    def __post_init__(self):
+        for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps", "runs", "check_draws"):
+            if name != "check_draws" or self.check_draws is not None:
+                object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
+        for name, allowed in (("asynchronous", "True or False"), ("recycle", "True, False or None")):
+            value = vars(self)[name]
+            if isinstance(value, np.bool_):
+                object.__setattr__(self, name, bool(value))
+            elif not isinstance(value, bool) and (value is not None or name == "asynchronous"):
+                raise ValueError(f"{name} must be {allowed}; got {value!r}")
+        variation, check_draws = self.coefficient_of_variation, self.check_draws
+        for name, possible, wanted in (
+            ("runs", self.runs >= 1, "a whole number of at least 1"),
+            ("ess_ratio", 0.0 < self.ess_ratio < 1.0, "between 0 and 1 (both excluded)"),
+            ("ess_rule", self.ess_rule in ("constant", "declining"), '"constant" or "declining"'),
+            ("ess_floor", self.ess_floor >= 0.0, "non-negative"),
+            ("coefficient_of_variation", variation is None or 0.0 < variation < np.inf, "positive and finite"),
+            (
+                "resampling",
+                callable(self.resampling) or self.resampling in RESAMPLING,
+                f"a function or in {[*RESAMPLING]}",
+            ),
+            ("min_moves", 1 <= self.min_moves <= self.max_moves, f"between 1 and max_moves = {self.max_moves}"),
+            ("max_correlation", 0.0 < self.max_correlation <= 1.0, "above 0 and at most 1"),
+            ("chains", self.chains in ("equal", "leaders"), '"equal" or "leaders"'),
+            ("burn_in", self.burn_in >= 0, "non-negative"),
+            ("fast_sweeps", self.fast_sweeps >= 0, "a whole number, 0 for none"),
+            ("check_draws", check_draws is None or check_draws >= 0, "non-negative"),
+            ("max_failure_share", 0.0 <= self.max_failure_share <= 1.0, "between 0 and 1"),
+        ):
+            if not possible:
+                raise ValueError(f"{name} must be {wanted}; got {vars(self)[name]!r}")
+        if self.ess_floor > 0.0 and self.ess_rule == "constant":
+            raise ValueError('ess_floor is the lower limit of a declining target: pass ess_rule="declining" too')
+        if self.burn_in > 0 and self.chains == "equal":
+            raise ValueError('burn_in belongs to chains="leaders": pass this too')
+
+    @property
+    def resample(self) -> Callable:
+        """The resampling scheme."""
+        return self.resampling if callable(self.resampling) else RESAMPLING[self.resampling]
+
+    def target(self, last_target: float, n_walkers: int) -> float:
+        """Effective sample size wanted of a stage, from that of the previous stage (n_walkers before the first)."""
+        variation = self.coefficient_of_variation
+        ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
+        return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
+
+
+def choose_settings(sampler: str, names: Collection[str], given: Mapping[str, Any]) -> Settings:
+    """The defaults with the given settings; TypeError for a name that is not among the `names` of the sampler."""
+    if unknown := set(given) - set(names):
+        raise TypeError(
+            f"{sampler}() got an unexpected keyword argument {min(unknown)!r}; settings are {', '.join(sorted(names))}"
+        )
+    return Settings(**given)
+
+
+def refuse_unused(settings: Settings, guided: bool) -> None:
+    """Raise ValueError for `runs` or `asynchronous` where the annealing, with a guide or without, cannot use them."""
+    if settings.runs > 1 and guided:
+        raise ValueError(
+            f"runs={settings.runs} cannot act here: they begin with draws of the prior, not of a guide: pass "
+            "one of them"
+        )
+    if settings.runs > 1 and not settings.recycle:
+        raise ValueError(
+            f"runs={settings.runs} cannot act here: it belongs to recycling, and the annealing is by moves: pass "
+            "recycle=True"
+        )
+    if settings.asynchronous and not (guided or settings.recycle):
+        raise ValueError(
+            "asynchronous=True cannot act here: moves wait for all points that they propose: pass recycle=True"
+        )

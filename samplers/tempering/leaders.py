@@ -1,0 +1,92 @@
+"""Chains of transitional Markov chain Monte Carlo: they grow from the resampled points, the leaders.
+
+Ching & Chen (2007) draw a leader by the weights for every new point, and move the chain of this leader by one step:
+a leader that is drawn n times has a chain of n points. Its first points have made few steps, and the leaders of long
+chains are those of large weight, so the new points are biased by an amount that does not decrease with their number.
+It decreases with the steps that every chain makes before its points count (burn-in; Betz, Papaioannou & Straub 2016).
+
+The same paper also computes the weight of a leader from the present point of its chain, after every single step. This
+needs chains that move one after another, and leaves a pool idle. With a fifth of the chains moved between two updates
+of the weights, the bias was larger than without updates, so the weights are not updated here.
+
+References
+----------
+Ching & Chen (2007), J. Eng. Mech. 133(7), doi:10.1061/(ASCE)0733-9399(2007)133:7(816)
+Betz, Papaioannou & Straub (2016), J. Eng. Mech. 142(5), doi:10.1061/(ASCE)EM.1943-7889.0001066
+"""
+
+from collections.abc import Generator
+
+import numpy as np
+from emcee import State
+
+from ..budget import BudgetExhausted
+from ..reports import Sweep
+from ..settings import Settings
+from .mutation import MoveSchedule, Mutated, StartCorrelation, VisitedPoints, tempered_log_prob, tempered_model
+from .population import Density, Population
+
+__all__ = ["grow_chains"]
+
+
+def grow_chains(
+    population: Population,
+    ancestors: np.ndarray,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+    visited: VisitedPoints | None = None,
+) -> Generator[tuple[Population, Sweep], None, Mutated]:
+    """Grow a chain from each distinct point (leader), one step per copy of it.
+
+    All chains first make ``settings.burn_in`` steps; then every step of a chain is a point of the new population. The
+    first step moves all chains together, the later ones those that are long enough, so the moves must be able to move
+    any number of points. The moves are tuned after each of these steps.
+
+    Parameters
+    ----------
+    population : Population
+        Resampled points, with the beta at which they are moved.
+    ancestors : (n,) int
+        Index of each point before the resampling; equal for copies.
+    density, random, schedule, settings, visited
+        As in `samplers.tempering.mutation.move_together`; of the settings, `burn_in`.
+
+    Yields
+    ------
+    Population, Sweep
+        After each step of the chains; points that their chain has not reached yet are those of the start.
+
+    Returns
+    -------
+    Mutated
+    """
+    beta, coords, records = population.beta, population.coords, population.records
+    model = tempered_model(density, beta, random, visited)
+    _, first, owner, counts = np.unique(ancestors, return_index=True, return_inverse=True, return_counts=True)
+    place = np.argsort(owner, kind="stable")
+    start = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    chains = State(coords[first], log_prob=tempered_log_prob(records[first], beta), blobs=records[first])
+    correlation = StartCorrelation(coords, records)
+    coords, records = coords.copy(), records.copy()
+    population = population._replace(coords=coords, records=records)
+    accepted_steps, steps = 0, 0
+    for length in range(-settings.burn_in, int(counts.max())):
+        growing = np.flatnonzero(counts > length)
+        move = schedule.choose(random)
+        state = State(chains.coords[growing], log_prob=chains.log_prob[growing], blobs=chains.blobs[growing])
+        try:
+            state, accepted = move.propose(model, state)
+        except BudgetExhausted:
+            return Mutated(population, accepted_steps / max(steps, 1), 0, 1.0, True)
+        move.tune(state, accepted)
+        chains.coords[growing], chains.log_prob[growing] = state.coords, state.log_prob
+        chains.blobs[growing] = state.blobs
+        if length >= 0:
+            rows = place[start[growing] + length]
+            coords[rows], records[rows] = state.coords, state.blobs
+        accepted_steps, steps = accepted_steps + int(np.sum(accepted)), steps + len(growing)
+        yield population, Sweep(float(np.mean(accepted)))
+    correlation.update(coords, records)
+    return Mutated(population, accepted_steps / steps, settings.burn_in + 1, correlation.values[-1])

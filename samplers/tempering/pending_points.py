@@ -1,0 +1,79 @@
+"""Points that were submitted together for evaluation, of which some may still be running.
+
+A synchronous density returns complete points. An asynchronous density lets the points arrive in any order. Points that
+have arrived may shape further proposals, but only complete batches may become part of the result: where the time of an
+evaluation depends on the parameters, the first arrivals are not a fair sample of the proposal.
+"""
+
+import numpy as np
+
+__all__ = ["PendingPoints"]
+
+BASE_FIELDS = [("log_prob", np.float64), ("log_prior", np.float64)]
+
+
+class PendingPoints:
+    """Points (n, ndim) and what is known of them.
+
+    Parameters
+    ----------
+    coords : (n, ndim) float
+        The points.
+    log_base : (n,) float
+        Their log-density at beta = 0, -inf outside the support of the prior.
+    refused : bool
+        Whether the limit of simulations did not allow all points that were to be submitted; `coords` are the others.
+
+    Attributes
+    ----------
+    coords, refused
+        See above.
+    base : (n,) structured array
+        Records with log_prior = `log_base` and log_prob = -inf, known from the beginning.
+    arrived : (n,) bool
+        Which points have arrived.
+    """
+
+    def __init__(self, coords: np.ndarray, log_base: np.ndarray, refused: bool = False):
+        self.coords, self.refused = coords, refused
+        self.base = np.zeros(len(coords), BASE_FIELDS)
+        self.base["log_prob"], self.base["log_prior"] = -np.inf, log_base
+        self.arrived = np.zeros(len(coords), dtype=bool)
+        self._records: np.ndarray | None = None
+
+    @classmethod
+    def known(cls, coords: np.ndarray, records: np.ndarray, refused: bool = False) -> "PendingPoints":
+        """Points (n, ndim) whose records (n,) are all known."""
+        pending = cls(coords, records["log_prior"], refused)
+        pending.arrive(np.arange(len(coords)), records)
+        return pending
+
+    def arrive(self, rows: np.ndarray, records: np.ndarray) -> None:
+        """Enter the records (m,) of points that have arrived, by their rows (m,)."""
+        if len(rows) == len(self.coords):
+            self._records = records
+        else:
+            if self._records is None or self._records.dtype != records.dtype:  # the first blobs change the type
+                earlier, self._records = self._records, np.zeros(len(self.coords), records.dtype)
+                for name in () if earlier is None else earlier.dtype.names:
+                    self._records[name] = earlier[name]
+            self._records[rows] = records
+        self.arrived[rows] = True
+
+    @property
+    def running(self) -> int:
+        """Number of points that have not arrived."""
+        return int(np.sum(~self.arrived))
+
+    @property
+    def complete(self) -> bool:
+        """Whether all points have arrived."""
+        return bool(self.arrived.all())
+
+    def arrived_part(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points (m, ndim) that have arrived, and their records (m,), in the order of submission."""
+        if self._records is None:
+            return self.coords[:0], self.base[:0]
+        if self.complete:
+            return self.coords, self._records
+        return self.coords[self.arrived], self._records[self.arrived]

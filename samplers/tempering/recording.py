@@ -1,0 +1,64 @@
+"""Recording of an annealing: what its reports add to its result, with wall times and numbers of evaluations."""
+
+import time
+
+from ..estimates.importance import EvidenceCheck
+from ..judgement.checks import check_evidence
+from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound, GuidedStart, Report, Restart, Stage, warn
+from .population import Density, Population
+
+__all__ = ["Recording"]
+
+
+class Recording:
+    """The result of an annealing as far as it has come.
+
+    Parameters
+    ----------
+    density : Density
+        Counts the evaluations.
+
+    Attributes
+    ----------
+    result : AnnealingResult
+        Everything found so far.
+    """
+
+    def __init__(self, density: Density):
+        self.result, self._density = AnnealingResult(), density
+        self._seconds, self._evaluations = time.perf_counter(), density.evaluations
+
+    def add(self, population: Population, report: Report) -> None:
+        """Add a report of `samplers.tempering.anneal.anneal`; a concern is a warning as well."""
+        result = self.result
+        if isinstance(report, Stage):
+            now = time.perf_counter(), self._density.evaluations
+            stage = report._replace(seconds=now[0] - self._seconds, evaluations=now[1] - self._evaluations)
+            self._seconds, self._evaluations = now
+            result = result._replace(ladder=(*result.ladder, stage))
+        elif isinstance(report, EvidenceCheck):
+            self._evaluations += report.evaluations  # these belong to no stage
+            result = result._replace(check=report)
+        elif isinstance(report, Restart):
+            result = AnnealingResult(rounds=result.rounds)
+        elif isinstance(report, GuidedRound):
+            result = result._replace(rounds=(*result.rounds, report))
+        elif isinstance(report, GuidedStart):
+            result = result._replace(start=report)
+        elif isinstance(report, Concern):
+            warn(report.message)
+            result = result._replace(findings=(*result.findings, report))
+        elif isinstance(report, EarlyStop):
+            result = result._replace(early_stop=report)
+        if result.finished and population.founders:
+            result = result._replace(founders=population.founders[0])
+        self.result = result
+
+    def check_evidence(self) -> None:
+        """Compare the two estimates of the evidence at the end, if there are two."""
+        result = self.result
+        if result.check is None:
+            return
+        for concern in check_evidence(result.log_evidence_ladder, result.ladder[-1].log_evidence_error, result.check):
+            warn(concern.message)
+            self.result = self.result._replace(findings=(*self.result.findings, concern))

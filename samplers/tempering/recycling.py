@@ -1,0 +1,514 @@
+"""Recycling: adaptive multiple importance sampling (AMIS) from the prior to the posterior.
+
+All points evaluated so far, draws of the prior and of every proposal since, are weighted by the tempered target over
+the mixture of all densities that they were drawn from (deterministic mixture weights). Each round
+
+1. chooses the next beta, which keeps the effective sample size of *all* points at a target,
+2. fits a mixture to the weighted points at that beta, and
+3. draws from this mixture, evaluates the draws and adds them to the points.
+
+A beta is left only when the draws made at it have an effective sample size of three quarters of the target: among many
+old points some have large weights by chance, and where the likelihood is rough, annealing that follows these points
+ends in a local mode. Once beta = 1 is reached, points are drawn until the effective sample size suffices.
+
+Adaptive proposals can be confidently wrong, so the last fit is checked with fresh draws. The result is used only if
+their weights are well-behaved and their evidence agrees (`Recycled.reliable`). If not, these draws join the other
+points and the next fit is checked, a few times. Reusing points that a proposal was fitted to underweights them, and a
+small mode can vanish. Therefore the resulting population consists only of draws made at beta = 1, each weighted by the
+one proposal that it was drawn from.
+
+The equations are in ``docs/theory/recycling``. Constants without a reference were chosen by trials on posteriors with
+known answers. The *efficiency* of a round is the effective sample size of its fresh draws divided by their number.
+
+References
+----------
+Cornuet, Marin, Mira & Robert (2012), Adaptive multiple importance sampling, Scand. J. Stat. 39(4),
+doi:10.1111/j.1467-9469.2011.00756.x
+Owen & Zhou (2000), JASA 95(449), doi:10.1080/01621459.2000.10473909 (deterministic mixture weights)
+"""
+
+from collections.abc import Callable, Generator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, round_shares, tail_variance
+from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
+from ..proposals.basins import find_basins, with_components
+from ..proposals.mixture import Mixture, fit_mixture, log_density
+from ..proposals.transforms import find_support_bounds
+from ..reports import Report, Stage, Sweep
+from .early_stop import StoppedEarly, stop_at
+from .pending_points import PendingPoints
+from .population import Density, Population
+
+__all__ = ["Recycled", "StartingDensity", "most_running", "pool_runs", "recycle", "stopped_at", "submit_start"]
+
+# Effective sample size wanted at each beta (the target), as a share of the number of starting points. A small target
+# allows large steps of beta; the fresh draws of a round then restore the effective sample size.
+TARGET_SHARE = 0.2
+# Smallest target per dimension (and one more): fewer effective points do not determine the covariances of the mixture.
+POINTS_PER_DIMENSION = 5.0
+# Draws of a round, as a multiple of the target.
+DRAWS_PER_TARGET = 3.0
+# Further draws, as a multiple of the number of starting points, spread over the stages below beta = 1. They find narrow
+# modes, which hold few points while beta is small: of modes with a ratio of volumes of 100, 500 starting points without
+# such draws miss one in 30 % of the runs, and in 6 % with them.
+SEARCH_DRAWS = 3.0
+# A beta is left once the draws made at it have an effective sample size of this share of the target.
+FRESH_SHARE = 0.75
+# More components than in moves, because there are more points.
+MOST_COMPONENTS = 8
+# Share of a proposal's weight that is spread evenly over its components, so that small components receive draws too.
+EVEN_SHARE = 0.25
+# Components added to a proposal for parts of the target that it does not explain (`samplers.proposals.basins`), and the
+# smallest share of the draws for each.
+MOST_BASINS, BASIN_SHARE = 3, 0.1
+# Before the check, unexplained parts of the target are explored this many times at most, with this number of draws for
+# each part: a mode may have been met late.
+MOST_BASIN_ROUNDS, DRAWS_PER_BASIN = 4, 30
+# Recycling is given up when the mean efficiency of the last 6 rounds is smaller than 0.03 (moves then need fewer
+# evaluations), or after 200 rounds without a check at beta = 1.
+SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200
+# Draws that contradict a fit also improve it, so a failed check is repeated.
+MOST_CHECKS = 4
+# Smallest efficiency of the check for which the result is used, and the efficiency at which the Pareto shape need no
+# longer be below 0.7 (Vehtari et al. 2024, JMLR 25(72)): the shape of the short tail of even weights is uncertain.
+RELIABLE_EFFICIENCY, HIGH_EFFICIENCY = 0.25, 0.5
+# Largest difference between the log-evidences of the check and of the earlier points for which the result is used.
+LARGEST_DIFFERENCE = 0.25
+# Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
+EXPECTED_GROWTH = 3.0
+# Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
+LARGEST_SHARE_KEPT = 0.9
+
+
+class StartingDensity(NamedTuple):
+    """Density that the starting points were drawn from.
+
+    Attributes
+    ----------
+    made : float
+        Number of draws made from it, including those outside the support of the prior.
+    log_density : callable
+        Function of points (n, ndim) and their records (n,) that returns the logarithm of the density (n,).
+    """
+
+    made: float
+    log_density: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class Recycled(NamedTuple):
+    """Result of recycling.
+
+    Attributes
+    ----------
+    reason : str
+        Why the result is not reliable; empty if it is.
+    coords, records : (n, ndim) float, (n,) structured array
+        The draws made at beta = 1, including the draws of the check, and their records (log_prob, log_prior and, where
+        there are any, blobs).
+    log_weights : (n,) float
+        Log-weights of the draws against the mixture of their round, which was not fitted to them. The rounds are
+        combined by `samplers.estimates.importance.round_shares`, which does not depend on the weights of the same
+        round: a round with few points of large weight in a tail would otherwise get a small share, and cut the tail.
+    log_evidence, log_evidence_error : float
+        Log-evidence from all points except the draws of the check, and its standard error.
+    check : EvidenceCheck, optional
+        The check with fresh draws; None if beta = 1 was not reached, or no check was wanted.
+    points : WeightedPoints, optional
+        All evaluated points with all proposals; None without draws.
+    log_evidence_below_one : float
+        Log-evidence at the last beta below 1; 0 without such a stage.
+    """
+
+    reason: str
+    coords: np.ndarray
+    records: np.ndarray
+    log_weights: np.ndarray
+    log_evidence: float
+    log_evidence_error: float
+    check: EvidenceCheck | None
+    points: "WeightedPoints | None" = None
+    log_evidence_below_one: float = 0.0
+
+    @property
+    def proposals(self) -> Sequence[tuple[int, Mixture]]:
+        """The proposals in order, and how many draws were made from each."""
+        return () if self.points is None else self.points.proposals
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the result is reliable."""
+        return not self.reason
+
+
+def recycle(
+    pending: PendingPoints,
+    density: Density,
+    random: np.random.RandomState,
+    start: StartingDensity | None = None,
+    size: int | None = None,
+    target_share: float | None = None,
+    whole: bool = True,
+) -> Generator[tuple[Population, Report], None, Recycled]:
+    """Anneal draws of the prior, or of another starting density, to beta = 1 by adaptive importance sampling.
+
+    Parameters
+    ----------
+    pending : PendingPoints
+        Starting points, most of which have arrived.
+    density : Density
+        Evaluates points.
+    random : RandomState
+        Source of random numbers.
+    start : StartingDensity, optional
+        What the points were drawn from; the prior by default. The path to the posterior is
+        start^(1 - beta) posterior^beta.
+    size : int, optional
+        Effective sample size wanted at beta = 1, and number of draws of the check; n by default.
+    target_share : float, optional
+        Effective sample size wanted below beta = 1, as a share of the number n of starting points; `TARGET_SHARE` by
+        default.
+    whole : bool
+        False for a part of a longer annealing: its stages are not reported, and it ends without a check, as soon as the
+        draws at beta = 1 satisfy the rule by which a beta is left.
+
+    Yields
+    ------
+    Population, Stage or Sweep
+        For each beta below 1, before its draws are made: all points with their weights, and the stage. Its acceptance
+        is the efficiency of the latest draws. Then the same points and a `Sweep`, as a tick of the progress bar.
+
+    Returns
+    -------
+    Recycled
+
+    Raises
+    ------
+    StoppedEarly
+        If the limit of simulations is exceeded.
+    """
+    n, ndim = pending.coords.shape
+    size = n if size is None else size
+    # another starting density was fitted by a search of its own
+    search, basin_rounds = _Search(SEARCH_DRAWS * n if start is None else 0.0), 0
+    start = StartingDensity(n, lambda _, records: records["log_prior"]) if start is None else start
+    share = TARGET_SHARE if target_share is None else target_share
+    target = max(share * n, POINTS_PER_DIMENSION * (ndim + 1.0))
+    enough_fresh = FRESH_SHARE * target
+    points, bounds = WeightedPoints(pending, start), find_support_bounds(density.inside, pending.coords)
+    beta, efficiencies, increments, checks = 0.0, [], [], 0
+    drawn: list[_Drawn] = []  # at the present beta
+    if (alive := effective_sample_size(points.log_weights(0.0))) < target:
+        density.wait(0)
+        points.update()
+        alive = effective_sample_size(points.log_weights(0.0))
+    if alive < target:
+        reason = f"only {alive:.0f} of {n} starting points have a likelihood above zero"
+        return Recycled(reason, *pending.arrived_part(), np.zeros(n), float("-inf"), float("inf"), None)
+    while True:
+        # choose beta
+        points.update()
+        fresh = sum(effective_sample_size(draws.log_weights(start, beta)) for draws in drawn)
+        log_weights, last_beta = points.log_weights(beta), beta
+        effective = effective_sample_size(log_weights)
+        if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= enough_fresh):
+            if points.running(latest=False) > 0:
+                # a mode whose evaluations take long would otherwise be left out of every proposal
+                density.wait(points.running() - 1)
+                continue
+            # more draws shall not make larger steps: it is their number per step that finds narrow modes
+            kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
+            following = next_beta(points.log_ratio, beta, kept, log_weights)
+            if following == 1.0 and points.running() > 0:  # what is drawn at beta = 1 is the result
+                density.wait(0)
+                continue
+            beta, drawn, fresh = following, [], 0.0
+            log_weights = points.log_weights(beta)
+            effective = effective_sample_size(log_weights)
+
+        # evidence; proposals were chosen by weights with an effective sample size of `target`, whose error remains
+        inherited = 1.0 / target if efficiencies else 0.0
+        log_evidence, error = _evidence(log_weights, inherited)
+        if last_beta < beta < 1.0:
+            increments.append(log_evidence - sum(increments))
+            acceptance = efficiencies[-1] if efficiencies else effective / n
+            stage = Stage(beta, effective, acceptance, 0, int(effective), increments[-1], error)
+            population = Population(beta, points.coords, points.records, effective, (), log_weights)
+            if whole:
+                yield population, stage
+            yield population, Sweep(acceptance)
+
+        # fit a proposal
+        mixture = fit_mixture(points.coords, coarse_weights(log_weights), MOST_COMPONENTS, bounds)
+        mixture = _with_even_share(mixture, EVEN_SHARE)
+        finished, basins = beta == 1.0 and effective >= size, None
+        if not finished or basin_rounds < MOST_BASIN_ROUNDS:
+            log_target = points.log_target(beta) - log_evidence
+            basins = find_basins(mixture, points.coords, log_target, MOST_BASINS, BASIN_SHARE)
+        if exploring := finished and basins is not None:
+            mixture, basin_rounds = _with_even_share(basins, 1.0), basin_rounds + 1
+            wanted = DRAWS_PER_BASIN * len(basins.weights)
+        else:
+            mixture = with_components(mixture, basins)
+            wanted = size if finished else DRAWS_PER_TARGET * target
+        if last_beta < beta < 1.0:
+            wanted = search.enlarge(wanted, beta)
+
+        # draw
+        new, made = draw_inside(mixture, int(round(wanted)), random, density.inside)
+        pending = density.submit(new)
+        if pending.refused:
+            density.wait(0)
+            points.update()
+            if (few := len(pending.coords)) > 0:
+                points.add(mixture, made * few / len(new), pending)
+            raise stopped_at(points, beta, sum(increments), inherited)
+        checking = finished and not exploring
+        density.wait(0 if checking else most_running(density, len(new)))
+        if exploring:
+            points.add(mixture, made, pending)
+            continue
+        drawn.append(draws := _Drawn(mixture, made, pending))
+        new_weights = draws.log_weights(start, beta)
+        fresh += effective_sample_size(new_weights)
+        efficiencies.append(effective_sample_size(new_weights) / max(len(new_weights), 1))
+
+        # check
+        check, checks = evidence_from_weights(new_weights, made) if checking else None, checks + checking
+        if checking:  # every point has arrived
+            points.update()
+            log_evidence, error = _evidence(points.log_weights(beta), inherited)
+        reason = _reason(check, log_evidence, beta, efficiencies)
+        # draws that contradict a fit also improve it: check again, as long as that is cheap
+        ends = not reason or checks == MOST_CHECKS if checking else bool(reason)
+        if ends or (not whole and beta == 1.0 and effective >= target and fresh >= enough_fresh):
+            if not checking:
+                density.wait(0)
+                points.update()
+                log_evidence, error = _evidence(points.log_weights(beta), inherited)
+            points.add(mixture, made, pending)
+            result = _result(drawn if beta == 1.0 else [draws], start, beta)
+            return Recycled(reason, *result, log_evidence, error, check, points, sum(increments))
+        points.add(mixture, made, pending)
+
+
+def pool_runs(runs: Sequence[Recycled], n_prior: int) -> tuple[np.ndarray, np.ndarray, StartingDensity]:
+    """All points of runs that have the same draws of the prior, and the density that they were drawn from.
+
+    A mode that no draw of a run has met is missing in all later proposals of this run, and nothing in the run shows it.
+    A second run makes other draws. All proposals of the runs and the prior are a mixture with a known density, from
+    which recycling continues to beta = 1, so the result contains what any run has found (Owen & Zhou 2000).
+
+    Parameters
+    ----------
+    runs : sequence of Recycled
+        The runs; the first points of each are the draws of the prior.
+    n_prior : int
+        Number of draws of the prior.
+
+    Returns
+    -------
+    coords, records : (n, ndim) float, (n,) structured array
+        The draws of the prior once, and the draws of all runs.
+    start : StartingDensity
+        Mixture of the prior and all proposals, by their numbers of draws.
+    """
+    first = runs[0].points
+    coords = np.concatenate([first.coords[:n_prior], *(run.points.coords[n_prior:] for run in runs)])
+    records = np.concatenate([first.records[:n_prior], *(run.points.records[n_prior:] for run in runs)])
+    proposals = [proposal for run in runs for proposal in run.proposals]
+    made = n_prior + sum(count for count, _ in proposals)
+
+    def log_start(points: np.ndarray, records: np.ndarray) -> np.ndarray:
+        total = np.log(n_prior / made) + records["log_prior"]
+        for count, mixture in proposals:
+            total = np.logaddexp(total, np.log(count / made) + log_density(mixture, points))
+        return total
+
+    return coords, records, StartingDensity(made, log_start)
+
+
+class WeightedPoints:
+    """All points that have arrived, and the logarithm of the mixture of all densities that they were drawn from.
+
+    The mixture counts every submitted draw. While some are running, the sum of the weights is therefore smaller than
+    the evidence.
+
+    Parameters
+    ----------
+    pending : PendingPoints
+        Starting points.
+    start : StartingDensity
+        What they were drawn from.
+
+    Attributes
+    ----------
+    coords, records : (n, ndim) float, (n,) structured array
+        The points that had arrived at the last `update`, and their records.
+    proposals : list of (int, Mixture)
+        The proposals in order, and how many draws were made from each.
+    """
+
+    def __init__(self, pending: PendingPoints, start: StartingDensity):
+        self._batches, self._start = [pending], start
+        self.proposals: list[tuple[int, Mixture]] = []
+        self._log_start_of_all = start.log_density(pending.coords, pending.base)
+        self._log_mixture_of_all = np.log(start.made) + self._log_start_of_all
+        self.update()
+
+    def add(self, mixture: Mixture, made: float, pending: PendingPoints) -> None:
+        """Add the draws inside the support, of `made` draws from a mixture."""
+        coords = pending.coords
+        log_start = self._start.log_density(coords, pending.base)
+        log_mixture = np.log(self._start.made) + log_start
+        for count, earlier in self.proposals:
+            log_mixture = np.logaddexp(log_mixture, np.log(count) + log_density(earlier, coords))
+        self.proposals.append((made, mixture))
+        self._batches.append(pending)
+        self._log_start_of_all = np.concatenate([self._log_start_of_all, log_start])
+        coords_of_all = np.concatenate([pending.coords for pending in self._batches])
+        self._log_mixture_of_all = np.logaddexp(
+            np.concatenate([self._log_mixture_of_all, log_mixture]), np.log(made) + log_density(mixture, coords_of_all)
+        )
+        self.update()
+
+    def update(self) -> None:
+        """Take in what has arrived."""
+        parts = [pending.arrived_part() for pending in self._batches]
+        parts = [part for part in parts if len(part[0]) > 0] or parts[:1]
+        self.coords = np.concatenate([coords for coords, _ in parts])
+        self.records = np.concatenate([records for _, records in parts])
+        arrived = np.concatenate([pending.arrived for pending in self._batches])
+        self._log_start, self._log_mixture = self._log_start_of_all[arrived], self._log_mixture_of_all[arrived]
+
+    def running(self, latest: bool = True) -> int:
+        """Number of points that have not arrived; without the latest draws if not `latest`."""
+        batches = self._batches if latest else self._batches[:-1]
+        return sum(pending.running for pending in batches)
+
+    @property
+    def log_ratio(self) -> np.ndarray:
+        """Logarithm of the posterior over the starting density; from the prior, the log-likelihood."""
+        return self.records["log_prob"] - self._log_start
+
+    def log_target(self, beta: float) -> np.ndarray:
+        """Logarithm (n,) of the tempered target, not normalised."""
+        alive = self.records["log_prob"] > -np.inf
+        return np.where(alive, self._log_start + beta * np.where(alive, self.log_ratio, 0.0), -np.inf)
+
+    def log_weights(self, beta: float) -> np.ndarray:
+        """Logarithm of the tempered target over the mixture, (n,); the sum of the weights estimates the evidence."""
+        return self.log_target(beta) - self._log_mixture
+
+
+class _Drawn(NamedTuple):
+    """The draws of a mixture inside the support of the prior, of `made` draws in all."""
+
+    mixture: Mixture
+    made: int
+    pending: PendingPoints
+
+    def log_weights(self, start: StartingDensity, beta: float) -> np.ndarray:
+        """Log-weights (m,) of the draws that have arrived, against the mixture that they were drawn from."""
+        coords, records = self.pending.arrived_part()
+        alive = records["log_prob"] > -np.inf
+        log_prob = np.where(alive, records["log_prob"], 0.0)
+        tempered = (1.0 - beta) * start.log_density(coords, records) + beta * log_prob
+        return np.where(alive, tempered - log_density(self.mixture, coords), -np.inf)
+
+
+def _result(drawn: Sequence[_Drawn], start: StartingDensity, beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, records and log-weights of rounds of draws that have all arrived, as in `Recycled`."""
+    parts = [draws.pending.arrived_part() for draws in drawn]
+    log_weights = [draws.log_weights(start, beta) for draws in drawn]
+    sizes = [draws.made for draws in drawn]
+    shares = round_shares(sizes, [effective_sample_size(w) / n for w, n in zip(log_weights, sizes, strict=True)])
+    scaled = [w + np.log(share / n) for w, share, n in zip(log_weights, shares, sizes, strict=True)]
+    return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
+
+
+def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
+    """Log-evidence from the weights of all points, and its standard error; `inherited`: variance of earlier choices."""
+    n, effective = len(log_weights), effective_sample_size(log_weights)
+    log_evidence = float(log_mean_weight(log_weights) + np.log(n))
+    return log_evidence, float(np.sqrt(max(1.0 / effective - 1.0 / n, 0.0) + inherited))
+
+
+def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> PendingPoints:
+    """Begin to evaluate the draws (n, ndim) of the prior that an annealing starts from; `whole`: wait for all of them.
+
+    Raises
+    ------
+    StoppedEarly
+        If the limit of simulations does not allow all points.
+    """
+    pending = density.submit(coords)
+    density.wait(0 if pending.refused or whole else most_running(density, len(coords)))
+    if pending.refused:
+        few, records = pending.arrived_part()
+        raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0)
+    return pending
+
+
+def most_running(density: Density, submitted: int) -> int:
+    """How many points may still run when the next proposal is made: as many as there are workers.
+
+    Half of the points that were submitted last must have arrived: fewer teach a proposal too little.
+    """
+    return min(density.workers, submitted // 2)
+
+
+class _Search:
+    """Additional draws that search for narrow modes, spread over the stages of an annealing.
+
+    `left` : float, their number. `increase` : float, all draws of the latest stage over the necessary draws.
+    """
+
+    def __init__(self, left: float) -> None:
+        self._left, self.increase = left, 1.0
+
+    def enlarge(self, draws: float, beta: float) -> float:
+        """The draws of a stage, increased by an equal share of the draws left for each stage still expected."""
+        share = self._left / (1.0 - np.log(beta) / np.log(EXPECTED_GROWTH))
+        self._left -= share
+        self.increase = 1.0 + share / draws
+        return draws + share
+
+
+def stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
+    """All points, weighted by the posterior over the mixture of their densities, when the limit is exceeded at `beta`.
+
+    `of_stages`: part of the log-evidence that is in stages already reported. `inherited`: variance of the log-evidence
+    from the weights by which the proposals were chosen.
+    """
+    log_weights = points.log_weights(1.0)
+    n, effective = len(log_weights), effective_sample_size(log_weights)
+    known = Population(1.0, points.coords, points.records, effective, (), log_weights)
+    log_evidence = float(log_mean_weight(log_weights) + np.log(n))
+    variance = max(1.0 / effective - 1.0 / n, 0.0) + inherited + tail_variance(log_weights)
+    return StoppedEarly(known, log_evidence, float(np.sqrt(variance)), beta, of_stages)
+
+
+def _with_even_share(mixture: Mixture, share: float) -> Mixture:
+    """The mixture with a share of its weight spread evenly over its components."""
+    weights = (1.0 - share) * mixture.weights + share / len(mixture.weights)
+    return mixture._replace(weights=weights)
+
+
+def _reason(check: EvidenceCheck | None, log_evidence: float, beta: float, efficiencies: list[float]) -> str:
+    """Why to give up, or not to use the result; empty if there is no reason."""
+    recent = float(np.mean(efficiencies[-PATIENCE:]))
+    if len(efficiencies) >= PATIENCE and recent < SMALLEST_EFFICIENCY:
+        return f"the effective sample size of fresh draws is {100 * recent:.2g} % of their number"
+    if check is None:
+        too_long = len(efficiencies) >= MOST_ROUNDS
+        return f"only beta = {beta:.3g} was reached in {MOST_ROUNDS} rounds" if too_long else ""
+    if not check.reliable and efficiencies[-1] < HIGH_EFFICIENCY:
+        return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
+    if efficiencies[-1] < RELIABLE_EFFICIENCY:
+        return f"the effective sample size of the draws of the check is {100 * efficiencies[-1]:.2g} % of their number"
+    if abs(check.log_evidence - log_evidence) > LARGEST_DIFFERENCE:
+        return f"fresh draws change the log-evidence by {check.log_evidence - log_evidence:.2g}"
+    return ""

@@ -1,0 +1,153 @@
+r"""Sequential Monte Carlo, as in Del Moral, Doucet & Jasra (2006), section 3: from draws of the prior to the posterior.
+
+The targets are :math:`\pi_\beta \propto p(\theta) L(\theta)^\beta` with the prior p and the likelihood L. A stage
+carries N points :math:`\theta_i` from :math:`\beta` to a larger :math:`\beta'`:
+
+1. choose the largest :math:`\beta'` at which the weights keep the wanted effective sample size (ESS);
+2. weigh the points, :math:`w_i = L(\theta_i)^{\beta' - \beta}`;
+3. estimate the evidence, :math:`Z_{\beta'} = Z_\beta \frac{1}{N} \sum_i w_i`;
+4. resample the points by :math:`w_i`, which copies some points and drops others;
+5. move every point by a Markov kernel that leaves :math:`\pi_{\beta'}` unchanged, which separates the copies.
+
+Weights follow from the points before the moves (Del Moral et al. 2006), so steps 1 to 4 need no
+evaluation. Before step 4, the kernels of step 5 are fitted to the weighted points. Steps 1 to 3 are pure functions in
+`samplers.estimates.weights`, the schemes of step 4 are in `samplers.resampling`, and the kernels of step 5 are in
+`samplers.tempering.mutation`. The equations are derived in ``docs/theory/tempering``.
+
+References
+----------
+Del Moral, Doucet & Jasra (2006), Sequential Monte Carlo samplers, J. R. Stat. Soc. B 68(3),
+doi:10.1111/j.1467-9868.2006.00553.x
+Ching & Chen (2007), Transitional Markov chain Monte Carlo method for Bayesian model updating, model class selection,
+and model averaging, J. Eng. Mech. 133(7), doi:10.1061/(ASCE)0733-9399(2007)133:7(816) (chains from resampled leaders)
+"""
+
+from collections.abc import Generator
+
+import numpy as np
+
+from ..estimates.genealogy import trace_founders
+from ..estimates.weights import (
+    EvidenceError,
+    coarse_weights,
+    effective_sample_size,
+    log_mean_weight,
+    next_beta,
+    normalised_weights,
+)
+from ..judgement.checks import check_stages
+from ..reports import Concern, Stage, Sweep
+from ..settings import Settings
+from .early_stop import stop_at
+from .leaders import grow_chains
+from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
+from .population import Density, Population
+
+__all__ = ["anneal_by_moves", "move"]
+
+
+def anneal_by_moves(
+    population: Population,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+    visited: VisitedPoints,
+) -> Generator[tuple[Population, Stage | Sweep | Concern], None, tuple[Population, list[Stage], float]]:
+    """Carry evaluated draws of the prior to beta = 1.
+
+    Parameters
+    ----------
+    population : Population
+        Draws of the prior, with their records.
+    density : Density
+        The posterior.
+    random : RandomState
+        Source of random numbers.
+    schedule : MoveSchedule
+        The moves.
+    settings : Settings
+        Effective sample size, resampling scheme and length of the moves.
+    visited : VisitedPoints
+        All evaluated points; points that are evaluated here are added.
+
+    Yields
+    ------
+    population : Population
+        The points as they are now.
+    report : Sweep, Stage or Concern
+        `Sweep`: the points have been moved once. `Stage`: a stage is finished. `Concern`: the stage is collapsed or
+        stuck.
+
+    Returns
+    -------
+    population : Population
+        The points at beta = 1.
+    stages : list of Stage
+        All stages.
+    correlation : float
+        Correlation of the points with their start after the moves of the last stage.
+
+    Raises
+    ------
+    StoppedEarly
+        If the limit of simulations is exceeded.
+    """
+    n, ndim = population.coords.shape
+    target, stages, error = float(n), [], EvidenceError(n)
+    while population.beta < 1.0:
+        log_likelihood = population.records["log_prob"] - population.records["log_prior"]
+
+        # 1. choose beta
+        target = settings.target(target, n)
+        beta = next_beta(log_likelihood, population.beta, target)
+
+        # 2. weigh
+        log_weights = (beta - population.beta) * log_likelihood
+        weights, ess = normalised_weights(log_weights), effective_sample_size(log_weights)
+
+        # 3. estimate the evidence
+        increment, standard_error = log_mean_weight(log_weights), error.weigh(weights)
+        log_evidence = sum(stage.log_evidence_increment for stage in stages) + increment
+
+        # fit the moves to the weighted points, and to parts of the target that this fit does not cover
+        schedule.calibrate(population.coords, coarse_weights(log_weights), density.inside)
+        coords, log_target = visited.at(beta)
+        schedule.cover_basins(coords, log_target - log_evidence)
+
+        # 4. resample
+        ancestors = settings.resample(weights, random)
+        error.resample(ancestors)
+        population = resample(population, ancestors, beta, ess)
+        distinct = len(np.unique(population.coords, axis=0))
+
+        # 5. move
+        moved = yield from move(population, ancestors, density, random, schedule, settings, visited)
+        population = moved.population
+        if moved.stopped:
+            raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
+        stages.append(Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error))
+        yield population, stages[-1]
+        yield from ((population, concern) for concern in check_stages(stages, n, ndim))
+    return population, stages, moved.correlation
+
+
+def resample(population: Population, ancestors: np.ndarray, beta: float, ess: float) -> Population:
+    """Equally weighted points at `beta`: copies of the points with the indices `ancestors` (n,)."""
+    founders = trace_founders(population.founders, ancestors)
+    return Population(beta, population.coords[ancestors], population.records[ancestors], ess, founders)
+
+
+def move(
+    population: Population,
+    ancestors: np.ndarray,
+    density: Density,
+    random: np.random.RandomState,
+    schedule: MoveSchedule,
+    settings: Settings,
+    visited: VisitedPoints | None = None,
+) -> Generator[tuple[Population, Sweep], None, Mutated]:
+    """Move resampled points at their beta: all of them equally often, or in chains from the distinct points."""
+    if settings.chains == "leaders":
+        return grow_chains(population, ancestors, density, random, schedule, settings, visited)
+    return move_together(population, density, random, schedule, settings, visited)

@@ -1,0 +1,318 @@
+"""A file is reopened as in emcee: `run_mcmc(None, n)` adds n steps after the last stored one.
+
+Beside the file, our samplers write the record of evaluations, ``<filename>.<group>.record``. What it contains is never
+evaluated again: not after a kill, not with a larger limit, not without the file.
+"""
+
+import os
+from collections import Counter
+from pathlib import Path
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SMCSampler, TMCMCSampler
+from tests.contract.targets import WithBlobs
+
+N, NDIM = 40, 3
+KINDS = {
+    "EnsembleSampler": (emcee.EnsembleSampler, {}),
+    "SMCSampler": (SMCSampler, {"recycle": True}),
+    "SMCSampler by moves": (SMCSampler, {"recycle": False}),
+    "TMCMCSampler": (TMCMCSampler, {}),
+}
+OURS = [kind for kind in KINDS if kind != "EnsembleSampler"]
+pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")  # 40 walkers are few
+
+
+class Counted(WithBlobs):
+    """Notes the points that it has evaluated, and raises KeyboardInterrupt once, in the call of this number."""
+
+    def __init__(self, fingerprint="counted", interrupt_at=None, **kwargs):
+        super().__init__(ndim=NDIM, **kwargs)
+        self.evaluated: list[bytes] = []
+        self.interrupt_at = interrupt_at
+        if fingerprint is not None:
+            self.fingerprint = fingerprint
+
+    def __call__(self, x):
+        if len(self.evaluated) == self.interrupt_at:
+            self.interrupt_at = None
+            raise KeyboardInterrupt
+        self.evaluated.append(x.tobytes())
+        return super().__call__(x)
+
+
+def make(kind, path, posterior, seed=7, **changes):
+    """A sampler on a file; `seed` is that of its first run."""
+    Sampler, settings = KINDS[kind]
+    np.random.seed(seed)  # noqa: NPY002  all three take their seed from the global generator
+    return Sampler(N, NDIM, posterior, backend=emcee.backends.HDFBackend(str(path)), **settings, **changes)
+
+
+def begin(sampler, nsteps):
+    """The first run on a file, from the same draws of the prior for every sampler."""
+    sampler.run_mcmc(np.random.default_rng(1).standard_normal((N, NDIM)), nsteps)
+    return sampler
+
+
+def run(kind, path, *calls, **kwargs):
+    """One process that makes some calls of `run_mcmc` on a new file."""
+    sampler = begin(make(kind, path, Counted(), **kwargs), calls[0])
+    for nsteps in calls[1:]:
+        sampler.run_mcmc(None, nsteps)
+    return sampler
+
+
+def same(sampler, other):
+    """Everything but the wall time is equal to the last bit."""
+    for get in ("get_chain", "get_log_prob", "get_blobs"):
+        assert np.array_equal(getattr(sampler, get)(), getattr(other, get)()), get
+    assert np.array_equal(sampler.backend.accepted, other.backend.accepted)
+    for ours, theirs in zip(sampler.backend.random_state, other.backend.random_state, strict=True):
+        assert np.all(ours == theirs)
+    if hasattr(sampler, "ladder"):
+        assert [s._replace(seconds=0) for s in sampler.ladder] == [s._replace(seconds=0) for s in other.ladder]
+        assert (sampler.log_evidence, sampler.log_evidence_error) == (other.log_evidence, other.log_evidence_error)
+    return True
+
+
+def evaluated_by(sampler):
+    """How often each point was evaluated: a run by moves may propose a point twice."""
+    return Counter(sampler.log_prob_fn.f.evaluated)
+
+
+def record_of(path):
+    return path.with_name(f"{path.name}.mcmc.record")
+
+
+# ---------------------------------------------------------------- emcee's idiom
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_steps_are_added_after_the_last_stored_one(kind, tmp_path):
+    begin(make(kind, tmp_path / "run.h5", Counted()), 3)
+    posterior = Counted()
+    reopened = make(kind, tmp_path / "run.h5", posterior, seed=8)
+    reopened.run_mcmc(None, 4)
+    assert reopened.iteration == 7
+    assert same(reopened, run(kind, tmp_path / "whole.h5", 3, 4))
+    assert len(posterior.evaluated) <= 4 * N  # those of the added steps only
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_equal_calls_add_steps_too(kind, tmp_path):
+    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
+    for _ in range(2):
+        reopened = make(kind, tmp_path / "run.h5", Counted())
+        reopened.run_mcmc(None, 2)
+    assert same(reopened, run(kind, tmp_path / "whole.h5", 2, 2, 2))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_loop_over_sample_adds_steps(kind, tmp_path):
+    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
+    reopened = make(kind, tmp_path / "run.h5", Counted())
+    seen = []
+    for state in reopened.sample(reopened.get_last_sample(), iterations=10):
+        seen.append(state.coords.copy())
+        if reopened.iteration == 5:
+            break
+    assert np.array_equal(reopened.get_chain()[2:], seen)
+    assert np.array_equal(reopened.get_chain(), run(kind, tmp_path / "whole.h5", 2, 3).get_chain())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reset_begins_anew(kind, tmp_path):
+    """Also with another posterior and another seed, which a file that is not reset would refuse or ignore."""
+    begin(make(kind, tmp_path / "run.h5", Counted()), 3)
+    emcee.backends.HDFBackend(str(tmp_path / "run.h5")).reset(N, NDIM)
+    other = {"posterior": Counted("other", centre=0.3), "seed": 9}
+    anew = begin(make(kind, tmp_path / "run.h5", **other), 2)
+    assert anew.iteration == 2
+    other["posterior"] = Counted("other", centre=0.3)
+    assert same(anew, begin(make(kind, tmp_path / "new.h5", **other), 2))
+
+
+# ---------------------------------------------------------------- the record makes the file again
+
+
+@pytest.mark.parametrize("fingerprint", ["counted", None])
+@pytest.mark.parametrize("kind", OURS)
+def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_path):
+    whole = run(kind, tmp_path / "whole.h5", 3)
+    path = tmp_path / "run.h5"
+    begin(make(kind, path, Counted(fingerprint)), 3)
+    path.unlink()
+    assert record_of(path).exists()
+    posterior = Counted(fingerprint)
+    again = make(kind, path, posterior, seed=8)
+    again.run_mcmc(None, 3)
+    assert same(again, whole)
+    assert len(posterior.evaluated) <= (2 if fingerprint is None else 0)  # a comparison replaces the fingerprint
+    again.run_mcmc(None, 2)
+    assert same(again, run(kind, tmp_path / "longer.h5", 3, 2))
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_damaged_file_is_set_aside_and_made_again(kind, tmp_path):
+    whole = run(kind, tmp_path / "whole.h5", 3)
+    path = tmp_path / "run.h5"
+    begin(make(kind, path, Counted()), 3)
+    os.truncate(path, path.stat().st_size // 2)
+    damaged = path.read_bytes()
+    posterior = Counted()
+    again = make(kind, path, posterior)
+    again.run_mcmc(None, 3)
+    assert same(again, whole) and not posterior.evaluated
+    assert Path(f"{path}.damaged").read_bytes() == damaged
+
+
+# ---------------------------------------------------------------- limits and interrupts
+
+
+@pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
+@pytest.mark.parametrize("place", ["annealing", "at beta = 1"])
+@pytest.mark.parametrize("kind", OURS)
+def test_a_limit_that_is_raised(kind, place, reopened, tmp_path):
+    """The result is that of the larger limit from the start, and nothing is evaluated twice."""
+    annealing = run(kind, tmp_path / "annealed.h5", 0, max_simulations=10_000).evaluations
+    whole = run(kind, tmp_path / "whole.h5", 4, max_simulations=10_000)
+    limit = annealing // 2 if place == "annealing" else annealing + int(1.5 * N)
+    posterior = Counted()
+    sampler = begin(make(kind, tmp_path / "run.h5", posterior, max_simulations=limit), 4)
+    assert len(set(posterior.evaluated)) <= limit
+    assert sampler.iteration == 1  # in the annealing, the step is an estimate that is replaced
+    if reopened:
+        sampler = make(kind, tmp_path / "run.h5", posterior, max_simulations=10_000)
+    else:
+        sampler.max_simulations = 10_000
+    sampler.run_mcmc(None, 4 - sampler.iteration)
+    assert same(sampler, whole)
+    assert (evaluated_by(sampler) - evaluated_by(whole)).total() == 0
+
+
+@pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
+@pytest.mark.parametrize("place", ["start", "annealing", "at beta = 1"])
+@pytest.mark.parametrize("kind", OURS)
+def test_an_interrupt_loses_no_evaluated_point(kind, place, reopened, tmp_path):
+    annealing = run(kind, tmp_path / "annealed.h5", 0).evaluations
+    whole = run(kind, tmp_path / "whole.h5", 4)
+    at = {"start": N // 2, "annealing": annealing // 2 + 5, "at beta = 1": annealing + int(1.5 * N)}[place]
+    posterior = Counted(interrupt_at=at)
+    sampler = make(kind, tmp_path / "run.h5", posterior)
+    with pytest.raises(KeyboardInterrupt):
+        begin(sampler, 4)
+    assert len(posterior.evaluated) == at
+    made = sampler.iteration
+    assert made == (1 if place == "at beta = 1" else 0)
+    if reopened:
+        sampler = make(kind, tmp_path / "run.h5", posterior)
+    sampler.run_mcmc(None, 4 - made)
+    assert same(sampler, whole)
+    assert (evaluated_by(sampler) - evaluated_by(whole)).total() == 0
+
+
+# ---------------------------------------------------------------- what is refused, and errors
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path):
+    path = tmp_path / "run.h5"
+    annealing = run(kind, tmp_path / "whole.h5", 0).evaluations
+    with pytest.raises(KeyboardInterrupt):
+        begin(make(kind, path, Counted(interrupt_at=annealing // 2)), 2)
+    other = np.random.default_rng(2).standard_normal((N, NDIM))
+    with pytest.raises(ValueError, match="a run from other draws of the prior: pass None"):
+        make(kind, path, Counted()).run_mcmc(other, 2)
+    again = make(kind, path, Counted())
+    again.run_mcmc(None, 2)
+    assert same(again, run(kind, tmp_path / "two.h5", 2))
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_second_annealing_of_a_reopened_run(kind, tmp_path):
+    """Other draws begin a new annealing after the steps of the first one; a third sampler goes on with the second."""
+    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
+    reopened = make(kind, tmp_path / "run.h5", Counted())
+    reopened.run_mcmc(None, 1)
+    reopened.run_mcmc(np.random.default_rng(2).standard_normal((N, NDIM)), 2)
+    assert reopened.iteration == 5
+    posterior = Counted()
+    third = make(kind, tmp_path / "run.h5", posterior)
+    assert third.ladder == reopened.ladder and third.log_evidence == reopened.log_evidence
+    third.run_mcmc(None, 0)
+    assert not posterior.evaluated and np.array_equal(third.get_chain(), reopened.get_chain())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": "TMCMCSampler"}, "it was written by SMCSampler, and this is a TMCMCSampler"),
+        ({"nwalkers": N + 2}, f"a run of {N} walkers in {NDIM} dimensions; got nwalkers={N + 2}"),
+        ({"recycle": False}, "recycle was True, is False"),
+    ],
+    ids=str,
+)
+def test_another_sampler_is_refused_in_words_of_the_user(changes, message, tmp_path):
+    begin(make("SMCSampler", tmp_path / "run.h5", Counted()), 1)
+    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+    settings = {"nwalkers": N, "kind": "SMCSampler", "recycle": True} | changes
+    Sampler, nwalkers = KINDS[settings.pop("kind")][0], settings.pop("nwalkers")
+    settings = settings if Sampler is SMCSampler else {}
+    with pytest.raises(ValueError, match=message):
+        Sampler(nwalkers, NDIM, Counted(), backend=backend, **settings).run_mcmc(None, 1)
+
+
+class Spoilt(Counted):
+    """Returns no number once, in the call of this number."""
+
+    def __init__(self, spoilt_at, **kwargs):
+        super().__init__(**kwargs)
+        self.spoilt_at = spoilt_at
+
+    def __call__(self, x):
+        if len(self.evaluated) == self.spoilt_at:
+            self.spoilt_at = None
+            return "no number", 0.0
+        return super().__call__(x)
+
+
+@pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
+@pytest.mark.parametrize("place", ["annealing", "at beta = 1"])
+@pytest.mark.parametrize("kind", OURS)
+def test_an_error_and_then_the_same_call(kind, place, reopened, tmp_path):
+    """The batch that contains the error is evaluated again; everything before it is kept."""
+    annealing = run(kind, tmp_path / "annealed.h5", 0).evaluations
+    whole = run(kind, tmp_path / "whole.h5", 4)
+    posterior = Spoilt({"annealing": annealing // 2 + 5, "at beta = 1": annealing + int(1.5 * N)}[place])
+    sampler = make(kind, tmp_path / "run.h5", posterior)
+    with pytest.raises(ValueError, match="must return a number"):
+        begin(sampler, 4)
+    made = sampler.iteration
+    if reopened:
+        sampler = make(kind, tmp_path / "run.h5", posterior)
+    sampler.run_mcmc(None, 4 - made)
+    assert same(sampler, whole)
+    assert sum(Counter(posterior.evaluated).values()) - len(set(posterior.evaluated)) <= 4 * N
+
+
+def test_a_log_prior_of_another_convention_is_named(tmp_path):
+    def of_one_point(x):
+        return -0.5 * x @ x if x[0] > -9.0 else -np.inf  # an error for a batch of points
+
+    sampler = SMCSampler(N, NDIM, lambda x: -(x[:, 0] ** 2), vectorize=True, log_prior_fn=of_one_point)
+    with pytest.raises(ValueError, match=r"log_prior_fn failed with .* an array \(n, ndim\) of points"):
+        sampler.run_mcmc(np.random.default_rng(1).standard_normal((N, NDIM)), 1)
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_file_that_is_only_read(kind, tmp_path):
+    whole = begin(make(kind, tmp_path / "run.h5", Counted()), 2)
+    before = sorted((path.name, path.read_bytes()) for path in tmp_path.iterdir())
+    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"), read_only=True)
+    sampler = KINDS[kind][0](N, NDIM, Counted(), backend=backend, **KINDS[kind][1])
+    assert sampler.ladder == whole.ladder and sampler.log_evidence == whole.log_evidence
+    assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.verdict == whole.verdict
+    assert sorted((path.name, path.read_bytes()) for path in tmp_path.iterdir()) == before

@@ -1,0 +1,94 @@
+"""Ctrl-C at any line of `samplers` or emcee, then the missing steps in the same process, in memory and with a file."""
+
+import random
+import signal
+import sys
+from pathlib import Path
+
+import emcee
+import pytest
+
+import samplers
+from tests.faults.kills import evaluated_again
+from tests.faults.resumable_run import STEPS, go_on, make, outcome, points_of
+
+FOLDERS = tuple(str(Path(package.__file__).parent) for package in (samplers, emcee))
+
+pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+
+
+class Interrupt:
+    """Raises KeyboardInterrupt at a line, counted from the start, except where Ctrl-C is deferred."""
+
+    def __init__(self, line=None):
+        self.line, self.count, self.handler = line, 0, signal.getsignal(signal.SIGINT)
+
+    def __enter__(self):
+        sys.settrace(self._enter)
+        return self
+
+    def __exit__(self, *error):
+        sys.settrace(None)
+
+    def _enter(self, frame, event, value):
+        return self._trace if frame.f_code.co_filename.startswith(FOLDERS) else None
+
+    def _trace(self, frame, event, value):
+        name = frame.f_code.co_name
+        if event == "line" and signal.getsignal(signal.SIGINT) is self.handler and name != "deferred_interrupts":
+            self.count += 1
+            if self.count == self.line:
+                sys.settrace(None)
+                raise KeyboardInterrupt
+        return self._trace
+
+
+def run(path, kind, log, lines=()):
+    """A run that is interrupted at some lines, each counted from the interrupt before."""
+    sampler, interrupts = make(path, kind, log=log), 0
+    for line in lines:
+        try:
+            with Interrupt(line):
+                go_on(sampler, kind)
+        except KeyboardInterrupt:
+            interrupts += 1
+    return go_on(sampler, kind), interrupts
+
+
+@pytest.mark.parametrize("stored", [False, True], ids=["memory", "file"])
+@pytest.mark.parametrize("kind", ["smc", "moves", "guided", "map", "asynchronous", "thin"])
+def test_the_missing_steps_have_the_bits_of_a_run_without_interrupt(kind, stored, tmp_path):
+    whole, _ = run(None, kind, tmp_path / "whole")
+    with Interrupt() as counted:
+        go_on(make(None, kind), kind)
+    choose, interrupts = random.Random(kind), 0
+    for trial in range(2):
+        path = tmp_path / f"{trial}.h5" if stored else None
+        # the last lines are those of the steps
+        lines = [choose.randint(1, counted.count), int((0.7 + 0.3 * choose.random()) * counted.count)]
+        sampler, more = run(path, kind, tmp_path / f"log {trial}", lines)
+        interrupts += more
+        assert sampler.iteration == STEPS and outcome(sampler) == outcome(whole)
+        points = points_of(tmp_path / f"log {trial}")
+        assert set(points) == set(points_of(tmp_path / "whole"))
+    assert interrupts >= 2
+
+
+def test_points_of_a_batch_that_ctrl_c_ends_are_kept(tmp_path):
+    """KeyboardInterrupt in the function, of single points that return blobs: only that point is evaluated again."""
+    for path in (None, tmp_path / "run.h5"):
+        log = tmp_path / f"log {path is None}"
+        sampler, left = make(path, "map", log=log), [300]
+
+        def event(left=left):
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+
+        sampler.log_prob_fn.f.event = event
+        with pytest.raises(KeyboardInterrupt):
+            go_on(sampler, "map")
+        go_on(sampler, "map")
+        points = points_of(log)
+        assert len(points) - sampler.evaluations <= 3  # that point, and two of the check of the first values
+    assert evaluated_again(log, "smc") == 0

@@ -1,0 +1,316 @@
+"""Damage to the two files of a run: nothing in the record is evaluated again, and the results keep their bits."""
+
+import io
+import os
+import pickle
+import resource
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import emcee
+import h5py
+import numpy as np
+import pytest
+
+from samplers import SMCSampler
+from samplers.record import BLOCK, MAGIC
+from tests.contract.targets import Gaussian
+from tests.faults.kills import end, evaluated_again, fork
+from tests.faults.resumable_run import NDIM, STEPS, N, go_on, make, outcome, points_of
+
+pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+
+
+def record_of(path):
+    return Path(f"{path}.mcmc.record")
+
+
+@pytest.fixture(scope="module", params=["smc", "guided"])
+def whole(request, tmp_path_factory):
+    """Kind, file and outcome of a finished run."""
+    path = tmp_path_factory.mktemp("whole") / "run.h5"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sampler = go_on(make(path, request.param, log=path.with_name("log")))
+    sampler._record.close()
+    return request.param, path, outcome(sampler)
+
+
+def copied(path, folder):
+    """A copy of the files of a run."""
+    folder.mkdir(exist_ok=True)
+    for name in (path, record_of(path)):
+        shutil.copy(name, folder / name.name)
+    return folder / path.name
+
+
+def garble(data):
+    return np.random.default_rng(len(data)).bytes(len(data))
+
+
+CHAINS = {
+    "kept": lambda path: None,
+    "deleted": os.unlink,
+    "empty": lambda path: path.write_bytes(b""),
+    "halved": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "garbled": lambda path: path.write_bytes(garble(path.read_bytes())),
+    "a bit": lambda path: path.write_bytes(flipped(path.read_bytes(), 0.6)),
+}
+
+
+def flipped(data, share):
+    """Bytes of which one bit differs."""
+    changed = bytearray(data)
+    changed[int(share * (len(data) - 1))] ^= 4
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("chain", [name for name in CHAINS if name != "a bit"])
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.5, 0.9, 1.0])
+def test_a_record_that_is_cut_anywhere(whole, chain, share, tmp_path):
+    kind, path, expected = whole
+    path = copied(path, tmp_path)
+    data = record_of(path).read_bytes()
+    place = int(share * len(data))
+    record_of(path).write_bytes(data[:place])
+    CHAINS[chain](path)
+    if share == 0.02 and chain in ("halved", "garbled"):  # before the start of the run
+        with pytest.raises(ValueError, match="is damaged, and has no record"):
+            make(path, kind)
+        return
+    sampler = make(path, kind, log=tmp_path / "log")
+    if sampler.iteration == STEPS:  # the chain is whole, and the record has lost some of its points
+        go_on(sampler)
+        assert sampler.iteration == STEPS
+        return
+    go_on(sampler)
+    assert outcome(sampler) == expected
+    sampler._record.close()
+    assert not set(points_of(tmp_path / "log")) - set(points_of(whole[1].with_name("log")))
+    again = set(points_of(tmp_path / "log"))
+    assert len(again & points_in(data[:place])) <= 2  # a comparison
+
+
+def points_in(data):
+    """Points in the whole blocks of a record."""
+    points, place = set(), len(MAGIC)
+    while place + BLOCK.size <= len(data):
+        kind, length, *_ = BLOCK.unpack_from(data, place)
+        content = data[place + BLOCK.size : place + BLOCK.size + length]
+        if kind == b"EVAL" and len(content) == length:
+            points |= {row.tobytes() for row in np.lib.format.read_array(io.BytesIO(content))}
+        place += BLOCK.size + length
+    return points
+
+
+@pytest.mark.parametrize("chain", ["kept", "deleted"])
+def test_a_record_with_a_changed_byte(whole, chain, tmp_path, caplog):
+    """In the name of the format: refused. Elsewhere: what is behind the byte is evaluated again."""
+    kind, source, expected = whole
+    for share in np.linspace(0.001, 0.999, 12):
+        path = copied(source, tmp_path)
+        record_of(path).write_bytes(flipped(record_of(path).read_bytes(), share))
+        CHAINS[chain](path)
+        caplog.clear()
+        sampler = go_on(make(path, kind))
+        assert "damaged after" in caplog.text and Path(f"{record_of(path)}.damaged").exists()
+        assert sampler.iteration == STEPS
+        if chain == "deleted":
+            assert outcome(sampler) == expected
+        sampler._record.close()
+        for name in tmp_path.iterdir():
+            name.unlink()
+    path = copied(source, tmp_path)
+    record_of(path).write_bytes(b"x" + record_of(path).read_bytes()[1:])
+    with pytest.raises(ValueError, match="is not the record of a run"):
+        make(path, kind)
+
+
+def damage_accepted(group):
+    group["accepted"][0] += 1
+
+
+def damage_iteration(group):
+    group.attrs["iteration"] -= 1
+
+
+def damage_random_state(group):
+    group.attrs["random_state_2"] += 1
+
+
+def damage_last_step(group):
+    group["blobs"][STEPS - 1, 3] += 1.0
+
+
+def damage_ladder(group):
+    group["tempering"][3:] = 0
+
+
+@pytest.mark.parametrize(
+    "damage", [damage_accepted, damage_iteration, damage_random_state, damage_last_step, damage_ladder]
+)
+def test_half_of_a_step_is_found_and_the_chain_made_again(whole, damage, tmp_path):
+    """As a process leaves it that is killed in HDF5; nothing is evaluated but a comparison."""
+    kind, path, expected = whole
+    path = copied(path, tmp_path)
+    with h5py.File(path, "a") as file:
+        damage(file["mcmc"])
+    sampler = go_on(make(path, kind, log=tmp_path / "log"))
+    assert outcome(sampler) == expected and Path(f"{path}.damaged").exists()
+    assert len(points_of(tmp_path / "log")) <= 2
+    sampler._record.close()
+
+
+def test_a_damaged_chain_without_a_record_is_refused(whole, tmp_path):
+    kind, path, _ = whole
+    path = copied(path, tmp_path)
+    record_of(path).unlink()
+    os.truncate(path, 2000)
+    with pytest.raises(ValueError, match="is damaged, and has no record"):
+        make(path, kind)
+
+
+def test_a_lost_record_leaves_the_chain(whole, tmp_path):
+    """The chain goes on as with emcee, where its last step is that of the same posterior."""
+    kind, path, _ = whole
+    path = copied(path, tmp_path)
+    record_of(path).unlink()
+    with pytest.raises(ValueError, match="contains another run"):
+        make(path, kind, sd=0.02).run_mcmc(None, 1)
+    sampler = make(path, kind)
+    ladder = sampler.ladder
+    sampler.run_mcmc(None, 2)
+    assert sampler.iteration == STEPS + 2 and sampler.ladder == ladder
+
+
+def test_another_run_is_refused_and_nothing_is_changed(whole, tmp_path):
+    kind, path, _ = whole
+    path = copied(path, tmp_path)
+    before = record_of(path).read_bytes(), path.read_bytes()
+    for change, message in (({"check_draws": 0}, "check_draws was"), ({"sd": 0.02}, "log_prob_fn was")):
+        with pytest.raises(ValueError, match=message):
+            make(path, kind, **change).run_mcmc(None, 1)
+        assert (record_of(path).read_bytes(), path.read_bytes()) == before
+
+
+def test_the_chain_of_another_run_begins_a_new_record(whole, tmp_path, caplog):
+    kind, path, _ = whole
+    path = copied(path, tmp_path)
+    other = make(tmp_path / "other.h5", kind, seed=6)
+    other.run_mcmc(None, 1)
+    other._record.close()
+    shutil.copy(tmp_path / "other.h5", path)
+    earlier = record_of(path).read_bytes()
+    sampler = make(path, kind)
+    assert "replaced by the chain of another run" in caplog.text
+    assert Path(f"{record_of(path)}.before_reset").read_bytes() == earlier
+    sampler.run_mcmc(None, 1)
+    assert np.array_equal(sampler.get_chain()[:1], other.get_chain())
+
+
+def test_groups_of_one_file_are_runs_of_their_own(tmp_path):
+    def sampler(name, seed):
+        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"), name=name)
+        posterior = Gaussian(NDIM, sd=0.05)
+        return SMCSampler(N, NDIM, posterior, vectorize=True, seed=seed, backend=backend)
+
+    first, second = sampler("one", 1), sampler("a/b", 2)
+    first.run_mcmc(None, 2)
+    second.run_mcmc(None, 2)
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        file["one/accepted"][0] += 1.0
+    again, other = sampler("one", 1), sampler("a/b", 2)
+    again.run_mcmc(None, 2)
+    assert np.array_equal(again.get_chain(), first.get_chain())
+    other.run_mcmc(None, 1)
+    assert other.iteration == 3
+
+
+def test_a_reader_of_the_file_costs_no_evaluation(tmp_path):
+    """HDF5 refuses to store a step while another process reads the file: the same call goes on later."""
+    expected = outcome(go_on(make(tmp_path / "whole.h5", "smc")))
+    path, log = tmp_path / "run.h5", tmp_path / "log"
+    make(path, "smc", log=log).run_mcmc(None, 1)
+    code = "import h5py, sys\nwith h5py.File(sys.argv[1]):\n    print('open', flush=True)\n    sys.stdin.read()"
+    sampler = make(path, "smc", log=log)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code, str(path)], **pipes) as reader:
+        assert reader.stdout.readline() == "open\n"
+        with pytest.raises(OSError, match="lock"):
+            sampler.run_mcmc(None, STEPS - sampler.iteration)
+        reader.communicate("")
+    go_on(sampler)
+    assert outcome(sampler) == expected
+    assert (
+        len(points_of(log)) - sampler.evaluations <= 4
+    )  # two for the check of the first values, two for the comparison
+
+
+def test_two_processes_and_two_samplers_on_one_file(tmp_path):
+    path = tmp_path / "run.h5"
+    first = make(path, "smc")
+    first.run_mcmc(None, 1)
+
+    code = (
+        "import sys; from tests.faults.resumable_run import make\n"
+        "try: make(sys.argv[1], 'smc').run_mcmc(None, 1)\n"
+        "except ValueError as error: print(error)"
+    )
+    said = subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(path)], capture_output=True, text=True)
+    assert "another run is writing" in said.stdout, said.stderr
+    second = make(path, "smc")  # of the same process: the last sampler owns the file
+    second.run_mcmc(None, 1)
+    assert make(path, "smc").iteration == 2
+
+
+def limit_files(size):
+    """Limit the size of files of this process [bytes]; None: no limit."""
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
+
+
+@pytest.mark.parametrize(
+    ("size", "ballast"), [(1_000, 0), (10_000, 0), (30_000, 0), (9_000, 300_000), (20_000, 300_000)]
+)
+def test_a_full_disk(size, ballast, tmp_path):
+    """Files may not grow: an OSError; a new process goes on when there is space again, and evaluates nothing twice."""
+    path, log = tmp_path / "run.h5", tmp_path / "log"
+    expected = outcome(go_on(make(tmp_path / "whole.h5", "smc")))
+    if ballast:  # another group, so that the file of the chain reaches the limit before the record
+        with h5py.File(path, "w") as file:
+            file["other"] = np.arange(ballast // 8)
+
+    def limited():
+        limit_files(size + ballast)
+        go_on(make(path, "smc", log=log))
+
+    def unlimited():
+        return pickle.dumps(outcome(go_on(make(path, "smc", log=log))))
+
+    for _ in range(2):
+        status, said = end(*fork(limited))
+        assert status != 0 and b"rror" in said
+    status, said = end(*fork(unlimited))
+    assert status == 0, said.decode()
+    assert pickle.loads(said) == expected
+    assert evaluated_again(log, "smc") == 0
+
+
+def test_blobs_that_cannot_be_stored_are_refused_after_the_first_batch(tmp_path):
+    posterior = Gaussian(NDIM)
+    for blob in ({"any": "thing"}, "text"):
+        path = tmp_path / f"{type(blob).__name__}.h5"
+        sampler = SMCSampler(
+            N,
+            NDIM,
+            lambda x, blob=blob: (posterior(x), blob),
+            log_prior_fn=posterior.log_prior,
+            backend=emcee.backends.HDFBackend(str(path)),
+        )
+        posterior.calls = 0
+        with pytest.raises(ValueError, match="blobs"):
+            sampler.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 1)
+        assert posterior.calls <= N + 2

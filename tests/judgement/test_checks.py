@@ -1,0 +1,139 @@
+"""Alarms: each one on runs that are wrong and on runs that are right."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
+from samplers.estimates.importance import EvidenceCheck, expected_efficiency
+from samplers.judgement.checks import check_evidence, check_fallback
+from samplers.proposals.mixture import fit_mixture, log_density
+from samplers.reports import Stage
+from tests.benchmarks import truth_targets
+
+
+def _check(log_evidence, error=0.05, effective=200.0, shape=0.3):
+    return EvidenceCheck(log_evidence, error, effective, shape, 500)
+
+
+def test_equal_evidences_raise_no_doubt():
+    assert check_evidence(-10.0, 0.1, _check(-10.2)) == []
+    assert check_evidence(-10.0, 0.1, _check(-10.9, effective=30.0, shape=0.9)) == []
+
+
+def test_reliable_check_that_differs_by_three_joint_errors_is_reported_without_condemning_the_posterior():
+    (doubt,) = check_evidence(-10.0, 0.1, _check(-10.5))
+    assert doubt.message.index("more walkers") < doubt.message.index("log_prior is a function of your own")
+    assert not doubt.grave
+
+
+@pytest.mark.parametrize("value", [-8.5, float("-inf")])
+def test_unreliable_check_that_differs_by_more_than_one_is_grave(value):
+    (doubt,) = check_evidence(-10.0, 0.1, _check(value, error=0.4, effective=12.0, shape=0.9))
+    assert "heavier tails" in doubt.message
+    assert doubt.message.index("more walkers and more moves") < doubt.message.index("log_prior")
+    assert doubt.grave
+
+
+def test_check_without_information_is_reported():
+    (doubt,) = check_evidence(-10.0, 0.1, _check(-10.4, error=0.5, effective=3.0, shape=1.1))
+    assert "no mixture fits the final points" in doubt.message
+
+
+@pytest.mark.parametrize(
+    ("recycled", "check_of_it", "lost"), [(-9.3, -9.2, True), (-10.05, -10.0, False), (-9.3, -10.0, False)]
+)
+@pytest.mark.parametrize("reliable", [True, False])
+def test_evidence_that_moves_lose_after_recycling_is_reported(recycled, check_of_it, lost, reliable):
+    """Both estimates of recycling must exceed that of the moves: that of the check, or else that of the stages."""
+    stages = [Stage(1.0, 250.0, 0.3, 5, 300, -10.0 if not reliable else -9.3, 0.05)]
+    check = _check(-10.0) if reliable else _check(-9.3, shape=1.2)
+    concerns = check_fallback(stages, check, recycled, 0.05, _check(check_of_it))
+    assert [concern.grave for concern in concerns] == [True] * lost
+
+
+@pytest.mark.parametrize(("Sampler", "walkers", "seed"), [(TMCMCSampler, 500, 1), (SMCSampler, 250, 80)])
+def test_run_that_does_not_reach_heavy_tails_says_so(Sampler, walkers, seed):
+    """Annealing by moves ends with tenfold standard deviations on a Student t in a wide box; nothing said so before."""
+    posterior = truth_targets.student(seed)
+    sampler = Sampler(
+        walkers,
+        posterior.ndim,
+        posterior,
+        vectorize=True,
+        seed=seed,
+        **({"recycle": False} if Sampler is SMCSampler else {}),
+    )
+    with pytest.warns(SamplingWarning):
+        sampler.run_mcmc(None, 1)
+    assert abs(sampler.log_evidence - posterior.log_evidence) > 4.0 * sampler.log_evidence_error
+    assert sampler.verdict.status == "not usable"
+
+
+def test_runs_by_moves_on_a_gaussian_are_not_doubted():
+    posterior = truth_targets.gaussian(1, ndim=4)
+    sampler = SMCSampler(300, 4, posterior, vectorize=True, recycle=False, seed=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SamplingWarning)
+        sampler.run_mcmc(None, 1)
+    assert np.abs(sampler.log_evidence - posterior.log_evidence) < 4.0 * sampler.log_evidence_error
+
+
+def test_expected_efficiency_is_that_of_fits_to_gaussian_draws(rng):
+    yields = []
+    for _ in range(8):
+        points, draws = rng.standard_normal((400, 6)), rng.standard_normal((4000, 6))
+        mixture = fit_mixture(points, np.full(400, 1.0 / 400), max_components=1)
+        log_ratio = stats.multivariate_normal(np.zeros(6)).logpdf(draws) - log_density(mixture, draws)
+        yields.append(1.0 / np.mean(np.exp(log_ratio)))
+    assert np.mean(yields) == pytest.approx(expected_efficiency(6, mixture.dof, 1, 400), rel=0.05)
+
+
+@pytest.mark.parametrize("posterior", [truth_targets.rosenbrock(1), truth_targets.rotated_banana(6)])
+def test_ends_of_a_bent_posterior_that_may_be_missing_are_reported(posterior):
+    sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=4)
+    with pytest.warns(SamplingWarning, match="Ends of the posterior may be missing"):
+        sampler.run_mcmc(None, 1)
+    assert sampler.ladder[0].moves == 0  # recycling, without a fallback
+    assert sampler.verdict.status == "not usable"
+
+
+@pytest.mark.parametrize(
+    "posterior",
+    [truth_targets.gaussian(1), truth_targets.bounds(1), truth_targets.banana(1), truth_targets.student(1)]
+    + [truth_targets.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal"), truth_targets.rough(1, 1.0)],
+)
+def test_posteriors_that_are_followed_are_not_doubted(posterior):
+    sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SamplingWarning)
+        sampler.run_mcmc(None, 1)
+    assert sampler.verdict.status == "converged"
+
+
+def _largest_shares(dimensions, walkers, seeds, Sampler, **settings):
+    """Error of the share of the larger one of two modes, and the verdict, for several runs."""
+    found = []
+    for seed in seeds:
+        posterior = truth_targets.modes(seed, 2, dimensions, 15.0, 2.0, 1.0, "box")
+        sampler = Sampler(walkers, dimensions, posterior, vectorize=True, seed=seed, **settings)
+        with warnings.catch_warnings(record=True):
+            sampler.run_mcmc(None, 1)
+        found.append((sampler.verdict.modes[0].share - max(posterior.shares), sampler.verdict.status))
+    return found
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_modes_that_the_moves_do_not_connect_are_no_converged_result(Sampler):
+    """150 walkers in 11 dimensions: shares of modes are wrong by more than 0.1 in about half of the runs."""
+    settings = {"recycle": False} if Sampler is SMCSampler else {}
+    found = _largest_shares(11, 150, range(4), Sampler, **settings)
+    assert max(abs(error) for error, _ in found) > 0.1
+    assert all(status != "converged" for error, status in found if abs(error) > 0.12)
+
+
+def test_modes_that_the_moves_connect_are_converged():
+    found = _largest_shares(2, 250, range(4), TMCMCSampler)
+    assert all(abs(error) < 0.12 and status == "converged" for error, status in found)

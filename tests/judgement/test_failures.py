@@ -1,0 +1,255 @@
+"""Failures among the final points end the posterior, not the data: the verdict says so, and only then."""
+
+import emcee
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers import SMCSampler, TMCMCSampler
+from samplers.evaluation.user_functions import OptionalAttributes
+from samplers.judgement import failures
+from samplers.judgement.failures import NearFailures, failures_near, judged_failures
+from tests.contract.targets import Box, Gaussian
+
+N = 250
+
+
+class Cut(Gaussian):
+    """A Gaussian whose simulations fail above a limit of the first parameter, and return NaN or -inf then.
+
+    Without failures, the mean of the first parameter is 0.70 and its standard deviation 0.05.
+    """
+
+    def __init__(self, limit, way, ndim=2, sd=0.05):
+        super().__init__(ndim=ndim, sd=sd)
+        self.limit, self.way, self.failed = limit, way, 0
+
+    def __call__(self, x):
+        values, failed = np.array(super().__call__(x)), np.asarray(x)[..., 0] > self.limit
+        self.failed += int(np.sum(failed))
+        values[failed] = np.nan if self.way == "nan" else -np.inf
+        return values
+
+
+class Counting(Cut):
+    """As a posterior of finite-element models, it says how many simulations failed."""
+
+    def report(self):
+        return {"failure_count": self.failed}
+
+
+def run(posterior, Sampler=SMCSampler, nwalkers=N, steps=1, **options):
+    options = {"vectorize": True, "seed": 1, "max_failure_share": 0.99} | options
+    sampler = Sampler(nwalkers, posterior.ndim, posterior, **options)
+    sampler.run_mcmc(None, steps)
+    return sampler
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize(
+    "options", [{}, {"recycle": False, "nwalkers": 80}, {"Sampler": TMCMCSampler, "nwalkers": 80}], ids=str
+)
+@pytest.mark.parametrize(("way", "status"), [("nan", "not usable"), ("inf", "usable"), ("counted", "not usable")])
+def test_a_run_that_is_piled_up_against_failures_says_so(way, status, options):
+    posterior = (Counting if way == "counted" else Cut)(0.7, way)
+    sampler = run(posterior, **options)
+    assert sampler.verdict.status == status
+    near = sampler.verdict.near_failures
+    (reason,) = (r for r in sampler.verdict.reasons if r.startswith("in the region of the final points"))
+    assert f"{near.failed} of {near.evaluated} evaluated points" in reason and near.borders
+    assert near.known == (status == "not usable")
+    # the points cannot tell: mean and standard deviation are those of half a Gaussian
+    samples = sampler.get_chain(flat=True)[:, 0]
+    mean, sd = Gaussian(ndim=2, sd=0.05).mean[0], Gaussian(ndim=2, sd=0.05).sd[0]
+    half = stats.truncnorm(-np.inf, (0.7 - mean) / sd, loc=mean, scale=sd)
+    error = half.std() * np.sqrt(1.0 / sampler.verdict.effective_sample_size + 1.0 / len(samples))
+    assert samples.max() <= 0.7 and abs(samples.mean() - half.mean()) < 4.0 * error < half.std()
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("way", ["nan", "inf", "counted"])
+def test_control_failures_away_from_the_posterior_are_no_concern(way):
+    posterior = (Counting if way == "counted" else Cut)(0.9, way)
+    sampler = run(posterior)
+    assert posterior.failed > 10 and not sampler.verdict.near_failures.borders
+    assert sampler.verdict.status == "converged"
+
+
+def test_control_a_bound_of_the_prior_is_no_failure():
+    """The posterior leans against a corner of the box, outside of which nothing is evaluated."""
+    sampler = run(Box([0.0, 0.0], [1.0, 1.0], lambda x: -20.0 * np.sum(x, axis=-1)))
+    assert sampler.verdict.near_failures == NearFailures(0, 0) and sampler.verdict.status == "converged"
+
+
+class RulesOut(Cut):
+    """Its second parameter is impossible above 0.7, which `possible` tells without a simulation."""
+
+    def __call__(self, x):
+        values = np.array(super().__call__(x))
+        values[~self.possible(x)] = -np.inf
+        return values
+
+    def possible(self, x):
+        return np.asarray(x)[..., 1] < 0.7
+
+
+class CountingRulesOut(RulesOut, Counting):
+    """The same, with a number of failures."""
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("Posterior", [RulesOut, CountingRulesOut])
+def test_what_is_known_to_be_impossible_is_no_failure(Posterior):
+    sampler = run(Posterior(5.0, "inf"))
+    assert sampler.verdict.near_failures.failed == 0 and sampler.verdict.status == "converged"
+    # failures beside it still count
+    near = run(Posterior(0.7, "inf")).verdict.near_failures
+    assert near.borders and near.known == (Posterior is CountingRulesOut)
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("answer", [None, np.array([True]), "error"])
+def test_an_answer_that_cannot_be_used_rules_nothing_out(answer, caplog):
+    def possible(x):
+        if answer == "error":
+            raise RuntimeError("no answer")
+        return answer
+
+    posterior = RulesOut(5.0, "inf")
+    sampler = run(posterior)
+    posterior.possible = possible
+    known = sampler._record.latest()
+    points = known.coords, known.log_prob, np.zeros(len(known.coords), bool), sampler.get_chain(flat=True)
+    expected = judged_failures(*points, np.arange(2), True)
+    found = judged_failures(*points, np.arange(2), True, OptionalAttributes.of(posterior).may_be_positive)
+    assert found == expected and found.failed > 50 and "takes all points as possible" in caplog.text
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_a_run_that_goes_on_from_its_file_says_the_same(tmp_path):
+    verdicts = []
+    for name, interrupted in (("whole", False), ("parts", True)):
+        path = str(tmp_path / f"{name}.h5")
+
+        def make(path=path):
+            posterior = Cut(0.7, "nan")
+            backend = emcee.backends.HDFBackend(path)
+            return SMCSampler(60, 2, posterior, vectorize=True, seed=3, backend=backend)
+
+        sampler = make()
+        if interrupted:
+            for count, _ in enumerate(sampler.sample(None, iterations=4)):
+                if count == 1:
+                    break
+            sampler = make()
+        sampler.run_mcmc(None, 4 - sampler.iteration)
+        verdicts.append((sampler.verdict, sampler.verdict.near_failures))
+    assert verdicts[0] == verdicts[1] and verdicts[0][1].borders
+
+
+def test_the_latest_points_count(monkeypatch, rng):
+    monkeypatch.setattr(failures, "KEPT_POINTS", 100)
+    samples, coords = rng.standard_normal((50, 2)), 0.1 * rng.standard_normal((140, 2))
+    log_prob = np.where(np.arange(140) < 40, -np.inf, 0.0)
+
+    def failed_of_the_first(n):
+        return judged_failures(coords[:n], log_prob[:n], np.zeros(n, bool), samples, np.arange(2), True).failed
+
+    assert failed_of_the_first(40) == 40 and failed_of_the_first(140) == 0
+
+
+def test_the_region_is_that_of_the_samples_in_any_units(rng):
+    samples = rng.standard_normal((400, 2))
+    failed, succeeded = rng.uniform(-4.0, 4.0, size=(100, 2)), rng.uniform(-4.0, 4.0, size=(300, 2))
+    found = failures_near(samples, failed, succeeded)
+    scale = np.array([2e-4, 3e10])
+    assert failures_near(samples * scale, failed * scale, succeeded * scale) == found
+    inside = np.sum(failed**2, axis=1) < np.quantile(np.sum(samples**2, axis=1), 0.99)
+    assert abs(found.failed - inside.sum()) <= 4 and found.evaluated > found.failed
+
+
+class Plane:
+    """A log-likelihood of two parameters with a flat prior between -6 and 6, some of whose simulations fail."""
+
+    ndim = 2
+
+    def __init__(self, log_likelihood, fails):
+        self.log_likelihood, self.fails, self.failed = log_likelihood, fails, 0
+
+    def log_prior(self, x):
+        return np.where(np.all(np.abs(x) < 6.0, axis=-1), -2.0 * np.log(12.0), -np.inf)
+
+    def sample_prior(self, n, rng=None):
+        return np.random.default_rng(rng).uniform(-6.0, 6.0, size=(n, 2))
+
+    def __call__(self, x):
+        x = np.asarray(x)
+        failed = self.fails(x) & (self.log_prior(x) > -np.inf)
+        self.failed += int(np.sum(failed))
+        return np.where(failed, np.nan, self.log_prior(x) + self.log_likelihood(x))
+
+
+def gaussian(x):
+    return -0.5 * np.sum(x**2, axis=-1)
+
+
+def bent(x):
+    """A ridge along x1 = x0² - 2 whose conditional standard deviation is 0.2."""
+    return -0.5 * (x[..., 0] / 1.3) ** 2 - 0.5 * ((x[..., 1] - x[..., 0] ** 2 + 2.0) / 0.2) ** 2
+
+
+def gamma(x):
+    """Gamma with shape 2 and scale 0.5 in x0 + 6, standard normal in x1."""
+    return np.log(np.maximum(x[..., 0] + 6.0, 1e-300)) - 2.0 * (x[..., 0] + 6.0) - 0.5 * x[..., 1] ** 2
+
+
+def scattered(x):
+    """4 % of all points, without any order."""
+    return np.abs(np.sin(x @ np.array([12.9898, 78.233]) * 43758.5453)) % 1.0 < 0.04
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+@pytest.mark.parametrize("seed", [101, 102])
+@pytest.mark.parametrize(
+    ("log_likelihood", "fails", "place", "status"),
+    [
+        (bent, lambda x: x[..., 1] > x[..., 0] ** 2 - 0.8, "away", "converged"),
+        (gaussian, lambda x: x[..., 0] > 4.0, "away", "converged"),
+        (gaussian, scattered, "scattered", "usable"),
+        (gamma, lambda x: x[..., 0] > -3.5, "edge", "usable"),
+        (gaussian, lambda x: x[..., 0] > 1.6, "border", "not usable"),
+    ],
+    ids=["inside a bend", "4 sd away", "scattered", "beyond the upper 4 %", "beyond the upper 5 %"],
+)
+def test_the_place_of_the_failures(log_likelihood, fails, place, status, seed):
+    """The standard deviation is right in the first three cases, and 20 % and 10 % too small in the others."""
+    posterior = Plane(log_likelihood, fails)
+    sampler = run(posterior, nwalkers=200, seed=seed, recycle=False)
+    assert posterior.failed > 10
+    assert (sampler.verdict.near_failures.place, sampler.verdict.status) == (place, status)
+    words = {"scattered": "scattered among successful ones", "edge": "at an edge", "border": "end the posterior there"}
+    assert [each for each in words if words[each] in str(sampler.verdict)] == [place] * (place in words)
+
+
+def test_scattered_failures_are_told_from_those_that_fill_a_hole(rng):
+    samples, points = rng.standard_normal((300, 2)), rng.standard_normal((1500, 2))
+    for fails, is_scattered in ((rng.random(1500) < 0.08, True), (np.linalg.norm(points, axis=1) < 0.4, False)):
+        found = failures_near(samples, points[fails], points[~fails])
+        assert found.scattered == is_scattered and found.borders != is_scattered and found.adjoining > 40
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_a_long_chain_says_the_same():
+    """Its many evaluated points are all closer to a sample than the next sample is."""
+    posterior = Plane(gaussian, lambda x: x[..., 0] > 1.6)
+    sampler = run(posterior, nwalkers=200, steps=90, seed=102)
+    assert (sampler.verdict.near_failures.place, sampler.verdict.status) == ("border", "not usable")
+
+
+def test_walkers_in_one_place_have_no_region(rng):
+    """As where a limit ended the run after a collapse; the smallest number of points that span a region has one."""
+    failed, succeeded = rng.normal(0.0, 1.0, (40, 2)), rng.normal(0.0, 1.0, (40, 2))
+    for samples in (np.full((30, 2), 0.1), np.repeat([[0.1, 0.3], [0.2, 0.5]], 15, axis=0)):
+        assert failures_near(samples, failed, succeeded) == NearFailures(0, 0)
+    triangle = np.repeat([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]], 10, axis=0)
+    assert failures_near(triangle, failed, succeeded).evaluated > 0

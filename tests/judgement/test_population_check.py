@@ -1,0 +1,99 @@
+"""Shares of the parts of a posterior: the final points compared with weighted draws."""
+
+import numpy as np
+import pytest
+
+from samplers.judgement.checks import check_shares
+from samplers.proposals.mixture import Mixture, draw, invert_roots, log_density
+from samplers.tempering.anneal import check_population
+from samplers.tempering.mutation import MOST_POINTS, VisitedPoints
+from samplers.tempering.population import Population
+
+N, NDIM = 500, 3
+MEANS = np.array([[-5.0] * NDIM, [5.0] * NDIM])
+WIDE = np.repeat(1.5 * np.eye(NDIM)[None], 2, axis=0)
+PROPOSAL = Mixture(np.array([0.5, 0.5]), MEANS, WIDE, invert_roots(WIDE), 6.0)
+
+
+def log_modes(x, share):
+    """Two standard Gaussian modes, not normalised; the first one has the given share."""
+    parts = [np.log(w) - 0.5 * np.sum((x - m) ** 2, axis=1) for w, m in zip((share, 1.0 - share), MEANS, strict=True)]
+    return np.logaddexp(*parts)
+
+
+def population(share, random):
+    first = int(round(share * N))
+    coords = random.standard_normal((N, NDIM)) + np.repeat(MEANS, [first, N - first], axis=0)
+    return Population(1.0, coords, None, N, (np.arange(N),))
+
+
+def concerns(points_share, true_share, seed=1):
+    random = np.random.RandomState(seed)
+    drawn = draw(PROPOSAL, N, random)
+    log_weights = log_modes(drawn, true_share) - log_density(PROPOSAL, drawn)
+    return check_shares(PROPOSAL, population(points_share, random).coords, np.arange(N), drawn, log_weights)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.5])
+def test_equal_shares_raise_no_doubt(share):
+    assert not any(concerns(share, share, seed) for seed in range(20))
+
+
+@pytest.mark.parametrize(("points", "truth"), [(0.0, 0.5), (0.5, 0.75), (1.0, 0.7)])
+def test_different_shares_are_reported(points, truth):
+    for seed in range(5):
+        (doubt,) = concerns(points, truth, seed)
+        assert doubt.grave and "a mode has been lost or has a wrong weight" in doubt.message
+
+
+def test_one_component_has_no_shares():
+    one = Mixture(np.ones(1), MEANS[:1], WIDE[:1], invert_roots(WIDE[:1]), 6.0)
+    random = np.random.RandomState(1)
+    drawn = draw(one, N, random)
+    assert check_shares(one, population(1.0, random).coords, np.arange(N), drawn, np.zeros(N)) == []
+
+
+class Modes:
+    """Density of two modes with equal shares and a flat prior."""
+
+    evaluations = 0
+    map = map
+
+    def evaluate(self, coords, observe=None):
+        self.evaluations += len(coords)
+        records = np.zeros(len(coords), [("log_prob", float), ("log_prior", float)])
+        records["log_prob"] = log_modes(coords, 0.5)
+        records["log_prob"][coords[:, 0] > 50.0] = -np.inf
+        return records
+
+    def inside(self, coords):
+        return np.ones(len(coords), dtype=bool)
+
+
+def visit(visited, density, coords):
+    visited.add(coords, density.evaluate(coords))
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_mode_that_only_earlier_points_show_is_reported(seen):
+    """Without the earlier points nothing can be known, and nothing is reported: the control of the test."""
+    random, density, visited = np.random.RandomState(3), Modes(), VisitedPoints()
+    if seen:
+        visit(visited, density, MEANS[1] + 4.0 * random.standard_normal((60, NDIM)))
+    points = population(1.0, random)
+    visit(visited, density, points.coords)
+    check, found = check_population(points, density, visited, np.log(0.5) + 1.5 * np.log(2.0 * np.pi), random, None)
+    assert bool(found) == seen
+    truth = 1.5 * np.log(2.0 * np.pi) - (0.0 if seen else np.log(2.0))
+    assert check.log_evidence == pytest.approx(truth, abs=0.15)
+
+
+def test_the_highest_points_are_kept():
+    random, density, visited = np.random.RandomState(3), Modes(), VisitedPoints()
+    visit(visited, density, np.full((3, NDIM), 60.0))
+    visit(visited, density, 4.0 * random.standard_normal((MOST_POINTS, NDIM)))
+    visit(visited, density, MEANS + 0.01)
+    coords, log_target = visited.at(1.0)
+    assert len(coords) == MOST_POINTS and np.all(np.isfinite(log_target))
+    assert np.sum(np.all(np.abs(coords - MEANS[0]) < 0.1, axis=1)) >= 1 and log_target.max() > np.log(0.5) - 0.01
+    assert np.all(visited.at(0.0)[1] == 0.0)

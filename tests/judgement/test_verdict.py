@@ -1,0 +1,103 @@
+"""``sampler.verdict``: modes with shares, agreement of the estimates, effective sample size, what is not known."""
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SMCSampler, compare_models, ladder_table
+from samplers.estimates.genealogy import worst_effective_sample_size
+from samplers.judgement.modes import find_modes
+from tests.benchmarks import truth_targets
+
+
+def run(posterior, walkers=300, seed=1, steps=3, **settings):
+    sampler = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=seed, **settings)
+    sampler.run_mcmc(None, steps)
+    return sampler
+
+
+@pytest.fixture(scope="module")
+def two_modes():
+    return truth_targets.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal")
+
+
+@pytest.fixture(scope="module")
+def sampler(two_modes):
+    return run(two_modes, 400)
+
+
+def test_modes_have_their_shares_and_places(two_modes, sampler):
+    modes = sampler.verdict.modes
+    assert len(modes) == 2
+    assert sum(mode.share for mode in modes) == pytest.approx(1.0)
+    for mode, share in zip(modes, sorted(two_modes.shares, reverse=True), strict=True):
+        assert abs(mode.share - share) < 4.0 * mode.share_error
+        assert 0.0 < mode.share_error < 0.1
+    difference = np.linalg.norm(modes[0].mean - modes[1].mean) / modes[0].sd.mean()
+    assert difference == pytest.approx(10.0, rel=0.15)
+
+
+@pytest.mark.parametrize("posterior", [truth_targets.gaussian(1), truth_targets.banana(1), truth_targets.bounds(1)])
+def test_one_mode_stays_one(posterior):
+    assert len(run(posterior).verdict.modes) == 1
+
+
+def test_walkers_that_agree_in_a_parameter_are_one_mode(rng):
+    chain = rng.standard_normal((2, 50, 3))
+    chain[:, :, 1] = 4.0
+    (mode,) = find_modes(chain, np.arange(50))
+    assert mode.share == 1.0
+    assert mode.sd[1] == 0.0
+
+
+def test_sentence_and_what_it_is_made_of(sampler):
+    found = sampler.verdict
+    assert found.summary.startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
+    assert "no failures" in found.summary
+    values = [estimate.log_evidence for estimate in found.evidences]
+    assert values == [sampler.log_evidence_ladder, sampler.log_evidence_check.log_evidence]
+    assert found.pareto_shape == sampler.log_evidence_check.pareto_shape
+    assert len(found.unknown) == 1 and "another seed" in found.unknown[0]
+    assert found.summary in ladder_table(sampler)
+    assert found.summary in str(compare_models({"a": sampler, "b": (-3.0, 0.1)}))
+
+
+def test_without_check_and_from_a_file(two_modes, tmp_path):
+    backend = emcee.backends.HDFBackend(str(tmp_path / "a.h5"))
+    run(two_modes, 300, check_draws=0, backend=backend)
+    sampler = SMCSampler(300, 4, two_modes, vectorize=True, backend=backend)
+    found = sampler.verdict
+    assert [estimate.source for estimate in found.evidences] == ["stages"]
+    assert found.pareto_shape is None
+    assert 100 < len(np.unique(sampler.founders)) < 300  # the file says which walkers are copies
+    assert len(found.unknown) == 2
+
+
+def test_modes_need_a_chain(two_modes):
+    sampler = SMCSampler(300, 4, two_modes, vectorize=True)
+    with pytest.raises(ValueError, match="call run_mcmc first"):
+        sampler.verdict  # noqa: B018
+    sampler.run_mcmc(None, 0)
+    assert len(sampler.verdict.unknown) == 1
+    with pytest.raises(ValueError, match="one step or more"):
+        sampler.verdict.modes  # noqa: B018
+
+
+def test_worst_direction_of_independent_draws_and_of_copies(rng):
+    draws = rng.standard_normal((1, 400, 8))
+    assert worst_effective_sample_size(draws, np.arange(400)) == pytest.approx(400.0, rel=0.01)
+    copies = np.repeat(draws, 4, axis=1)
+    assert worst_effective_sample_size(copies, np.repeat(np.arange(400), 4)) == pytest.approx(400.0, rel=0.01)
+    assert worst_effective_sample_size(draws, np.zeros(400, dtype=int)) == 0.0
+
+
+def test_worst_direction_is_a_combination_of_parameters(rng):
+    """Pairs that move together in x + y but are independent in x - y: no single parameter shows all of it."""
+    shared = np.repeat(rng.standard_normal(200), 2)
+    own = rng.standard_normal(400)
+    chain = np.stack([shared + own, shared - own], axis=1)[None]
+    founders = np.repeat(np.arange(200), 2)
+    assert worst_effective_sample_size(chain, founders) == pytest.approx(200.0, rel=0.03)
+    assert worst_effective_sample_size(1e9 * chain + 1e12, founders) == pytest.approx(
+        worst_effective_sample_size(chain, founders), rel=1e-3
+    )

@@ -1,0 +1,59 @@
+"""Chains from leaders, the default of TMCMCSampler: right within their stated errors, and not the run of SMCSampler."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers import SMCSampler, TMCMCSampler
+from samplers.moves.kernels import RandomWalkMove
+from tests.contract.targets import Box, Gaussian
+from tests.statistics.test_mean_error import TwoModes, scores
+from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
+
+
+@pytest.mark.parametrize("nwalkers", [pytest.param(100, marks=pytest.mark.slow), 400])
+def test_two_modes(nwalkers, seed):
+    posterior = TwoModes()
+    samplers = runs(posterior, seed, count=12, nwalkers=nwalkers, nsteps=2, Sampler=TMCMCSampler)
+    assert within(deviations(samplers, posterior.mean), samplers)
+    assert within(evidence_deviation(samplers, -3.0 * np.log(3.0)), samplers)
+
+
+def test_truncated_prior_edges(seed):
+    """The posterior is largest at two edges of the box, which cut it off."""
+    posterior = Box([0, 0], [1, 1], lambda x: -10.0 * x[..., 0] + 3.0 * x[..., 1])
+    samplers = runs(posterior, seed, count=12, nwalkers=100, nsteps=2, Sampler=TMCMCSampler)
+    falling = stats.truncexpon(b=10, scale=0.1).mean()
+    rising = 1.0 - stats.truncexpon(b=3, scale=1.0 / 3.0).mean()
+    assert within(deviations(samplers, [falling, rising]), samplers)
+    log_evidence = np.log((1.0 - np.exp(-10.0)) / 10.0) + np.log((np.exp(3.0) - 1.0) / 3.0)
+    assert within(evidence_deviation(samplers, log_evidence), samplers)
+
+
+@pytest.mark.parametrize(("settings", "biased"), [({}, False), ({"burn_in": 0, "moves": RandomWalkMove(0.7)}, True)])
+def test_burn_in_removes_the_bias_of_chains_from_leaders(settings, biased, seed):
+    """Negative control: without burn-in, a random walk has a bias that many points do not remove."""
+    posterior = Gaussian(1, sd=0.2)
+    variance = posterior.sd**2 + (posterior.mean - 0.7) ** 2
+    samplers = runs(posterior, seed, count=40, nwalkers=1000, nsteps=1, Sampler=TMCMCSampler, check_draws=0, **settings)
+    found = within(deviations(samplers, variance, lambda x: (x - 0.7) ** 2), samplers)
+    assert found != biased
+
+
+@pytest.mark.parametrize(("target", "nwalkers"), [(Gaussian, 100), pytest.param(TwoModes, 250, marks=pytest.mark.slow)])
+def test_stated_errors_cover(target, nwalkers, seed):
+    """Two stated errors cover the truth in nearly 95 % of 40 runs, and are not too wide."""
+    posterior = target()
+    samplers = runs(posterior, seed, count=40, nwalkers=nwalkers, nsteps=1, Sampler=TMCMCSampler)
+    covered, ratio = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
+    assert np.all(covered >= stats.binom(40, 0.93).ppf(1e-3))
+    assert np.all((0.5 < ratio) & (ratio < 1.6))
+
+
+@pytest.mark.parametrize("nwalkers", [60, 150, 400])
+def test_smc_and_tmcmc_are_different_runs(nwalkers):
+    smc, tmcmc = (Sampler(nwalkers, 3, Gaussian(3), vectorize=True, seed=1) for Sampler in (SMCSampler, TMCMCSampler))
+    for sampler in (smc, tmcmc):
+        sampler.run_mcmc(None, 1)
+    assert not np.isin(smc.get_chain(flat=True), tmcmc.get_chain(flat=True)).any()
+    assert [stage.beta for stage in smc.ladder] != [stage.beta for stage in tmcmc.ladder]
