@@ -40,7 +40,7 @@ class RunResults:
     def evaluations(self) -> int:
         """Points for which `log_prob_fn` was called, by this object and by the interrupted run that it continues.
 
-        Includes those of sweeps over fast parameters.
+        Sweeps over fast parameters are included.
         """
         return self._record.count
 
@@ -81,7 +81,7 @@ class RunResults:
     def ended_at(self) -> float | None:
         """Exponent beta at which the limit of simulations ended the annealing; None if it did not end it.
 
-        The last stage of `ladder` is then that of all points known at that time, weighted for beta = 1.
+        The last stage of `ladder` then has all points known at that time, weighted for beta = 1.
         """
         stop = self._result.early_stop
         return None if stop is None or stop.complete or stop.beta >= 1.0 else stop.beta
@@ -163,7 +163,7 @@ class RunResults:
     def max_simulations(self) -> float | None:
         """Largest number of simulations; None for no limit.
 
-        Where a run is continued, a number below that of the simulations it has made acts as their number.
+        A limit below the number of simulations already made acts as this number.
         """
         return self._budget.limit
 

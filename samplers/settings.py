@@ -137,7 +137,7 @@ class Settings:
         return self.resampling if callable(self.resampling) else RESAMPLING[self.resampling]
 
     def target(self, last_target: float, n_walkers: int) -> float:
-        """Effective sample size wanted of a stage, from that of the previous stage (n_walkers before the first)."""
+        """Effective sample size wanted of a stage, from the previous stage's target (n_walkers before the first)."""
         variation = self.coefficient_of_variation
         ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
         return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)

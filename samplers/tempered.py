@@ -77,7 +77,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         It is always called in this process.
     log_likelihood_fn : callable, optional
         Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
-        blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
+        blobs; the log-prior is added to its values. Its attributes are used like attributes of `log_prob_fn`.
     start_density : callable, optional
         Normalised log-density that the initial state is drawn from, if that is not the prior, called like
         `log_prior_fn`; finite wherever the log-prior is. The annealing then leads from it to the posterior.
@@ -89,7 +89,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Largest number of simulations (`simulations`). Where it is reached, the posterior is estimated from the points
         that are known, the state is stored once if the chain has no step, and a `SamplingWarning` says so; see
         `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the same
-        file, and call `run_mcmc` again: the result is that of a run with the larger number from the start.
+        file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
         the run, and two samplers never share a stream. A file that contains a run keeps its seed: another one has no
@@ -154,7 +154,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         slow = self._optional.slow_parameters(ndim)
         self._record = open_record(backend, nwalkers, ndim, slow)
         self._budget = Budget(self._record, as_limit(max_simulations))
-        # whether the annealing of the record must be made again, and whether the record is that of another sampler
+        # whether the annealing of the record must be made again, and whether another sampler wrote the record
         self._must_repeat = self._reopened = self._record.start is not None
         self.seconds = 0.0
         set_previous_state(self, None)
@@ -241,7 +241,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
         With an emcee `HDFBackend`, a new sampler with the file of a run goes on with it, as in emcee: the annealing is
         made again from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last
-        stored one. The results are those of a run that was never interrupted, to the last bit. So a script that is
+        stored one. The results equal a run that was never interrupted, to the last bit. So a script that is
         started again after a kill makes ``run_mcmc(None, nsteps - sampler.iteration)``.
 
         Parameters
@@ -283,7 +283,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ) -> Iterator[State]:
         """Advance the chain as a generator: emcee's ``sample``, preceded by the annealing where it is needed.
 
-        The arguments are those of emcee, with `initial_state` as in `run_mcmc`.
+        The arguments are as in emcee, with `initial_state` as in `run_mcmc`.
         """
         if iterations is None and store:
             raise ValueError("'store' must be False when 'iterations' is None")
@@ -371,7 +371,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             yield stored
 
     def _judge(self, missing: int, coords: np.ndarray) -> None:
-        """Store the verdict on an annealing of this object, or keep that of the backend."""
+        """Store the verdict on an annealing of this object, or keep the verdict of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
             optional, latest, self._near = self._optional, self._record.latest(), None
@@ -443,7 +443,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         return self._new_start(given, skip_check)
 
     def _open_record(self) -> None:
-        """Lock the record of a file, and find out once whether a stored run is that of this sampler."""
+        """Lock the record of a file, and find out once whether this sampler made the stored run."""
         if self._record.start is not None:
             self._record.open()
         if self._is_compared:
@@ -463,7 +463,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._is_compared = True
 
     def _compare(self, found: list[str], known: EvaluatedBatch | None) -> None:
-        """Raise ValueError if a stored run is that of another posterior or of other settings."""
+        """Raise ValueError if a stored run has another posterior or other settings."""
         if not found and known is not None and getattr(self._functions.function, "fingerprint", None) is None:
             found = compare(known, self._evaluator.compute)
         if found:

@@ -4,7 +4,7 @@ Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816): the next expon
 of variation of the weights is 1, and a chain grows from each resampled point, its leader, with one step per copy. As
 published, with steps of a fixed scale, it is biased, and can collapse on a sharp posterior; these settings are
 `samplers.presets.CHING_CHEN_2007`. By default every chain has a burn-in and scales are adapted to the acceptance, after
-Betz, Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066. The moves are those of `MixtureMove`, since a
+Betz, Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066. The moves are `MixtureMove`, since a
 random walk alone gives separate modes wrong shares. With ``chains="equal"``, all chains have the same length, so that
 all processors of a pool are busy, as in BASIS (Angelikopoulos, Papadimitriou & Koumoutsakos 2012,
 doi:10.1063/1.4757266; Wu, Angelikopoulos, Papadimitriou & Koumoutsakos 2018, doi:10.1115/1.4037450).

@@ -2,7 +2,7 @@
 
 Ching & Chen (2007) draw a leader by the weights for every new point, and move the chain of this leader by one step:
 a leader that is drawn n times has a chain of n points. Its first points have made few steps, and the leaders of long
-chains are those of large weight, so the new points are biased by an amount that does not decrease with their number.
+chains have large weights, so the new points are biased by an amount that does not decrease with their number.
 It decreases with the steps that every chain makes before its points count (burn-in; Betz, Papaioannou & Straub 2016).
 
 The same paper also computes the weight of a leader from the present point of its chain, after every single step. This
@@ -56,7 +56,7 @@ def grow_chains(
     Yields
     ------
     Population, Sweep
-        After each step of the chains; points that their chain has not reached yet are those of the start.
+        After each step of the chains; points that their chain has not reached yet are starting points.
 
     Returns
     -------

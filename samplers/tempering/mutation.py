@@ -99,7 +99,7 @@ class MoveSchedule(NamedTuple):
         Parameters
         ----------
         coords : (n, ndim) float
-            Points, also those of earlier stages.
+            Points, also of earlier stages.
         log_target : (n,) float
             Logarithm of the target of the stage, scaled so that its integral is about 1.
         """
