@@ -187,12 +187,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator = self._make_evaluator(blobs_dtype)
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._seed = None if seed is None else np.ravel(seed).tolist()
+        # also drawn where it is not used, so that a script draws the same numbers after a restart
+        drawn = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
         if self._reopened and self._seed not in (None, stored := self._record.start.header["seed"]):
             logger.warning(
                 "%s contains a run with seed=%s: seed=%s has no effect", self.backend.filename, stored, self._seed
             )
         elif self.backend.random_state is None:
-            get_random(self).seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
+            get_random(self).seed(drawn)
 
     def _make_evaluator(self, blobs_dtype: Any) -> Evaluator:
         """The evaluator of the user's function."""
@@ -223,6 +225,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Whether to recycle, and the moves."""
         return bool(settings.recycle), RandomWalkMove() if moves is None else moves
 
+    def __deepcopy__(self, memo):
+        memo[id(self)] = copied = type(self).__new__(type(self))
+        memo[id(self._evaluator)] = evaluator = copy.copy(self._evaluator)  # which copies of moves share
+        vars(evaluator).update(copy.deepcopy(self._evaluator.__getstate__(), memo))
+        vars(copied).update(copy.deepcopy(self.__getstate__(), memo))
+        return copied
+
     def __getstate__(self):
         # emcee removes the pool from the living sampler here; remove it from the copy only
         return {**self.__dict__, "pool": None}
@@ -230,7 +239,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def reset(self):
         """Clear the chain, as in emcee. Ladder and state at beta = 1 are kept: burn in, reset, continue."""
         if hasattr(self, "_output"):
-            self._output.clear_chain(None if self._must_repeat else get_previous_state(self))
+            if not self._must_repeat:
+                state = get_previous_state(self)
+            else:  # the annealing of a file, whose chain may end with an estimate that is replaced
+                state = None if self._output.provisional else self._output.last_state()
+            self._output.clear_chain(state)
         else:  # emcee initialises a new backend
             super().reset()
 
@@ -337,7 +350,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._judge(missing, stored.coords)
             if ended:
                 yield from self._end_early(advanced, stored, new, missing, store)
-        except Exception:
+        except (Exception, SystemExit):
             self._output.undo_half_a_step()
             raise
         except KeyboardInterrupt:

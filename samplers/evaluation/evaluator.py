@@ -331,7 +331,7 @@ class Evaluator:
                     self.observer.repeated(len(part))
                 batches.append(known)
             elif len(part) > 0:
-                batches.append(self._compute_and_store(part))
+                batches.append(self._compute_and_store(part, whole=len(part) == len(points)))
             self.evaluations += len(part)
             if len(part) < rows.stop - rows.start:
                 raise BudgetExhausted(self._first_records(log_base, inside, batches))
@@ -342,7 +342,8 @@ class Evaluator:
         fitting = self.budget.fitting(coords)
         return coords if fitting == len(coords) else coords[: fitting if self.evaluates_parts else 0]
 
-    def _compute_and_store(self, coords: np.ndarray) -> EvaluatedBatch:
+    def _compute_and_store(self, coords: np.ndarray, whole: bool) -> EvaluatedBatch:
+        """Evaluate points that are not in the record: the `whole` of a batch, or a part of it."""
         stored, failed = 0, []
 
         def store_first(results: list) -> None:
@@ -370,7 +371,7 @@ class Evaluator:
             self._check(self, batch)
             self._check = None
         new = batch.rows([*failed, *range(stored, len(coords))])
-        self._check_failures(new, whole=stored == 0)
+        self._check_failures(new, whole=whole and stored == 0)
         self._enter(new)
         return batch
 
