@@ -46,7 +46,7 @@ from .replay import compare, describe_run, differences, open_record, points_to_c
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
 from .reports import AnnealingResult, warn
 from .results import RunResults
-from .settings import Settings, as_whole_number, choose_settings, refuse_unused
+from .settings import Settings, as_whole_number, check_arguments, check_names, refuse_unused
 from .tempering.anneal import anneal
 from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import lend
@@ -57,6 +57,8 @@ from .tempering.recording import Recording
 __all__ = ["TemperedSampler"]
 
 logger = logging.getLogger(__name__)
+
+ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "start_density", "guide", "max_simulations", "seed")
 
 
 class TemperedSampler(RunResults, EnsembleSampler):
@@ -87,9 +89,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         starts from them, with a `SamplingWarning`.
     max_simulations : float, optional
         Largest number of simulations (`simulations`). Where it is reached, the posterior is estimated from the points
-        that are known, the state is stored once if the chain has no step, and a `SamplingWarning` says so; see
-        `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the same
-        file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
+        that are known, the final walkers are stored as one step if the chain is empty, and a `SamplingWarning` says so;
+        see `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the
+        same file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
         the run, and two samplers never share a stream. A file that contains a run keeps its seed: another one has no
@@ -138,13 +140,15 @@ class TemperedSampler(RunResults, EnsembleSampler):
         seed: int | None = None,
         **settings: Any,
     ):
+        check_names(type(self).__name__, self.setting_names, settings, ARGUMENTS)
+        check_arguments(pool, backend, seed)
         functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn, start_density)
         self._functions, self._optional, self.log_prior_fn = functions, functions.optional, functions.log_prior
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         self._optional.check_ndim(ndim, functions.name)
         check_size(nwalkers, ndim)
         settings = self._with_defaults(settings, moves)
-        given = choose_settings(type(self).__name__, self.setting_names, settings)
+        given = Settings(**settings)
         recycle, moves = self._choose(given, settings, moves, nwalkers)
         self.settings = replace(given, recycle=recycle)
         self._given_guide, self._guide = guide, None
@@ -255,15 +259,17 @@ class TemperedSampler(RunResults, EnsembleSampler):
         With an emcee `HDFBackend`, a new sampler with the file of a run goes on with it, as in emcee: the annealing is
         made again from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last
         stored one. The results equal a run that was never interrupted, to the last bit. So a script that is
-        started again after a kill makes ``run_mcmc(None, nsteps - sampler.iteration)``.
+        started again after a kill makes ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
 
         Parameters
         ----------
         initial_state : (nwalkers, ndim) float, State or None
             Draws of the prior, or of `start_density`. None: continue from the last state if there is one, else draw
             ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
-            of its last one) is continued; other coordinates start a new annealing. Points that cannot be such draws,
-            as a ball near the posterior, are refused with a ValueError (`samplers.evaluation.starts`).
+            of its last one) is continued, and so is a run that began with the same draws. Other coordinates start a
+            new annealing, whose steps are added to the chain: call `reset` before, or use a new sampler. Points that
+            cannot be such draws, as a ball near the posterior, are refused with a ValueError
+            (`samplers.evaluation.starts`).
         nsteps : int
             Number of steps stored in the chain; 0 for the annealing only.
         **kwargs
@@ -302,8 +308,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             raise ValueError("'store' must be False when 'iterations' is None")
         if int(thin_by if thin is None else thin) <= 0:
             raise ValueError("Invalid thinning argument")
-        if iterations is not None:
-            iterations = as_whole_number("nsteps", iterations)
+        if iterations is not None and (iterations := as_whole_number("nsteps", iterations)) < 0:
+            raise ValueError(f"nsteps must be 0 or more; got {iterations} (the chain has {self.iteration} steps)")
         state = None if initial_state is None else State(initial_state, copy=True)
         for name, value in (("log_prob", log_prob0), ("random_state", rstate0), ("blobs", blobs0)):
             if value is not None:
@@ -359,10 +365,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if self._record.start is None:  # the next call makes the same draws
                     get_random(self).set_state(random_state)
             logger.warning(
-                "interrupted: %d evaluations and %d steps are kept%s. Call run_mcmc again to go on",
+                "interrupted: %d evaluations and %d steps are kept in %s. Call run_mcmc again to go on",
                 self.evaluations,
                 self.iteration,
-                "" if self._record.path is None else f" in {self._record.path} and {self.backend.filename}",
+                "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}",
             )
             raise
         if self.failure_count > failures:
@@ -444,8 +450,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         elif given is None:
             self._drawn = self._functions.draw_prior(self.nwalkers, get_random(self))
             given = State(self._drawn)
-        elif previous is not None and given.log_prob is None and np.array_equal(given.coords, previous.coords):
-            given.log_prob, given.blobs = copy.deepcopy((previous.log_prob, previous.blobs))
+        elif previous is not None and given.log_prob is None:
+            if np.array_equal(given.coords, previous.coords):
+                given.log_prob, given.blobs = copy.deepcopy((previous.log_prob, previous.blobs))
+            elif start is not None and np.array_equal(given.coords, start.coords):  # a cell, or a script, that is
+                given = previous  # started again with the same draws goes on
         if given.log_prob is not None and self._result.finished:
             return given
         if self.backend.iteration > 0 and not self._result.finished and start is None:
@@ -490,6 +499,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         described = {"sampler": type(self).__name__, **self._functions.described()}
         header = describe_run(self._functions.function, described, self.settings, *self._first_moves, self._given_guide)
         return json.loads(json.dumps(header))
+
+    def _say_that_bits_differ(self) -> None:
+        warn(
+            f"the annealing in {self.backend.filename} is made again, and needs points that its record does not have: "
+            "another processor, or another version of NumPy or SciPy, computes other bits. The chain goes on from its "
+            "last step, but points are evaluated anew; continue on the first processor and environment to avoid this"
+        )
 
     def _repeated(self, start: RunStart) -> RunStart:
         """The start of the record, from which the annealing is made again."""
@@ -536,6 +552,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
             lent = get_random(self), self._record.remember, self._budget, self.settings.asynchronous
             guidance = lend(self._guide, *lent)
+        # an annealing that had reached beta = 1 finds all its points in the record
+        self._evaluator.on_unknown = self._say_that_bits_differ if self._output.last_state() is not None else None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         recording = Recording(self._evaluator)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, guidance)

@@ -190,6 +190,8 @@ class Evaluator:
         Where functions of one point are called; set by the sampler.
     observer : Observer, optional
         Told of points while they are evaluated.
+    on_unknown : callable, optional
+        Called once, before a point is evaluated that the record does not have.
     asynchronous : bool
         Whether `submit` returns without waiting.
     """
@@ -216,6 +218,7 @@ class Evaluator:
         self.evaluates_parts = True
         self.pool: Any = None
         self.observer: Observer | None = None
+        self.on_unknown: Callable[[], None] | None = None
         self.evaluations = self.new_evaluations = 0
 
     def __getstate__(self):
@@ -292,7 +295,8 @@ class Evaluator:
         """Nothing runs after `submit`."""
 
     def close(self) -> None:
-        """Nothing runs after `submit`."""
+        """An annealing has ended: nothing runs after `submit`."""
+        self.on_unknown = None
 
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
@@ -331,6 +335,9 @@ class Evaluator:
                     self.observer.repeated(len(part))
                 batches.append(known)
             elif len(part) > 0:
+                if self.on_unknown is not None:
+                    self.on_unknown()
+                    self.on_unknown = None
                 batches.append(self._compute_and_store(part, whole=len(part) == len(points)))
             self.evaluations += len(part)
             if len(part) < rows.stop - rows.start:
