@@ -12,6 +12,7 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
+from emcee.backends import Backend
 
 from .resampling import RESAMPLING
 
@@ -159,7 +160,7 @@ def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
     """Raise ValueError for arguments that emcee or NumPy would refuse with another error, or later."""
     if pool is not None and not (hasattr(pool, "map") or hasattr(pool, "submit")):
         raise ValueError(f"pool must be an object with a method map, such as multiprocessing.Pool(4); got {pool!r}")
-    if backend is not None and not hasattr(backend, "initialized"):
+    if backend is not None and not isinstance(backend, Backend):
         raise ValueError(f"backend must be a backend of emcee, as emcee.backends.HDFBackend('run.h5'); got {backend!r}")
     if seed is not None and not all(isinstance(each, Integral) for each in np.ravel(seed)):
         raise ValueError(f"seed must be a whole number, several of them, or None; got {seed!r}")

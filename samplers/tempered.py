@@ -357,13 +357,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
             if ended:
                 yield from self._end_early(advanced, stored, new, missing, store)
         except (Exception, SystemExit):
-            self._output.undo_half_a_step()
+            self._undo(random_state)
             raise
         except KeyboardInterrupt:
             with deferred_interrupts():
-                self._output.undo_half_a_step()
-                if self._record.start is None:  # the next call makes the same draws
-                    get_random(self).set_state(random_state)
+                self._undo(random_state)
             logger.warning(
                 "interrupted: %d evaluations and %d steps are kept in %s. Call run_mcmc again to go on",
                 self.evaluations,
@@ -376,6 +374,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 f"{self.failure_count - failures} evaluations failed and count as impossible "
                 f"({most_common_reasons(self._record.failed)}); see failures"
             )
+
+    def _undo(self, random_state: tuple) -> None:
+        """Leave nothing half-made: no part of a step, and no draws of a run that has not begun."""
+        self._output.undo_half_a_step()
+        if self._record.start is None:  # the next call makes the same draws
+            get_random(self).set_state(random_state)
 
     def _end_early(self, advanced: State | None, stored: State, new: int, missing: int, store: bool) -> Iterator[State]:
         """End a call that the limit of simulations has ended, after `new` steps, of which `stored` is the last."""

@@ -43,9 +43,11 @@ class TMCMCSampler(TemperedSampler):
         with moves of emcee that need many walkers, such as the stretch move.
     burn_in : int, default 4
         Steps of a chain before its points count; with "leaders" only. With 0, the algorithm is as published.
-    min_moves, max_moves : int, default 2 and 7
-        Smallest and largest number of sweeps of the ensemble per stage. With "leaders", sweeps are made only where the
-        chains have left the points correlated with the resampled points.
+    min_moves : int, default 2
+        Smallest number of sweeps of the ensemble per stage. With "leaders", sweeps are made only where the chains have
+        left the points correlated with the resampled points.
+    max_moves : int, default 7
+        Largest number of these sweeps; equal to `min_moves` for a fixed number.
     max_correlation : float, default 0.15
         Between `min_moves` and `max_moves`, moving stops once the correlation with the resampled points is below this
         value.

@@ -90,7 +90,10 @@ def test_fitting_a_line(Sampler):
     assert np.all(np.abs(samples.mean(axis=0) - mean) < 0.3 * sd)
     assert np.allclose(samples.std(axis=0), sd, rtol=0.3)
     if Sampler is not emcee.EnsembleSampler and sampler.verdict.status != "not usable":
-        assert abs(sampler.log_evidence - log_evidence) < 4 * sampler.log_evidence_error < 3.0
+        assert abs(sampler.log_evidence - log_evidence) < 4 * sampler.log_evidence_error
+        assert (
+            sampler.log_evidence_error < 2.0
+        )  # the stages of 32 walkers scatter by 0.6, and half a difference is stated
 
 
 @every

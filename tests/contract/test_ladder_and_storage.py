@@ -192,7 +192,9 @@ def test_published_tmcmc_grows_chains_from_leaders():
         assert stage.evaluations <= 200 * (2 if stage is sampler.ladder[0] else 1)
     for stage in sampler.ladder[:-1]:  # a coefficient of variation of one
         assert 200 / stage.effective_sample_size - 1 == pytest.approx(1.0, rel=1e-3)
-    burnt = TMCMCSampler(200, 2, Gaussian(2), vectorize=True, seed=1, **{**CHING_CHEN_2007, "burn_in": 5})
+    burnt = TMCMCSampler(
+        200, 2, Gaussian(2), vectorize=True, seed=1, **{**CHING_CHEN_2007, "burn_in": 5, "max_correlation": 1.0}
+    )
     burnt.run_mcmc(None, 0)
     assert {s.moves for s in burnt.ladder} == {6}
     stage = burnt.ladder[2]

@@ -12,7 +12,7 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SMCSampler, TMCMCSampler
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from tests.contract.targets import WithBlobs
 
 N, NDIM = 40, 3
@@ -316,3 +316,89 @@ def test_a_file_that_is_only_read(kind, tmp_path):
     assert sampler.ladder == whole.ladder and sampler.log_evidence == whole.log_evidence
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.verdict == whole.verdict
     assert sorted((path.name, path.read_bytes()) for path in tmp_path.iterdir()) == before
+
+
+# ---------------------------------------------------------------- idioms of emcee's users
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_script_that_draws_its_start_goes_on(kind, tmp_path):
+    """``np.random.seed``, a sampler, a start from the global generator: the same start after a restart."""
+
+    def script(steps):
+        sampler = make(kind, tmp_path / "run.h5", Counted(), seed=42)
+        sampler.run_mcmc(np.random.standard_normal((N, NDIM)), max(0, steps - sampler.iteration))  # noqa: NPY002
+        return sampler
+
+    script(2)
+    np.random.seed(1)  # noqa: NPY002
+    again = script(5)
+    assert again.iteration == 5 and again.log_prob_fn.f.evaluated
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path):
+    annealing = run(kind, tmp_path / "annealed.h5", 0).evaluations
+    posterior = Counted(interrupt_at=annealing + int(2.5 * N))
+    sampler = make(kind, tmp_path / "run.h5", posterior)
+    with pytest.raises(KeyboardInterrupt):
+        begin(sampler, 4)
+    begin(sampler, 4 - sampler.iteration)  # the same cell
+    assert same(sampler, run(kind, tmp_path / "whole.h5", 4))
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_reset_of_a_reopened_run_goes_on(kind, tmp_path):
+    whole = run(kind, tmp_path / "whole.h5", 2, 2)
+    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
+    again = make(kind, tmp_path / "run.h5", Counted())
+    again.reset()
+    again.run_mcmc(None, 2)
+    assert np.array_equal(again.get_chain(), whole.get_chain()[2:])
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_negative_number_of_steps_is_refused(kind, tmp_path):
+    sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 3)
+    for each in (sampler, make(kind, tmp_path / "run.h5", Counted())):
+        with pytest.raises(ValueError, match="nsteps must be 0 or more; got -2 "):
+            each.run_mcmc(None, -2)
+        assert each.iteration == 3
+
+
+def test_other_blobs_are_noticed(tmp_path):
+    class Doubled(Counted):
+        def __call__(self, x):
+            log_prob, *blobs = super().__call__(x)
+            return (log_prob, *(2.0 * np.asarray(blob) for blob in blobs))
+
+    begin(make("SMCSampler", tmp_path / "run.h5", Counted(None)), 2)
+    with pytest.raises(ValueError, match="blobs of log_prob_fn were"):
+        make("SMCSampler", tmp_path / "run.h5", Doubled(None)).run_mcmc(None, 1)
+
+
+def test_an_annealing_with_other_bits_says_so(tmp_path):
+    """Another processor computes other bits; here, a proposal is changed in its last one."""
+    begin(make("SMCSampler by moves", tmp_path / "run.h5", Counted()), 2)
+    again = make("SMCSampler by moves", tmp_path / "run.h5", Counted())
+    start = again._record.start
+    again._record.start = start._replace(coords=np.nextafter(start.coords, 9.0))
+    with pytest.warns(SamplingWarning, match="computes other bits"):
+        again.run_mcmc(None, 1)
+    assert again.iteration == 3
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"log_prior": None}, TypeError, "did you mean log_prior_fn"),
+        ({"pool": 4}, ValueError, "pool must be an object with a method map"),
+        ({"backend": "run.h5"}, ValueError, "backend must be a backend of emcee"),
+        ({"seed": 1.5}, ValueError, "seed must be a whole number"),
+    ],
+    ids=str,
+)
+def test_arguments_of_the_wrong_kind_are_named(Sampler, arguments, error, message):
+    with pytest.raises(error, match=message):
+        Sampler(N, NDIM, Counted(), **arguments)

@@ -1,5 +1,6 @@
 """Damage to the two files of a run: nothing in the record is evaluated again, and the results keep their bits."""
 
+import copy
 import io
 import os
 import pickle
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler
+from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
 from tests.faults.kills import end, evaluated_again, fork
@@ -314,3 +316,142 @@ def test_blobs_that_cannot_be_stored_are_refused_after_the_first_batch(tmp_path)
         with pytest.raises(ValueError, match="blobs"):
             sampler.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 1)
         assert posterior.calls <= N + 2
+
+
+# ---------------------------------------------------------------------- half-opened records, names, earlier steps
+
+
+def test_a_record_that_could_not_be_opened_is_opened_again(tmp_path):
+    """A full disk at the first bytes, then the same call in the same process."""
+    expected = outcome(go_on(make(tmp_path / "whole.h5", "smc")))
+
+    def run():
+        sampler = make(tmp_path / "run.h5", "smc")
+        limit_files(10)
+        try:
+            sampler.run_mcmc(None, 1)
+        except OSError:
+            limit_files(None)
+            go_on(sampler)
+            sampler._record.close()
+            return pickle.dumps(outcome(sampler))
+        return None
+
+    status, said = end(*fork(run))
+    assert status == 0, said.decode()
+    assert pickle.loads(said) == expected
+    assert record_of(tmp_path / "run.h5").read_bytes().startswith(MAGIC)
+
+
+@pytest.mark.parametrize("name", ["chain", "log_prob", "blobs"])
+def test_a_changed_number_in_an_earlier_step_is_found(whole, name, tmp_path):
+    kind, path, expected = whole
+    path = copied(path, tmp_path)
+    with h5py.File(path, "a") as file:
+        file["mcmc"][name][0, 3] += 1.0
+    sampler = go_on(make(path, kind))
+    assert outcome(sampler) == expected and Path(f"{path}.damaged").exists()
+
+
+def test_damaged_files_are_kept_under_different_names(whole, tmp_path):
+    kind, path, _ = whole
+    path = copied(path, tmp_path)
+    for number in ("", ".2"):
+        os.truncate(path, path.stat().st_size // 2)
+        make(path, kind)
+        assert Path(f"{path}.damaged{number}").exists()
+
+
+def test_names_of_groups_and_files_that_are_alike(tmp_path):
+    """Groups "a.b" and "a/b" have a record each; two names of one file have one record, and one lock."""
+
+    def sampler(file, name, seed):
+        backend = emcee.backends.HDFBackend(str(file), name=name)
+        return SMCSampler(N, NDIM, Gaussian(NDIM), vectorize=True, seed=seed, backend=backend)
+
+    path = tmp_path / "run.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("a/other").attrs["kept"] = True
+        file.attrs["note"] = "kept"
+    one, two = sampler(path, "a.b", 1), sampler(path, "a/b", 2)
+    one.run_mcmc(None, 1)
+    two.run_mcmc(None, 1)
+    assert not np.array_equal(one.get_chain(), two.get_chain())
+    with h5py.File(path) as file:
+        assert file["a/other"].attrs["kept"] and file.attrs["note"] == "kept"
+    link = tmp_path / "link.h5"
+    link.symlink_to(path)
+    again = sampler(link, "a.b", 1)
+    assert again._record.path == one._record.path and again.iteration == 1 and link.is_symlink()
+
+
+def test_a_second_process_that_finds_a_live_run_does_not_touch_its_files(tmp_path):
+    """Between two writes, the file of a live run looks damaged."""
+    path = tmp_path / "run.h5"
+    first = make(path, "smc")
+    first.run_mcmc(None, 1)
+    with h5py.File(path, "a") as file:
+        damage_last_step_of(file["mcmc"])
+    before = path.read_bytes()
+
+    def second():
+        make(path, "smc")
+
+    status, said = end(*fork(second))
+    assert status != 0 and b"another run is writing" in said
+    assert path.read_bytes() == before
+
+
+def damage_last_step_of(group):
+    group["blobs"][0, 3] += 1.0
+
+
+@pytest.mark.parametrize("in_file", [True, False])
+def test_a_copy_goes_on_by_itself(in_file, tmp_path):
+    """What a copy evaluates is in its own record, in its file and in its limit."""
+    path = tmp_path / "run.h5" if in_file else None
+    sampler = make(path, "moves")
+    sampler.run_mcmc(None, 1)
+    copied_sampler = copy.deepcopy(sampler)
+    assert copied_sampler._evaluator.record is copied_sampler._record is copied_sampler._budget._record
+    made = sampler.evaluations
+    copied_sampler.max_simulations = made + N
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        copied_sampler.run_mcmc(None, 50)
+    assert made < copied_sampler.evaluations <= made + N and sampler.evaluations == made
+    if in_file:
+        copied_sampler._record.close()
+        assert make(path, "moves").evaluations == copied_sampler.evaluations
+
+
+def test_parts_of_a_batch_that_fail_do_not_end_a_run_that_goes_on(tmp_path):
+    """Values that were stored before Ctrl-C are successes; those left of their batch may all be failures."""
+
+    class Fails(Gaussian):
+        stop = None
+
+        def __call__(self, x):
+            self.calls += 1
+            if self.calls == self.stop:
+                raise KeyboardInterrupt
+            if x[0] < -0.5:
+                raise RuntimeError("no convergence")
+            return super().__call__(x)
+
+    def sampler(posterior):
+        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+        return SMCSampler(N, 1, posterior, seed=3, backend=backend)
+
+    posterior = Fails(1)
+    posterior.stop = N // 2
+    evaluator.SECONDS_BETWEEN_NOTES, before = 1e9, evaluator.SECONDS_BETWEEN_NOTES  # successes are stored at Ctrl-C
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            sampler(posterior).run_mcmc(None, 1)
+    finally:
+        evaluator.SECONDS_BETWEEN_NOTES = before
+    posterior.stop = None
+    again = sampler(posterior)
+    again.run_mcmc(None, 1)
+    assert again.failure_count > 0

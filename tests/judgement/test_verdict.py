@@ -53,7 +53,7 @@ def test_walkers_that_agree_in_a_parameter_are_one_mode(rng):
 def test_sentence_and_what_it_is_made_of(sampler):
     found = sampler.verdict
     assert found.summary.startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
-    assert "no failures" in found.summary
+    assert "no failed evaluations" in found.summary
     values = [estimate.log_evidence for estimate in found.evidences]
     assert values == [sampler.log_evidence_ladder, sampler.log_evidence_check.log_evidence]
     assert found.pareto_shape == sampler.log_evidence_check.pareto_shape

@@ -50,6 +50,15 @@ def test_stated_errors_cover(target, nwalkers, seed):
     assert np.all((0.5 < ratio) & (ratio < 1.6))
 
 
+@pytest.mark.parametrize(("burn_in", "right"), [(4, True), (0, False)])
+def test_few_walkers_for_many_parameters(burn_in, right, seed):
+    """Chains alone leave copies, of which the next fit sees too few distinct points; the control makes no sweeps."""
+    posterior = Gaussian(12, sd=0.1)
+    samplers = runs(posterior, seed, count=6, nwalkers=100, nsteps=1, Sampler=TMCMCSampler, burn_in=burn_in)
+    off = np.array([(s.get_chain(flat=True).mean(axis=0) - posterior.mean) / posterior.sd for s in samplers])
+    assert (np.sqrt(np.mean(off**2)) < 0.25) == right
+
+
 @pytest.mark.parametrize("nwalkers", [60, 150, 400])
 def test_smc_and_tmcmc_are_different_runs(nwalkers):
     smc, tmcmc = (Sampler(nwalkers, 3, Gaussian(3), vectorize=True, seed=1) for Sampler in (SMCSampler, TMCMCSampler))

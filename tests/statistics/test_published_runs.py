@@ -79,7 +79,7 @@ DEFAULTS = {
     ("SMC", "T3"): (9e3, 0.08, 0.0, 0.15),
     ("SMC", "T4"): (8e3, 0.06, 0.04, 0.1),
     ("TMCMC", "T1"): (80e3, 0.08, 0.0, 0.2),
-    ("TMCMC", "T2"): (46e3, 0.1, 0.06, 0.25),  # bent: proposals for basins cost up to a fifth here
+    ("TMCMC", "T2"): (52e3, 0.1, 0.06, 0.25),  # bent: proposals for basins cost up to a fifth here, sweeps as much
     ("TMCMC", "T4"): (15e3, 0.06, 0.04, 0.15),
 }
 
