@@ -293,6 +293,7 @@ class Record:
                 file.close()
                 raise
             self._file, _open_records[self.path] = file, self
+            weakref.finalize(self, file.close)
 
     def _lock(self, file: Any) -> None:
         try:
