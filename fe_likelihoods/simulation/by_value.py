@@ -41,14 +41,6 @@ _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.FunctionType, types.ModuleType)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
-    "__name__",
-    "__qualname__",
-    "__defaults__",
-    "__kwdefaults__",
-    "__annotations__",
-    "__doc__",
-    "__module__",
-)
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
