@@ -38,7 +38,7 @@ _SCRIPTS = ("__main__", "__mp_main__")  # names of a script or notebook, and of 
 _LIBRARIES = {"fe_likelihoods", "samplers"}
 _INSTALLED = {"site-packages", "dist-packages"}
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
-_PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.FunctionType, types.ModuleType)
+_PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.ModuleType)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
 _lock = threading.RLock()
@@ -333,7 +333,11 @@ def _new_lock(value: Any) -> Any:
 
 def _sendable(name: str, value: Any) -> Any:
     """A value of a module or class, or what is sent instead if it cannot be pickled."""
-    if isinstance(value, _PLAIN) or (type(value).__module__ == "numpy" and not value.dtype.hasobject):
+    if isinstance(value, types.FunctionType):
+        plain = not (value.__defaults__ or value.__kwdefaults__ or value.__closure__ or vars(value))
+    else:
+        plain = isinstance(value, _PLAIN) or (type(value).__module__ == "numpy" and not value.dtype.hasobject)
+    if plain:
         return value
     if isinstance(value, _LOCKS):
         return _new_lock(value)
@@ -345,10 +349,13 @@ def _sendable(name: str, value: Any) -> Any:
 
 
 class _Probe(cloudpickle.Pickler):
-    """Pickler that finds out whether an object can be pickled, apart from functions, classes and modules."""
+    """Pickler that finds out whether an object can be pickled, apart from classes, modules and the code of functions."""
 
     def reducer_override(self, obj: Any) -> Any:
-        return (abs, (0,)) if isinstance(obj, type | types.FunctionType | types.ModuleType) else NotImplemented
+        if isinstance(obj, types.FunctionType):
+            values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
+            return abs, (), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))
+        return (abs, ()) if isinstance(obj, type | types.ModuleType) else NotImplemented
 
 
 class _Lock:
