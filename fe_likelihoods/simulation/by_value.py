@@ -16,6 +16,7 @@ import contextlib
 import dis
 import functools
 import importlib.machinery
+import importlib.util
 import io
 import os
 import pickle
@@ -220,6 +221,8 @@ class _Pickler(cloudpickle.Pickler):
             if self._modules.get(obj.__name__) is not obj:
                 return NotImplemented
             values = {name: value for name, value in vars(obj).items() if name not in _OF_THE_IMPORT}
+            for name in [name for name in values if f"{obj.__name__}.{name}" in self._modules]:
+                del values[name]  # modules of a package are sent where a function names them
             if obj.__name__ in _SCRIPTS:
                 values = {name: values[name] for name in ("__file__", "__package__") if name in values}
             parent = self._modules.get(obj.__name__.rpartition(".")[0])
@@ -243,10 +246,11 @@ class _Pickler(cloudpickle.Pickler):
         used = {}
         if module.__name__ in _SCRIPTS:
             used = {name: _new_lock(value) for name, value in vars(module).items() if name in names.all}
-        imported = [each for name, each in self._modules.items() if {name, name.rpartition(".")[2]} & names.imported]
+        package = module.__dict__.get("__package__") or ""
+        imported = [self._modules[name] for name in _resolved(names.imported, package) if name in self._modules]
         state = (
             used,
-            [*imported, *_submodules(vars(module), names.all)],
+            [*imported, *_named_modules(vars(module), names.all)],
             {name: getattr(function, name) for name in _OF_A_FUNCTION},
             [cell for cell in function.__closure__ or ()],
             vars(function),
@@ -258,14 +262,19 @@ class _Names(NamedTuple):
     """Names in the code of a function and of the functions inside it."""
 
     all: frozenset[str]
-    imported: frozenset[str]  # by import statements: modules, their last parts, and what is imported from them
+    imported: frozenset[str]  # modules, with a dot for each level of a relative import, and what is imported from them
 
 
 @functools.lru_cache(maxsize=4096)
 def _names_in(code: types.CodeType) -> _Names:
-    steps = [(step.opname, step.argval) for step in dis.get_instructions(code)]
-    imported = {name for operation, name in steps if operation in ("IMPORT_NAME", "IMPORT_FROM")}
-    imported |= {name.rpartition(".")[2] for name in imported}
+    imported: set[str] = set()
+    before: list[Any] = [0, None]
+    for step in dis.get_instructions(code):
+        if step.opname == "IMPORT_NAME":
+            level, items = before[-2:]
+            module = "." * level + step.argval
+            imported |= {module, *(f"{module}{'.' if step.argval else ''}{item}" for item in items or ())}
+        before.append(step.argval)
     inner = [_names_in(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return _Names(
         frozenset(code.co_names).union(*(names.all for names in inner)),
@@ -273,16 +282,22 @@ def _names_in(code: types.CodeType) -> _Names:
     )
 
 
-def _submodules(values: Mapping[str, Any], names: frozenset[str]) -> list[types.ModuleType]:
-    """Modules of installed packages that a code names as ``package.module``: a worker has to import them as well."""
+def _resolved(imported: frozenset[str], package: str) -> set[str]:
+    """Full names of modules."""
+    found = set()
+    for name in imported:
+        with contextlib.suppress(ImportError):
+            found.add(importlib.util.resolve_name(name, package))
+    return found
+
+
+def _named_modules(values: Mapping[str, Any], names: frozenset[str]) -> list[types.ModuleType]:
+    """Modules that a code names, also as ``package.module``, which a worker has to import as well."""
     found = []
-    packages = [value for name, value in values.items() if name in names and isinstance(value, types.ModuleType)]
-    for package in packages:
-        inner = (names & vars(package).keys()) if hasattr(package, "__path__") and not is_of_user(package) else ()
-        for name in inner:
-            module = sys.modules.get(f"{package.__name__}.{name}")
-            if module is not None:
-                found += [module, *_submodules({name: module}, names)]
+    for module in [values[name] for name in sorted(names & values.keys())]:
+        if isinstance(module, types.ModuleType):
+            inner = {name: sys.modules.get(f"{module.__name__}.{name}") for name in names & vars(module).keys()}
+            found += [module, *(_named_modules(inner, names) if hasattr(module, "__path__") else ())]
     return found
 
 
@@ -324,7 +339,10 @@ def _new_module(name: str) -> types.ModuleType:
 
 def _fill_module(module: types.ModuleType, state: tuple[Any, Mapping[str, Any]]) -> None:
     if _arriving is not None:
-        vars(module).update(state[1])
+        parent, values = state
+        vars(module).update(values)
+        if parent is not None:
+            vars(parent)[module.__name__.rpartition(".")[2]] = module
 
 
 def _new_lock(value: Any) -> Any:
@@ -349,7 +367,7 @@ def _sendable(name: str, value: Any) -> Any:
 
 
 class _Probe(cloudpickle.Pickler):
-    """Pickler that finds out whether an object can be pickled, apart from classes, modules and the code of functions."""
+    """Pickler that finds out whether an object can be pickled, without classes, modules and the code of functions."""
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, types.FunctionType):
@@ -388,6 +406,6 @@ class NotSent:
             raise AttributeError(name)
         return self._refuse()
 
-    __call__ = __getitem__ = __setitem__ = __contains__ = __iter__ = __len__ = __bool__ = __enter__ = _refuse
+    __call__ = __next__ = __getitem__ = __setitem__ = __contains__ = __iter__ = __len__ = __bool__ = __enter__ = _refuse
     __exit__ = __setattr__ = __eq__ = __lt__ = __add__ = __radd__ = __mul__ = __rmul__ = __array__ = _refuse
     __hash__ = object.__hash__

@@ -273,7 +273,9 @@ def test_local_pool_maps_any_function_and_raises_its_exceptions():
         assert pool.map(str, [1, 2]) == ["1", "2"]
         assert pool.map(lambda x: 2 * x, [1]) == [2]
         numbers = (number for number in (1, 2))
-        with pytest.raises(ValueError, match=r"cannot be sent to another process \(TypeError: cannot pickle 'generator'"):
+        with pytest.raises(
+            ValueError, match=r"cannot be sent to another process \(TypeError: cannot pickle 'generator'"
+        ):
             pool.map(lambda x: next(numbers), [1])
 
 
