@@ -27,6 +27,9 @@ __all__ = [
 _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
 
 
+_LONGEST_REASON = 2000  # characters
+
+
 class FailedRun(RuntimeError):
     """Base of exceptions that say in words why a run failed.
 
@@ -151,4 +154,6 @@ def reason_of(error: BaseException) -> str:
     if isinstance(error, FailedRun):
         return error.reason
     text = f"{type(error).__name__}: {error}"
+    if len(text) > _LONGEST_REASON:
+        text = f"{text[:_LONGEST_REASON]} ..."
     return TransientReason(text) if is_transient(error) else text

@@ -292,5 +292,4 @@ def _packed(value: Any, error: BaseException | None = None) -> bytes:
     except Exception as failure:
         error = error or failure
     text = without_addresses(f"{type(error).__name__}: {error}")
-    failed = RunFailed(TransientReason(text)) if is_transient(error) else RuntimeError(text)
-    return pickle.dumps((None, failed), protocol=5)
+    return pickle.dumps((None, RunFailed(TransientReason(text) if is_transient(error) else text)), protocol=5)
