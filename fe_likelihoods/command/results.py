@@ -76,6 +76,8 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
     if run.tempered:
         evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2f}"
         return [evidence, in_toml_terms(str(run.verdict))]
+    if isinstance(run.posterior.likelihood.model, NotRun):
+        return [f"{len(run.samples)} samples. The evidence and the verdict are not known, the model was not run."]
     used = run.sampler.iteration - run.discard
     worth = (
         f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "

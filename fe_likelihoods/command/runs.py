@@ -144,18 +144,19 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
     job = replace(job, runs_code=runs_code)
     cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
     problem = make_problem(job, cache)
-    sampler = _stored_sampler(job, problem, folder)
+    runs = not isinstance(problem.posterior.likelihood.model, NotRun)
+    sampler = _stored_sampler(job, problem, folder) if runs else _chain_only(folder, problem)
     if sampler.iteration <= discarded(job):
         raise ValueError(
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
     steps = job.sampler.get("steps", STEPS)
-    if not is_emcee(job) and sampler.iteration >= steps:
+    if runs and not is_emcee(job) and sampler.iteration >= steps:
         # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
         with _without_messages("samplers.tempered"):
             sampler.run_mcmc(None, 0, progress=False)
-    events = read_events(job, problem) if not isinstance(problem.posterior.likelihood.model, NotRun) else ()
+    events = read_events(job, problem) if runs else ()
     file = Path(origin["file"])
     return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
 
@@ -236,6 +237,22 @@ def _write(
     return (report, *tables, samples, *pictures), tuple(cautions), not run.is_inconclusive
 
 
+def _chain_only(folder: Path, problem: Problem) -> Any:
+    """The chain of a folder in a sampler of emcee, without the evaluations that led to it."""
+    import emcee
+
+    path = folder / CHAIN
+    try:
+        backend = emcee.backends.HDFBackend(str(path), read_only=True)
+        walkers, ndim = backend.shape
+        backend.get_chain(), backend.get_log_prob()
+    except (*DAMAGE, AttributeError, ValueError) as error:
+        raise _damaged(path, error) from error
+    if ndim != problem.posterior.ndim:
+        raise ValueError(f"{path} has {ndim} parameters, {SETTINGS} describes {problem.posterior.ndim}")
+    return emcee.EnsembleSampler(walkers, ndim, problem.posterior, backend=backend)
+
+
 def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """As `_write`, without anything that needs a simulation."""
     from ..reporting.report import report
@@ -243,8 +260,9 @@ def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tup
     samples = write_samples(folder, run, None, 0)
     report(run.sampler, None, None, folder / "report.html", discard=run.discard, repeat=again)
     caution = (
-        "the model is a Python file or program that the settings name, which was not run: the report has no responses "
-        "and no predictions. `fe-likelihoods report FOLDER --run-code` runs it; do that only with code that you trust"
+        "the model is a Python file or program that the settings name, which was not run: the report has no "
+        "responses, no predictions and no evidence. `fe-likelihoods report FOLDER --run-code` runs it; do that only with "
+        "code that you trust"
     )
     return ("report.html", *write_tables(folder, run), samples), (caution,), not run.is_inconclusive
 

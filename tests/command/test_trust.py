@@ -30,32 +30,39 @@ def _refuse(*arguments, **options):
 
 @pytest.mark.parametrize("kind", ["function", "program"])
 def test_a_report_of_a_folder_of_a_stranger_runs_no_code(kind, folder, monkeypatch):  # noqa: F811
-    source = folder / "strange_model.py"
+    own = OWN.replace("strange_model", name := f"strange_{kind}")  # imported once per process
+    source = folder / f"{name}.py"
     source.write_text(FUNCTION)
-    (folder / "own.toml").write_text(OWN)
+    (folder / "own.toml").write_text(own)
     call("run", "own.toml", "--out", "r")
     whole = (folder / "r" / "summary.txt").read_text()
     assert "RRMSE" in whole and (folder / "r" / "fit.csv").exists()
-    sys.modules.pop("strange_model", None)
+    before = (folder / "r" / "summary.csv").read_text().splitlines()
+    sys.modules.pop(name, None)
     source.write_text(HOSTILE + FUNCTION)
     if kind == "program":
         program = folder / "program.py"
         program.write_text(HOSTILE)
         command = f'command = ["{sys.executable}", "program.py", "$stiffness", "$damping"]\noutput = "out.txt"\ntemplates = {{"in.txt" = "base.csv"}}\n'
-        settings = OWN.replace(
-            'kind = "function"\nfunction = "strange_model.py:simulate"', 'kind = "executable"\n' + command
+        settings = own.replace(
+            'kind = "function"\nfunction = "strange_program.py:simulate"', 'kind = "executable"\n' + command
         )
         (folder / "r" / "settings.toml").write_text(settings)
     with monkeypatch.context() as patched:
         patched.setattr(models, "load_function", _refuse)
-        for name in ("load", "loads", "Unpickler"):
-            patched.setattr(pickle, name, _refuse)
+        for reader in ("load", "loads", "Unpickler"):
+            patched.setattr(pickle, reader, _refuse)
         said = call("report", "r")
-    assert "which was not run: the report has no responses" in " ".join(said.split())
-    assert not (folder / "was_run").exists() and "strange_model" not in sys.modules
+    assert "which was not run: the report has no responses, no predictions" in " ".join(said.split())
+    assert not (folder / "was_run").exists() and name not in sys.modules
     summary = (folder / "r" / "summary.txt").read_text()
-    assert summary.splitlines()[:4] == whole.splitlines()[:4]  # moments of the same samples
-    assert "log-evidence" in summary
+    assert "stiffness" in summary and "The evidence and the verdict are not known" in summary
+    rows = [
+        (folder / "r" / name).read_text().splitlines() for name in ("summary.csv", "report.html", "posterior.nc")[:2]
+    ]
+    assert len(rows[0]) == 5 and len(rows[1]) > 10
+    means = [float(row.split(",")[1]) for row in rows[0][1:]]
+    assert means == pytest.approx([float(row.split(",")[1]) for row in before[1:]], rel=1e-6)  # of the same samples
     if kind == "function":
         call("report", "r", "--run-code")
         assert (folder / "was_run").exists()  # the test can fail
