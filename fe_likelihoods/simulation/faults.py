@@ -10,6 +10,7 @@ point again. A `MisfitReason` depends on the measurements, so that it says nothi
 """
 
 import dis
+import signal
 import subprocess
 from concurrent.futures import BrokenExecutor
 
@@ -131,9 +132,11 @@ def raise_if_it_ends_the_run(error: BaseException) -> None:
 
 
 def _is_raised(error: BaseException) -> bool:
-    """Whether an exception comes from a ``raise`` statement."""
-    trace = error.__traceback__
+    """Whether an exception comes from a ``raise`` statement outside the handler of Ctrl-C."""
+    trace, handler = error.__traceback__, getattr(signal.getsignal(signal.SIGINT), "__code__", None)
     while trace is not None and trace.tb_next is not None:
+        if trace.tb_next.tb_frame.f_code is handler:
+            return False
         trace = trace.tb_next
     return trace is not None and dis.opname[trace.tb_frame.f_code.co_code[trace.tb_lasti]] == "RAISE_VARARGS"
 

@@ -43,7 +43,8 @@ def test_a_report_of_a_folder_of_a_stranger_runs_no_code(kind, folder, monkeypat
     if kind == "program":
         program = folder / "program.py"
         program.write_text(HOSTILE)
-        command = f'command = ["{sys.executable}", "program.py", "$stiffness", "$damping"]\noutput = "out.txt"\ntemplates = {{"in.txt" = "base.csv"}}\n'
+        command = f'command = ["{sys.executable}", "program.py", "$stiffness", "$damping"]'
+        command += '\noutput = "out.txt"\ntemplates = {"in.txt" = "base.csv"}\n'
         settings = own.replace(
             'kind = "function"\nfunction = "strange_program.py:simulate"', 'kind = "executable"\n' + command
         )
