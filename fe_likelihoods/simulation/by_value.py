@@ -40,6 +40,7 @@ _LIBRARIES = {"fe_likelihoods", "samplers"}
 _INSTALLED = {"site-packages", "dist-packages"}
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.ModuleType)
+_CACHED = type(functools.cache(len))
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
 _lock = threading.RLock()
@@ -228,6 +229,8 @@ class _Pickler(cloudpickle.Pickler):
             parent = self._modules.get(obj.__name__.rpartition(".")[0])
             state = parent, {name: _sendable(name, value) for name, value in values.items()}
             return _new_module, (obj.__name__,), state, None, None, _fill_module
+        if isinstance(obj, _CACHED) and self._modules.get(obj.__module__) is not None:  # pickled by its name otherwise
+            return _new_cached, (obj.__wrapped__, *obj.cache_parameters().values())
         reduced = super().reducer_override(obj) if not isinstance(obj, types.FunctionType) else self._function(obj)
         if reduced is NotImplemented or len(reduced) != 6 or isinstance(obj, types.FunctionType):
             return reduced
@@ -345,6 +348,10 @@ def _fill_module(module: types.ModuleType, state: tuple[Any, Mapping[str, Any]])
             vars(parent)[module.__name__.rpartition(".")[2]] = module
 
 
+def _new_cached(function: Any, maxsize: int | None, typed: bool) -> Any:
+    return functools.lru_cache(maxsize, typed)(function)
+
+
 def _new_lock(value: Any) -> Any:
     return _Lock(isinstance(value, _LOCKS[1])) if isinstance(value, _LOCKS) else value
 
@@ -354,22 +361,35 @@ def _sendable(name: str, value: Any) -> Any:
     if isinstance(value, types.FunctionType):
         plain = not (value.__defaults__ or value.__kwdefaults__ or value.__closure__ or vars(value))
     else:
-        plain = isinstance(value, _PLAIN) or (type(value).__module__ == "numpy" and not value.dtype.hasobject)
+        plain = isinstance(value, _PLAIN) or not getattr(getattr(value, "dtype", None), "hasobject", True)
     if plain:
         return value
     if isinstance(value, _LOCKS):
         return _new_lock(value)
     try:
         _Probe(io.BytesIO(), protocol=5).dump(value)
+        _refuse_a_name(value)
     except Exception as error:
         return NotSent(name, f"{type(error).__name__}: {without_addresses(str(error))}")
     return value
+
+
+def _refuse_a_name(value: Any) -> None:
+    """Raise TypeError if an object is pickled as its name in a module of the user, as compiled functions are."""
+    if isinstance(value, types.FunctionType | _CACHED):
+        return
+    reduce = cloudpickle.Pickler.dispatch_table.get(type(value), lambda value: value.__reduce_ex__(4))
+    name = reduce(value)
+    if isinstance(name, str) and is_of_user(sys.modules[pickle.whichmodule(value, name)]):
+        raise TypeError("it is known by its name only")
 
 
 class _Probe(cloudpickle.Pickler):
     """Pickler that finds out whether an object can be pickled, without classes, modules and the code of functions."""
 
     def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, _CACHED):
+            return self.reducer_override(obj.__wrapped__)
         if isinstance(obj, types.FunctionType):
             values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
             return abs, (), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))

@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from .by_value import Pickled
-from .faults import RunFailed, TransientReason
+from .faults import ChangedModel, RunFailed, TransientReason
 from .worker import Answer, Worker, WorkerDied, last_lines
 
 __all__ = ["Sandbox"]
@@ -111,6 +111,8 @@ class Sandbox:
             worker.kill()
             if isinstance(error, WorkerDied):
                 raise _with_output(error, output) from None
+            if isinstance(error, ValueError) and not isinstance(error, ChangedModel):  # it cannot be loaded there
+                raise RunFailed(TransientReason(str(error))) from error
             raise
         return worker, output
 

@@ -21,21 +21,25 @@ from fe_likelihoods.simulation.sandbox import Sandbox
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line
 
 LAW = """
+import functools
 import threading
 import numpy as np
+from numpy import sqrt
 K = 2.0
 LOCK = threading.Lock()
 NUMBERS = (number for number in (1, 2))
 def get():
     return K
 class Spring:
+    stiffness = property(lambda self: K)
+    make = staticmethod(lambda: Spring())
     lock = threading.RLock()
     def force(self, x):
         return K * x
 def direct(x):
     return K * x
 def through_a_class(x):
-    return Spring().force(x)
+    return Spring.make().force(x) / Spring().stiffness * K
 def with_a_lock(x):
     with LOCK, Spring.lock:
         return K * x
@@ -44,6 +48,20 @@ def counts(x):
     K = K + 1.0
     import law
     return law.K * x
+@functools.cache
+def cached(x):
+    return K * x
+class Cached:
+    @functools.lru_cache(maxsize=3)
+    def force(self, x):
+        return K * x
+ufunc = np.frompyfunc(direct, 1, 1)
+def through_a_cache(x):
+    return cached(x) + Cached().force(x) - K * x
+def through_a_ufunc(x):
+    return ufunc(x)
+def through_numpy(x):
+    return float(sqrt(K * x))
 def unsent(x):
     return next(NUMBERS)
 def unsent_elsewhere(x):
@@ -161,6 +179,13 @@ def test_lambdas_closures_and_arrays_are_sent(pool):
         return n * recursive(n - 1) if n else 1
 
     assert pool.map(recursive, [5]) == [120]
+
+
+def test_cached_functions_are_sent_and_compiled_objects_end_the_run_where_they_are_used(user, pool):
+    assert pool.map(user.law.through_a_cache, [1.0]) == pool.map(user.law.cached, [1.0]) == [3.0]
+    assert pool.map(user.law.through_numpy, [3.0]) == [3.0]
+    with pytest.raises(ChangedModel, match="uses the value 'ufunc' of its module, .* by its name only"):
+        pool.map(user.law.through_a_ufunc, [1.0])
 
 
 def test_an_unchanged_function_has_the_same_key(user):
