@@ -133,7 +133,9 @@ def raise_if_it_ends_the_run(error: BaseException) -> None:
 
 def _is_raised(error: BaseException) -> bool:
     """Whether an exception comes from a ``raise`` statement outside the handler of Ctrl-C."""
-    trace, handler = error.__traceback__, getattr(signal.getsignal(signal.SIGINT), "__code__", None)
+    handler = signal.getsignal(signal.SIGINT)
+    handler = getattr(handler, "__code__", None) or getattr(type(handler).__call__, "__code__", None)
+    trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         if trace.tb_next.tb_frame.f_code is handler:
             return False

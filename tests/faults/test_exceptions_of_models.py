@@ -85,6 +85,15 @@ def press():
         pass
 
 
+@pytest.fixture
+def usual_handler():
+    """Another test of this process may have left another handler."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("usual_handler")
 @pytest.mark.parametrize("make", [Plain, Batched, of_function])
 @pytest.mark.parametrize("act", [press, lambda: signal.raise_signal(signal.SIGINT), turned, repeated])
 def test_ctrl_c_ends_the_run(make, act):

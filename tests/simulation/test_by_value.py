@@ -55,7 +55,12 @@ class Cached:
     @functools.lru_cache(maxsize=3)
     def force(self, x):
         return K * x
-ufunc = np.frompyfunc(direct, 1, 1)
+class Named:
+    def __reduce__(self):
+        return "ufunc"
+    def __call__(self, x):
+        return K * x
+ufunc = Named()
 def through_a_cache(x):
     return cached(x) + Cached().force(x) - K * x
 def through_a_ufunc(x):
