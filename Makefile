@@ -10,7 +10,8 @@ READY := $(VENV)/.ready
 help:            ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/'
 
-$(READY): pyproject.toml
+$(READY): pyproject.toml .ci/setup
+	.ci/setup
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@touch $(READY)

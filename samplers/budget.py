@@ -1,6 +1,6 @@
 """Simulations of a run: how many there were, and whether more fit into a limit.
 
-An evaluation needs a simulation unless only fast parameters differ from an evaluated point. The points are those of the
+An evaluation needs a simulation unless only fast parameters differ from an evaluated point. The points are in the
 record of the run (`samplers.record`), and the simulations that a guide made by itself are added.
 
 A limit never changes what a run does: the limit only ends the run. So a run that is continued with a larger limit
@@ -99,7 +99,7 @@ class Budget:
         self._record.note(OF_GUIDES, np.array([max(self.of_guides, self._allowed)]))
 
     def begin(self, guide: CountsSimulations) -> None:
-        """Count the simulations of a new guide from now on, besides those of earlier guides."""
+        """Count the simulations of a new guide from now on, besides the simulations of earlier guides."""
         self._of_earlier_guides = self.of_guides
         self._guide, self.refused = guide, False
 

@@ -29,7 +29,8 @@ __all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file"]
 logger = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
-STORED = "stored step"  # key of the checksum of the last step that was stored as a whole
+STORED = "stored step"  # key of the checksums of the steps that were stored as a whole
+STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 
 class Output:
@@ -58,6 +59,7 @@ class Output:
     def __init__(self, backend: Backend, record: Record):
         self._backend, self._record = backend, record
         self._counts = int(backend.iteration), np.array(backend.accepted)
+        self._summed = 0, 0  # steps, and their checksum
         stored = self._read()
         ladder = tuple(Stage(*values) for values in stored.get("ladder", ()))
         check, founders, verdict = (stored.get(name) for name in ("check", "founders", "verdict"))
@@ -89,7 +91,8 @@ class Output:
         """Note in the record what the chain ends with, since a process that is killed may store half of a step."""
         self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
         if isinstance(self._backend, HDFBackend):
-            self._record.note(STORED, np.array([_checksum(self._backend)]))
+            self._summed = _checksum_of_steps(self._backend, *self._summed)
+            self._record.note(STORED, np.array([self._summed[1], _checksum_of_rest(self._backend)]))
 
     def undo_half_a_step(self) -> None:
         """Leave no step that was not stored as a whole, after an error or Ctrl-C in the middle of it."""
@@ -181,15 +184,30 @@ class Output:
             self.step_stored()
 
 
-def _checksum(backend: HDFBackend) -> int:
-    """CRC-32 of what a chain ends with: counts, last step, state to go on from, random state."""
+def _checksum_of_steps(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int]:
+    """Number of steps of a chain, and the CRC-32 of all of them; from the `checksum` of the first `known` steps."""
+    with backend.open() as file:
+        group = file[backend.name]
+        steps = int(group.attrs["iteration"])
+        if steps < known:
+            known, checksum = 0, 0
+        for first in range(known, steps, STEPS_AT_ONCE):
+            rows = slice(first, min(first + STEPS_AT_ONCE, steps))
+            parts = [group[name][rows] for name in ("chain", "log_prob", "blobs") if name in group]
+            for step in zip(*parts, strict=True):
+                for part in step:
+                    checksum = zlib.crc32(part.tobytes(), checksum)
+    return steps, checksum
+
+
+def _checksum_of_rest(backend: HDFBackend) -> int:
+    """CRC-32 of what a chain ends with: counts, state to go on from, random state."""
     with backend.open() as file:
         group, checksum = file[backend.name], 0
-        steps = int(group.attrs["iteration"])
         stored = json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
-        parts = [steps, stored.get("first_step"), stored.get("provisional"), group["accepted"][...]]
+        parts = [int(group.attrs["iteration"]), stored.get("first_step"), stored.get("provisional")]
+        parts += [group["accepted"][...]]
         parts += [group.attrs[name] for name in sorted(group.attrs) if name.startswith("random_state_")]
-        parts += [group[name][steps - 1] for name in ("chain", "log_prob", "blobs") if steps > 0 and name in group]
         parts += [dataset[...] for _, dataset in sorted(group.get("restart", {}).items())]
         for part in parts:
             data = part.tobytes() if isinstance(part, np.ndarray | np.generic) else repr(part).encode()
@@ -198,14 +216,14 @@ def _checksum(backend: HDFBackend) -> int:
 
 
 def is_whole(backend: HDFBackend, record: Record) -> bool:
-    """Whether a chain ends with a step that was stored as a whole, or is empty and has never had a step."""
+    """Whether a chain has the steps that were stored, each as a whole, or is empty and has never had a step."""
     try:
         with backend.open() as file:
             group = file[backend.name]
             if group.attrs["iteration"] == 0 and "restart" not in group and not np.any(group["accepted"]):
                 return True
         noted = record.noted(STORED)
-        return noted is not None and int(noted[0]) == _checksum(backend)
+        return noted is not None and noted.tolist() == [_checksum_of_steps(backend)[1], _checksum_of_rest(backend)]
     except BlockingIOError:  # another process writes to it
         raise
     except Exception:  # HDF5 raises nearly anything
@@ -239,6 +257,20 @@ def run_of_file(backend: HDFBackend) -> str | None:
         return DAMAGED
 
 
+def _copy_missing(present: h5py.Group, new: h5py.Group, ours: str) -> None:
+    """Copy what can be read of a group and is not in a new one, but nothing of the group `ours`."""
+    if present.name.strip("/") == ours.strip("/"):
+        return
+    for name, value in present.attrs.items():
+        new.attrs[name] = value
+    for name in present:
+        with contextlib.suppress(OSError, RuntimeError, KeyError):  # it cannot be read
+            if name not in new:
+                present.copy(name, new)
+            elif isinstance(present[name], h5py.Group):
+                _copy_missing(present[name], new[name], ours)
+
+
 def _read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:
     """Read an object of a file as a whole."""
     dict(node.attrs)
@@ -248,7 +280,7 @@ def _read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:
 
 def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
     """Make the file of a backend, with an empty chain of a run, in one piece; other groups that can be read stay."""
-    path = Path(backend.filename)
+    path = Path(backend.filename).resolve()
     new = path.with_name(f"{path.name}.new")
     new.unlink(missing_ok=True)
     options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
@@ -258,10 +290,7 @@ def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
         file[made.name].attrs["run"] = run
         try:
             with h5py.File(path, "r") as present:
-                for name in present:
-                    if name not in file:
-                        with contextlib.suppress(OSError, RuntimeError, KeyError):  # it cannot be read
-                            present.copy(name, file)
+                _copy_missing(present, file, made.name)
         except BlockingIOError:  # another process writes to it
             raise
         except OSError as error:

@@ -17,6 +17,7 @@ A kill can leave only the last block incomplete, and an incomplete block is drop
 in memory only.
 """
 
+import errno
 import io
 import json
 import logging
@@ -42,7 +43,7 @@ try:
 except ImportError:  # Windows has no such locks: two runs on one file are not detected there
     flock = None
 
-__all__ = ["EvaluatedBatch", "Record", "RunStart", "merge_batches"]
+__all__ = ["EvaluatedBatch", "Record", "RunStart", "free_name", "merge_batches"]
 
 logger = logging.getLogger(__name__)
 
@@ -131,9 +132,10 @@ class Record:
     """
 
     def __init__(self, path: Path | None = None, slow: Sequence[int] | None = None):
-        self.path, self._slow, self._file = path, None if slow is None else list(slow), None
+        self.path = None if path is None else path.resolve()  # two names of one file are one record
+        self._slow, self._file = None if slow is None else list(slow), None
         self._clear()
-        if path is not None and path.exists():
+        if self.path is not None and self.path.exists():
             self._read()
 
     def _clear(self) -> None:
@@ -169,14 +171,8 @@ class Record:
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter evaluated points; they are in the file when this returns. ValueError for blobs that it cannot hold."""
-        if self._file is not None and batch.blobs is not None:
-            try:
-                h5py.h5t.py_create(batch.blobs.dtype, logical=True)
-            except TypeError as error:
-                raise ValueError(
-                    f"blobs of dtype {batch.blobs.dtype} cannot be stored in a file ({error}): return numbers, or pass "
-                    "blobs_dtype, as for text blobs_dtype='S20'"
-                ) from None
+        if self.path is not None and batch.blobs is not None:
+            _check_blobs(batch.blobs.dtype)
         blobs = [] if batch.blobs is None else [batch.blobs]
         with deferred_interrupts():
             self._write(b"EVAL", [batch.coords, batch.log_prob, _text(batch.reasons), *blobs])
@@ -265,10 +261,6 @@ class Record:
         start = start._replace(header=json.loads(json.dumps(start.header)))
         kind, keys, *rest = start.random_state
         arrays = [_text([start.header, kind, *rest]), start.coords, keys]
-        if self.path is not None and self._file is None:
-            with open(self.path, "ab"):
-                pass
-            self.open()
         with deferred_interrupts():
             self._write(b"RUN ", arrays)
             self._begin(start)
@@ -281,27 +273,35 @@ class Record:
         """Open the file for writing, and lock it. ValueError if another process writes to it."""
         if self.path is None or self._file is not None:
             return
-        if (earlier := _open_records.get(self.path.resolve())) is not None:  # the last sampler of a process owns it
+        if (earlier := _open_records.get(self.path)) is not None:  # the last sampler of a process owns it
             earlier.close()
-        self._file = open(self.path, "r+b", buffering=0)  # noqa: SIM115  open during the run
+        with deferred_interrupts():
+            self.path.touch()
+            file = open(self.path, "r+b", buffering=0)  # noqa: SIM115  open during the run
+            try:
+                self._lock(file)
+                if self.path.stat().st_size != self._whole:  # an incomplete block, or another process has written
+                    vars(self).update(vars(Record(self.path, self._slow)))
+                if self._whole == 0:
+                    file.truncate(0)
+                    if file.write(MAGIC) < len(MAGIC):
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+                    self._whole = len(MAGIC)
+                file.truncate(self._whole)
+                file.seek(self._whole)
+            except BaseException:  # a file that is open is one whose state is known
+                file.close()
+                raise
+            self._file, _open_records[self.path] = file, self
+
+    def _lock(self, file: Any) -> None:
         try:
             if flock is not None:
-                flock(self._file, LOCK_EX | LOCK_NB)
+                flock(file, LOCK_EX | LOCK_NB)
         except BlockingIOError:
-            self.close()
             raise ValueError(f"another run is writing to {self.path}: wait for its end, or use another file") from None
         except OSError as error:
             logger.info("%s cannot be locked (%s): do not start two runs on it", self.path, error.strerror)
-        _open_records[self.path.resolve()] = self
-        if self.path.stat().st_size != self._whole:  # an incomplete block, or another process has written since
-            self._clear()
-            self._read()
-        if self._whole == 0:
-            self._file.truncate(0)
-            self._file.write(MAGIC)
-            self._whole = len(MAGIC)
-        self._file.truncate(self._whole)
-        self._file.seek(self._whole)
 
     def close(self) -> None:
         """Close the file."""
@@ -312,16 +312,15 @@ class Record:
     def set_aside(self, ending: str) -> Path:
         """Rename the file, and begin with an empty record; returns the new name."""
         self.close()
-        aside, number = self.path.with_name(f"{self.path.name}.{ending}"), 2
-        while aside.exists():  # simulations are never overwritten
-            aside, number = self.path.with_name(f"{self.path.name}.{ending}.{number}"), number + 1
+        aside = free_name(self.path, ending)
         os.replace(self.path, aside)
         self._clear()
         return aside
 
     def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> None:
-        if self._file is None:
+        if self.path is None:
             return
+        self.open()
         data, start = memoryview(_block(kind, arrays)), self._whole
         try:
             written = 0
@@ -349,7 +348,7 @@ class Record:
             if known and len(content) < length:
                 break  # the process was killed while it wrote this block
             if not known or zlib.crc32(content) != checksum or not self._read_block(kind, content):
-                aside = self.path.with_name(f"{self.path.name}.damaged")
+                aside = free_name(self.path, "damaged")
                 shutil.copyfile(self.path, aside)
                 logger.warning(
                     "%s is damaged after %d of %d bytes, with %d evaluations before: the rest is not used, and a copy "
@@ -380,6 +379,28 @@ class Record:
         except ValueError:
             return False
         return True
+
+
+def free_name(path: Path, ending: str) -> Path:
+    """A name beside `path` with this ending that no file has: simulations are never overwritten."""
+    name, number = path.with_name(f"{path.name}.{ending}"), 2
+    while name.exists():
+        name, number = path.with_name(f"{path.name}.{ending}.{number}"), number + 1
+    return name
+
+
+def _check_blobs(dtype: np.dtype) -> None:
+    """Raise ValueError for blobs that a file cannot hold."""
+    try:
+        h5py.h5t.py_create(dtype, logical=True)
+        reason = "Python objects" if dtype.hasobject else ""
+    except TypeError as error:
+        reason = str(error)
+    if reason:
+        raise ValueError(
+            f"blobs of dtype {dtype} cannot be stored in a file ({reason}): return numbers, or pass blobs_dtype, as "
+            "for text blobs_dtype='S20'"
+        )
 
 
 def _close_in_child() -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from emcee import State
@@ -19,7 +20,7 @@ from emcee.moves import Move
 
 from .moves.kernels import describe
 from .output import DAMAGED, is_whole, make_group, run_of_file
-from .record import EvaluatedBatch, Record
+from .record import EvaluatedBatch, Record, free_name
 from .settings import Settings
 from .tempering.guide import Guide, guide_fingerprint
 
@@ -46,7 +47,8 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
     """
     if not isinstance(backend, HDFBackend) or backend.read_only:
         return Record(slow=slow)
-    record = Record(Path(f"{backend.filename}.{backend.name.replace('/', '.')}.record"), slow)
+    path = Path(backend.filename).resolve()
+    record = Record(path.with_name(f"{path.name}.{quote(backend.name, safe='')}.record"), slow)
     stored = run_of_file(backend)
     if record.start is None:
         if stored == DAMAGED:
@@ -62,10 +64,14 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
         )
     if stored == run and is_whole(backend, record):
         return record
+    record.open()  # another process that writes to the files owns them, and is between two writes
+    stored = run_of_file(backend)
+    if stored == run and is_whole(backend, record):
+        return record
     if stored in (run, None, DAMAGED):
         if stored is not None:
-            aside = f"{backend.filename}.damaged"
-            shutil.copyfile(backend.filename, aside)
+            aside = free_name(path, "damaged")
+            shutil.copyfile(path, aside)
             logger.warning(
                 "%s does not end with a step that this run has stored: it is damaged, its writer was killed, or "
                 "another program has added steps. A copy of it is kept as %s",
@@ -156,8 +162,22 @@ def compare(known: EvaluatedBatch, compute: Callable[[np.ndarray], EvaluatedBatc
         return [
             "log_prob_fn returned blobs, and returns none" if found.blobs is None else "log_prob_fn returns blobs now"
         ]
-    now = found.log_prob
-    for coords, before, after in zip(known.coords, known.log_prob, now, strict=True):
+    for row, (coords, before, after) in enumerate(zip(known.coords, known.log_prob, found.log_prob, strict=True)):
         if not np.isclose(before, after, **CLOSE, equal_nan=True):
             return [f"log_prob_fn was {before:.10g} at {coords}, is {after:.10g}"]
+        if known.blobs is not None and not _same_blobs(known.blobs[row], found.blobs[row]):
+            return [f"blobs of log_prob_fn were {known.blobs[row]} at {coords}, are {found.blobs[row]}"]
     return []
+
+
+def _same_blobs(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether the blobs of a point agree: numbers up to rounding, and everything else exactly."""
+    before, after = np.asarray(before), np.asarray(after)
+    if before.dtype.names is not None:
+        same_names = before.dtype.names == after.dtype.names
+        return same_names and all(_same_blobs(before[name], after[name]) for name in before.dtype.names)
+    if before.shape != after.shape:
+        return False
+    if before.dtype.kind in "fc" and after.dtype.kind in "fc":
+        return bool(np.allclose(before, after, **CLOSE, equal_nan=True))
+    return bool(np.all(before == after))

@@ -9,6 +9,7 @@ from .budget import Budget, as_limit
 from .estimates.genealogy import standard_error_of_mean
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
+from .evaluation.user_functions import OptionalAttributes
 from .judgement.failures import NearFailures
 from .judgement.verdict import RunParts, Verdict
 from .record import Record
@@ -32,6 +33,7 @@ class RunResults:
     _guide: AdaptedGuide | None
     _result: AnnealingResult
     _verdict: Verdict | None
+    _optional: OptionalAttributes
     _seed: list[int] | None
     _near: NearFailures | None = None
     _prior_draws: np.ndarray | None = None
@@ -40,7 +42,7 @@ class RunResults:
     def evaluations(self) -> int:
         """Points for which `log_prob_fn` was called, by this object and by the interrupted run that it continues.
 
-        Includes those of sweeps over fast parameters.
+        Sweeps over fast parameters are included.
         """
         return self._record.count
 
@@ -81,7 +83,7 @@ class RunResults:
     def ended_at(self) -> float | None:
         """Exponent beta at which the limit of simulations ended the annealing; None if it did not end it.
 
-        The last stage of `ladder` is then that of all points known at that time, weighted for beta = 1.
+        The last stage of `ladder` then has all points known at that time, weighted for beta = 1.
         """
         stop = self._result.early_stop
         return None if stop is None or stop.complete or stop.beta >= 1.0 else stop.beta
@@ -134,14 +136,16 @@ class RunResults:
         Copies made by the latest resamplings and the autocorrelation of the chain are accounted for
         (`samplers.estimates.genealogy`). The variance of a mean is estimated from as many groups of walkers as there
         are `founders`. With few founders, it is itself uncertain, so the errors are multiplied by a quantile of
-        Student's t: two errors then contain the true mean with 95 % probability. Where `founders` are not known, each
+        Student's t: two errors then contain the true mean with 95 % probability. Groups of unequal size count as
+        1 / sum(share^2) groups. Where `founders` are not known, each
         walker counts as independent. The dependence between walkers that some moves introduce, such as emcee's stretch
         move, is not accounted for. A single run cannot detect a mode that it lost, or moves that did not move: after a
         `SamplingWarning` the errors are too small.
         """
-        groups = len(np.unique(self.founders))
+        shares = np.unique(self.founders, return_counts=True)[1] / self.nwalkers
+        groups = 1.0 / np.sum(shares**2)
         errors = standard_error_of_mean(self.get_chain(discard=discard, thin=thin), self.founders)
-        return errors if groups == 1 else errors * stdtrit(groups - 1.0, 0.975) / ndtri(0.975)
+        return errors if len(shares) == 1 else errors * stdtrit(groups - 1.0, 0.975) / ndtri(0.975)
 
     def _repr_html_(self) -> str:
         """In notebooks: what the run has done and found, or how to start it."""
@@ -163,7 +167,7 @@ class RunResults:
     def max_simulations(self) -> float | None:
         """Largest number of simulations; None for no limit.
 
-        Where a run is continued, a number below that of the simulations it has made acts as their number.
+        A limit below the number of simulations already made acts as this number.
         """
         return self._budget.limit
 
@@ -196,5 +200,6 @@ class RunResults:
             raise ValueError("there is no verdict before a run: call run_mcmc first")
         near = None if self._result.independent_points is None else self._near
         get_chain = self.get_chain if self.iteration > 0 else lambda: np.empty((0, self.nwalkers, 0))
-        run = self._result, get_chain, self.nwalkers, self.evaluations, self.failure_count, near
+        failed = self._optional.failure_count
+        run = self._result, get_chain, self.nwalkers, self.evaluations, self.failure_count, near, failed
         return self._verdict.of(RunParts(*run))

@@ -5,8 +5,9 @@ settings of annealing by moves, which both have. Constants that no user changes 
 for their value (`samplers.tempering.recycling`, `samplers.tempering.guided`).
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from difflib import get_close_matches
 from numbers import Integral
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from .resampling import RESAMPLING
 
-__all__ = ["MOVES", "Settings", "as_whole_number", "choose_settings", "refuse_unused"]
+__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "refuse_unused"]
 
 # settings of annealing by moves that every sampler has
 MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "check_draws", "max_failure_share")
@@ -48,13 +49,13 @@ class Settings:
     min_moves, max_moves : int
         Smallest and largest number of sweeps of the ensemble per stage; equal for a fixed number.
     max_correlation : float
-        Between these two numbers, moving stops once the correlation of every parameter and of the log-likelihood with
-        their values after the resampling is below this value, or decreases no further.
+        Between `min_moves` and `max_moves`, moving stops once the correlation of every parameter and of the
+        log-likelihood with their values after the resampling is below this value, or decreases no further.
     chains : {"equal", "leaders"}
         With "equal", every resampled point is moved equally often. With "leaders", a chain grows from each distinct
-        resampled point, one step per copy of it; each point is then moved `burn_in` + 1 times.
+        resampled point, one step per copy of it, and sweeps follow where the points are still correlated.
     burn_in : int
-        With "leaders", steps of a chain before its points count.
+        With "leaders", steps of a chain before its points count; 0 for the published algorithm, without sweeps.
     fast_sweeps : int
         Sweeps over the fast parameters after every move, where `log_prob_fn` has an attribute ``fast_parameters``
         (`samplers.moves.fast_parameters`); 0 for none.
@@ -63,7 +64,7 @@ class Settings:
         by moves only where its result cannot be trusted. None leaves the choice to the sampler.
     runs : int
         Number of runs of recycling from the same draws of the prior, whose points are used together at the end. A
-        difference between them is reported: one of them has then lost a part of the posterior.
+        difference between the runs means that one run has lost a part of the posterior, and is reported.
     check_draws : int, optional
         Evaluations for an estimate of the evidence that is independent of the annealing. None: as many as there are
         walkers; 0: no such estimate.
@@ -137,19 +138,31 @@ class Settings:
         return self.resampling if callable(self.resampling) else RESAMPLING[self.resampling]
 
     def target(self, last_target: float, n_walkers: int) -> float:
-        """Effective sample size wanted of a stage, from that of the previous stage (n_walkers before the first)."""
+        """Effective sample size wanted of a stage, from the previous stage's target (n_walkers before the first)."""
         variation = self.coefficient_of_variation
         ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
         return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
 
 
-def choose_settings(sampler: str, names: Collection[str], given: Mapping[str, Any]) -> Settings:
-    """The defaults with the given settings; TypeError for a name that is not among the `names` of the sampler."""
+def check_names(sampler: str, names: Collection[str], given: Collection[str], arguments: Collection[str]) -> None:
+    """Raise TypeError for a keyword that is neither a setting, of the `names`, nor one of the other `arguments`."""
     if unknown := set(given) - set(names):
+        name = min(unknown)
+        near = get_close_matches(name, [*names, *arguments], n=1, cutoff=0.6)
         raise TypeError(
-            f"{sampler}() got an unexpected keyword argument {min(unknown)!r}; settings are {', '.join(sorted(names))}"
+            f"{sampler}() got an unexpected keyword argument {name!r}{f': did you mean {near[0]}?' if near else ''}; "
+            f"arguments besides those of emcee are {', '.join(arguments)}; settings are {', '.join(sorted(names))}"
         )
-    return Settings(**given)
+
+
+def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
+    """Raise ValueError for arguments that emcee or NumPy would refuse with another error, or later."""
+    if pool is not None and not (hasattr(pool, "map") or hasattr(pool, "submit")):
+        raise ValueError(f"pool must be an object with a method map, such as multiprocessing.Pool(4); got {pool!r}")
+    if backend is not None and not hasattr(backend, "initialized"):
+        raise ValueError(f"backend must be a backend of emcee, as emcee.backends.HDFBackend('run.h5'); got {backend!r}")
+    if seed is not None and not all(isinstance(each, Integral) for each in np.ravel(seed)):
+        raise ValueError(f"seed must be a whole number, several of them, or None; got {seed!r}")
 
 
 def refuse_unused(settings: Settings, guided: bool) -> None:

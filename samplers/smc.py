@@ -34,8 +34,8 @@ class SMCSampler(TemperedSampler):
         `samplers.moves.kernels.MixtureMove`: three kernels from a mixture fitted to every stage.
     recycle : bool, optional
         Anneal by recycling every evaluated point (`samplers.tempering.recycling`), and by moves where its result cannot
-        be trusted. By default yes with 150 walkers or more, and neither `moves` nor a setting of annealing by moves
-        given (`ess_ratio` to `max_correlation`): with fewer walkers, a mode can be lost unnoticed, and recycling often
+        be trusted. By default yes with 150 walkers or more, unless `moves` or a setting of annealing by moves is
+        given (`ess_ratio` to `max_correlation`). With fewer walkers, a mode can be lost unnoticed, and recycling often
         fails.
     runs, asynchronous
         As in `samplers.settings.Settings`; they need recycling. Two runs cost up to twice the evaluations of the

@@ -46,7 +46,7 @@ from .replay import compare, describe_run, differences, open_record, points_to_c
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
 from .reports import AnnealingResult, warn
 from .results import RunResults
-from .settings import Settings, as_whole_number, choose_settings, refuse_unused
+from .settings import Settings, as_whole_number, check_arguments, check_names, refuse_unused
 from .tempering.anneal import anneal
 from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import lend
@@ -57,6 +57,8 @@ from .tempering.recording import Recording
 __all__ = ["TemperedSampler"]
 
 logger = logging.getLogger(__name__)
+
+ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "start_density", "guide", "max_simulations", "seed")
 
 
 class TemperedSampler(RunResults, EnsembleSampler):
@@ -77,7 +79,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         It is always called in this process.
     log_likelihood_fn : callable, optional
         Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
-        blobs; the log-prior is added to its values. Its attributes count as those of `log_prob_fn`.
+        blobs; the log-prior is added to its values. Its attributes are used like attributes of `log_prob_fn`.
     start_density : callable, optional
         Normalised log-density that the initial state is drawn from, if that is not the prior, called like
         `log_prior_fn`; finite wherever the log-prior is. The annealing then leads from it to the posterior.
@@ -87,9 +89,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         starts from them, with a `SamplingWarning`.
     max_simulations : float, optional
         Largest number of simulations (`simulations`). Where it is reached, the posterior is estimated from the points
-        that are known, the state is stored once if the chain has no step, and a `SamplingWarning` says so; see
-        `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the same
-        file, and call `run_mcmc` again: the result is that of a run with the larger number from the start.
+        that are known, the final walkers are stored as one step if the chain is empty, and a `SamplingWarning` says so;
+        see `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the
+        same file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
         the run, and two samplers never share a stream. A file that contains a run keeps its seed: another one has no
@@ -138,13 +140,15 @@ class TemperedSampler(RunResults, EnsembleSampler):
         seed: int | None = None,
         **settings: Any,
     ):
+        check_names(type(self).__name__, self.setting_names, settings, ARGUMENTS)
+        check_arguments(pool, backend, seed)
         functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn, start_density)
         self._functions, self._optional, self.log_prior_fn = functions, functions.optional, functions.log_prior
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         self._optional.check_ndim(ndim, functions.name)
         check_size(nwalkers, ndim)
         settings = self._with_defaults(settings, moves)
-        given = choose_settings(type(self).__name__, self.setting_names, settings)
+        given = Settings(**settings)
         recycle, moves = self._choose(given, settings, moves, nwalkers)
         self.settings = replace(given, recycle=recycle)
         self._given_guide, self._guide = guide, None
@@ -154,7 +158,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         slow = self._optional.slow_parameters(ndim)
         self._record = open_record(backend, nwalkers, ndim, slow)
         self._budget = Budget(self._record, as_limit(max_simulations))
-        # whether the annealing of the record must be made again, and whether the record is that of another sampler
+        # whether the annealing of the record must be made again, and whether another sampler wrote the record
         self._must_repeat = self._reopened = self._record.start is not None
         self.seconds = 0.0
         set_previous_state(self, None)
@@ -187,12 +191,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator = self._make_evaluator(blobs_dtype)
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._seed = None if seed is None else np.ravel(seed).tolist()
+        # also drawn where it is not used, so that a script draws the same numbers after a restart
+        drawn = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
         if self._reopened and self._seed not in (None, stored := self._record.start.header["seed"]):
             logger.warning(
                 "%s contains a run with seed=%s: seed=%s has no effect", self.backend.filename, stored, self._seed
             )
         elif self.backend.random_state is None:
-            get_random(self).seed(np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed)  # noqa: NPY002
+            get_random(self).seed(drawn)
 
     def _make_evaluator(self, blobs_dtype: Any) -> Evaluator:
         """The evaluator of the user's function."""
@@ -223,6 +229,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Whether to recycle, and the moves."""
         return bool(settings.recycle), RandomWalkMove() if moves is None else moves
 
+    def __deepcopy__(self, memo):
+        memo[id(self)] = copied = type(self).__new__(type(self))
+        memo[id(self._evaluator)] = evaluator = copy.copy(self._evaluator)  # which copies of moves share
+        vars(evaluator).update(copy.deepcopy(self._evaluator.__getstate__(), memo))
+        vars(copied).update(copy.deepcopy(self.__getstate__(), memo))
+        return copied
+
     def __getstate__(self):
         # emcee removes the pool from the living sampler here; remove it from the copy only
         return {**self.__dict__, "pool": None}
@@ -230,7 +243,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def reset(self):
         """Clear the chain, as in emcee. Ladder and state at beta = 1 are kept: burn in, reset, continue."""
         if hasattr(self, "_output"):
-            self._output.clear_chain(None if self._must_repeat else get_previous_state(self))
+            if not self._must_repeat:
+                state = get_previous_state(self)
+            else:  # the annealing of a file, whose chain may end with an estimate that is replaced
+                state = None if self._output.provisional else self._output.last_state()
+            self._output.clear_chain(state)
         else:  # emcee initialises a new backend
             super().reset()
 
@@ -241,16 +258,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
         With an emcee `HDFBackend`, a new sampler with the file of a run goes on with it, as in emcee: the annealing is
         made again from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last
-        stored one. The results are those of a run that was never interrupted, to the last bit. So a script that is
-        started again after a kill makes ``run_mcmc(None, nsteps - sampler.iteration)``.
+        stored one. The results equal a run that was never interrupted, to the last bit. So a script that is
+        started again after a kill makes ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
 
         Parameters
         ----------
         initial_state : (nwalkers, ndim) float, State or None
             Draws of the prior, or of `start_density`. None: continue from the last state if there is one, else draw
             ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
-            of its last one) is continued; other coordinates start a new annealing. Points that cannot be such draws,
-            as a ball near the posterior, are refused with a ValueError (`samplers.evaluation.starts`).
+            of its last one) is continued, and so is a run that began with the same draws. Other coordinates start a
+            new annealing, whose steps are added to the chain: call `reset` before, or use a new sampler. Points that
+            cannot be such draws, as a ball near the posterior, are refused with a ValueError
+            (`samplers.evaluation.starts`).
         nsteps : int
             Number of steps stored in the chain; 0 for the annealing only.
         **kwargs
@@ -283,14 +302,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ) -> Iterator[State]:
         """Advance the chain as a generator: emcee's ``sample``, preceded by the annealing where it is needed.
 
-        The arguments are those of emcee, with `initial_state` as in `run_mcmc`.
+        The arguments are as in emcee, with `initial_state` as in `run_mcmc`.
         """
         if iterations is None and store:
             raise ValueError("'store' must be False when 'iterations' is None")
         if int(thin_by if thin is None else thin) <= 0:
             raise ValueError("Invalid thinning argument")
-        if iterations is not None:
-            iterations = as_whole_number("nsteps", iterations)
+        if iterations is not None and (iterations := as_whole_number("nsteps", iterations)) < 0:
+            raise ValueError(f"nsteps must be 0 or more; got {iterations} (the chain has {self.iteration} steps)")
         state = None if initial_state is None else State(initial_state, copy=True)
         for name, value in (("log_prob", log_prob0), ("random_state", rstate0), ("blobs", blobs0)):
             if value is not None:
@@ -337,7 +356,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._judge(missing, stored.coords)
             if ended:
                 yield from self._end_early(advanced, stored, new, missing, store)
-        except Exception:
+        except (Exception, SystemExit):
             self._output.undo_half_a_step()
             raise
         except KeyboardInterrupt:
@@ -346,10 +365,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 if self._record.start is None:  # the next call makes the same draws
                     get_random(self).set_state(random_state)
             logger.warning(
-                "interrupted: %d evaluations and %d steps are kept%s. Call run_mcmc again to go on",
+                "interrupted: %d evaluations and %d steps are kept in %s. Call run_mcmc again to go on",
                 self.evaluations,
                 self.iteration,
-                "" if self._record.path is None else f" in {self._record.path} and {self.backend.filename}",
+                "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}",
             )
             raise
         if self.failure_count > failures:
@@ -371,7 +390,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             yield stored
 
     def _judge(self, missing: int, coords: np.ndarray) -> None:
-        """Store the verdict on an annealing of this object, or keep that of the backend."""
+        """Store the verdict on an annealing of this object, or keep the verdict of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
             optional, latest, self._near = self._optional, self._record.latest(), None
@@ -431,8 +450,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         elif given is None:
             self._drawn = self._functions.draw_prior(self.nwalkers, get_random(self))
             given = State(self._drawn)
-        elif previous is not None and given.log_prob is None and np.array_equal(given.coords, previous.coords):
-            given.log_prob, given.blobs = copy.deepcopy((previous.log_prob, previous.blobs))
+        elif previous is not None and given.log_prob is None:
+            if np.array_equal(given.coords, previous.coords):
+                given.log_prob, given.blobs = copy.deepcopy((previous.log_prob, previous.blobs))
+            elif start is not None and np.array_equal(given.coords, start.coords):  # a cell, or a script, that is
+                given = previous  # started again with the same draws goes on
         if given.log_prob is not None and self._result.finished:
             return given
         if self.backend.iteration > 0 and not self._result.finished and start is None:
@@ -443,7 +465,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         return self._new_start(given, skip_check)
 
     def _open_record(self) -> None:
-        """Lock the record of a file, and find out once whether a stored run is that of this sampler."""
+        """Lock the record of a file, and find out once whether this sampler made the stored run."""
         if self._record.start is not None:
             self._record.open()
         if self._is_compared:
@@ -463,7 +485,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._is_compared = True
 
     def _compare(self, found: list[str], known: EvaluatedBatch | None) -> None:
-        """Raise ValueError if a stored run is that of another posterior or of other settings."""
+        """Raise ValueError if a stored run has another posterior or other settings."""
         if not found and known is not None and getattr(self._functions.function, "fingerprint", None) is None:
             found = compare(known, self._evaluator.compute)
         if found:
@@ -477,6 +499,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         described = {"sampler": type(self).__name__, **self._functions.described()}
         header = describe_run(self._functions.function, described, self.settings, *self._first_moves, self._given_guide)
         return json.loads(json.dumps(header))
+
+    def _say_that_bits_differ(self) -> None:
+        warn(
+            f"the annealing in {self.backend.filename} is made again, and needs points that its record does not have: "
+            "another processor, or another version of NumPy or SciPy, computes other bits. The chain goes on from its "
+            "last step, but points are evaluated anew; continue on the first processor and environment to avoid this"
+        )
 
     def _repeated(self, start: RunStart) -> RunStart:
         """The start of the record, from which the annealing is made again."""
@@ -523,6 +552,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
             lent = get_random(self), self._record.remember, self._budget, self.settings.asynchronous
             guidance = lend(self._guide, *lent)
+        # an annealing that had reached beta = 1 finds all its points in the record
+        self._evaluator.on_unknown = self._say_that_bits_differ if self._output.last_state() is not None else None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         recording = Recording(self._evaluator)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, guidance)

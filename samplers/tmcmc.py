@@ -4,7 +4,8 @@ Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816): the next expon
 of variation of the weights is 1, and a chain grows from each resampled point, its leader, with one step per copy. As
 published, with steps of a fixed scale, it is biased, and can collapse on a sharp posterior; these settings are
 `samplers.presets.CHING_CHEN_2007`. By default every chain has a burn-in and scales are adapted to the acceptance, after
-Betz, Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066. The moves are those of `MixtureMove`, since a
+Betz, Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066, and points that are still correlated with the
+leaders are moved on together (`samplers.tempering.leaders`). The moves are `MixtureMove`, since a
 random walk alone gives separate modes wrong shares. With ``chains="equal"``, all chains have the same length, so that
 all processors of a pool are busy, as in BASIS (Angelikopoulos, Papadimitriou & Koumoutsakos 2012,
 doi:10.1063/1.4757266; Wu, Angelikopoulos, Papadimitriou & Koumoutsakos 2018, doi:10.1115/1.4037450).
@@ -22,7 +23,7 @@ __all__ = ["TMCMCSampler"]
 
 # Steps of a chain from a leader before its points count: without them the shares of the points are biased.
 BURN_IN = 4
-OF_EQUAL_CHAINS = ("min_moves", "max_moves", "max_correlation")
+OF_SWEEPS = ("min_moves", "max_moves", "max_correlation")
 
 
 class TMCMCSampler(TemperedSampler):
@@ -38,23 +39,23 @@ class TMCMCSampler(TemperedSampler):
         an effective sample size of half the number of walkers.
     chains : {"leaders", "equal"}
         With "leaders", the default, a chain grows from each distinct resampled point, one step per copy of it. With
-        "equal", every resampled point is moved equally often, all at once: for a pool that should be busy. It is the
-        default with moves of emcee that need many walkers, such as the stretch move.
+        "equal", every resampled point is moved equally often, in one batch, which keeps a pool busy. It is the default
+        with moves of emcee that need many walkers, such as the stretch move.
     burn_in : int, default 4
-        Steps of a chain before its points count; with "leaders" only.
-    min_moves : int, default 2
-        Smallest number of sweeps of the ensemble per stage; with "equal" only, as the next two settings.
-    max_moves : int, default 7
-        Largest number of these sweeps; equal to `min_moves` for a fixed number.
+        Steps of a chain before its points count; with "leaders" only. With 0, the algorithm is as published.
+    min_moves, max_moves : int, default 2 and 7
+        Smallest and largest number of sweeps of the ensemble per stage. With "leaders", sweeps are made only where the
+        chains have left the points correlated with the resampled points.
     max_correlation : float, default 0.15
-        Between these two numbers, moving stops once the correlation with the resampled start is below this value.
+        Between `min_moves` and `max_moves`, moving stops once the correlation with the resampled points is below this
+        value.
     resampling, fast_sweeps, check_draws, max_failure_share
         As in `samplers.settings.Settings`.
 
     Raises
     ------
     ValueError
-        For an impossible value, or for a setting that cannot act, such as ``max_moves=5`` with chains from leaders.
+        For an impossible value, or for a setting that cannot act, such as ``max_moves=5`` with ``burn_in=0``.
     TypeError
         For a keyword that is not a setting of this sampler.
 
@@ -71,12 +72,13 @@ class TMCMCSampler(TemperedSampler):
         chains = settings.get("chains", "equal" if needs_many_walkers(moves) else "leaders")
         if chains != "leaders":
             return {"chains": chains} | settings
-        if idle := [name for name in OF_EQUAL_CHAINS if name in settings]:
+        settings = {"chains": chains, "burn_in": BURN_IN} | settings
+        if settings["burn_in"] == 0 and (idle := [name for name in OF_SWEEPS if name in settings]):
             raise ValueError(
-                f'{idle[0]} cannot act with chains="leaders", whose points are moved burn_in + 1 times: pass burn_in, '
-                'or chains="equal"'
+                f"{idle[0]} cannot act with burn_in=0, which makes no sweeps after the chains, as published: pass "
+                'burn_in of 1 or more, or chains="equal"'
             )
-        return {"chains": chains, "burn_in": BURN_IN} | settings
+        return settings
 
     @classmethod
     def _choose(cls, settings: Settings, given: Collection[str], moves: Any, nwalkers: int) -> tuple[bool, Any]:

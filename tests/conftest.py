@@ -51,6 +51,15 @@ def figures_are_closed():
         sys.modules["matplotlib.pyplot"].close("all")
 
 
+def pytest_terminal_summary(terminalreporter):
+    """One line about the tests that were skipped because OpenSees does not start."""
+    skipped = terminalreporter.stats.get("skipped", ())
+    if number := sum("NO OPENSEES" in str(report.longrepr) for report in skipped):
+        terminalreporter.write_line(
+            f"{number} tests compare with OpenSees and were skipped: install libblas3 and liblapack3, and openseespy"
+        )
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items):
     """Begin with the files whose tests take up to a minute; the order within a file stays."""

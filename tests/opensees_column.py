@@ -11,6 +11,7 @@ OpenSees has one model per process and may end that process. Each run therefore 
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import pickle
 import subprocess
@@ -75,12 +76,18 @@ class Push(NamedTuple):
 
 def require_opensees() -> None:
     """Skip the test with a message where OpenSees cannot be imported."""
+    if reason := why_no_opensees():
+        pytest.skip(f"NO OPENSEES: {reason}")
+
+
+@functools.cache
+def why_no_opensees() -> str:
+    """Why OpenSees cannot be imported; empty if it can."""
     if importlib.util.find_spec("openseespy") is None:
-        pytest.skip("NO OPENSEES: install openseespy (extra 'test') to compare with it")
+        return "openseespy is not installed (extra 'test')"
     probe = subprocess.run([sys.executable, "-c", "import openseespy.opensees"], capture_output=True, text=True)
-    if probe.returncode:
-        last = (probe.stderr.strip() or "no message").splitlines()[-1]
-        pytest.skip(f"NO OPENSEES: openseespy does not start (it needs libblas3 and liblapack3): {last}")
+    last = (probe.stderr.strip() or "no message").splitlines()[-1]
+    return f"openseespy does not start (it needs libblas3 and liblapack3): {last}" if probe.returncode else ""
 
 
 def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:

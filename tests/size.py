@@ -79,8 +79,7 @@ def count_fields(settings: type) -> int:
 
 def arguments_of(sampler: type) -> tuple[int, int]:
     """Numbers of arguments in emcee's order and of keyword arguments, without the settings."""
-    samplers = import_module("samplers")
-    settings = {field.name for field in fields(samplers.Settings)} if hasattr(samplers, "Settings") else set()
+    settings = {field.name for field in fields(import_module("samplers.settings").Settings)}
     given = [p for p in signature(sampler).parameters.values() if p.kind is not Parameter.VAR_KEYWORD]
     keywords = [p.name for p in given if p.kind is Parameter.KEYWORD_ONLY]
     return len(given) - len(keywords), len(set(keywords) - settings)
@@ -221,8 +220,7 @@ def rows():
         yield '    "... of ... of" within six words per 1000', f"{chains:.2f}"
         yield f"{package}: public names", str(len(import_module(package).__all__))
     samplers = import_module("samplers")
-    if hasattr(samplers, "Settings"):
-        yield "settings that a user may change", str(count_fields(samplers.Settings))
+    yield "settings that a user may change", str(count_fields(import_module("samplers.settings").Settings))
     theirs = emcee.EnsembleSampler(WALKERS, 3, Normal())
     for label, value in frames_of(emcee.EnsembleSampler, "emcee"):
         yield f"EnsembleSampler: {label}", value

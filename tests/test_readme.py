@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.opensees_column import require_opensees
+
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = {"api", "tutorials", "_build"}
 PAGES = [
@@ -56,6 +58,8 @@ def run(page: Path, folder: Path, slow: bool) -> None:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python", slow=False)], ids=name_of)
 def test_python_blocks_run_as_printed(page, tmp_path):
+    if any("OpenSeesModel(" in block for block in blocks(page, "python", slow=False)):
+        require_opensees()
     run(page, tmp_path, slow=False)
 
 

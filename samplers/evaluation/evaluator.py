@@ -190,6 +190,8 @@ class Evaluator:
         Where functions of one point are called; set by the sampler.
     observer : Observer, optional
         Told of points while they are evaluated.
+    on_unknown : callable, optional
+        Called once, before a point is evaluated that the record does not have.
     asynchronous : bool
         Whether `submit` returns without waiting.
     """
@@ -216,6 +218,7 @@ class Evaluator:
         self.evaluates_parts = True
         self.pool: Any = None
         self.observer: Observer | None = None
+        self.on_unknown: Callable[[], None] | None = None
         self.evaluations = self.new_evaluations = 0
 
     def __getstate__(self):
@@ -292,7 +295,8 @@ class Evaluator:
         """Nothing runs after `submit`."""
 
     def close(self) -> None:
-        """Nothing runs after `submit`."""
+        """An annealing has ended: nothing runs after `submit`."""
+        self.on_unknown = None
 
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
@@ -331,7 +335,10 @@ class Evaluator:
                     self.observer.repeated(len(part))
                 batches.append(known)
             elif len(part) > 0:
-                batches.append(self._compute_and_store(part))
+                if self.on_unknown is not None:
+                    self.on_unknown()
+                    self.on_unknown = None
+                batches.append(self._compute_and_store(part, whole=len(part) == len(points)))
             self.evaluations += len(part)
             if len(part) < rows.stop - rows.start:
                 raise BudgetExhausted(self._first_records(log_base, inside, batches))
@@ -342,7 +349,8 @@ class Evaluator:
         fitting = self.budget.fitting(coords)
         return coords if fitting == len(coords) else coords[: fitting if self.evaluates_parts else 0]
 
-    def _compute_and_store(self, coords: np.ndarray) -> EvaluatedBatch:
+    def _compute_and_store(self, coords: np.ndarray, whole: bool) -> EvaluatedBatch:
+        """Evaluate points that are not in the record: the `whole` of a batch, or a part of it."""
         stored, failed = 0, []
 
         def store_first(results: list) -> None:
@@ -370,7 +378,7 @@ class Evaluator:
             self._check(self, batch)
             self._check = None
         new = batch.rows([*failed, *range(stored, len(coords))])
-        self._check_failures(new, whole=stored == 0)
+        self._check_failures(new, whole=whole and stored == 0)
         self._enter(new)
         return batch
 

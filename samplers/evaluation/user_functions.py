@@ -63,8 +63,13 @@ class OptionalAttributes(NamedTuple):
     @property
     def counts_failures(self) -> bool:
         """Whether the function counts failed simulations by itself, so that -inf at a possible point is a failure."""
+        return self.failure_count is not None
+
+    @property
+    def failure_count(self) -> int | None:
+        """Number of failed simulations by the count of the function; None if it does not count them."""
         found = self.report() if callable(self.report) else None
-        return isinstance(found, Mapping) and "failure_count" in found
+        return int(found["failure_count"]) if isinstance(found, Mapping) and "failure_count" in found else None
 
     def may_be_positive(self, coords: np.ndarray) -> np.ndarray:
         """Whether points (n, ndim) may have a positive density, as bool (n,), by `possible`; True if unknown."""
@@ -199,7 +204,8 @@ class UserFunctions(NamedTuple):
             density = "the prior"
             remedy = (
                 f"Pass {known}, not points near the posterior; or declare what they were drawn from: "
-                "start_density=log_density"
+                "start_density=log_density. If they are draws of the prior, its log-density is another one: a constant "
+                "without bounds has no draws. To continue a chain, pass None, or the State that run_mcmc returned"
             )
         raise ValueError(
             f"initial_state must consist of draws of {density}; got points that cannot be: {compared}{reason}. "

@@ -42,8 +42,8 @@ LARGE_ERROR = 0.35
 LARGE_SHARE = 0.8
 # Difference of two log-evidences that is reported even where the error of the second one is not known.
 LARGE_DIFFERENCE = 1.0
-# Excess of the log-evidence of recycling over that of the moves after it, from which on a mode may be lost: a mode with
-# a quarter of the mass.
+# Log-evidence of recycling minus log-evidence of the moves after it, from which on a mode may be lost: a mode with a
+# quarter of the mass.
 LOST_EVIDENCE = 0.3
 # Correlation of log-weights with the log-weights of the nearest points, below which jumps of the likelihood explain a
 # poor efficiency: 0.2 to 0.44 with jumps of standard deviation 1, 0.44 to 0.56 for Gaussian modes with the chance
@@ -142,7 +142,7 @@ def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlati
 def check_mode_shares(coords: np.ndarray, founders: np.ndarray, correlation: float) -> list[Concern]:
     """A concern if the moves hardly connect the modes that there are or may be, so that their shares are uncertain.
 
-    The shares are then those of all resamplings since the modes separated, and the founders show only the latest ones.
+    All resamplings since the modes separated have changed the shares; the founders show only the latest resamplings.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ from ..proposals.mixture import Mixture, fit_mixture, log_density, log_responsib
 
 __all__ = ["Mode", "find_modes"]
 
-# ratio of the density in the valley between two modes to that of the lower mode
+# ratio of the density in the valley between two modes to the density of the lower mode
 DEEPEST_VALLEY = 0.2
 POINTS_OF_LINE = 33
 

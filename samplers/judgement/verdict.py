@@ -70,7 +70,8 @@ class RunParts(NamedTuple):
     """What `Verdict` computes its attributes from.
 
     `get_chain`, called without arguments, returns the chain (nsteps, nwalkers, ndim) at beta = 1. `near` are the
-    failures in the region of the last walkers, or None for a chain that was read from a file.
+    failures in the region of the last walkers, or None for a chain that was read from a file. `failed_simulations` is
+    the count of a log-density that counts failed simulations itself.
     """
 
     result: AnnealingResult
@@ -79,6 +80,7 @@ class RunParts(NamedTuple):
     evaluations: int
     failures: int
     near: NearFailures | None
+    failed_simulations: int | None = None
 
 
 class _Stored(NamedTuple):
@@ -112,7 +114,8 @@ class Verdict(_Stored):
     effective_sample_size : float
         Effective sample size of the points that `sample` names, when beta = 1 was reached.
     sample : str
-        Which points these are: the walkers, or weighted ones that the walkers were resampled from.
+        The points that `effective_sample_size` counts: the walkers, or weighted points that the walkers were resampled
+        from.
     """
 
     _run: RunParts | None = None
@@ -201,7 +204,9 @@ class Verdict(_Stored):
             for estimate in self.evidences
         )
         run = self._parts
-        failed = f"{run.failures} of {run.evaluations} evaluations failed" if run.failures else "no failures"
+        failed = f"{run.failures} of {run.evaluations} evaluations failed" if run.failures else "no failed evaluations"
+        if run.failed_simulations:
+            failed = f"{run.failed_simulations} simulations failed"
         return (
             f"{self.status.capitalize()}: {found}; log-evidence by {estimates}; effective sample size "
             f"{self.worst_effective_sample_size:.0f} in the worst direction; {failed}."

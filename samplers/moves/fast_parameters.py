@@ -115,7 +115,7 @@ class WithFastSweeps(Move):
     ) -> None:
         """Fit the walk, and the wrapped move if it can be fitted, to points (n, ndim) with weights (n,).
 
-        `mixture` is that of `MixtureMove.calibrate`; other moves do not use it.
+        `mixture` as in `MixtureMove.calibrate`; other moves do not use it.
         """
         calibrate_move(self.move, coords, weights, inside, mixture)
         self._walk.calibrate(coords, weights, inside)

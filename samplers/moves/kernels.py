@@ -127,7 +127,7 @@ def _check_half(coords: np.ndarray) -> None:
     fewest = FEWEST_PER_DIMENSION * (ndim + 1)
     if len(places) < fewest:
         warnings.warn(
-            f"a move is fitted to {len(places)} distinct points, half of those of the walkers, in {ndim} dimensions, "
+            f"a move is fitted to {len(places)} distinct points, half of the walkers' points, in {ndim} dimensions, "
             f"and may be too narrow: a long chain can have wrong variances. With fewer than {fewest} points in a half, "
             f"{advice}",
             stacklevel=2,
@@ -261,8 +261,7 @@ class StudentTMove(_GaussianFit):
     """Independent draws from a multivariate Student t with the weighted mean and covariance of the stage.
 
     When the posterior is nearly Gaussian, one sweep replaces most of the ensemble by new points. The tails are heavier
-    than those of a Gaussian, so the ratio of target and proposal stays bounded unless the posterior has even heavier
-    tails.
+    than Gaussian tails, so the ratio of target and proposal stays bounded unless the posterior has even heavier tails.
 
     Parameters
     ----------
@@ -379,7 +378,7 @@ class MixtureMove(_FittedMove):
         Parameters
         ----------
         coords : ndarray, shape (n, ndim)
-            Points, also those of earlier stages.
+            Points, also of earlier stages.
         log_target : ndarray, shape (n,)
             Logarithm of the target of the stage, scaled so that its integral is about 1.
         """
@@ -434,7 +433,7 @@ class MixtureMove(_FittedMove):
         return proposed, log_density(self._mixture, coords) - log_density(self._mixture, proposed)
 
     def draw_local_walk(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Propose steps of the local random walk; parameters and results are those of `draw_independence`."""
+        """Propose steps of the local random walk; parameters and results as in `draw_independence`."""
         n, ndim = coords.shape
         before = log_responsibilities(self._mixture, coords)
         cumulated = np.cumsum(np.exp(before), axis=1)
@@ -457,7 +456,7 @@ class MixtureMove(_FittedMove):
         return proposed, np.where(possible, np.where(possible, before, 0.0) - np.where(possible, after, 0.0), -np.inf)
 
     def draw_differences(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Propose steps along differences of points; parameters and results are those of `draw_independence`."""
+        """Propose steps along differences of points; parameters and results as in `draw_independence`."""
         n, ndim = coords.shape
         first, second = (
             np.searchsorted(self._cumulated, random.uniform(size=n) * self._cumulated[-1], side="right")

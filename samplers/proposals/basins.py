@@ -13,13 +13,13 @@ For every component of the mixture, a quadratic
 is fitted to the points that belong to it, in the coordinates in which the component is the standard one, by least
 trimmed squares, which ignores a minority of the points.
 
-1. Points clearly above this quadratic, and above those of the other components, belong to another basin. A second
-   quadratic is fitted to the highest of them, its neighbours, and all that agree with these. Its mode, at a limited
-   distance, is the mean of a new component, and A^-1 its covariance. So points on the flank of a mode suffice to find
-   it, long before a draw hits its top. With fewer points than coefficients, A is drawn towards a multiple of the
-   identity by ridge regression, with the strength that has the smallest leave-one-out error. With fewer than 1.5 points
-   per dimension, the new component is centred at these points and somewhat narrower than the component they were taken
-   from. The points that it explains are set aside, and the next basin is found among the others.
+1. Points clearly above the quadratics of all components belong to another basin. A second quadratic is fitted to the
+   highest of them, its neighbours, and all that agree with these. Its mode, at a limited distance, is the mean of a new
+   component, and A^-1 its covariance. So points on the flank of a mode suffice to find it, long before a draw hits its
+   top. With fewer points than coefficients, A is drawn towards a multiple of the identity by ridge regression, with the
+   strength that has the smallest leave-one-out error. With fewer than 1.5 points per dimension, the new component is
+   centred at these points and somewhat narrower than the component they were taken from. The points that it explains
+   are set aside, and the next basin is found among the others.
 2. If most points agree with the first quadratic, but its mode and A^-1 are far from mean and covariance of the
    component, which were estimated from few effective points, a component is made from the quadratic too.
 
@@ -65,7 +65,7 @@ LONGEST_STEP, LONGEST_SHIFT = 1.5, 2.0
 # Spread up to which most points agree with a quadratic, and Kullback-Leibler divergence per dimension from which on the
 # component is far from it.
 AGREEING, FAR = 1.0, 0.1
-# Covariance of a new component by A^-1, and its scale around very few points by that of the component.
+# Covariance of a new component by A^-1, and its scale around very few points by the component's scale.
 WIDER, FEW_POINTS_SCALE = 1.2, 0.7
 # Largest share of one basin, and of all together: an estimated mass may be far too large.
 LARGEST_SHARE, LARGEST_SHARE_OF_ALL = 0.25, 0.5

@@ -165,7 +165,7 @@ def log_density(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
 def draw(mixture: Mixture, n: int, random: np.random.RandomState) -> np.ndarray:
     """Draw points (n, ndim) from the mixture, in random order.
 
-    The number of draws per component is the one of systematic resampling: it differs from ``n`` times the weight by
+    Systematic resampling gives the number of draws per component, which differs from ``n`` times the weight by
     less than one.
     """
     ndim = mixture.means.shape[1]
@@ -304,7 +304,7 @@ def _criterion(count: int, ndim: int, effective: float, log_likelihood: float) -
 def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
     """Starting assignments (n, K + 1) with one more component: each component is split in two, along two directions.
 
-    The directions are those of the smallest and the largest fourth moment of the component's points. Two groups of
+    The component's points have their smallest and largest fourth moments in these directions. Two groups of
     similar size are visible along the former, and a small group beside a large one along the latter, in any number of
     dimensions (invariant coordinate selection: Tyler, D. E., Critchley, F., Duembgen, L. & Oja, H. (2009), J. R. Stat.
     Soc. B 71(3), doi:10.1111/j.1467-9868.2009.00706.x).

@@ -195,7 +195,7 @@ def plot_marginals(
     A panel shows the prior, but is at most 2.5 times as wide as the range of the samples. Where the prior is wider,
     the title says by how much.
 
-    The parameters and errors are those of `plot_corner`. All parameters are drawn, in one axes each.
+    Parameters and errors as for `plot_corner`. All parameters are drawn, in one axes each.
     """
     import matplotlib.pyplot as plt
 

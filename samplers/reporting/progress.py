@@ -141,7 +141,7 @@ class Progress:
         self.finished(self._running)
 
     def _simulated(self, points: float) -> None:
-        """Simulations have ended; those of a batch belong to points that were submitted."""
+        """Simulations have ended; the simulations of a batch belong to points that were submitted."""
         self._part += points if self._running > 0 else 0.0
         whole = int(self._part + 1e-9)
         self._part -= whole

@@ -111,7 +111,7 @@ def _draw_phases(axes: "Axes", sampler: Any) -> None:
 
 def _draw_ladder(axes: "Axes", sampler: Any, stage: Mapping[str, np.ndarray], ends: np.ndarray) -> None:
     """Exponent beta and acceptance of the stages."""
-    ended = sampler.ended_at is not None  # then the last stage is that of all known points, weighted for beta = 1
+    ended = sampler.ended_at is not None  # then the last stage has all known points, weighted for beta = 1
     reached = slice(None, -1 if ended else None)
     axes.semilogy(ends[reached], stage["beta"][reached], "o-", color=BLUE, markersize=4)
     if ended:

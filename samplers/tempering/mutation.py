@@ -99,7 +99,7 @@ class MoveSchedule(NamedTuple):
         Parameters
         ----------
         coords : (n, ndim) float
-            Points, also those of earlier stages.
+            Points, also of earlier stages.
         log_target : (n,) float
             Logarithm of the target of the stage, scaled so that its integral is about 1.
         """
@@ -247,6 +247,7 @@ def move_together(
     schedule: MoveSchedule,
     settings: Settings,
     visited: VisitedPoints | None = None,
+    correlation: StartCorrelation | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move all points equally often, until they are nearly uncorrelated with their start.
 
@@ -264,6 +265,8 @@ def move_together(
         Length of the moves: `min_moves`, `max_moves` and `max_correlation`.
     visited : VisitedPoints, optional
         Points that are evaluated are added to it.
+    correlation : StartCorrelation, optional
+        Correlation with an earlier start, from which the points have been moved already; by default with the points.
 
     Yields
     ------
@@ -276,7 +279,7 @@ def move_together(
     """
     beta, records = population.beta, population.records
     model = tempered_model(density, beta, random, visited)
-    correlation = StartCorrelation(population.coords, records)
+    correlation = StartCorrelation(population.coords, records) if correlation is None else correlation
     state = State(population.coords, log_prob=tempered_log_prob(records, beta), blobs=records)
     acceptance = []
     while not correlation.is_low_enough(settings):

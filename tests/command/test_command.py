@@ -25,6 +25,7 @@ from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from samplers import SamplingWarning
 from tests.command.key_tables import PAGE, key_tables
+from tests.opensees_column import require_opensees
 
 ROOT = Path(__file__).resolve().parents[2]
 OSCILLATOR = """
@@ -127,7 +128,7 @@ def test_new_writes_files_that_can_be_read(kind, tmp_path):
 def test_templates_find_the_true_values_of_their_data(kind, tmp_path):
     """One step of Gauss and Newton from the true values stays within 3 standard errors; a long time step does not."""
     if kind == "opensees":
-        pytest.importorskip("openseespy")
+        require_opensees()
     shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
     text = (tmp_path / f"my_{kind}.py").read_text()
     shifts = []

@@ -42,7 +42,8 @@ class Kernel:
         self.client.wait_for_ready(timeout=60)
 
     def start(self, code):
-        return self.client.execute(code, allow_stdin=False)
+        # by default, a cell that ends with an error aborts those that follow within a moment
+        return self.client.execute(code, allow_stdin=False, stop_on_error=False)
 
     def wait_for(self, text):
         """Read what the kernel prints until it contains a text."""

@@ -17,6 +17,7 @@ from fe_likelihoods import (
     SimulationFailed,
 )
 from fe_likelihoods.models.tall_buildings import beam_modes
+from tests.opensees_column import require_opensees
 
 DT, N = 0.02, 6
 FLOORS = {"middle": 3, "roof": 6}
@@ -89,7 +90,9 @@ def test_rayleigh_damping_has_the_ratios_of_its_modes():
 
 def test_rayleigh_frame_equals_opensees():
     """OpenSees steps by Newmark's average acceleration, whose error falls with the square of the step."""
-    ops = pytest.importorskip("openseespy.opensees")
+    require_opensees()
+    import openseespy.opensees as ops
+
     time = DT * np.arange(400)
     motion = np.sin(3.0 * time) * np.sin(0.4 * time) ** 2
     parts = GroupedFrame({"roof": N}, MASSES, STIFFNESSES, [1, 1, 1, 2, 2, 2], rayleigh=(1, 2))
