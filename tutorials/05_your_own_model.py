@@ -150,7 +150,7 @@ def make_pool(kind: str, workers: int):
 # Sampling all three
 # ------------------
 #
-# Worker processes import the script, so a script that starts them needs the guard ``if __name__ == "__main__"``.
+# The processes of a dask cluster import the script, so it needs the guard ``if __name__ == "__main__"``.
 
 
 # %%

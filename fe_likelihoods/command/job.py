@@ -38,6 +38,8 @@ class Job:
         Keys of the events to predict, by name.
     event : str
         The event whose record and measurements these are; empty for those of the calibration.
+    runs_code : bool
+        Whether Python files and programs that the file names may be imported and run.
     """
 
     file: Path
@@ -55,6 +57,7 @@ class Job:
     prediction: dict[str, Any]
     events: dict[str, dict[str, Any]] = field(default_factory=dict)
     event: str = ""
+    runs_code: bool = True
 
     def where(self, section: str) -> str:
         """File and section, for messages."""

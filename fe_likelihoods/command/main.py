@@ -129,11 +129,15 @@ def check(file: Path, out: Path | None) -> None:
 
 @main.command()
 @click.argument("run", type=_FILE, metavar="RUN")
-def report(run: Path) -> None:
-    """Make report and tables of RUN again, a folder that `run` made or a file in it, without new samples."""
+@click.option("--run-code", is_flag=True, help="Run the Python file or program that the settings name as model.")
+def report(run: Path, run_code: bool) -> None:
+    """Make report and tables of RUN again, a folder that `run` made or a file in it, without new samples.
+
+    Nothing that the settings in RUN name is run unless --run-code is given, so that the folder may come from anybody.
+    """
     from .runs import report_run
 
-    _show(report_run(run))
+    _show(report_run(run, run_code))
 
 
 @main.command()

@@ -10,6 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from ..models.external import UserModel
 from ..probability.distributions import Distribution, HalfNormal, Uniform
 from ..probability.likelihood import FELikelihood
 from ..probability.noise import SharedGaussianNoise
@@ -18,14 +21,14 @@ from ..probability.posterior import Posterior
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.disk_cache import SimulationCache
-from ..simulation.model import Model
+from ..simulation.model import Model, SimulationFailed
 from .data import is_dataset, read_base_motion, read_bundled, read_measured
 from .job import Job
 from .noises import make_noise
 from .priors import parse_prior
 from .schema import PARTS, did_you_mean
 
-__all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
+__all__ = ["USER_MODELS", "NotRun", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
 
 USER_MODELS = ("function", "opensees", "executable")
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
@@ -213,6 +216,9 @@ def _user_model(job: Job, record: Record | None) -> Model:
     given = dict(job.model)
     names, channels = given.pop("parameters"), _user_channels(job)
     given.pop("channels")
+    if not job.runs_code:
+        sampling = {key: given.get(key) for key in ("dt", "n_steps")}
+        return NotRun(names, channels, **sampling, record=record)
     given["depends_on"] = [job.path("model", "depends_on", name) for name in given.get("depends_on", ())]
     common = {"record": record} | given
     if job.kind == "executable":
@@ -233,6 +239,16 @@ def _user_model(job: Job, record: Record | None) -> Model:
     from ..models.function import FunctionModel
 
     return FunctionModel(function, names, channels, **common)
+
+
+class NotRun(UserModel):
+    """A model of the user in a report that runs no code of the user; every simulation fails."""
+
+    def _prepare(self) -> None:
+        self.fingerprint = self._digest("not run")
+
+    def _respond(self, theta: np.ndarray) -> np.ndarray:
+        raise SimulationFailed("this report runs no code that the settings name")
 
 
 def load_function(job: Job, text: str) -> Callable:

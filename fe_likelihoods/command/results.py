@@ -16,6 +16,7 @@ from ..signals.channels import Measurements
 from ..signals.error_measures import rrmse
 from ..simulation.model import SimulationFailed
 from .hints import in_toml_terms
+from .models import NotRun
 
 __all__ = ["write_csv", "write_report", "write_samples", "write_tables"]
 
@@ -51,18 +52,23 @@ def write_tables(folder: Path, run: FinishedRun) -> tuple[str, ...]:
         "",
         "Relative RMS error of the response (RRMSE):",
     ]
-    lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
+    lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit] or [
+        "  not known: the model was not run"
+    ]
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     columns = ("parameter", "mean", "mean_error", "sd", "cv", "q05", "median", "q95", "nominal")
     nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
     values = (labels, moments.mean, errors, moments.sd, moments.cv, low, median, high, nominal)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     write_csv(folder / "summary.csv", rows)
-    write_csv(folder / "fit.csv", fit)
-    if not run.tempered:
-        return ("summary.txt", "summary.csv", "fit.csv")
-    (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
-    return ("summary.txt", "summary.csv", "fit.csv", "stages.txt")
+    files = ["summary.txt", "summary.csv"]
+    if fit:
+        write_csv(folder / "fit.csv", fit)
+        files.append("fit.csv")
+    if run.tempered:
+        (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
+        files.append("stages.txt")
+    return tuple(files)
 
 
 def _of_the_sampler(run: FinishedRun) -> list[str]:
@@ -70,6 +76,8 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
     if run.tempered:
         evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2f}"
         return [evidence, in_toml_terms(str(run.verdict))]
+    if isinstance(run.posterior.likelihood.model, NotRun):
+        return [f"{len(run.samples)} samples. The evidence and the verdict are not known, the model was not run."]
     used = run.sampler.iteration - run.discard
     worth = (
         f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
@@ -102,8 +110,10 @@ def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
 
 
 def _fit_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]:
-    """RRMSE of every channel at the posterior mean; one simulation."""
+    """RRMSE of every channel at the posterior mean; one simulation. Empty if the model is not run."""
     likelihood = posterior.likelihood
+    if isinstance(likelihood.model, NotRun):
+        return []
     n = len(likelihood.model.parameter_names)
     residuals = (
         likelihood.residuals(samples[:, :n].mean(axis=0))

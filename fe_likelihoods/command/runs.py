@@ -11,13 +11,14 @@ import shlex
 import shutil
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..prediction.prediction import Prediction
-from ..reporting.run import read_run
+from ..reporting.run import FinishedRun, read_run
 from ..signals.hdf5_files import DAMAGE
 from ..simulation.disk_cache import SimulationCache
 from .events import (
@@ -31,7 +32,7 @@ from .events import (
 )
 from .hints import in_toml_terms
 from .job import Job, parse_job, read_job
-from .models import Problem, make_problem
+from .models import NotRun, Problem, make_problem
 from .results import write_report, write_samples, write_tables
 from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
 
@@ -112,13 +113,16 @@ def run_job(
     return Outcome(folder, sampler, problem, *_write(folder, job, job.file, sampler, problem, events, progress))
 
 
-def report_run(path: Path) -> Outcome:
+def report_run(path: Path, runs_code: bool = False) -> Outcome:
     """Make the tables and the report of a stored run again, without new samples.
 
     Parameters
     ----------
     path : Path
         Folder of a run, or a file in it.
+    runs_code : bool
+        Whether a Python file or program that the settings name as the model may be run. Without it, a report of such a
+        run has no responses and no predictions.
 
     Returns
     -------
@@ -137,20 +141,22 @@ def report_run(path: Path) -> Outcome:
         )
     origin = _origin(folder)
     job = parse_job((folder / SETTINGS).read_text(encoding="utf-8"), folder / SETTINGS, Path(origin["folder"]))
+    job = replace(job, runs_code=runs_code)
     cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
     problem = make_problem(job, cache)
-    sampler = _stored_sampler(job, problem, folder)
+    runs = not isinstance(problem.posterior.likelihood.model, NotRun)
+    sampler = _stored_sampler(job, problem, folder) if runs else _chain_only(folder, problem)
     if sampler.iteration <= discarded(job):
         raise ValueError(
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
     steps = job.sampler.get("steps", STEPS)
-    if not is_emcee(job) and sampler.iteration >= steps:
+    if runs and not is_emcee(job) and sampler.iteration >= steps:
         # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
         with _without_messages("samplers.tempered"):
             sampler.run_mcmc(None, 0, progress=False)
-    events = read_events(job, problem)
+    events = read_events(job, problem) if runs else ()
     file = Path(origin["file"])
     return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
 
@@ -212,6 +218,8 @@ def _write(
     """
     posterior, again = problem.posterior, shlex.join(["fe-likelihoods", "run", str(file), "--out", str(folder)])
     run = read_run(sampler, posterior, discard=discarded(job))
+    if isinstance(posterior.likelihood.model, NotRun):
+        return _write_samples_only(folder, run, again)
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
     samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS))
@@ -227,6 +235,36 @@ def _write(
     for each in described:
         cautions += [in_toml_terms(f"event {each.name}: {remark}", f"[events.{each.name}]") for remark in each.remarks]
     return (report, *tables, samples, *pictures), tuple(cautions), not run.is_inconclusive
+
+
+def _chain_only(folder: Path, problem: Problem) -> Any:
+    """The chain of a folder in a sampler of emcee, without the evaluations that led to it."""
+    import emcee
+
+    path = folder / CHAIN
+    try:
+        backend = emcee.backends.HDFBackend(str(path), read_only=True)
+        walkers, ndim = backend.shape
+        backend.get_chain(), backend.get_log_prob()
+    except (*DAMAGE, AttributeError, ValueError) as error:
+        raise _damaged(path, error) from error
+    if ndim != problem.posterior.ndim:
+        raise ValueError(f"{path} has {ndim} parameters, {SETTINGS} describes {problem.posterior.ndim}")
+    return emcee.EnsembleSampler(walkers, ndim, problem.posterior, backend=backend)
+
+
+def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """As `_write`, without anything that needs a simulation."""
+    from ..reporting.report import report
+
+    samples = write_samples(folder, run, None, 0)
+    report(run.sampler, None, None, folder / "report.html", discard=run.discard, repeat=again)
+    caution = (
+        "the model is a Python file or program that the settings name, which was not run: the report has no "
+        "responses, no predictions and no evidence. `fe-likelihoods report FOLDER --run-code` runs it; do that only "
+        "with code that you trust"
+    )
+    return ("report.html", *write_tables(folder, run), samples), (caution,), not run.is_inconclusive
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:

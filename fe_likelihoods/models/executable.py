@@ -22,10 +22,10 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.code_digest import code_digest
-from ..simulation.faults import TransientReason, reason_of
+from ..simulation.faults import RunFailed, TransientReason, reason_of
 from ..simulation.model import SimulationFailed
-from ..simulation.processes import RunFailed, TemporaryFolder, describe_exit, last_lines
 from ..simulation.programs import run_program
+from ..simulation.worker import describe_exit, last_lines
 from .dependencies import content_digest
 from .external import UserModel
 from .validation import positive_float
@@ -183,6 +183,9 @@ class ExecutableModel(UserModel):
         self.watched_files = (*self._named, *self.files.values(), *self._dependencies.paths)
         self._prepare()
 
+    def _files(self) -> tuple[Path, ...]:
+        return *self._named, *map(Path, self.files.values()), *self._dependencies.paths
+
     def _prepare(self) -> None:
         self.fingerprint = self.current_fingerprint()
 
@@ -241,7 +244,8 @@ class ExecutableModel(UserModel):
     def _respond(self, theta: np.ndarray) -> Any:
         values = {name: repr(float(value)) for name, value in zip(self.parameter_names, theta, strict=True)}
         values |= self._record_values
-        with TemporaryFolder() as place:
+        with tempfile.TemporaryDirectory(prefix="fe_likelihoods_", ignore_cleanup_errors=True) as name:
+            place = Path(name)
             folder = place / "run"
             folder.mkdir()
             start = time.monotonic()
@@ -286,7 +290,7 @@ class ExecutableModel(UserModel):
 
         environment = os.environ if self.env is None else self.env
         outputs = place / "stdout.txt", place / "stderr.txt"
-        exit_code = run_program([self.command[0], *arguments], environment, place / "run", *outputs, watch)
+        exit_code = run_program([self.command[0], *arguments], environment, place / "run", *outputs, place, watch)
         seconds = time.monotonic() - start
         if exit_code:
             with open(outputs[1], "rb") as stderr:

@@ -12,6 +12,7 @@ import copy
 import json
 import time
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,11 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples
-from ..simulation.faults import ChangedModel, TransientReason, reason_of
+from ..simulation.by_value import is_arriving
+from ..simulation.faults import ChangedModel, TransientReason, raise_if_it_ends_the_run, reason_of
 from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest
-from .dependencies import Dependencies
+from .dependencies import Dependencies, content_digest
 from .validation import check_theta, positive_float
 
 __all__ = ["ExternalModel", "UserModel"]
@@ -81,6 +83,24 @@ class ExternalModel(StructuralModel):
         self.n_steps = int(n_steps)
         self._dependencies = Dependencies(depends_on, kind)
 
+    def _files(self) -> Iterable[Path]:
+        """Files whose content a response depends on."""
+        return self._dependencies.paths
+
+    def __getstate__(self) -> dict[str, Any]:
+        contents = {str(path): content_digest(path) for path in self._files()}
+        return vars(self) | {"_contents": contents} if contents else dict(vars(self))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        contents = state.pop("_contents", {})
+        vars(self).update(state)
+        for path, content in contents.items() if is_arriving() else ():
+            if content_digest(Path(path)) != content:
+                raise ChangedModel(
+                    f"{type(self).__name__}: {path} in the worker process differs from the file in the process that "
+                    "sends simulations: it was changed meanwhile, or is another one on that machine"
+                )
+
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Simulate the structure for one set of parameters.
 
@@ -101,15 +121,14 @@ class ExternalModel(StructuralModel):
             The reason ends in the duration of the simulation. It is a `TransientReason` if the cause is not the model
             (see `fe_likelihoods.simulation.faults`).
         ValueError
-            If `theta` has another shape, or a worker process has other code (`ChangedModel`).
+            If `theta` has another shape.
         """
         theta = check_theta(theta, self.parameter_names).copy()
         start = time.perf_counter()
         try:
             return self._check_response(self._respond(theta))
-        except ChangedModel:
-            raise
-        except Exception as error:  # external code may raise anything
+        except BaseException as error:  # external code may raise anything, SystemExit among it
+            raise_if_it_ends_the_run(error)
             reason = reason_of(error)
             seconds = getattr(error, "seconds", None)  # excludes the start of a process, where that is known
             seconds = time.perf_counter() - start if seconds is None else seconds

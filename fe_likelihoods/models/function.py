@@ -14,7 +14,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..simulation.changed_model import SentCode, SentFunction, different_in_worker, sent_code
+from ..simulation.by_value import is_worker
 from ..simulation.code_digest import describe_code
 from ..simulation.sandbox import Sandbox
 from .external import UserModel
@@ -47,8 +47,8 @@ class FunctionModel(UserModel):
     ----------
     function : callable
         Function of theta (n_parameters,), and of the record if one is given, that returns the response (n_channels,
-        n_steps) in SI units. It may raise any exception, preferably `SimulationFailed` with a reason. For a pool of
-        processes, or with `isolated`, it must be picklable: defined at the top level of a module.
+        n_steps) in SI units. It may raise any exception, preferably `SimulationFailed` with a reason. A pool of
+        processes, or `isolated`, receives it with the values that it uses (`fe_likelihoods.simulation.by_value`).
     parameter_names : sequence of str
         Names of the structural parameters, in the order of theta.
     channels : sequence of Channel
@@ -132,7 +132,6 @@ class FunctionModel(UserModel):
         settings = (time_limit, memory_limit, runs_per_process)
         self.isolated = bool(isolated) or any(setting is not None for setting in settings)
         self.watched_files = tuple(map(str, self._dependencies.paths))
-        self._sent_code: SentCode | None = None
         self._steady_at_start = ""
         self._code_at_start = self._code()
         self._prepare()
@@ -141,8 +140,9 @@ class FunctionModel(UserModel):
         self.fingerprint = self._digest(*self._identity(self._code_at_start))
         self._run = self.function if self.record is None else _UnderRecord(self.function, self.record)
         if self.isolated:
-            sent = SentFunction(self._run, self._fingerprinted, self._sent_code, self.version is None)
-            self._run = Sandbox(sent, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process)
+            self._run = Sandbox(
+                self._run, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process
+            )
 
     def current_fingerprint(self) -> str:
         """The fingerprint of the function as it is now, computed again.
@@ -178,7 +178,6 @@ class FunctionModel(UserModel):
     def _code(self) -> str:
         """Digest of the code, empty if there is a version; ValueError if it has none."""
         if self.version is not None:
-            self._sent_code = self._sent_code or sent_code(self._fingerprinted)
             return ""
         try:
             code = describe_code(self._fingerprinted)
@@ -188,7 +187,6 @@ class FunctionModel(UserModel):
                 f"changed whenever the function changes: {error}"
             ) from error
         self.watched_files = tuple(code.files) + tuple(map(str, self._dependencies.paths))
-        self._sent_code = self._sent_code or sent_code(self._fingerprinted, code)
         self._steady_at_start = self._steady_at_start or code.steady
         return code.digest
 
@@ -196,25 +194,13 @@ class FunctionModel(UserModel):
         """Digest of the code as it is now, without the values that it may itself change."""
         return describe_code(self._fingerprinted, strict=False).steady
 
-    def compare_with_sender(self) -> None:
-        """Compare code and files in a worker process with those of the process that has made the model.
-
-        Raises
-        ------
-        ChangedModel
-            If the code differs, or a file or value of `depends_on`. Other values may differ.
-        """
-        self._sent_code.compare(self._fingerprinted, self.version is None)
-        if self._digest(*self._identity(self._code_at_start)) != self.fingerprint:
-            raise different_in_worker(type(self).__name__, "what depends_on= names differs")
-
     def _identity(self, code: str) -> list[Any]:
         """Texts that identify what the function computes."""
         identity = ["code", code] if self.version is None else ["version", str(self.version)]
         return [identity] if self.record is None else [identity, ["record", self.record.fingerprint]]
 
     def _respond(self, theta: np.ndarray) -> Any:
-        if self.isolated or self.version is not None or self.fingerprint in _observed:
+        if self.isolated or self.version is not None or self.fingerprint in _observed or is_worker():
             return self._run(theta)
         before = self._code_or_error()
         try:

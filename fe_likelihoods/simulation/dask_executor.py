@@ -16,7 +16,7 @@ from .dask_workers import WorkerWatch
 from .faults import TransientReason
 from .local_pool import Outcome
 from .pool_executor import PoolExecutor, resolve
-from .sent_functions import FunctionReference, Missing, Unusable
+from .sent_functions import FunctionReference, Missing
 
 __all__ = ["DaskExecutor", "wait_for_nanny"]
 
@@ -30,14 +30,14 @@ _DIED = TransientReason("the worker process died in every attempt of dask")
 class _Item(Future):
     """Future of one item, with the function."""
 
-    def __init__(self, item: Any, references: tuple[FunctionReference, FunctionReference]) -> None:
+    def __init__(self, item: Any, reference: FunctionReference) -> None:
         super().__init__()
-        self.item, self.references, self.carried = item, references, False
+        self.item, self.reference, self.carried = item, reference, False
         self.deaths = 0  # attempts of dask that ended with the death of the worker
 
     @property
-    def reference(self) -> FunctionReference:
-        return self.references[self.carried]
+    def function(self) -> Callable:
+        return self.reference.carried() if self.carried else self.reference
 
 
 class _Group:
@@ -115,7 +115,7 @@ class DaskExecutor(PoolExecutor):
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
         """As `PoolExecutor.map`."""
-        futures = self._enqueue(self._references(function), list(items))
+        futures = self._enqueue(self._reference(function), list(items))
         try:
             for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
                 future.result()
@@ -126,9 +126,7 @@ class DaskExecutor(PoolExecutor):
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """As `PoolExecutor.submit_all`; short simulations of one call may be one task."""
-        if self._last is None or self._last[0] is not function:
-            self._last = function, *self._references(function)
-        return self._enqueue(self._last[1:], items)
+        return self._enqueue(self._reference(function), items)
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
         """Cancel items; with `running`, also those that a worker has received."""
@@ -152,8 +150,8 @@ class DaskExecutor(PoolExecutor):
 
     # sending ------------------------------------------------------------------------------------------------------
 
-    def _enqueue(self, references: tuple, items: Sequence[Any]) -> list[_Item]:
-        futures = [_Item(item, references) for item in items]
+    def _enqueue(self, reference: FunctionReference, items: Sequence[Any]) -> list[_Item]:
+        futures = [_Item(item, reference) for item in items]
         if not futures:
             return futures
         n_workers = self.n_workers if len(items) > 1 or not self._sent else 1
@@ -180,7 +178,7 @@ class DaskExecutor(PoolExecutor):
             # not in the threads of dask, for which Python waits at its end: a lost scheduler sends no result
             threading.Thread(target=self._receive_all, args=(self._ended,), name="results of dask", daemon=True).start()
         self._sent.update(sent)
-        function = partial(_run_group, groups[0][0].reference)
+        function = partial(_run_group, groups[0][0].function)
         try:
             contents = [[item.item for item in items] for items in groups]
             inner = self.pool.map(function, contents, pure=False, **self._options)
@@ -261,9 +259,7 @@ class DaskExecutor(PoolExecutor):
                 self._send([[item] for item in missing])
             self._try_next_suspect()
         for item, outcome in zip(group.items, answer.outcomes, strict=True):
-            if isinstance(outcome, Unusable):
-                resolve(item, error=outcome.error)
-            elif item not in missing:
+            if item not in missing:
                 resolve(item, outcome)
 
     def _lose(self, group: _Group) -> None:

@@ -10,9 +10,10 @@ The rule for ``pool=``:
   multiprocessing and schwimmbad.
 
 The mapped function contains the model and the measurements and may be large; an item is a few parameters. The function
-is sent to each worker process once: through the worker's own pipe in a `LocalPool`, through a private temporary file,
-whose digest is checked, in other pools on the same machine, and together with the items where a worker reports that it
-has neither the function nor the file. Later tasks consist of a digest of the function and the parameters.
+is sent by value (`fe_likelihoods.simulation.by_value`) to each worker process once: through the worker's own pipe in a
+`LocalPool`, through a private temporary file, whose digest is checked, in other pools on the same machine, and together
+with the items where a worker reports that it has neither the function nor the file. Later tasks consist of a digest of
+the function and the parameters. A function is sent again when anything that it uses has changed.
 
 ``submit(function, item)`` returns a `concurrent.futures.Future` of the result that ``map`` would give, also where an
 item kills every process that runs it, and ``submit_all(function, items)`` a list of them. ``give_up(futures)`` cancels.
@@ -22,13 +23,12 @@ item kills every process that runs it, and ``submit_all(function, items)`` a lis
 Results do not depend on the pool, to the last bit.
 """
 
-import pickle
 from typing import Any
 
+from .by_value import Pickled, dumps
 from .dask_executor import DaskExecutor
 from .local_pool import LocalPool
 from .pool_executor import PoolExecutor
-from .processes import PickledFunction, local_definition
 
 __all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 
@@ -62,26 +62,19 @@ def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | Poo
     else:
         executor = LocalPool(pool)
     if executor is not None and executor.other_processes:
-        _check_picklable(model, executor)
+        _check_picklable(model)
     return executor
 
 
-def _check_picklable(model: Any, executor: Any) -> None:
+def _check_picklable(model: Any) -> None:
     """Raise ValueError, with the name of the attribute to blame, if a model cannot be sent to other processes."""
     try:
-        pickled = PickledFunction.of(model)
-        if isinstance(executor, LocalPool):
-            pickled.script()
+        Pickled.of(model)
     except ValueError as error:
         name, value = _culprit(model)
         kind = type(model).__name__
         if not name:
             raise ValueError(f"with this pool the model must be sent to other processes. {error}") from error
-        if local := local_definition(value):
-            raise ValueError(
-                f"the {name} of {kind} cannot be sent to other processes (it is {local}): define it at the top level "
-                "of a module"
-            ) from error
         raise ValueError(
             f"the {name} of {kind}, of type {type(value).__name__}, cannot be sent to other processes. {error}"
         ) from error
@@ -96,7 +89,7 @@ def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
     state = state if isinstance(state, dict) else getattr(thing, "__dict__", {})
     for name, value in state.items():
         try:
-            pickle.dumps(value)
+            dumps(value)
         except Exception:
             inner, culprit = _culprit(value, depth - 1) if depth else ("", value)
             return (f"{name}.{inner}", culprit) if inner else (name, value)

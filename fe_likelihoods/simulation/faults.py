@@ -9,6 +9,8 @@ output, a full disk, a missing folder or library. The log-likelihood is -inf in 
 point again. A `MisfitReason` depends on the measurements, so that it says nothing about other measurements.
 """
 
+import dis
+import signal
 import subprocess
 from concurrent.futures import BrokenExecutor
 
@@ -16,16 +18,17 @@ __all__ = [
     "ChangedModel",
     "FailedRun",
     "MisfitReason",
+    "RunFailed",
     "TransientReason",
     "is_transient",
-    "raise_if_refused",
+    "raise_if_it_ends_the_run",
     "reason_of",
 ]
 
 _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
 
 
-_REFUSED = "ChangedModel: "
+_LONGEST_REASON = 2000  # characters
 
 
 class FailedRun(RuntimeError):
@@ -40,6 +43,23 @@ class FailedRun(RuntimeError):
     reason: str
 
 
+class RunFailed(FailedRun):
+    """A run in another process failed.
+
+    Attributes
+    ----------
+    reason : str
+        Why it failed, in words; a `TransientReason` if the process was stopped, was killed or crashed.
+    seconds : float or None
+        Duration of the run [s], if known.
+    """
+
+    def __init__(self, reason: str, seconds: float | None = None) -> None:
+        super().__init__(reason, seconds)
+        self.reason = reason
+        self.seconds = seconds
+
+
 class ChangedModel(ValueError):
     """A model is not the one whose fingerprint was computed. The message says what to do.
 
@@ -50,12 +70,6 @@ class ChangedModel(ValueError):
     """
 
     ends_run = True
-
-
-def raise_if_refused(reason: str) -> None:
-    """Raise the `ChangedModel` with which a worker process has refused a function, if that is the reason."""
-    if reason.startswith(_REFUSED):
-        raise ChangedModel(reason.removeprefix(_REFUSED))
 
 
 class TransientReason(str):
@@ -100,12 +114,41 @@ def is_transient(error: BaseException) -> bool:
     return isinstance(error, _FAULTS)
 
 
-def reason_of(error: Exception) -> str:
+def raise_if_it_ends_the_run(error: BaseException) -> None:
+    """Raise what must not become a failed simulation: `ChangedModel`, and Ctrl-C of the user.
+
+    A model that calls ``sys.exit`` or itself raises KeyboardInterrupt has failed. Ctrl-C interrupts the code at any
+    place, not at a ``raise`` statement; a model may have turned it into another exception.
+    """
+    if isinstance(error, ChangedModel):
+        raise error
+    cause: BaseException | None = error
+    seen: set[int] = set()
+    while cause is not None and id(cause) not in seen:
+        if isinstance(cause, KeyboardInterrupt) and not _is_raised(cause):
+            raise cause
+        seen.add(id(cause))
+        cause = cause.__cause__ or cause.__context__
+
+
+def _is_raised(error: BaseException) -> bool:
+    """Whether an exception comes from a ``raise`` statement outside the handler of Ctrl-C."""
+    handler = signal.getsignal(signal.SIGINT)
+    handler = getattr(handler, "__code__", None) or getattr(type(handler).__call__, "__code__", None)
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        if trace.tb_next.tb_frame.f_code is handler:
+            return False
+        trace = trace.tb_next
+    return trace is not None and dis.opname[trace.tb_frame.f_code.co_code[trace.tb_lasti]] == "RAISE_VARARGS"
+
+
+def reason_of(error: BaseException) -> str:
     """Reason of the failure of a simulation that raised an exception.
 
     Parameters
     ----------
-    error : Exception
+    error : BaseException
         The reason of a `FailedRun` is kept, together with its kind.
 
     Returns
@@ -116,4 +159,6 @@ def reason_of(error: Exception) -> str:
     if isinstance(error, FailedRun):
         return error.reason
     text = f"{type(error).__name__}: {error}"
+    if len(text) > _LONGEST_REASON:
+        text = f"{text[:_LONGEST_REASON]} ..."
     return TransientReason(text) if is_transient(error) else text

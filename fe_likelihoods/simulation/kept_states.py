@@ -20,9 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .changed_model import SentModel
 from .code_digest import describe_code
-from .faults import ChangedModel, reason_of
+from .faults import raise_if_it_ends_the_run, reason_of
 from .model import Model, SimulationBatch, SimulationFailed, first_part, not_finite, real_response, simulate_batch
 from .source_digest import LIBRARY
 from .threads import run_on_threads
@@ -196,7 +195,7 @@ def _run(
     """Response (if `responses` are wanted), state at the end and reason of the failure of each simulation."""
     items = [(theta.copy(), start) for theta, start in zip(thetas, starts, strict=True)]
     if pool is not None:
-        outcomes = list(pool.map(partial(_continue_sent, responses, SentModel(model)), items)) if items else []
+        outcomes = list(pool.map(partial(_continue, responses, model), items)) if items else []
     elif getattr(model, "runs_on_threads", False):
         outcomes = run_on_threads(partial(_continue, responses, model), items)
     else:
@@ -224,13 +223,8 @@ def _continue(responses: bool, model: Model, item: tuple[np.ndarray, _Start]) ->
                 "numbers (ndarray), of which copies can be kept; put all that the model needs to go on into one array"
             )
         response = real_response(response, model.channels, expected[1])
-    except ChangedModel:
-        raise
-    except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
+    except BaseException as error:  # a model may raise anything, SystemExit among it
+        raise_if_it_ends_the_run(error)
         return None, reason_of(error)
     reason = not_finite(model, response)
     return (None, reason) if reason else ((response if responses else None, np.array(end)), "")
-
-
-def _continue_sent(responses: bool, sent: SentModel, item: tuple[np.ndarray, _Start]) -> tuple[tuple | None, str]:
-    return _continue(responses, sent.model, item)

@@ -1,26 +1,21 @@
 """Pool of processes of this machine that survives the death of its workers.
 
-When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Here each worker
-has a pipe of its own, so it is known which item every process was running. Only that item is run again, and it is given
-up after the third time.
-
-A thread of this process sends the items and receives the results, so that workers get their next item while the main
-thread computes. It lives as long as there are items.
+When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Here each process
+has a pipe and a thread of this process, which sends it one item at a time. So it is known which item a process was
+running. Only that item is run again, and it is given up after the third time.
 """
 
 import math
 import os
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, Future
 from concurrent.futures import wait as wait_for
-from multiprocessing import Pipe
-from multiprocessing.connection import wait
 from typing import Any
 
-from .faults import ChangedModel, raise_if_refused
-from .processes import PickledFunction, RunFailed, Worker, WorkerReply
+from .by_value import Pickled
+from .worker import Worker, WorkerDied
 
 __all__ = ["LocalPool", "Outcome"]
 
@@ -34,11 +29,18 @@ Outcome = tuple[Any, str]
 class _Job(Future):
     """An item with its function; the future of its result."""
 
-    def __init__(self, function: PickledFunction, source: Any, item: Any) -> None:
+    def __init__(self, function: Pickled, item: Any) -> None:
         super().__init__()
-        self.function, self.source, self.item = function, source, item
+        self.function, self.item = function, item
         self.deaths = 0
         self.given_up = False
+
+    def start(self) -> bool:
+        """Whether it is to be run, for the first time or again; a job that was given up ends."""
+        if self.given_up:
+            self.set_exception(CancelledError())
+            return False
+        return self.running() or self.set_running_or_notify_cancel()
 
 
 def _is_positive_whole(value: Any) -> bool:
@@ -52,9 +54,12 @@ class LocalPool:
     """Pool of processes of this machine.
 
     The processes start with the first item. They end with `close`, when this object is garbage-collected, or when this
-    process exits, even if it is killed. A process that dies is replaced and its item run again; the other items are not
-    affected. Linear algebra and numba use one thread per process, unless environment variables such as
-    OMP_NUM_THREADS say otherwise.
+    process ends, even if it is killed (on macOS within a second, unless compiled code keeps the process busy). A
+    process that dies is replaced and its item run again; the other items are not affected. Linear algebra and numba use
+    one thread per process, unless environment variables such as OMP_NUM_THREADS say otherwise.
+
+    Functions are sent by value, with the values of their modules at that time
+    (`fe_likelihoods.simulation.by_value`), so lambdas and functions of a script or notebook can be used.
 
     A pool can be shared by several likelihoods, and can be the ``pool=`` of samplers. Its methods may be called from
     several threads.
@@ -94,19 +99,12 @@ class LocalPool:
         self._set_up()
 
     def _set_up(self) -> None:
-        self._owner, self._lock = os.getpid(), threading.RLock()
+        self._owner, self._changed = os.getpid(), threading.Condition(threading.RLock())
         self._waiting: deque[_Job] = deque()
-        self._running: dict[Worker, _Job | None] = {}  # each worker's job, None while it loads a function
+        self._busy: dict[Worker, _Job | None] = {}  # each worker's job, None while it loads a function
         self._free: list[Worker] = []
-        self._deaths_loading: Counter[bytes] = Counter()  # in succession, by function
-        self._thread: threading.Thread | None = None
-        self._woken, self._wake = Pipe(duplex=False)
-        self._finished: list[tuple[_Job, Any, BaseException | None]] = []  # with a result or an error, not yet set
-        self._is_woken = self._gives_up = (
-            False  # the thread has been sent a message; jobs that were started are given up
-        )
-        self._idle_ended: threading.Event | None = None  # the thread is to end processes without an item, and to set it
-        self._last: tuple[Any, PickledFunction | None] = None, None  # the function that was submitted last
+        self._threads: set[threading.Thread] = set()
+        self._closed = 0  # how often
 
     def __enter__(self) -> "LocalPool":
         return self
@@ -125,26 +123,17 @@ class LocalPool:
     def close(self) -> None:
         """Give up all items and end the processes; another item starts new ones."""
         self._notice_fork()
-        with self._lock:
-            left = [*self._waiting, *filter(None, self._running.values())]
+        with self._changed:
+            self._closed += 1
+            loading = [worker for worker, job in self._busy.items() if job is None]
+            left = [*self._waiting, *filter(None, self._busy.values())]
+        for worker in loading:
+            worker.kill()
         self.give_up(left)
-        with self._lock:
-            if self._thread is None or threading.current_thread() is self._thread:
-                self._end_idle()
-                return
-            ended = self._idle_ended = self._idle_ended or threading.Event()
-            self._wake_thread()
-        ended.wait()
-
-    def _end_idle(self) -> None:
-        """End the processes that have no item: those that are free, and those that load a function."""
-        for worker in [worker for worker, job in self._running.items() if job is None]:
-            self._end(worker)
-        while self._free:
-            self._free.pop().kill()
-        if self._idle_ended is not None:
-            self._idle_ended.set()
-            self._idle_ended = None
+        with self._changed:
+            self._changed.wait_for(lambda: not self._threads - {threading.current_thread()})
+            while self._free:
+                self._free.pop().kill()
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in their order; they run before items that were submitted.
@@ -160,7 +149,7 @@ class LocalPool:
         Exception
             The first exception that `function` raises; no further items are started.
         """
-        jobs = self._enqueue(PickledFunction.of(function), function, list(items), first=True)
+        jobs = self._enqueue(function, list(items), first=True)
         try:
             for job in wait_for(jobs, return_when=FIRST_EXCEPTION).done:
                 job.result()
@@ -177,20 +166,8 @@ class LocalPool:
         return self.submit_all(function, [item])[0]
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
-        """Futures as of `submit` for several items.
-
-        The function is pickled again if it is another object than in the last call.
-
-        Raises
-        ------
-        ValueError
-            If the function cannot be sent to the processes.
-        """
-        last, pickled = self._last
-        if pickled is None or last is not function:
-            pickled = PickledFunction.of(function)
-            self._last = function, pickled
-        return self._enqueue(pickled, function, items)
+        """Futures as of `submit` for several items; ValueError if the function cannot be sent to the processes."""
+        return self._enqueue(function, items)
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
         """Cancel items; with `running`, the processes of those that run are killed. Results that are there are kept."""
@@ -198,202 +175,150 @@ class LocalPool:
         for job in futures:
             if not job.cancel() and running:
                 job.given_up = True
-        with self._lock:
-            if self._thread is None:
-                return
-            self._gives_up = True
-            self._wake_thread()
-        if threading.current_thread() is not self._thread:
+        with self._changed:
+            killed = [worker for worker, job in self._busy.items() if job is not None and job.given_up]
+            me = threading.current_thread() in self._threads
+        for worker in killed:
+            worker.kill()
+        if not me:
             wait_for([job for job in futures if job.given_up])
 
     def _notice_fork(self) -> None:
-        """In a forked process: forget the parent's workers and thread."""
+        """In a forked process: forget the parent's workers and threads."""
         if self._owner != os.getpid():
             self._set_up()
 
-    def _enqueue(
-        self, pickled: PickledFunction, function: Any, items: Sequence[Any], first: bool = False
-    ) -> list[_Job]:
+    def _enqueue(self, function: Any, items: Sequence[Any], first: bool = False) -> list[_Job]:
         self._notice_fork()
-        pickled.script()  # raises here what would be raised in the thread
-        jobs = [_Job(pickled, function, item) for item in items]
-        if not jobs:
-            return jobs
-        with self._lock:
+        pickled = Pickled.of(function)  # each time: the values that it uses may have changed
+        jobs = [_Job(pickled, item) for item in items]
+        with self._changed:
             if first:
                 self._waiting.extendleft(reversed(jobs))
             else:
                 self._waiting.extend(jobs)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._serve, name="LocalPool", daemon=True)
-                self._thread.start()
-            else:
-                self._wake_thread()
+            for _ in range(min(self.workers - len(self._threads), len(jobs))):
+                thread = threading.Thread(target=self._work, name="LocalPool", daemon=True)
+                self._threads.add(thread)
+                thread.start()
         return jobs
 
-    def _wake_thread(self) -> None:
-        """End the thread's wait for replies; one message at a time, so that the pipe cannot be full."""
-        if not self._is_woken:
-            self._is_woken = True
-            self._wake.send_bytes(b"")
+    # in a thread per worker -----------------------------------------------------------------------------------------
 
-    # in the thread ------------------------------------------------------------------------------------------------
-
-    def _serve(self) -> None:
-        """Send items and receive results until there are none."""
-        try:
-            while True:
-                with self._lock:
-                    if self._idle_ended is not None:
-                        self._end_idle()
-                    self._start_jobs()
-                    finished, self._finished = self._finished, []
-                    ends = not self._running
-                    if ends:
-                        self._thread = None
-                    connections = [self._woken, *(worker.connection for worker in self._running)]
-                for job, result, error in finished:
-                    _fail(job, error) if error is not None else job.set_result(result)
-                if ends:
-                    return
-                woken = self._woken in wait(connections, timeout=1.0)
-                with self._lock:
-                    if woken:
-                        self._woken.recv_bytes()
-                        self._is_woken = False
-                    self._receive()
-        except BaseException as error:  # such as an operating system that starts no process
-            with self._lock:
-                self._thread = None
-                left = [job for job, _, _ in self._finished]
-                left += [*self._waiting, *filter(None, self._running.values())]
-                for worker in self._running:
-                    worker.kill()
-                self._finished = []
-                self._waiting.clear()
-                self._running.clear()
-                self._end_idle()
-            for job in left:
-                _fail(job, error)
-
-    def _start_jobs(self) -> None:
-        """Give free workers their next items, and start as many workers as there are items for."""
-        loading = sum(job is None for job in self._running.values())
-        while self._waiting and len(self._running) < self.workers:
-            if self._waiting[0].cancelled():
-                self._waiting.popleft()
-                continue
-            function = self._waiting[0].function
-            is_loaded = any(worker.key == function.key and worker.alive for worker in self._free)
-            if loading >= len(self._waiting) and not is_loaded:  # else an item would wait although a worker is free
-                return
-            worker = self._take(function.key)
-            if worker.key == function.key:
-                self._next(worker)
-            else:
-                self._running[worker] = None
-                worker.load(function)
-                loading += 1
-
-    def _take(self, key: bytes) -> Worker:
-        """An idle process, preferably with the function of a key, or a new one."""
-        self._free.sort(key=lambda worker: worker.key == key)
-        while self._free:
-            worker = self._free.pop()
-            if worker.alive:
-                return worker
-        return Worker(self._environment)
-
-    def _next(self, worker: Worker) -> None:
-        """Send the next item to a worker that has loaded its function, or make the worker idle."""
-        self._running.pop(worker, None)
-        if worker.runs >= (self.runs_per_process or math.inf):
-            worker.kill()  # another one is started if items are waiting
-            return
-        for place, job in enumerate(self._waiting):
-            if job.function.key != worker.key or job.cancelled():
-                continue
-            if job.running() or job.set_running_or_notify_cancel():
-                del self._waiting[place]
-                try:
-                    worker.submit(job.item)
-                except Exception as error:  # the item cannot be pickled
-                    self._finished.append((job, None, error))
-                    worker.kill()
-                else:
-                    self._running[worker] = job
-                return
-        self._free.append(worker)
-
-    def _receive(self) -> None:
-        """Take what the workers have answered, and the results of those that have died."""
-        if self._gives_up:  # jobs that wait for another attempt cannot be cancelled
-            self._gives_up = False
-            self._finished += [(job, None, CancelledError()) for job in self._waiting if job.given_up]
-            self._waiting = deque(job for job in self._waiting if not job.given_up)
-        for worker, job in list(self._running.items()):
-            if job is not None and job.given_up:
-                self._end(worker)
-                self._finished.append((job, None, CancelledError()))
-                continue
+    def _work(self) -> None:
+        """Run items, one after the other, in one process until none waits."""
+        worker = None
+        while (function := self._next_function(worker)) is not None:
             try:
-                reply = worker.receive()
-            except RunFailed as error:
-                del self._running[worker]
-                self._died(worker.key, job, error.reason)
-                continue
-            except BaseException as error:  # a reply whose unpickling raises
-                reply = WorkerReply("raised", error)
-            if reply is None:
+                worker = self._loaded(worker, function)
+                job = self._next_job(worker, function)
+            except BaseException as error:
+                worker = None
+                self._drop(function, error)
                 continue
             if job is not None:
-                failed = reply.kind == "raised"
-                self._finished.append((job, None, reply.value) if failed else (job, reply.value, None))
-            elif reply.kind == "loaded":
-                self._deaths_loading[worker.key] = 0
-            else:
+                worker = self._run(worker, job)
+
+    def _next_function(self, worker: Worker | None) -> Pickled | None:
+        """The function of the next item, None if the thread ends, and with it the work of a process."""
+        with self._changed:
+            while self._waiting and (self._waiting[0].cancelled() or self._waiting[0].given_up):
+                self._waiting.popleft().start()
+            if self._waiting:
+                return self._waiting[0].function
+            if worker is not None:
+                self._busy.pop(worker, None)
+                self._free.append(worker)
+            self._threads.discard(threading.current_thread())
+            self._changed.notify_all()
+            return None
+
+    def _loaded(self, worker: Worker | None, function: Pickled) -> Worker | None:
+        """A process that has loaded a function; None if the pool is closed meanwhile."""
+        closed = self._closed
+        for _ in range(MAX_ATTEMPTS):
+            worker = worker or self._take(function) or Worker(self._environment)
+            with self._changed:
+                self._busy[worker] = None
+                if closed != self._closed:
+                    worker.kill()
+            try:
+                worker.load(function)
+                return worker
+            except BaseException as error:
                 self._end(worker)
-                self._drop(worker.key, lambda job, reply=reply: _unusable(job.source, reply))
-                continue
-            self._next(worker)
+                worker = None
+                if closed != self._closed:
+                    return None
+                if not isinstance(error, WorkerDied):
+                    raise
+                reason = error.reason
+        raise RuntimeError(f"{reason} while loading the model; see its output on stderr")
+
+    def _take(self, function: Pickled) -> Worker | None:
+        """A process that is free, preferably one that has loaded a function."""
+        with self._changed:
+            self._free.sort(key=lambda worker: worker.key == function.key)
+            while self._free:
+                worker = self._free.pop()
+                if worker.alive:
+                    return worker
+        return None
+
+    def _next_job(self, worker: Worker | None, function: Pickled) -> _Job | None:
+        """The next item of a function, for a process; it is no longer waiting."""
+        with self._changed:
+            for place, job in enumerate(self._waiting if worker is not None else ()):
+                if job.function.key == function.key and not job.cancelled() and not job.given_up:
+                    del self._waiting[place]
+                    if job.start():
+                        self._busy[worker] = job
+                        return job
+                    break
+        return None
+
+    def _run(self, worker: Worker, job: _Job) -> Worker | None:
+        """Run an item; returns the process if it can go on."""
+        try:
+            worker.send(job.item)
+            answer = worker.receive()
+        except WorkerDied as error:
+            self._end(worker)
+            job.deaths += 1
+            if job.deaths == MAX_ATTEMPTS:
+                job.set_result((None, error.reason))
+            elif job.given_up:
+                job.set_exception(CancelledError())
+            else:
+                with self._changed:
+                    self._waiting.appendleft(job)
+            return None
+        except BaseException as error:  # the item cannot be pickled, or the answer cannot be unpickled
+            self._end(worker)
+            job.set_exception(error)
+            return None
+        if worker.calls >= (self.runs_per_process or math.inf):
+            self._end(worker)
+            worker = None
+        else:
+            with self._changed:
+                self._busy[worker] = None
+        if answer.error is None:
+            job.set_result(answer.value)
+        else:
+            job.set_exception(answer.error)
+        return worker
 
     def _end(self, worker: Worker) -> None:
-        del self._running[worker]
+        with self._changed:
+            self._busy.pop(worker, None)
         worker.kill()
 
-    def _died(self, key: bytes, job: _Job | None, reason: str) -> None:
-        """Count the death of a worker: put its item first in the queue, or give it up."""
-        if job is None:
-            self._deaths_loading[key] += 1
-            if self._deaths_loading[key] == MAX_ATTEMPTS:
-                del self._deaths_loading[key]
-                text = f"{reason} while loading the model; see its output on stderr"
-                self._drop(key, lambda _: RuntimeError(text))
-            return
-        job.deaths += 1
-        if job.deaths == MAX_ATTEMPTS:
-            self._finished.append((job, (None, reason), None))
-        elif job.given_up:
-            self._finished.append((job, None, CancelledError()))
-        else:
-            self._waiting.appendleft(job)
-
-    def _drop(self, key: bytes, error: Callable[[_Job], Exception]) -> None:
+    def _drop(self, function: Pickled, error: BaseException) -> None:
         """Remove the waiting items of a function that cannot be used."""
-        self._finished += [(job, None, error(job)) for job in self._waiting if job.function.key == key]
-        self._waiting = deque(job for job in self._waiting if job.function.key != key)
-
-
-def _fail(job: _Job, error: BaseException) -> None:
-    """Set the exception of a job, whether it was started or not."""
-    if job.running() or (not job.cancelled() and job.set_running_or_notify_cancel()):
-        job.set_exception(error)
-
-
-def _unusable(function: Any, reply: WorkerReply) -> Exception:
-    """The error for a function that cannot be loaded in a worker."""
-    try:
-        raise_if_refused(str(reply.value))
-    except ChangedModel as error:
-        return error
-    return ValueError(f"{function!r} cannot be loaded in a worker process: {reply.value}")
+        with self._changed:
+            dropped = [job for job in self._waiting if job.function.key == function.key]
+            self._waiting = deque(job for job in self._waiting if job.function.key != function.key)
+        for job in dropped:
+            if job.start():
+                job.set_exception(error)

@@ -20,8 +20,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
-from .changed_model import SentModel
-from .faults import ChangedModel, FailedRun, MisfitReason, is_transient, reason_of
+from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of
 from .residual_statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 
 __all__ = [
@@ -288,9 +287,7 @@ def sent_simulation(
         as in `misfit_batch` or `simulate_batch`.
     """
     reduce = sums_of_squares if statistic is None else statistic
-    return partial(
-        _attempt_sent, _response if measured is None else partial(_misfit, measured, reduce), SentModel(model)
-    )
+    return partial(_attempt, _response if measured is None else partial(_misfit, measured, reduce), model)
 
 
 def misfit_of_responses(
@@ -402,18 +399,11 @@ def _attempt(
     """Run one simulation; returns its result and an empty reason, or None and the reason. Called in the worker."""
     try:
         result = run(model, theta)
-    except ChangedModel:
-        raise
-    except Exception as error:  # a model may raise anything; KeyboardInterrupt is not an Exception and is passed on
+    except BaseException as error:  # a model may raise anything, SystemExit among it
+        raise_if_it_ends_the_run(error)
         return None, reason_of(error)
     reason = not_finite(model, result)
     return (None, reason) if reason else (result, "")
-
-
-def _attempt_sent(
-    run: Callable[[Model, np.ndarray], np.ndarray], sent: SentModel, theta: np.ndarray
-) -> tuple[np.ndarray | None, str]:
-    return _attempt(run, sent.model, theta)
 
 
 def _run_each(
@@ -423,7 +413,7 @@ def _run_each(
     if pool is None:
         outcomes = [_attempt(run, model, theta) for theta in thetas]
     else:
-        outcomes = list(pool.map(partial(_attempt_sent, run, SentModel(model)), list(thetas)))
+        outcomes = list(pool.map(partial(_attempt, run, model), list(thetas)))
     values = np.full((len(thetas), *shape), np.nan)
     for row, (result, _) in zip(values, outcomes, strict=True):
         if result is not None:
@@ -445,7 +435,8 @@ def _run_whole(
             raise ValueError(
                 f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"
             )
-    except Exception as error:  # one bad parameter set must not make the others fail
+    except BaseException as error:  # one bad parameter set must not make the others fail
+        raise_if_it_ends_the_run(error)
         logger.warning(
             "A batch method of %s failed; its parameter sets are run one by one: %s: %s",
             type(model).__name__,

@@ -10,14 +10,14 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import wait
 from pathlib import Path
 
 from . import supervisor
-from .faults import TransientReason
-from .processes import ManagedProcess, RunFailed
+from .faults import RunFailed, TransientReason
 
 __all__ = ["run_program"]
 
@@ -31,33 +31,40 @@ class _Supervisor:
     """A supervisor process, seen from the process that uses it."""
 
     def __init__(self) -> None:
-        self._managed = ManagedProcess(
+        self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", supervisor.__file__],
-            grace=_STOP_SECONDS,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
+            start_new_session=True,
             bufsize=0,
             cwd="/",
         )
-        self._process = self._managed.process
         self._owner = os.getpid()
+        self._end = weakref.finalize(self, _end, self._process, self._owner)
 
     @property
     def alive(self) -> bool:
         """Whether it runs and is a child of this process (not of the one this was forked from)."""
-        return self._owner == os.getpid() and not self._managed.ended()
+        return self._owner == os.getpid() and self._process.poll() is None
 
     def start(
-        self, command: Sequence[str], environment: Mapping[str, str], folder: Path, stdout: Path, stderr: Path
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        folder: Path,
+        stdout: Path,
+        stderr: Path,
+        place: Path,
     ) -> None:
         """Start a program; `wait` reports its end."""
         request = {
             "command": list(command),
-            "environment": {**environment, self._managed.mark: "1"},
+            "environment": dict(environment),
             "folder": str(folder),
             "stdout": str(stdout),
             "stderr": str(stderr),
+            "place": str(place),
         }
         self._send(request)
 
@@ -87,10 +94,8 @@ class _Supervisor:
             self.kill()
 
     def kill(self) -> None:
-        """Kill the supervisor as well."""
-        self._managed.kill()
-        self._process.stdin.close()
-        self._process.stdout.close()
+        """End the supervisor as well."""
+        self._end()
 
     def _receive(self, seconds: float) -> dict:
         """Next answer, empty if there is none within a time [s]; RunFailed if the supervisor has died."""
@@ -113,6 +118,7 @@ def run_program(
     folder: Path,
     stdout: Path,
     stderr: Path,
+    place: Path,
     watch: Callable[[float], float],
 ) -> int:
     """Run a program to its end and kill everything that it leaves.
@@ -122,11 +128,13 @@ def run_program(
     command : sequence of str
         Absolute path of the program, and arguments; no shell is used. Standard input is empty.
     environment : mapping
-        All environment variables of the program. One more is added, with a random name, by which processes are found.
+        All environment variables of the program.
     folder : Path
         Working folder.
     stdout, stderr : Path
         Files for its output.
+    place : Path
+        Folder of the run, which is removed if this process is killed.
     watch : callable
         Called repeatedly with the time since the start of the program [s]. It returns the time until the next call [s],
         or raises an exception, which stops the program and is passed on.
@@ -146,7 +154,7 @@ def run_program(
     keeper = _take()
     running = True
     try:
-        keeper.start(command, environment, folder, stdout, stderr)
+        keeper.start(command, environment, folder, stdout, stderr, place)
         start = time.monotonic()
         while (exit_code := keeper.wait(watch(time.monotonic() - start))) is None:
             pass
@@ -162,6 +170,19 @@ def run_program(
                 keeper.kill()
 
 
+def _end(process: subprocess.Popen, owner: int) -> None:
+    """End a supervisor, which kills its program when its standard input closes."""
+    process.stdin.close()
+    process.stdout.close()
+    if owner != os.getpid():  # a forked copy
+        return
+    try:
+        process.wait(_STOP_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
 def _forget() -> None:
     """In a forked process: the supervisors belong to its parent, and one of its threads may have held the lock."""
     global _lock
@@ -169,7 +190,8 @@ def _forget() -> None:
     _idle.clear()
 
 
-os.register_at_fork(after_in_child=_forget)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
 
 
 def _take() -> _Supervisor:

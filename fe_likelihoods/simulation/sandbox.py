@@ -8,8 +8,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from .faults import TransientReason, raise_if_refused
-from .processes import PickledFunction, RunFailed, Worker, WorkerReply, last_lines, without_addresses
+from .by_value import Pickled
+from .faults import ChangedModel, RunFailed, TransientReason
+from .worker import Answer, Worker, WorkerDied, last_lines
 
 __all__ = ["Sandbox"]
 
@@ -22,12 +23,12 @@ class Sandbox:
 
     The process is kept for later calls. It is replaced after a call that did not end by itself, and after a number of
     calls, which limits the memory that the function leaks. Concurrent calls of several threads use one process each.
-    What the function prints is not shown.
+    The function is sent by value, as it is when it is called. What it prints is not shown.
 
     Parameters
     ----------
     function : callable
-        Takes one argument. The function, its argument and its result must be picklable.
+        Takes one argument.
     time_limit : float, optional
         Largest duration of a call [s], without the start of the process.
     memory_limit : int
@@ -51,17 +52,13 @@ class Sandbox:
         max_output: int = 2**24,
         runs_per_process: int | None = None,
     ) -> None:
-        self._settings = function, time_limit, memory_limit, max_output, runs_per_process
-        self._function = function
-        self._time_limit = math.inf if time_limit is None else time_limit
-        self._memory_limit, self._max_output = memory_limit, max_output
-        self._most_runs = runs_per_process or math.inf
-        self._pickled = PickledFunction.of(function)
-        self._pickled.script()  # raises here what would be raised in the first call
+        self.function, self.time_limit, self.memory_limit = function, time_limit, memory_limit
+        self.max_output, self.runs_per_process = max_output, runs_per_process
         self._free: list[tuple[Worker, Any]] = []
+        Pickled.of(function)  # raises here what would be raised in the first call
 
-    def __reduce__(self) -> tuple:
-        return type(self), self._settings
+    def __getstate__(self) -> dict:
+        return vars(self) | {"_free": []}
 
     def __call__(self, item: Any) -> Any:
         """Result of the function for one item.
@@ -73,72 +70,68 @@ class Sandbox:
         Exception
             Any exception that the function raises.
         """
-        worker, output = self._take()
+        worker, output = self._take(Pickled.of(self.function))
         start = time.monotonic()
         try:
-            worker.submit(item)
-            reply = self._wait(worker, output, self._time_limit)
-            if reply is None:
-                limit = self._time_limit
-                raise RunFailed(TransientReason(f"stopped at the time limit of {limit:g} s", time_limit=limit))
+            worker.send(item)
+            answer = self._receive(worker, output)
         except RunFailed as error:
             worker.kill()
             raise RunFailed(error.reason, time.monotonic() - start) from None
         except BaseException:
             worker.kill()
             raise
-        if worker.runs >= self._most_runs:
+        if worker.calls >= (self.runs_per_process or math.inf):
             worker.kill()
         else:
             os.ftruncate(output.fileno(), 0)
             os.lseek(output.fileno(), 0, os.SEEK_SET)
             self._free.append((worker, output))
-        if reply.kind == "raised":
-            raise reply.value
-        return reply.value
+        if answer.error is not None:
+            raise answer.error
+        return answer.value
 
     def close(self) -> None:
         """End the idle processes."""
         while self._free:
             self._free.pop()[0].kill()
 
-    def _take(self) -> tuple[Worker, Any]:
-        """An idle process that has loaded the function, or a new one, and the file with its output."""
+    def _take(self, function: Pickled) -> tuple[Worker, Any]:
+        """A process that has loaded the function, and the file with its output."""
+        worker = None
         with suppress(IndexError):
-            while True:
+            while worker is None or not worker.alive:
                 worker, output = self._free.pop()
-                if worker.alive:
-                    return worker, output
-        output = tempfile.TemporaryFile()
-        worker = Worker(memory_limit=self._memory_limit, output=output)
+        if worker is None or not worker.alive:
+            output = tempfile.TemporaryFile()
+            worker = Worker(memory_limit=self.memory_limit, output=output)
         try:
-            worker.load(self._pickled)
-            reply = self._wait(worker, output, _START_LIMIT)
-            if reply is None:
-                raise RunFailed(TransientReason(f"the worker process did not start within {_START_LIMIT:g} s"))
-        except BaseException:
+            worker.load(function, _START_LIMIT)
+        except BaseException as error:
             worker.kill()
+            if isinstance(error, WorkerDied):
+                raise _with_output(error, output) from None
+            if isinstance(error, ValueError) and not isinstance(error, ChangedModel):  # it cannot be loaded there
+                raise RunFailed(TransientReason(str(error))) from error
             raise
-        if reply.kind != "loaded":
-            worker.kill()
-            raise_if_refused(reply.value)
-            reason = f"{self._function!r} cannot be loaded in another process: {reply.value}"
-            raise RunFailed(TransientReason(without_addresses(reason)))
         return worker, output
 
-    def _wait(self, worker: Worker, output: Any, limit: float) -> WorkerReply | None:
-        """Reply of a worker, None if there is none within the limit [s]; RunFailed if it dies or prints too much."""
+    def _receive(self, worker: Worker, output: Any) -> Answer:
+        """Answer of a worker; RunFailed if there is none within the limit, or it dies or prints too much."""
+        limit = math.inf if self.time_limit is None else self.time_limit
         stop = time.monotonic() + limit
         while (left := stop - time.monotonic()) > 0.0:
-            with suppress(OSError):
-                worker.connection.poll(min(left, _POLL_INTERVAL))
             try:
-                reply = worker.receive()
-            except RunFailed as error:
-                reasons = filter(None, [error.reason, last_lines(output, 1)])
-                raise RunFailed(TransientReason("; ".join(reasons))) from None
-            if os.fstat(output.fileno()).st_size > self._max_output:
-                raise RunFailed(TransientReason(f"stopped because it printed more than {self._max_output} bytes"))
-            if reply is not None:
-                return reply
-        return None
+                answer = worker.receive(min(left, _POLL_INTERVAL))
+            except WorkerDied as error:
+                raise _with_output(error, output) from None
+            if os.fstat(output.fileno()).st_size > self.max_output:
+                raise RunFailed(TransientReason(f"stopped because it printed more than {self.max_output} bytes"))
+            if answer is not None:
+                return answer
+        raise RunFailed(TransientReason(f"stopped at the time limit of {limit:g} s", time_limit=limit))
+
+
+def _with_output(error: WorkerDied, output: Any) -> RunFailed:
+    """The death of a process with the last line that it has printed."""
+    return RunFailed(TransientReason("; ".join(filter(None, [error.reason, last_lines(output, 1)]))))

@@ -1,16 +1,20 @@
-"""Functions that are sent to each worker process of a pool once, through a private file, and then named by a digest."""
+"""Functions that are sent to each worker process of any pool once, through a private file, and then named by a digest.
+
+Workers on other machines, which do not find the file, get the function together with the items.
+"""
 
 import os
+import sys
+import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .faults import ChangedModel, raise_if_refused
-from .processes import PickledFunction
+from .by_value import Arrived, Pickled
 
-__all__ = ["MAX_LOADED_FUNCTIONS", "FunctionReference", "Missing", "Unusable", "loaded_functions"]
+__all__ = ["MAX_LOADED_FUNCTIONS", "FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
 
 MAX_LOADED_FUNCTIONS = 8
 
@@ -19,22 +23,27 @@ class Missing(NamedTuple):
     """Reply of a worker that does not have the function."""
 
 
-class Unusable(NamedTuple):
-    """Reply of a worker that has the function but cannot load it, with the reason."""
+class PrivateFiles:
+    """The most recent functions of one pool, in files that only this user can read, and that end with this process."""
 
-    reason: str
+    def __init__(self) -> None:
+        self._files: OrderedDict[bytes, Any] = OrderedDict()
+        self._lock = threading.Lock()
 
-    @property
-    def error(self) -> Exception:
-        """The error for it: `ChangedModel` if the worker has refused the function, else RuntimeError."""
-        try:
-            raise_if_refused(self.reason)
-        except ChangedModel as error:
-            return error
-        return RuntimeError(
-            f"a worker cannot load the model: {self.reason}. Define its classes and functions in modules that the "
-            "workers can import"
-        )
+    def path(self, function: Pickled) -> str:
+        """Path of the file with a function."""
+        with self._lock:
+            if function.key not in self._files:
+                linux = sys.platform == "linux"
+                file = tempfile.TemporaryFile() if linux else tempfile.NamedTemporaryFile(prefix="fe_likelihoods_")
+                file.write(function.payload)
+                file.flush()
+                self._files[function.key] = file
+            self._files.move_to_end(function.key)
+            while len(self._files) > MAX_LOADED_FUNCTIONS:
+                self._files.popitem(last=False)
+            file = self._files[function.key]
+            return f"/proc/{os.getpid()}/fd/{file.fileno()}" if sys.platform == "linux" else file.name
 
 
 class FunctionReference:
@@ -45,61 +54,59 @@ class FunctionReference:
     Parameters
     ----------
     function : callable
-    folder : Path
-        Temporary folder for the file.
-    carried : bool
-        Whether the pickled function itself is part of the reference, for workers that cannot read the file.
+    files : PrivateFiles
     """
 
-    def __init__(self, function: Callable, folder: Path, carried: bool = False) -> None:
-        self._function, self._folder, self._carried = function, folder, carried
+    def __init__(self, function: Callable, files: PrivateFiles) -> None:
+        self._function, self._files = function, files
+        self._pickled: Pickled | None = None
         self._lock = threading.Lock()
-        self._parts: tuple | None = None
 
     def __call__(self, item: Any) -> Any:
         return self._function(item)
 
-    def __reduce__(self) -> tuple:
+    def pickle(self) -> Pickled:
+        """The function as it was when this was first called; ValueError if it cannot be pickled."""
         with self._lock:  # pools pickle in threads of their own, often once per item
-            if self._parts is None:
-                pickled = PickledFunction.of(self._function)
-                path = self._folder / pickled.key.hex()
-                if not self._carried and not path.exists():
-                    part = path.with_suffix(f".{threading.get_ident()}")
-                    with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-                        file.write(pickled.payload)
-                    part.replace(path)
-                self._parts = pickled.key, str(path), pickled.payload if self._carried else b""
-        return _LoadedFunction, self._parts
+            if self._pickled is None:
+                self._pickled = Pickled.of(self._function)
+            return self._pickled
+
+    def __reduce__(self) -> tuple:
+        pickled = self.pickle()
+        return _LoadedFunction, (pickled.key, self._files.path(pickled))
+
+    def carried(self) -> "_LoadedFunction":
+        """The function itself, for workers that cannot read the file."""
+        return _LoadedFunction(*self.pickle()[::-1])
 
 
-loaded_functions: OrderedDict[bytes, Callable] = OrderedDict()
+loaded_functions: OrderedDict[bytes, Arrived] = OrderedDict()
 _loading = threading.Lock()
 
 
 class _LoadedFunction:
     """A `FunctionReference` in a worker process, which loads the function once and keeps the most recent ones."""
 
-    def __init__(self, key: bytes, path: str, payload: bytes) -> None:
-        self._parts = key, path, payload
+    def __init__(self, key: bytes, source: str | bytes) -> None:
+        self._parts = key, source
 
     def __reduce__(self) -> tuple:
         return type(self), self._parts
 
     def __call__(self, item: Any) -> Any:
-        key, path, payload = self._parts
+        key, source = self._parts
         with _loading:
             function = loaded_functions.get(key)
             if function is None:
                 try:
-                    pickled = PickledFunction(payload or Path(path).read_bytes(), key)
+                    payload = source if isinstance(source, bytes) else Path(source).read_bytes()
                 except OSError:
                     return Missing()
-                try:
-                    function = pickled.load()
-                except Exception as error:
-                    return Unusable(f"{type(error).__name__}: {error}")
-                loaded_functions[key] = function
+                pickled = Pickled(payload, key)
+                if not pickled.is_whole() and not isinstance(source, bytes):  # a file of another machine
+                    return Missing()
+                function = loaded_functions[key] = pickled.load()
             loaded_functions.move_to_end(key)
             while len(loaded_functions) > MAX_LOADED_FUNCTIONS:
                 loaded_functions.popitem(last=False)

@@ -4,7 +4,8 @@ On Linux it is a subreaper (``PR_SET_CHILD_SUBREAPER``): a process whose parent 
 session, group or environment the process has given itself. All its children are therefore the program and what this
 has started. On other systems the process group of the program is killed.
 
-It also kills them when its standard input closes, as it does when the process that started it dies, or at SIGTERM.
+It also kills them when its standard input closes, as it does when the process that started it dies, or at SIGTERM, and
+then removes the folder of the run.
 
 This file imports the standard library only, so that it can be run alone and starts quickly.
 """
@@ -13,6 +14,7 @@ import ctypes
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,9 +34,12 @@ class _Program:
         self.adopts = sys.platform == "linux" and not ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         self.process: subprocess.Popen | None = None
         self.exit_code: int | None = None
+        self.place = ""  # folder of the run
 
-    def start(self, command: list[str], environment: dict[str, str], folder: str, stdout: str, stderr: str) -> None:
-        self.exit_code = None
+    def start(
+        self, command: list[str], environment: dict[str, str], folder: str, stdout: str, stderr: str, place: str
+    ) -> None:
+        self.exit_code, self.place = None, place
         with open(stdout, "wb") as out, open(stderr, "wb") as error:
             self.process = subprocess.Popen(
                 command,
@@ -130,6 +135,8 @@ def main() -> None:
                 program.exit_code = None
     finally:
         program.kill()
+        if program.place:
+            shutil.rmtree(program.place, ignore_errors=True)
 
 
 def _answer(**values: object) -> None:

@@ -4,15 +4,18 @@ The model takes almost no time, so the result is the overhead of sending and rec
 process, ``python -m tests.benchmarks.executors WHAT POOL REPEATS``, which is killed if it hangs.
 """
 
+import contextlib
 import importlib.util
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +23,6 @@ from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation.executors import as_executor
 from fe_likelihoods.simulation.model import simulate_batch
-from fe_likelihoods.simulation.processes import ManagedProcess
 from tests.faults.pooled_run import NAMES, POOLS, WORKERS, at_work
 from tests.faults.treacherous import CHANNELS, DT, KILLED, N_STEPS, DiesOnce, Treacherous, descendants, gone, line
 
@@ -79,16 +81,28 @@ def _command(module: str, name: str, *arguments: object) -> list[str]:
 ENVIRONMENT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
 
 
+def _start(command: list[str], output: Any) -> subprocess.Popen:
+    options = {"stdout": output, "stderr": subprocess.STDOUT, "start_new_session": True}
+    return subprocess.Popen(command, cwd=ROOT, env=os.environ | ENVIRONMENT, **options)
+
+
+def _kill(process: subprocess.Popen) -> int:
+    """Kill a process with its session; returns its exit code."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    return process.wait()
+
+
 def _answer(what: str, name: str, repeats: int) -> dict:
     """The last line of JSON that the process of one case prints, or how the process ended."""
     with tempfile.TemporaryFile("w+") as output:
         command = _command("tests.benchmarks.executors", name, what, name, repeats)
-        process = ManagedProcess(command, ENVIRONMENT, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+        process = _start(command, output)
         stop = time.monotonic() + LIMIT
-        while not process.ended() and time.monotonic() < stop:
+        while process.poll() is None and time.monotonic() < stop:
             time.sleep(0.05)
-        hangs = not process.ended()
-        exit_code = process.kill()
+        hangs = process.poll() is None
+        exit_code = _kill(process)
         output.seek(0)
         found = [row for row in output.read().splitlines() if row.startswith('{"')]
     if found:
@@ -100,24 +114,24 @@ def _left_over(name: str) -> tuple[float | None, str, str]:
     """Number of processes left ten seconds after the process with the pool was killed."""
     with tempfile.TemporaryDirectory() as folder:
         command = _command("tests.faults.pooled_run", name, name, folder)
-        parent = ManagedProcess(command, ENVIRONMENT, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        parent = _start(command, subprocess.DEVNULL)
         try:
             stop = time.monotonic() + LIMIT
             while len(at_work(Path(folder))) < WORKERS:
-                if parent.ended() or time.monotonic() > stop:
+                if parent.poll() is not None or time.monotonic() > stop:
                     return None, "processes left", "did not start"
                 time.sleep(0.05)
-            children = descendants(parent.process.pid)
+            children = descendants(parent.pid)
             if name == "mpi":  # the first rank, which is the parent of the pool, not that of the processes
                 (first, *_) = sorted(set(_ranks(children)) - at_work(Path(folder)))
                 os.kill(first, 9)
             else:
-                parent.process.kill()
+                parent.kill()
             gone(children, 10.0)
             left = [pid for pid in children if not gone([pid], 0.0)]
             return len(left), "processes left", f"of {len(children)}"
         finally:
-            parent.kill()
+            _kill(parent)
 
 
 def _ranks(pids: list[int]) -> list[int]:

@@ -12,7 +12,6 @@ The modules of the user are written into a folder, imported, edited, and importe
 import builtins
 import importlib
 import os
-import pickle
 import sys
 import tempfile
 from collections import Counter
@@ -34,7 +33,6 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.models.function import _changes_itself, _observed
 from fe_likelihoods.simulation import changed_model, source_digest, used_modules
-from fe_likelihoods.simulation.changed_model import SentModel
 from fe_likelihoods.simulation.faults import ChangedModel
 
 CHANNELS = (Channel("a", "displacement", "m"),)
@@ -78,14 +76,6 @@ class During(NamedTuple):
     files: dict[str, str]
     change: Callable[[Path, Any, FELikelihood], Any]
     options: dict[str, Any] = {}
-
-
-class InWorker(NamedTuple):
-    """Another state of the modules in a worker than in the main process, by a function of the imported module."""
-
-    name: str
-    files: dict[str, str]
-    change: Callable[[Path, Any], Any]
 
 
 def user(body: str, **others: str) -> dict[str, str]:
@@ -571,13 +561,6 @@ DURING = [
     ),
 ]
 
-WORKERS = [
-    InWorker(
-        "a file that was edited after the import", CALLS_HELPER, rewrite("helper.py", HELPER.replace("3.0", "4.0"))
-    ),
-    InWorker("a module that the main process has reloaded", CALLS_HELPER, None),
-]
-
 
 @contextmanager
 def workshop(files: dict[str, str]):
@@ -676,31 +659,10 @@ def during(way: During) -> str:
         return "not noticed"
 
 
-def in_worker(way: InWorker) -> str:
-    """What a worker does with a model whose modules have another state there."""
-    with workshop(way.files) as folder:
-        model = likelihood_of(folder, {}, None).model
-        if way.change is None:
-            data = None
-            (folder / "helper.py").write_text(HELPER.replace("3.0", "40.0"))
-            old = {name: sys.modules[name] for name in ("user", "helper")}
-            data = pickle.dumps(SentModel(likelihood_of(folder, {}, None).model))
-            sys.modules.update(old)  # the worker has imported the earlier version
-        else:
-            data = pickle.dumps(SentModel(model))
-            way.change(folder, sys.modules["user"])
-            forget_modules(folder)  # the worker imports the files as they are now
-        try:
-            pickle.loads(data)
-        except ChangedModel:
-            return NOTICED
-        return "not noticed"
-
-
 def main() -> None:
     counts: Counter[str] = Counter()
     parts = [("Between two runs: code", between, CODE), ("Between two runs: outside the code", between, OUTSIDE)]
-    for title, run, ways in [*parts, ("During a run", during, DURING), ("In a worker", in_worker, WORKERS)]:
+    for title, run, ways in [*parts, ("During a run", during, DURING)]:
         print(title)
         for way in ways:
             try:

@@ -15,7 +15,7 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.probability.failures import TooManyFailures
-from fe_likelihoods.simulation import dask_executor, dask_workers, executors, processes
+from fe_likelihoods.simulation import dask_executor, dask_workers, executors
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -52,11 +52,11 @@ def nothing_is_left():
     yield
     gc.collect()  # samplers and their states refer to each other
     if Path("/proc").is_dir():
-        # the orphan reaper stays with this process, and the resource tracker of multiprocessing
+        # the resource tracker of multiprocessing stays
         left = [
             pid
             for pid in set(descendants(os.getpid())) - before
-            if b"fe_likelihoods.simulation.processes" in _command(pid)
+            if b"fe_likelihoods.simulation.worker" in _command(pid)
         ]
         assert gone(left)
 
@@ -109,33 +109,11 @@ def test_processes_may_die_while_they_load_the_function(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def _send_while_sending(ended):
-    with processes._REAPER._lock:  # the garbage collector runs a finalizer while a message is sent
-        processes._REAPER.send("gone", "nothing")
-    ended.set()
-
-
-def test_messages_to_the_orphan_reaper_do_not_block():
-    ended = threading.Event()
-    threading.Thread(target=_send_while_sending, args=(ended,), daemon=True).start()
-    assert ended.wait(10.0)
-    with processes._REAPER._lock:  # another thread sends while this one forks
-        child = os.fork()
-        if child == 0:
-            blocked = threading.Thread(target=processes._REAPER.send, args=("gone", "nothing"), daemon=True)
-            blocked.start()
-            blocked.join(10.0)
-            os._exit(blocked.is_alive())
-    assert os.waitpid(child, 0)[1] == 0
-
-
 @needs_proc
 def test_idle_worker_that_is_killed_is_replaced():
     with LocalPool(1) as pool:
         expected = simulate_batch(Treacherous(), theta(bad.FINE, 3), pool)
-        (pid,) = [
-            child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.processes" in _command(child)
-        ]
+        (pid,) = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)]
         os.kill(pid, 9)
         assert gone([pid])
         batch = simulate_batch(Treacherous(), theta(bad.FINE, 3), pool)
@@ -146,7 +124,7 @@ def test_idle_worker_that_is_killed_is_replaced():
 def test_workers_end_with_the_likelihood_and_after_an_interrupt():
     posterior = posterior_of(Treacherous(), pool=2)
     posterior(posterior.sample_prior(4, 1))
-    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.processes" in _command(child)]
+    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)]
     assert len(workers) == 2
     del posterior
     assert gone(workers)
@@ -159,11 +137,11 @@ def test_a_pool_that_is_closed_while_a_process_loads_ends_that_process(tmp_path)
     function = LoadsOnce(tmp_path)  # only the first process can load it
     pool = LocalPool(2)
     assert pool.map(function, [1, 2, 3]) == [1, 2, 3]
-    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.processes" in _command(child)]
+    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)]
     assert len(workers) == 2
     pool.close()
     assert not any(worker in descendants(os.getpid()) for worker in workers)
-    assert pool._thread is None or not pool._running
+    assert not pool._threads
     pool.close()
 
 
@@ -361,8 +339,8 @@ PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask"
 @needs_proc
 @pytest.mark.parametrize("pool", PARENTS)
 def test_nothing_outlives_a_parent_that_is_killed(pool, tmp_path, tmp_path_factory):
-    # one orphan reaper per process that starts others; three more for the program, its supervisor and its child
-    expected = {"isolated": 2, "nested": 1 + 2 * 3, "program": 1 + 2 * 5, "dask": WORKERS}.get(pool, 1 + WORKERS)
+    # three more for the program, its supervisor and its child
+    expected = {"isolated": 1, "nested": 2 * WORKERS, "program": 4 * WORKERS}.get(pool, WORKERS)
     at_once = 1 if pool == "isolated" else WORKERS
     command = [sys.executable, "-m", "tests.faults.pooled_run", pool, str(tmp_path)]
     place = tmp_path_factory.mktemp("place")

@@ -1,7 +1,6 @@
 """No way of changing a model lets the cache use simulations of another model in silence."""
 
 import copy
-import importlib
 import os
 import pickle
 import sys
@@ -13,7 +12,8 @@ import pytest
 
 from fe_likelihoods import ExecutableModel, FELikelihood, FunctionModel, LocalPool, SimulationCache
 from fe_likelihoods.simulation import changed_model
-from fe_likelihoods.simulation.changed_model import SentModel, current_fingerprint
+from fe_likelihoods.simulation.by_value import Pickled
+from fe_likelihoods.simulation.changed_model import current_fingerprint
 from fe_likelihoods.simulation.code_digest import code_digest
 from fe_likelihoods.simulation.faults import ChangedModel
 
@@ -33,14 +33,9 @@ def test_a_change_during_a_run(way):
     assert changes.during(way) == NOTICED
 
 
-@pytest.mark.parametrize("way", changes.WORKERS, ids=lambda way: way.name)
-def test_a_worker_with_other_code_refuses(way):
-    assert changes.in_worker(way) == NOTICED
-
-
 def test_only_what_is_documented_is_used_unseen():
     expected = Counter(way.expected for way in [*changes.CODE, *changes.OUTSIDE])
-    assert len(changes.CODE) + len(changes.OUTSIDE) + len(changes.DURING) + len(changes.WORKERS) > 80
+    assert len(changes.CODE) + len(changes.OUTSIDE) + len(changes.DURING) > 80
     assert expected[changes.DOCUMENTED] == 3
 
 
@@ -58,7 +53,7 @@ def test_a_function_that_changes_its_own_state_is_not_refused(body, tmp_path):
         for row in THETAS:
             first.misfit(row)
         assert first.cache.info().simulations == len(THETAS)
-        pickle.loads(pickle.dumps(SentModel(first.model)))
+        Pickled.of(first.model)
         again = changes.likelihood_of(folder, {}, SimulationCache(tmp_path / "cache.sqlite"))
         again.misfit(THETAS)
         assert (again.simulations, again.verifications) == (0, 2)
@@ -118,47 +113,6 @@ HONEST = {
 }
 
 
-@pytest.mark.parametrize("body", HONEST.values(), ids=HONEST)
-def test_a_worker_with_other_values_computes(body, caplog):
-    """The main process may have called the function before it makes the model."""
-    with changes.workshop(changes.user(body)) as folder:
-        function = importlib.import_module("user").f
-        function(THETAS[0])
-        model = FunctionModel(function, NAMES, CHANNELS, 0.1, N_STEPS)
-        expected = model.simulate(THETAS[0])
-        data = pickle.dumps(SentModel(model))
-        changes.forget_modules(folder)  # a worker imports the module
-        changed_model._compared.clear()
-        for _ in range(2):
-            received = pickle.loads(data).model
-            np.testing.assert_array_equal(received.simulate(THETAS[0]), expected)
-    messages = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    if body in (COUNTS, STARTED):
-        (message,) = messages
-        assert f"those of the main process: user.{'calls' if body == COUNTS else 'started'}. The worker" in message
-    assert len(messages) <= 1
-
-
-@pytest.mark.parametrize("options", [{}, {"version": "2"}], ids=["digest", "version"])
-@pytest.mark.parametrize(("old", "new"), [("3.0", "4.0"), ("2.0", "5.0")], ids=["code", "value"])
-def test_a_worker_with_an_earlier_version_of_a_file_refuses(options, old, new):
-    """Also with a version, which the main process has changed together with the file."""
-    with changes.workshop(EDITED) as folder:
-        data = pickle.dumps(SentModel(changes.likelihood_of(folder, options, None).model))
-        changed_model._sources.clear()
-        changed_model._compared.clear()
-        pickle.loads(data)  # a worker has computed with the earlier files
-        worker = dict(changed_model._sources)
-        modules = {name: sys.modules[name] for name in ("user", "helper")}
-        (folder / "helper.py").write_text(changes.HELPER.replace(old, new))
-        data = pickle.dumps(SentModel(changes.likelihood_of(folder, options, None).model))
-        sys.modules.update(modules)
-        changed_model._sources.update(worker)
-        changed_model._compared.clear()
-        with pytest.raises(ChangedModel, match="not the same in the worker process"):
-            pickle.loads(data)
-
-
 @pytest.mark.parametrize("name", ["Data", "Frozen", "Slotted", "Named", "Concrete"])
 def test_a_pickle_or_copy_of_an_instance_changes_no_digest(name):
     """Python writes attributes of its own into the class, such as `__slotnames__`."""
@@ -182,23 +136,15 @@ def test_a_dataclass_runs_in_a_pool():
     assert likelihood.failure_count == 0
 
 
-@pytest.mark.parametrize("isolated", [False, True], ids=["pool", "process of its own"])
-def test_processes_that_import_other_code_refuse(isolated):
+@pytest.mark.parametrize("isolated", [False, True], ids=["pool", "isolated"])
+def test_processes_run_the_code_of_this_process_after_a_file_was_edited(isolated):
     with changes.workshop(EDITED) as folder, LocalPool(1) as pool:
-        expected = changes.likelihood_of(folder, {}, None).misfit(THETAS[:1])
+        expected = changes.likelihood_of(folder, {}, None).misfit(THETAS)
         likelihood = changes.likelihood_of(folder, {"isolated": isolated}, None)
         if not isolated:
             likelihood.pool = pool
-        if not isolated:
-            np.testing.assert_array_equal(likelihood.misfit(THETAS[:1]), expected)
-            pool.close()
         (folder / "helper.py").write_text(changes.HELPER.replace("3.0", "4.0"))
-        # Python takes compiled code for that of a source of the same size and the same second
-        later = time.time() + 5.0
-        os.utime(folder / "helper.py", (later, later))
-        with pytest.raises(ValueError, match="not the same in the worker process .* source file was edited"):
-            likelihood.misfit(THETAS[1:2])
-        assert likelihood.failure_count == 0
+        np.testing.assert_array_equal(likelihood.misfit(THETAS), expected)
 
 
 # arguments ------------------------------------------------------------------------------------------------------------

@@ -115,3 +115,47 @@ def test_a_cell_that_was_interrupted_is_run_again(name, place, in_file, kernel, 
     chain, log_evidence, evaluations = eval(kernel.printed(SHOW))
     assert chain == whole.get_chain().tolist()
     assert (log_evidence, evaluations) == (whole.log_evidence, whole.evaluations)
+
+
+MODEL = """
+import numpy as np
+from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements
+TIME, K = np.linspace(0.0, 1.0, 20), 2.0
+CHANNELS = (Channel("u", "displacement", "m"),)
+
+def helper(x):
+    return K * x
+
+class Spring:
+    def force(self, x):
+        return helper(x)
+
+def simulate(theta):
+    return Spring().force(theta[0]) * TIME[None]
+
+data = Measurements(CHANNELS, 0.01, TIME[None])
+unused = (number for number in range(3))  # cannot be sent, and need not be
+x = np.array([[1.3, 0.1], [1.1, 0.1], [0.7, 0.1]])
+
+def values(function, **where):
+    model = FunctionModel(function, ("a",), CHANNELS, 0.01, 20, version=str(K))
+    return FELikelihood(model, data, **where).log_likelihood(x)
+"""
+COMPARE = """
+here = values(simulate)
+found = [values(simulate, pool=2), values(lambda theta: simulate(theta), pool=2)]
+alone = FELikelihood(FunctionModel(simulate, ("a",), CHANNELS, 0.01, 20, isolated=True), data).log_likelihood(x)
+print([np.array_equal(here, other) for other in (*found, alone)], here.sum())
+"""
+
+
+def test_functions_of_cells_run_in_workers_with_the_values_of_the_notebook(kernel):
+    """Also after a cell has changed a value; the workers are other processes."""
+    assert kernel.reply(kernel.start(MODEL))["status"] == "ok"
+    sums = []
+    for cell in ("", "K = 3.0"):
+        assert kernel.reply(kernel.start(cell))["status"] == "ok"
+        said = kernel.printed(COMPARE)
+        assert said.startswith("[True, True, True]"), said
+        sums.append(said)
+    assert sums[0] != sums[1]

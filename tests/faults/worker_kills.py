@@ -23,7 +23,7 @@ from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, descend
 __all__ = ["main"]
 
 SECONDS = 0.04  # of a simulation
-MARK = b"fe_likelihoods.simulation.processes"
+MARK = b"fe_likelihoods.simulation.worker"
 
 
 class Slow(Treacherous):

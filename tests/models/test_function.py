@@ -193,7 +193,7 @@ def test_failures_are_in_the_report_with_their_duration():
         ({"runs_per_process": 0}, "runs_per_process must be None or a positive integer"),
         ({"runs_per_process": 2.5}, "runs_per_process"),
         ({"function": 3}, "expected a function"),
-        ({"function": lambda theta: line(theta), "isolated": True}, "cannot be sent to another process"),
+        ({"function": lambda theta, lock=threading.Lock(): line(theta), "isolated": True}, "cannot be sent to another"),
         ({"parameter_names": ()}, "parameter_names must be a tuple of one or more str"),
         ({"parameter_names": "ab"}, "parameter_names"),
         ({"parameter_names": ("a", "a")}, "must differ"),

@@ -1,5 +1,7 @@
 """Predictions with a cache: the same bits, and no simulation twice, also after an interruption."""
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ class Counted(Flexible):
             self.runs.append(theta[0])
             raise SimulationFailed("too flexible")
         if len(self.runs) == self.interrupted_at:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         self.runs.append(theta[0])
         return self.factor * super().simulate(theta)
 

@@ -1,6 +1,7 @@
 """Responses that are simulated on request: their statistics are cached as those of a log-likelihood are."""
 
 import pickle
+import signal
 
 import numpy as np
 import pytest
@@ -300,7 +301,7 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkey
     class Interrupted(Line):
         def simulate(self, theta):
             if self.runs == 25:
-                raise KeyboardInterrupt
+                signal.raise_signal(signal.SIGINT)
             return super().simulate(theta)
 
     first = likelihood_of(Interrupted(), cache=path)

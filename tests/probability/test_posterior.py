@@ -4,6 +4,7 @@ import logging
 import math
 import multiprocessing
 import pickle
+import signal
 import warnings
 from multiprocessing.pool import ThreadPool
 
@@ -85,7 +86,7 @@ class Polynomial:
         if offset == 6.0:
             return None
         if offset == 7.0:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         if offset == 8.0:
             response *= 1e200
         if offset == 9.0:

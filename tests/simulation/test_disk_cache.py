@@ -4,6 +4,7 @@ import dataclasses
 import multiprocessing
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import threading
@@ -397,7 +398,7 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypat
     class Interrupted(Line):
         def simulate(self, theta):
             if self.runs == 7:
-                raise KeyboardInterrupt
+                signal.raise_signal(signal.SIGINT)
             return super().simulate(theta)
 
     thetas = rng.normal(size=(20, 2)) * [1.0, 0.1]

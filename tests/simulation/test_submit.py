@@ -1,6 +1,5 @@
 """Items that are submitted to an executor: each ends by itself, and as with ``map`` if it kills its process."""
 
-import multiprocessing
 import os
 import threading
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_completed
@@ -8,7 +7,6 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_co
 import numpy as np
 import pytest
 
-from fe_likelihoods.simulation import pool_executor
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
 from tests.faults import treacherous as bad
@@ -22,7 +20,6 @@ from tests.faults.treacherous import (
     Treacherous,
     gone,
     line,
-    posterior_of,
 )
 
 LONG, SHORT = np.array([0.95, 0.1]), [np.array([offset, 0.1]) for offset in (0.1, 0.2, 0.3, 0.4)]
@@ -165,23 +162,3 @@ def test_a_forked_process_starts_workers_of_its_own():
             os._exit(int(pool.map(os.getsid, [0]) == parent))
         assert os.waitpid(child, 0)[1] == 0
         assert pool.map(os.getsid, [0]) == parent
-
-
-def test_a_killed_process_of_a_multiprocessing_pool_is_an_error(monkeypatch):
-    """Such a pool replaces the process and loses its item: neither a batch nor single items wait for ever."""
-    monkeypatch.setattr(pool_executor, "SECONDS_BETWEEN_CHECKS", 0.05)
-    points = [[what + 0.5, 0.1, 0.5] for what in (bad.FINE, bad.KILLED, bad.FINE)]
-    message = r"a process of the multiprocessing.Pool has died \(exit code -9\)"
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        executor = as_executor(pool)
-        assert simulate_batch(Treacherous(), np.array(points)[::2, :2], executor).reasons == ["", ""]
-        with pytest.raises(RuntimeError, match=message):
-            simulate_batch(Treacherous(), np.array(points)[:, :2], executor)
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        posterior = posterior_of(Treacherous(), top=20.0, pool=pool)
-        with posterior.evaluation_queue() as queue:
-            arrived, tickets = [], queue.submit(points)
-            with pytest.raises(RuntimeError, match=message):
-                while len(arrived) < 3:
-                    arrived += queue.collect()
-    assert tickets[1] not in dict(arrived)

@@ -1,0 +1,295 @@
+"""A process of this machine that calls a function for one item at a time, and may hang, crash or use too much memory.
+
+The process is a Python interpreter that receives the function by value (`fe_likelihoods.simulation.by_value`), so the
+user's script is not imported in it. It leads a session of its own, which is killed with it. On Linux it is also killed
+when the process that started it ends, for whatever reason (``PR_SET_PDEATHSIG``); on macOS it notices that within a
+second, unless compiled code keeps the interpreter busy.
+
+It is started with `subprocess`, not with `multiprocessing`, because it must also work in the processes of any pool,
+many of which may not start processes with `multiprocessing`.
+"""
+
+import ctypes
+import json
+import math
+import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+from .by_value import Pickled, without_addresses
+from .faults import RunFailed, TransientReason, is_transient
+
+__all__ = ["Answer", "Worker", "WorkerDied", "describe_exit", "last_lines", "serve"]
+
+_BOOT = (
+    "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
+    "from fe_likelihoods.simulation.worker import serve; serve(*settings)"
+)
+_PR_SET_PDEATHSIG = 1
+_CHECK = 0.5  # [s] between two looks at the process while its answer is waited for
+
+
+class WorkerDied(RunFailed):
+    """The process of a worker has ended before it answered."""
+
+
+class _Starter:
+    """Starts processes in one thread that lasts: Linux kills a process when the thread that started it ends."""
+
+    def __init__(self) -> None:
+        self._requests: SimpleQueue = SimpleQueue()
+        self._owner, self._lock = 0, threading.Lock()
+
+    def start(self, command: list[str], **options: Any) -> subprocess.Popen:
+        with self._lock:
+            if self._owner != os.getpid():
+                self._requests, self._owner = SimpleQueue(), os.getpid()
+                threading.Thread(target=_start_all, args=(self._requests,), name="starts workers", daemon=True).start()
+        future: Future = Future()
+        self._requests.put((future, command, options))
+        return future.result()
+
+    def forget_lock(self) -> None:
+        """In a forked process: another thread of the parent may have held the lock."""
+        self._lock = threading.Lock()
+
+
+def _start_all(requests: SimpleQueue) -> None:
+    while True:
+        future, command, options = requests.get()
+        try:
+            future.set_result(subprocess.Popen(command, **options))
+        except BaseException as error:
+            future.set_exception(error)
+        del future, options
+
+
+_STARTER = _Starter()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_STARTER.forget_lock)
+
+
+class Worker:
+    """A process that calls a function. Its methods may be called from one thread, apart from `kill`.
+
+    It is killed by `kill`, when this object is garbage-collected, or when this process ends.
+
+    Parameters
+    ----------
+    environment : mapping, optional
+        Environment variables in addition to those of this process.
+    memory_limit : int
+        Limit of the address space of the process [bytes], beyond which its allocations fail; 0 for no limit.
+    output : open file, optional
+        Receives standard output and standard error, which are otherwise those of this process.
+
+    Attributes
+    ----------
+    key : bytes
+        Of the function that was loaded last (`Pickled`).
+    calls : int
+        Number of items that were sent.
+    """
+
+    def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
+        self._connection, theirs = Pipe()
+        with theirs:
+            texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
+            settings = json.dumps([*texts, theirs.fileno(), memory_limit, os.getpid()])
+            self._process = _STARTER.start(
+                [sys.executable, "-c", _BOOT, settings],
+                env={**os.environ, **(environment or {})},
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
+        readable = select.poll()  # kept, since Connection.poll makes one for each call
+        readable.register(self._connection, select.POLLIN)
+        self._poll = readable.poll
+        self.key, self.calls, self._owner = b"", 0, os.getpid()
+        self._end = weakref.finalize(self, _kill, self._process, os.getpid())
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs and is a child of this process (not of the one this was forked from)."""
+        return self._owner == os.getpid() and not _ended(self._process)
+
+    def load(self, function: Pickled, seconds: float | None = None) -> None:
+        """Send the function to call, unless it is loaded, and wait until it is.
+
+        Raises
+        ------
+        WorkerDied
+            If the process dies meanwhile, or does not answer within a time.
+        ValueError
+            If the process cannot load it.
+        """
+        if function.key == self.key:
+            return
+        self._send(b"l" + pickle.dumps(function, protocol=5))
+        answer = self.receive(seconds)
+        if answer is None:
+            raise WorkerDied(TransientReason(f"the worker process did not start within {seconds:g} s"))
+        if answer.error is not None:
+            raise answer.error
+        self.key = function.key
+
+    def send(self, item: Any) -> None:
+        """Send an item; its answer is then received."""
+        self._send(b"c" + pickle.dumps(item, protocol=5))
+        self.calls += 1
+
+    def receive(self, seconds: float | None = None) -> "Answer | None":
+        """The answer, None if there is none within a time; WorkerDied if the process has died."""
+        stop = math.inf if seconds is None else time.monotonic() + seconds
+        try:
+            while not self._poll(1000.0 * min(_CHECK, max(0.0, stop - time.monotonic()))):
+                # a program that the function has started may hold the connection open
+                if _ended(self._process) and not self._poll(0):
+                    raise EOFError
+                if time.monotonic() >= stop:
+                    return None
+            return Answer(*pickle.loads(self._connection.recv_bytes()))
+        except (EOFError, OSError):
+            give_up = time.monotonic() + 5.0
+            while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
+                time.sleep(0.001)
+            raise WorkerDied(TransientReason(describe_exit(self.kill(), "the worker process"))) from None
+
+    def _send(self, message: bytes) -> None:
+        with suppress(OSError):  # `receive` reports that the process has died
+            self._connection.send_bytes(message)
+
+    def kill(self) -> int:
+        """Kill the process and its session; returns its exit code, as in `subprocess`."""
+        self._end()
+        return self._process.wait()
+
+
+class Answer(NamedTuple):
+    """Answer of a worker: the result of the function, or the exception that it has raised."""
+
+    value: Any
+    error: Exception | None
+
+
+def _ended(process: subprocess.Popen) -> bool:
+    """Whether a process has ended; it is not waited for, so that its process id is not used again."""
+    if process.returncode is not None:
+        return True
+    if not hasattr(os, "waitid"):  # macOS before Python 3.13
+        return process.poll() is not None
+    with suppress(ChildProcessError):
+        return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+    return True
+
+
+def _kill(process: subprocess.Popen, owner: int) -> None:
+    """Kill a process with its session, unless the calling process has only a forked copy of its object."""
+    if owner == os.getpid():
+        if process.returncode is None or not hasattr(os, "waitid"):
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def describe_exit(exit_code: int, who: str) -> str:
+    """Description of an exit code, such as "the worker process died (signal 11)"."""
+    return f"{who} died (signal {-exit_code})" if exit_code < 0 else f"{who} ended with exit code {exit_code}"
+
+
+def last_lines(file: Any, most: int) -> str:
+    """The last non-empty lines of an open file, at most `most` lines and 300 characters."""
+    size = os.fstat(file.fileno()).st_size
+    data = os.pread(file.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
+    lines = [line.strip() for line in data.splitlines() if line.strip()]
+    return " / ".join(lines[-most:])[-300:]
+
+
+# in the worker ------------------------------------------------------------------------------------------------------
+
+
+def serve(fileno: int, memory_limit: int, parent: int) -> None:
+    """Main loop of a worker process: answer messages until the connection closes.
+
+    Parameters
+    ----------
+    fileno : int
+        File descriptor of the connection.
+    memory_limit : int
+        As for `Worker`.
+    parent : int
+        Process that has started this one.
+    """
+    _end_with(parent)
+    os.set_inheritable(fileno, False)
+    if memory_limit:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (memory_limit, memory_limit))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
+    function, me = None, os.getpid()
+    with Connection(fileno) as connection:
+        while True:
+            try:
+                message = memoryview(connection.recv_bytes())
+            except (EOFError, OSError):
+                return
+            try:
+                if message[:1] == b"l":
+                    function = None
+                    function = pickle.loads(message[1:]).load()
+                    answer = _packed(None)
+                else:
+                    function.prepare()
+                    answer = _packed(function(pickle.loads(message[1:])))
+            except BaseException as error:
+                answer = _packed(None, error)
+            if os.getpid() != me:  # the function has forked, and its copy has returned as well
+                os._exit(0)
+            connection.send_bytes(answer)
+
+
+def _end_with(parent: int) -> None:
+    """Let this process end when another one ends."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it has ended before
+            os._exit(1)
+        return
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _packed(value: Any, error: BaseException | None = None) -> bytes:
+    """Pickled `Answer`; what cannot be pickled is replaced by an exception with its message, or that of the error."""
+    try:
+        data = pickle.dumps((value, error), protocol=5)
+        if error is not None:
+            pickle.loads(data)  # exceptions with constructors of their own can often be pickled but not unpickled
+        if error is None or isinstance(error, Exception):
+            return data  # but SystemExit and KeyboardInterrupt of the function must not end the parent
+    except Exception as failure:
+        error = error or failure
+    text = without_addresses(f"{type(error).__name__}: {error}")
+    return pickle.dumps((None, RunFailed(TransientReason(text) if is_transient(error) else text)), protocol=5)

@@ -1,0 +1,241 @@
+"""Workers compute with the code and the values of the process that sends them, whatever its files say."""
+
+import subprocess
+import sys
+import threading
+import types
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import FunctionModel
+from fe_likelihoods.simulation import by_value
+from fe_likelihoods.simulation.by_value import NotSent, Pickled
+from fe_likelihoods.simulation.executors import LocalPool, as_executor
+from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.model import simulate_batch
+from fe_likelihoods.simulation.sandbox import Sandbox
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line
+
+LAW = """
+import functools
+import threading
+import numpy as np
+from numpy import sqrt
+K = 2.0
+LOCK = threading.Lock()
+NUMBERS = (number for number in (1, 2))
+def get():
+    return K
+class Spring:
+    stiffness = property(lambda self: K)
+    make = staticmethod(lambda: Spring())
+    lock = threading.RLock()
+    def force(self, x):
+        return K * x
+def direct(x):
+    return K * x
+def through_a_class(x):
+    return Spring.make().force(x) / Spring().stiffness * K
+def with_a_lock(x):
+    with LOCK, Spring.lock:
+        return K * x
+def counts(x):
+    global K
+    K = K + 1.0
+    import law
+    return law.K * x
+@functools.cache
+def cached(x):
+    return K * x
+class Cached:
+    @functools.lru_cache(maxsize=3)
+    def force(self, x):
+        return K * x
+class Named:
+    def __reduce__(self):
+        return "ufunc"
+    def __call__(self, x):
+        return K * x
+ufunc = Named()
+def through_a_cache(x):
+    return cached(x) + Cached().force(x) - K * x
+def through_a_ufunc(x):
+    return ufunc(x)
+def through_numpy(x):
+    return float(sqrt(K * x))
+def unsent(x):
+    return next(NUMBERS)
+def unsent_elsewhere(x):
+    for number in NUMBERS:
+        return number
+"""
+USER = """
+import law, pack.deep
+from law import direct
+def by_module(x):
+    return law.K * x
+def by_name(x):
+    return direct(x)
+def late(x):
+    from law import K
+    return K * x
+def late_module(x):
+    import law as there
+    return there.get() * x
+def deep(x):
+    return pack.deep.twice(x)
+def late_relative(x):
+    return pack.late(x)
+"""
+FUNCTIONS = ("by_module", "by_name", "late", "late_module", "deep", "late_relative")
+
+
+@pytest.fixture
+def user(tmp_path, monkeypatch):
+    """Modules of a user, whose values have been changed after they were imported."""
+    (tmp_path / "law.py").write_text(LAW)
+    (tmp_path / "user.py").write_text(USER)
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("def late(x):\n    from .deep import twice\n    return twice(x)\n")
+    (tmp_path / "pack" / "deep.py").write_text("import law\ndef twice(x):\n    return law.get() * x\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    names = ("law", "user", "pack", "pack.deep")
+    import user as module
+
+    module.law.K = 3.0
+    yield module
+    for name in names:
+        sys.modules.pop(name, None)
+        by_value._of_user.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with LocalPool(1) as pool:
+        yield pool
+
+
+def results(user, pool):
+    return {name: pool.map(getattr(user, name), [1.0, 2.0]) for name in FUNCTIONS}
+
+
+def test_a_worker_has_the_values_of_the_parent_also_after_they_change(user, pool):
+    """The functions are sent again when anything that they use has changed."""
+    for k in (3.0, 4.0, 3.0):
+        user.law.K = k
+        assert results(user, pool) == dict.fromkeys(FUNCTIONS, [k, 2.0 * k])
+        assert pool.map(user.law.through_a_class, [1.0]) == [k]
+        assert [pool.submit(user.late, 1.0).result(), pool.submit(user.deep, 1.0).result()] == [k, k]
+    user.law.get = lambda: 10.0  # another function of the same name
+    assert pool.map(user.late_module, [1.0]) == [10.0]
+
+
+@pytest.mark.parametrize("start", ["spawn", "fork"])
+def test_the_same_in_processes_of_other_pools(start, user, pool):
+    with ProcessPoolExecutor(1, mp_context=get_context(start)) as executor, get_context(start).Pool(1) as processes:
+        for other in (as_executor(executor), as_executor(processes)):
+            for k in (3.0, 4.0, 3.0):  # the workers keep several functions
+                user.law.K = k
+                assert results(user, other) == dict.fromkeys(FUNCTIONS, [k, 2.0 * k])
+                assert other.map(user.law.through_a_class, [1.0]) == [k]
+
+
+def test_the_same_in_an_isolated_process(user):
+    sandbox = Sandbox(user.late_module)
+    user.law.K = 5.0
+    assert sandbox(1.0) == 5.0
+    user.law.K = 6.0
+    assert sandbox(1.0) == 6.0
+    sandbox.close()
+
+
+def test_a_module_is_one_namespace_in_the_worker(user, pool):
+    assert pool.map(user.law.counts, [1.0, 1.0]) == [4.0, 5.0]
+    assert user.law.K == 3.0
+
+
+def test_locks_are_new_and_other_values_that_cannot_be_sent_end_the_run_where_they_are_used(user, pool):
+    assert pool.map(user.law.with_a_lock, [1.0]) == [3.0]
+    for function in (user.law.unsent_elsewhere, user.law.unsent):
+        with pytest.raises(ChangedModel, match="uses the value 'NUMBERS' of its module, which cannot be sent"):
+            pool.map(function, [1.0])
+    model = FunctionModel(user.law.unsent, ("a",), CHANNELS, DT, N_STEPS, version="1")
+    with pytest.raises(ChangedModel, match="NUMBERS"):
+        simulate_batch(model, np.ones((1, 1)), pool)
+
+
+@pytest.mark.parametrize("use", [lambda v: v(1), lambda v: v[0], lambda v: v + 1, lambda v: v.name_of, bool, list, len])
+def test_a_value_that_was_not_sent_is_never_used(use):
+    with pytest.raises(ChangedModel, match="uses the value 'SOLVER'"):
+        use(NotSent("SOLVER", "TypeError"))
+
+
+def test_lambdas_closures_and_arrays_are_sent(pool):
+    table, factor = np.arange(5.0), 2.0
+    assert pool.map(lambda i: factor * table[i], [1, 2]) == [2.0, 4.0]
+    table[1] = 7.0
+    assert pool.map(lambda i: factor * table[i], [1, 2]) == [14.0, 4.0]
+
+    def recursive(n):
+        return n * recursive(n - 1) if n else 1
+
+    assert pool.map(recursive, [5]) == [120]
+
+
+def test_cached_functions_are_sent_and_compiled_objects_end_the_run_where_they_are_used(user, pool):
+    assert pool.map(user.law.through_a_cache, [1.0]) == pool.map(user.law.cached, [1.0]) == [3.0]
+    assert pool.map(user.law.through_numpy, [3.0]) == [3.0]
+    with pytest.raises(ChangedModel, match="uses the value 'ufunc' of its module, .* by its name only"):
+        pool.map(user.law.through_a_ufunc, [1.0])
+
+
+def test_an_unchanged_function_has_the_same_key(user):
+    assert Pickled.of(user.late_module) == Pickled.of(user.late_module)
+
+
+def test_another_version_of_the_library_is_refused(monkeypatch):
+    pickled = Pickled.of(line)
+    monkeypatch.setattr(by_value, "library_digest", lambda: bytes(16))
+    with pytest.raises(ChangedModel, match="another version of fe_likelihoods"):
+        pickled.load()
+
+
+def test_a_file_that_differs_in_the_worker_is_refused(tmp_path, pool):
+    table = tmp_path / "table.txt"
+    table.write_text("1")
+    pickled = Pickled.of(FunctionModel(line, ("a", "b"), CHANNELS, DT, N_STEPS, depends_on=[table]))
+    table.write_text("22")
+    with pytest.raises(ChangedModel, match=r"table\.txt in the worker process differs"):
+        pool.map(_load, [pickled])
+
+
+def _load(pickled):
+    return pickled.load() is not None
+
+
+def test_modules_of_this_process_stay_when_a_function_is_loaded_in_it(user):
+    law = user.law
+    assert Pickled.of(user.by_module).load()(1.0) == 3.0
+    assert sys.modules["law"] is law and law.K == 3.0
+
+
+def test_what_belongs_to_the_user():
+    for module in (sys.modules[__name__], sys.modules["__main__"], types.ModuleType("made_by_hand")):
+        assert by_value.is_of_user(module)
+    for module in (np, pytest, threading, by_value, sys, np.random.mtrand):
+        assert not by_value.is_of_user(module)
+
+
+def test_the_script_is_not_run_again(tmp_path):
+    """Values of the script that the function does not use are not sent, whatever they are."""
+    (tmp_path / "script.py").write_text(
+        "print('runs')\nfrom fe_likelihoods import LocalPool\nunused = (i for i in range(3))\nK = 2\n"
+        "def f(x): return K * x\nK = 3\nwith LocalPool(2) as pool:\n    print(pool.map(f, [1, 2]))\n"
+    )
+    environment = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    run = subprocess.run([sys.executable, tmp_path / "script.py"], env=environment, capture_output=True, text=True)
+    assert run.stdout.split("\n")[:2] == ["runs", "[3, 6]"], run.stderr
