@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..cache.simulation_cache import SimulationCache
 from ..probability.distributions import Distribution, HalfNormal, Uniform
 from ..probability.likelihood import FELikelihood
 from ..probability.noise import SharedGaussianNoise
@@ -17,7 +18,6 @@ from ..probability.parameters import channels_of_deviations
 from ..probability.posterior import Posterior
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
-from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model
 from .data import is_dataset, read_base_motion, read_bundled, read_measured
 from .job import Job

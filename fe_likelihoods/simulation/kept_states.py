@@ -21,10 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .changed_model import SentModel
-from .code_digest import describe_code
 from .faults import ChangedModel, reason_of
+from .label import LIBRARY, items_of
 from .model import Model, SimulationBatch, SimulationFailed, first_part, not_finite, real_response, simulate_batch
-from .source_digest import LIBRARY
 from .threads import run_on_threads
 
 __all__ = ["KEPT_STATES", "StateMemory", "simulate_last_part"]
@@ -173,7 +172,8 @@ def _identity(model: Model) -> str:
     cls = type(model)
     if cls.__module__.split(".")[0] == LIBRARY:
         return model.fingerprint
-    return f"{model.fingerprint} {describe_code([cls], strict=False, user=cls).steady}"
+    items = items_of({"class": cls})
+    return f"{model.fingerprint} {items['class']} {sorted(items.items())}"
 
 
 def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> list[_Start]:

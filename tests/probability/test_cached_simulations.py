@@ -17,7 +17,7 @@ from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
 
 RECORD = Record("pulse", 0.01, np.sin(np.arange(40) / 3))

@@ -20,7 +20,7 @@ from fe_likelihoods.probability.residuals import effective_samples, lag_one_sums
 from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))

@@ -24,7 +24,7 @@ from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import cache_rows, source_digest
-from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
 
 SINE = np.sin(np.arange(50.0))
@@ -548,7 +548,7 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
 
 def test_the_key_is_the_same_in_another_process():
     code = (
-        "import numpy as np; from fe_likelihoods.simulation.cache_rows import simulation_keys; "
+        "import numpy as np; from fe_likelihoods.cache.rows import simulation_keys; "
         "print(b''.join(simulation_keys('any', np.array([[1.5, -0.0], [2.0, np.pi]]))).hex())"
     )
     root = Path(__file__).resolve().parents[2]

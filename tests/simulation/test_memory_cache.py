@@ -18,7 +18,7 @@ from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.memory_cache import MemoryCache
+from fe_likelihoods.cache.memory import MemoryCache
 from fe_likelihoods.simulation.model import SimulationFailed
 
 

@@ -21,7 +21,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.probability.residuals import lag_one_sums
 from fe_likelihoods.simulation import source_digest
-from fe_likelihoods.simulation.cache_rows import simulation_keys
+from fe_likelihoods.cache.rows import simulation_keys
 from fe_likelihoods.simulation.code_digest import code_digest
 from fe_likelihoods.simulation.fingerprint import simulation_fingerprint
 from fe_likelihoods.simulation.source_digest import imported_files

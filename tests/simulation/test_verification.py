@@ -13,8 +13,8 @@ from fe_likelihoods import AutoregressiveNoise, FELikelihood, LinearOscillator, 
 from fe_likelihoods.simulation import verification, verification_schedule
 from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
 from fe_likelihoods.simulation.model import SimulationFailed
-from fe_likelihoods.simulation.tolerance import largest_difference, response_tolerance
-from fe_likelihoods.simulation.verification import StaleCache
+from fe_likelihoods.cache.tolerance import largest_difference, response_tolerance
+from fe_likelihoods.cache.verification import StaleCache
 from samplers import SMCSampler
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
