@@ -18,14 +18,14 @@ from ..simulation.label import ModelLabel
 from ..simulation.model import Model, misfit_batch
 from .tolerance import VerifyingRun, agree, response_tolerance
 
-__all__ = ["ModelGuard"]
+__all__ = ["EarlierPoint", "ModelGuard"]
 
 _SHARE_OF_TIME = 0.01  # for comparisons
 _NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
 _ROWS_PER_REPETITION = 100  # simulations between two repetitions because of values that have changed before
 
 
-class _Point(NamedTuple):
+class EarlierPoint(NamedTuple):
     """A simulation that may be run again."""
 
     theta: np.ndarray
@@ -45,6 +45,8 @@ class ModelGuard:
     ----------
     known : ModelLabel
         What the model is compared with.
+    points : list of EarlierPoint
+        The first and the latest successful simulation.
     unchecked : list of (n, n_structural) ndarray
         Parameters of the simulations since the last comparison.
     compared : int
@@ -57,14 +59,14 @@ class ModelGuard:
         self._fingerprint = model.fingerprint
         self.known = copy.copy(label)  # because the label of stored rows never changes
         self._changing: set[str] = set()  # items that have changed without an effect
-        self._points: list[_Point] = []
+        self.points: list[EarlierPoint] = []
         self.unchecked: list[np.ndarray] = []
         self.compared, self.seconds = 0, 0.0
         self._rows_since = 0  # the last repetition
         self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
 
     def __getstate__(self) -> dict:
-        return self.__dict__ | {"unchecked": [], "_points": [], "_not_before": -np.inf}
+        return self.__dict__ | {"unchecked": [], "points": [], "_not_before": -np.inf}
 
     def before(self, run: VerifyingRun) -> None:
         """Compare before simulations, unless the last comparison was too short ago.
@@ -122,8 +124,8 @@ class ModelGuard:
         if due:
             self._require_same(run, simulated_here=here)
         succeeded = [row for row, reason in enumerate(reasons) if not reason]
-        for row in succeeded[:1] + succeeded[-1:] if not self.unchecked or not self._points else []:
-            self._points[1:] = [_Point(thetas[row].copy(), misfit[row].copy())]
+        for row in succeeded[:1] + succeeded[-1:] if not self.unchecked or not self.points else []:
+            self.points[1:] = [EarlierPoint(thetas[row].copy(), misfit[row].copy())]
         return due
 
     def _require_same(self, run: VerifyingRun, simulated_here: bool = False) -> None:
@@ -136,17 +138,20 @@ class ModelGuard:
             self.unchecked.clear()
             return
         if same_fingerprint:
-            if not self._points and simulated_here:  # the first simulation has changed what it uses
+            if not self.points and simulated_here:  # the first simulation has changed what it uses
                 self._accept(run.model, changed)
                 return
             if changed <= self._changing and self._rows_since < _ROWS_PER_REPETITION:
                 return
-            if not self._points or self._repeat(run):
+            if self.points and self._repeat(run):
                 self._accept(run.model, changed)
                 return
-        why = f"{', '.join(sorted(changed)[:3])} differs" if same_fingerprint else "its fingerprint differs"
+        why = "its fingerprint differs"
+        if same_fingerprint:
+            why = f"different: {', '.join(sorted(changed)[:3])}"
+            why += ", and an earlier simulation gives another result" if self.points else ""
         raise ChangedModel(
-            f"the {type(run.model).__name__} has changed since the likelihood was made ({why}, and so do its results): "
+            f"the {type(run.model).__name__} has changed since the likelihood was made ({why}): "
             "a value or file that it uses was changed, or another model was set. Its simulations cannot be stored with "
             "the earlier ones. Make a new model and a new likelihood; what varies during a run has to be a parameter"
         )
@@ -160,7 +165,7 @@ class ModelGuard:
     def _repeat(self, run: VerifyingRun) -> bool:
         """Whether the first and the latest simulation give the earlier results, or the model is not repeatable."""
         start = time.perf_counter()
-        thetas = np.array([point.theta for point in self._points])
+        thetas = np.array([point.theta for point in self.points])
 
         def same(earlier: list[np.ndarray]) -> tuple[bool, list[np.ndarray]]:
             misfit, reasons = misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic)
@@ -171,7 +176,7 @@ class ModelGuard:
                 for one, other, reason in zip(earlier, misfit, reasons, strict=True)
             ), list(misfit)
 
-        agrees, new = same([point.misfit for point in self._points])
+        agrees, new = same([point.misfit for point in self.points])
         agrees = agrees or not same(new)[0]
         self.seconds += time.perf_counter() - start
         return agrees

@@ -245,7 +245,7 @@ class SimulationCache:
     # simulations --------------------------------------------------------------------------------------------------
 
     def look_up(
-        self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int, generation: int = 1
+        self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int, generation: int | None = None
     ) -> CachedRows:
         """Look up simulations, with few queries for the whole batch.
 
@@ -258,13 +258,13 @@ class SimulationCache:
         n_channels, n_steps : int
             Shape of the measurements; rows of another shape count as damaged.
         generation : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
 
         Returns
         -------
         CachedRows
         """
-        keys = simulation_keys(fingerprint, thetas, generation)
+        keys = simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
         misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
         with self.file.lock:
             found, bad = {}, []
@@ -293,7 +293,7 @@ class SimulationCache:
         misfit: np.ndarray,
         reasons: Sequence[str],
         seconds: float,
-        generation: int = 1,
+        generation: int | None = None,
         label: int = 0,
     ) -> None:
         """Store simulations in one transaction that also evicts; failed ones unless the reason is a `TransientReason`.
@@ -313,8 +313,9 @@ class SimulationCache:
         seconds : float
             Wall time of all simulations together [s].
         generation, label : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
         """
+        generation = self._given_or_latest(fingerprint, generation)
         keys, source = simulation_keys(fingerprint, thetas, generation), source_number(fingerprint)
         rows = [
             pack_row(key, source, theta, sums, n_steps, reason, seconds / len(keys), generation, label)
@@ -324,7 +325,7 @@ class SimulationCache:
         self._write(STORE, rows)
 
     def store_responses(
-        self, model: Model, thetas: np.ndarray, responses: np.ndarray, generation: int = 1, label: int = 0
+        self, model: Model, thetas: np.ndarray, responses: np.ndarray, generation: int | None = None, label: int = 0
     ) -> None:
         """Store responses in double precision, in one transaction that also evicts.
 
@@ -337,9 +338,10 @@ class SimulationCache:
         responses : (n, n_channels, n_steps) float
             [SI]. Responses that are not finite are not stored.
         generation, label : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
         """
         rows = []
+        generation = self._given_or_latest(model.fingerprint, generation)
         keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
         for key, theta, response in zip(keys, thetas, responses, strict=True):
             if np.isfinite(response).all():
@@ -350,7 +352,9 @@ class SimulationCache:
         if rows:
             self._write(STORE_RESPONSE, rows)
 
-    def look_up_responses(self, model: Model, thetas: np.ndarray, generation: int = 1) -> list[np.ndarray | None]:
+    def look_up_responses(
+        self, model: Model, thetas: np.ndarray, generation: int | None = None
+    ) -> list[np.ndarray | None]:
         """Look up responses of a model.
 
         Parameters
@@ -359,7 +363,7 @@ class SimulationCache:
         thetas : (n, n_structural) float
             Structural parameters.
         generation : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
 
         Returns
         -------
@@ -368,7 +372,7 @@ class SimulationCache:
         """
         shape = len(model.channels), model.n_steps
         size = 8 * shape[0] * shape[1]
-        keys = simulation_keys(model.fingerprint, thetas, generation)
+        keys = simulation_keys(model.fingerprint, thetas, self._given_or_latest(model.fingerprint, generation))
         query = "key, crc, response FROM responses"
         found, bad = {}, []
         with self.file.lock:
@@ -380,7 +384,7 @@ class SimulationCache:
             self._drop("responses", bad)
         return [found.get(key) for key in keys]
 
-    def are_stored(self, fingerprints: Sequence[str], thetas: np.ndarray, generation: int = 1) -> np.ndarray:
+    def are_stored(self, fingerprints: Sequence[str], thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
         """Whether a simulation, a response or a failure is stored, under one of several fingerprints.
 
         Parameters
@@ -390,7 +394,7 @@ class SimulationCache:
         thetas : (n, n_structural) float
             Structural parameters.
         generation : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
 
         Returns
         -------
@@ -399,7 +403,7 @@ class SimulationCache:
         """
         tables, stored = ("simulations", "responses", "failures"), np.zeros(len(thetas), dtype=bool)
         for fingerprint in fingerprints:
-            keys = simulation_keys(fingerprint, thetas, generation)
+            keys = simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
 
             def find(connection: sqlite3.Connection, keys: list[bytes] = keys) -> set:
                 return {row for table in tables for (row,) in select_rows(connection, keys, f"key FROM {table}")}
@@ -410,7 +414,9 @@ class SimulationCache:
 
     # failures and remarks --------------------------------------------------------------------------------------------
 
-    def store_failures(self, model: Model, thetas: np.ndarray, reasons: Sequence[str], generation: int = 1) -> None:
+    def store_failures(
+        self, model: Model, thetas: np.ndarray, reasons: Sequence[str], generation: int | None = None
+    ) -> None:
         """Store failures of a model for any measurements, and simulations that were stopped at a time limit.
 
         Parameters
@@ -422,14 +428,15 @@ class SimulationCache:
             Reasons of failures; empty where the simulation succeeded. A `MisfitReason` is not stored, nor is a
             `TransientReason` without a time limit.
         generation : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
         """
+        generation = self._given_or_latest(model.fingerprint, generation)
         keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
         rows = [pack_failure(key, source, reason) for key, reason in zip(keys, reasons, strict=True)]
         if any(rows):
             self._write(STORE_FAILURE, [row for row in rows if row is not None])
 
-    def look_up_failures(self, model: Model, thetas: np.ndarray, generation: int = 1) -> list[str]:
+    def look_up_failures(self, model: Model, thetas: np.ndarray, generation: int | None = None) -> list[str]:
         """Look up failures of a model that are answers for any measurements.
 
         Parameters
@@ -439,7 +446,7 @@ class SimulationCache:
         thetas : (n, n_structural) float
             Structural parameters.
         generation : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
 
         Returns
         -------
@@ -449,7 +456,7 @@ class SimulationCache:
         if self.retry_failures:
             return [""] * len(thetas)
         limit = getattr(model, "time_limit", None) or np.inf
-        keys = simulation_keys(model.fingerprint, thetas, generation)
+        keys = simulation_keys(model.fingerprint, thetas, self._given_or_latest(model.fingerprint, generation))
         query = "key, source, reason, time_limit, crc, stops FROM failures"
         found, bad = {}, []
         with self.file.lock:
@@ -518,15 +525,17 @@ class SimulationCache:
         with self.file.lock:
             return self._try("written", add, label) if self.file.writable else label
 
-    def generations_of(self, fingerprint: str) -> list[int]:
+    def generations_of(self, fingerprint: str, table: str = "simulations") -> list[int]:
         """Generations of the simulations, or of the responses, of one identity, the latest first."""
         source = source_number(fingerprint)
-        found: dict[int, None] = {}
-        for table in ("simulations", "responses"):
-            query = f"SELECT generation FROM {table} WHERE source = ? GROUP BY generation ORDER BY max(id) DESC"
-            rows = self._try("read", lambda connection, q=query: connection.execute(q, (source,)).fetchall(), [])
-            found |= dict.fromkeys(generation for (generation,) in rows)
-        return list(found)
+        query = f"SELECT generation FROM {table} WHERE source = ? GROUP BY generation ORDER BY max(id) DESC"
+        rows = self._try("read", lambda connection: connection.execute(query, (source,)).fetchall(), [])
+        return [generation for (generation,) in rows]
+
+    def _given_or_latest(self, fingerprint: str, generation: int | None) -> int:
+        if generation is not None:
+            return generation
+        return (self.generations_of(fingerprint) or self.generations_of(fingerprint, "responses") or [1])[0]
 
     def stored_rows(
         self, fingerprint: str | int, generation: int, n_channels: int, n_steps: int, most: int = MAX_CANDIDATES
@@ -771,7 +780,7 @@ class SimulationCache:
             self._waiting = [row for row in self._waiting if (row[1],) not in sources]
             return self._insist(delete)
 
-    def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int = 1) -> None:
+    def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int | None = None) -> None:
         """Delete the rows of some simulations, if possible.
 
         Parameters
@@ -781,9 +790,13 @@ class SimulationCache:
         *fingerprints : str
             As for `look_up`.
         generation : int
-            See `StoredLabel`.
+            See `StoredLabel`; by default the latest.
         """
-        keys = [(key,) for fingerprint in fingerprints for key in simulation_keys(fingerprint, thetas, generation)]
+        keys = [
+            (key,)
+            for fingerprint in fingerprints
+            for key in simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
+        ]
 
         def delete(connection: sqlite3.Connection) -> None:
             connection.execute("BEGIN IMMEDIATE")

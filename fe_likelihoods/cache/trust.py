@@ -61,7 +61,7 @@ class Trust:
         self.failed_attempts = 0
         self.pause_ends, self.rows_in_pause = -np.inf, 0
         self.stale: tuple[str, Any] | None = None  # fingerprint of the row that differed, and the error
-        self.simulated: dict[tuple[str, bytes], StoredSimulation] = {}  # for comparisons, until a generation is found
+        self.simulated: dict[tuple, StoredSimulation] = {}  # of the comparison that goes on
         self._lock, self._owner = threading.RLock(), os.getpid()
         self.made_for: tuple = ()  # the model and pool, so that their ids are not reused
 
@@ -81,11 +81,16 @@ class Trust:
         """Name of the processor; empty if simulations run on other machines."""
         return cpu_name() if self.is_local else ""
 
-    def find(self, cache: SimulationCache, model: Model) -> StoredLabel | None:
-        """The label as it is in the file; None if it is unknown there, or not complete."""
-        if self.stored is None and self.label.complete:
-            text = self.label.text
+    def find(self, cache: SimulationCache, model: Model, incomplete: bool = False) -> StoredLabel | None:
+        """The label as it is in the file; None if it is unknown there, or not complete.
+
+        With `incomplete`, where no simulation could complete it, the latest label with the same code.
+        """
+        if self.stored is None and (self.label.complete or incomplete):
+            text, code = self.label.text, self.label.code
             known = [stored for stored in cache.labels_of(model) if stored.label == text]
+            if not known and not self.label.complete:
+                known = [stored for stored in cache.labels_of(model) if stored.label.startswith(code)]
             if known:
                 here = [stored for stored in known if stored.cpu == self.cpu]
                 self.stored = here[0] if here else self._add(cache, model, known[-1].generation, known[-1].compared)

@@ -36,7 +36,7 @@ from ..simulation.opened import Observed, Opened, observing
 from ..simulation.residual_statistics import needs_response
 from .coverage import choose_rows
 from .rows import OF_EARLIER_RELEASES, CachedRows, StoredLabel, StoredSimulation, simulation_keys
-from .simulation_cache import SimulationCache, rows_to_compare
+from .simulation_cache import MAX_CANDIDATES, SimulationCache, rows_to_compare
 from .tolerance import DEFAULT_TOLERANCE, VerifyingRun, largest_difference, response_tolerance
 from .trust import OWN, shared_trust
 
@@ -48,6 +48,7 @@ FIRST_ROWS = 2  # verified before the first row is used, where the label is know
 ROWS_PER_VERIFICATION = 1000
 FIRST_COMPARED = 3  # of many rows; then four times as many, and so on, because the first difference is enough
 LARGEST_ROUNDING = 1e-4  # relative difference of responses that may come from rounding and iterations
+LATEST = 100  # rows among which the latest success is looked for
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
@@ -163,6 +164,7 @@ class VerifiedCache:
         while True:
             generation = self._generation(fingerprint, run)
             if generation is None:
+                self.cache.misses += len(thetas)
                 shape = len(thetas), run.n_numbers
                 return CachedRows(np.full(shape, np.nan), [""] * len(thetas), np.zeros(len(thetas), bool))
             rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps, generation)
@@ -182,7 +184,7 @@ class VerifiedCache:
         latest = None
         if first or not succeeded:
             n_steps = measured_values(run.measured).shape[1]
-            stored = self.cache.stored_rows(fingerprint, generation, run.n_numbers, n_steps, most=100)
+            stored = self.cache.stored_rows(fingerprint, generation, run.n_numbers, n_steps, LATEST)
             others = (row for row in stored if not row.reason)
             latest = next(others, None)
             if latest is not None and not self._of_others(fingerprint, latest.theta[None], [0], generation):
@@ -194,7 +196,7 @@ class VerifiedCache:
             if latest is not None:
                 yield latest
             for some in (succeeded, failed):
-                for row in self._random.sample(some, len(some)):
+                for row in self._in_random_order(thetas, some):
                     if latest is None or not np.array_equal(latest.theta, thetas[row]):
                         yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row], -1)
 
@@ -219,7 +221,7 @@ class VerifiedCache:
             known = self._of_others(fingerprint, thetas, known, generation)
 
             def candidates(known: list = known, responses: list = responses) -> Iterator[StoredSimulation]:
-                for row in self._random.sample(known, len(known)):
+                for row in self._in_random_order(thetas, known):
                     yield _of_response(thetas[row], responses[row], -1, run)
 
             if not known or self._verify_due("responses", fingerprint, len(known), candidates, run):
@@ -323,18 +325,19 @@ class VerifiedCache:
                 if of_responses:
                     points = self.cache.response_points(run.model, generation, most)
                     return [StoredSimulation(theta, None, "", label) for theta, label in points]
-                return self.cache.stored_rows(fingerprint, generation, run.n_numbers, n_steps, most)
+                rows = self.cache.stored_rows(fingerprint, generation, run.n_numbers, n_steps, most)
+                return [row for row in rows if not (row.reason and self.cache.retry_failures)]
 
             found = self._find_generation(fingerprint, run, rows_of)
             if found is not None:
                 self._trust.generations[fingerprint] = found
-                self._trust.simulated.clear()
             return found
 
     def _find_generation(self, fingerprint: str, run: VerifyingRun, rows_of: Callable) -> int | None:
         trust, n = self._trust, rows_to_compare(self.cache.verify)
-        present = self.cache.generations_of(fingerprint)
-        present = [each for each in present if each != OF_EARLIER_RELEASES and rows_of(each, 1)]
+        table = "responses" if fingerprint == run.model.fingerprint else "simulations"
+        present = self.cache.generations_of(fingerprint, table)
+        present = [each for each in present if each != OF_EARLIER_RELEASES and rows_of(each, LATEST)]
         shape = len(run.model.parameter_names), run.n_numbers, measured_values(run.measured).shape[1]
         earlier = self.cache.earlier_sources(*shape) if fingerprint != run.model.fingerprint else []
         if not present and not earlier:
@@ -344,14 +347,15 @@ class VerifiedCache:
             return None
         if not trust.label.complete and n:
             self._complete_label(fingerprint, present, earlier, rows_of, run)
-        stored = trust.find(self.cache, run.model)
+        stored = trust.find(self.cache, run.model, incomplete=True)
         if not n:
             if stored is None:
                 trust.adopt(self.cache, run.model, present[0] if present else self._begun(run.model), 0)
             return trust.stored.generation
         if stored is not None:
             if stored.generation in present and stored.compared < n:
-                labels = {each.id for each in self.cache.labels_of(run.model) if each.label == stored.label}
+                same = stored.label, trust.label.code
+                labels = {each.id for each in self.cache.labels_of(run.model) if each.label in same}
                 rows = [row for row in rows_of(stored.generation, n + MAX_ATTEMPTS) if row.label not in labels]
                 left = min(n, len(rows)) - stored.compared
                 if left > 0 and not self._adopts(fingerprint, stored.generation, rows_of, left, run):
@@ -359,7 +363,7 @@ class VerifiedCache:
             if stored.generation not in present and earlier:
                 self._adopt_earlier(fingerprint, earlier, run, n)
             return stored.generation
-        count = min(n, sum(len(rows_of(each, n)) for each in present[:1]) or n)
+        count = min(n, len(rows_of(present[0], MAX_CANDIDATES))) if present else n
         logger.warning(
             "%s: the code, a file, a package or the machine of this %s is not that of its stored simulations; up to %d "
             "of them are simulated again, to see whether they can be used",
@@ -384,14 +388,15 @@ class VerifiedCache:
 
     def _begin(self, fingerprint: str, run: VerifyingRun) -> None:
         """Begin a new generation, with the simulations that have shown that it is needed."""
-        used = set(self.cache.generations_of(fingerprint)) | set(self.cache.generations_of(run.model.fingerprint))
+        used = set(self.cache.generations_of(fingerprint))
+        used |= set(self.cache.generations_of(run.model.fingerprint, "responses"))
         self._trust.begin(self.cache, run.model, used)
         logger.warning(
             "%s: stored simulations of this %s differ from new ones; they stay in the file and are not used",
             self.cache.path,
             type(run.model).__name__,
         )
-        new = [row for (name, _), row in self._trust.simulated.items() if name == fingerprint]
+        new = [row for (name, *_), row in self._trust.simulated.items() if name == fingerprint]
         if new and fingerprint != run.model.fingerprint:
             thetas, misfit = (np.array([row[place] for row in new]) for place in (0, 1))
             self.store(fingerprint, thetas, misfit, [row.reason for row in new], None, 0.0, run)
@@ -401,10 +406,10 @@ class VerifiedCache:
         self, fingerprint: str, present: list[int], earlier: list[int], rows_of: Callable, run: VerifyingRun
     ) -> None:
         """Simulate the latest success again, which completes the label by what it opens."""
-        stored = [row for generation in present[:1] for row in rows_of(generation, 20)]
+        stored = [row for generation in present[:1] for row in rows_of(generation, LATEST)]
         if not stored:
             n_steps = measured_values(run.measured).shape[1]
-            stored = self.cache.stored_rows(earlier[0], OF_EARLIER_RELEASES, run.n_numbers, n_steps, 20)
+            stored = self.cache.stored_rows(earlier[0], OF_EARLIER_RELEASES, run.n_numbers, n_steps, LATEST)
         for row in [row for row in stored if not row.reason][:MAX_ATTEMPTS]:
             self._simulate_again(fingerprint, [row], run)
             if self._trust.label.complete:
@@ -430,7 +435,7 @@ class VerifiedCache:
 
     def _adopts(self, fingerprint: str, generation: int, rows_of: Callable, n: int, run: VerifyingRun) -> bool | None:
         """Whether rows of a generation agree with new simulations; the label is then one of it. None: cannot tell."""
-        trust, rows = self._trust, rows_of(generation, 5000)
+        trust, rows = self._trust, rows_of(generation, MAX_CANDIDATES)
         chosen = choose_rows(rows, n, self._generator())
         if fingerprint == run.model.fingerprint:
             responses = self.cache.look_up_responses(run.model, np.array([row.theta for row in chosen]), generation)
@@ -456,16 +461,16 @@ class VerifiedCache:
 
     def _compare_many(self, fingerprint: str, rows: list[StoredSimulation], run: VerifyingRun) -> tuple[bool, int]:
         """Whether rows agree with new simulations, as far as these were not stopped, and how many were compared."""
-        size, compared, succeeded = FIRST_COMPARED, 0, 0
+        size, attempts, compared = FIRST_COMPARED, 0, 0
         tolerances = self._tolerances(run)
-        while rows:
+        while rows and not (attempts >= MAX_ATTEMPTS and compared == 0):
             some, rows = rows[:size], rows[size:]
+            attempts += len(some)
             size *= 4
             for row, new in zip(some, self._simulate_again(fingerprint, some, run), strict=True):
                 if _is_transient(new.reason):
                     continue
                 compared += 1
-                succeeded += not row.reason
                 if bool(row.reason) != bool(new.reason):
                     return False, compared
                 tolerance = tolerances.get(row.label, max(tolerances[0], DEFAULT_TOLERANCE))
@@ -478,8 +483,8 @@ class VerifiedCache:
         self, fingerprint: str, rows: list[StoredSimulation], run: VerifyingRun
     ) -> list[StoredSimulation]:
         """New simulations at the points of some rows, those of this search for a generation included."""
-        simulated = self._trust.simulated
-        left = [row.theta for row in rows if (fingerprint, row.theta.tobytes()) not in simulated]
+        simulated, key = self._trust.simulated, (fingerprint, id(run.measured), id(run.statistic))
+        left = [row.theta for row in rows if (*key, row.theta.tobytes()) not in simulated]
         if left:
             thetas, start = np.array(left), time.perf_counter()
             if not self.label.complete:
@@ -489,8 +494,8 @@ class VerifiedCache:
                 misfit, reasons = misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic)
             self._count(start, reasons)
             for theta, values, reason in zip(thetas, misfit, reasons, strict=True):
-                simulated[fingerprint, theta.tobytes()] = StoredSimulation(theta, values, reason)
-        return [simulated[fingerprint, row.theta.tobytes()] for row in rows]
+                simulated[(*key, theta.tobytes())] = StoredSimulation(theta, values, reason)
+        return [simulated[(*key, row.theta.tobytes())] for row in rows]
 
     def _label_to_store(self, model: Model) -> StoredLabel | None:
         """The label under which new simulations are stored; None while it is not known which rows agree with them."""
@@ -509,6 +514,12 @@ class VerifiedCache:
         cpu = self._trust.cpu
         found = {each.id: same if each.cpu == cpu != "" else other for each in self.cache.labels_of(run.model)}
         return found | {0: same}
+
+    def _in_random_order(self, thetas: np.ndarray, rows: list[int]) -> list[int]:
+        """Indices in random order, first those that have just been simulated again."""
+        again = {key[-1] for key in self._trust.simulated}
+        shuffled = self._random.sample(rows, len(rows))
+        return sorted(shuffled, key=lambda row: thetas[row].tobytes() not in again) if again else shuffled
 
     def _generator(self) -> np.random.Generator:
         return np.random.default_rng(self._random.getrandbits(64))
@@ -569,6 +580,8 @@ class VerifiedCache:
             except StaleCache as error:
                 trust.stale = fingerprint, error
                 raise
+            finally:
+                trust.simulated.clear()
             if compared is None:
                 return False
             if not compared:
@@ -596,13 +609,10 @@ class VerifiedCache:
             if not chosen:
                 break
             attempts -= len(chosen)
-            thetas, start = np.array([row.theta for row in chosen]), time.perf_counter()
-            misfit, new_reasons = misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic)
-            self._count(start, new_reasons)
-            for row, values, reason in zip(chosen, misfit, new_reasons, strict=True):
-                if _is_transient(reason):
-                    reasons.append(reason)
-                elif self._differs(row, values, reason, fingerprint, run):
+            for row, new in zip(chosen, self._simulate_again(fingerprint, chosen, run), strict=True):
+                if _is_transient(new.reason):
+                    reasons.append(new.reason)
+                elif self._differs(row, new.misfit, new.reason, fingerprint, run):
                     return None
                 else:
                     done += 1
@@ -653,7 +663,8 @@ class VerifiedCache:
         served = self._trust.served.total()
         self._start_again()
         stored = self._trust.stored
-        of_others = {each.id for each in self.cache.labels_of(run.model) if stored and each.label != stored.label}
+        same = () if stored is None else (stored.label, self.label.code)  # the second, before it was completed
+        of_others = {each.id for each in self.cache.labels_of(run.model) if each.label not in same}
         if label in of_others and not scatter:
             # the label was adopted, but the model has changed in a part of the space where no row was compared
             self._begin(fingerprint, run)

@@ -78,6 +78,8 @@ class CachedSimulations(NewSimulations):
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self._own_label = label = ModelLabel(model, statistic)
         self._verified_cache = None if self.cache is None else VerifiedCache(self.cache, model, self.pool, label)
+        if self._verified_cache is not None:
+            self._own_label = label = self._verified_cache.label  # an equal one
         self._guard = ModelGuard(model, label)
         self._key = None if cache is None else self.simulation_key
         self.chunk_size = 1

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cache.guard import ModelGuard
+from ..cache.guard import EarlierPoint, ModelGuard
 from ..cache.memory import MemoryCache, ResponseMemory
 from ..cache.remarks import store_remark_of
 from ..cache.row_buffer import FinishedRows, RowBuffer
@@ -115,6 +115,7 @@ class NewSimulations:
     seconds: float
     _statistic: Statistic | None
     _width: int
+    _n_structural: int
     _response_shape: tuple[int, int]
     _failures: FailureLog
     _guard: ModelGuard
@@ -449,6 +450,15 @@ class NewSimulations:
             else:
                 self._verified_cache.complete(opened, self.model)
 
+    def _label_again(self) -> None:
+        """Label the model as it is now, if it has changed since the likelihood was made and nothing was used yet."""
+        if self._guard.known.changed(self.model):
+            label = ModelLabel(self.model, self._statistic)
+            if self.cache is not None:
+                self._verified_cache = VerifiedCache(self.cache, self.model, self.pool, label)
+                label = self._verified_cache.label
+            self._own_label, self._guard = label, ModelGuard(self.model, label)
+
     def _compare_model(self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float) -> None:
         """Compare the model after simulations, if that is due."""
         stream, last = self._stream, not self._stream.running
@@ -460,6 +470,14 @@ class NewSimulations:
     def _check_model(self, check: Callable, *arguments: Any) -> Any:
         """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
         self._guard.known.complete_with(self._label.opened)
+        if not self._guard.points and check == self._guard.before:
+            if not self._outcomes:
+                self._label_again()
+                check = self._guard.before
+            else:  # only rows of the disk are known
+                known = self.memory_cache.successes(self._n_structural)[:1]
+                statistics, _ = self.memory_cache.look_up([theta.tobytes() for theta in known], self._width)
+                self._guard.points += map(EarlierPoint, known, statistics)
         try:
             return check(self._verifying_run, *arguments)
         except ChangedModel:

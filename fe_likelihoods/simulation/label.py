@@ -62,6 +62,7 @@ _WRAPPERS = (
 _OF_CLASSES = {"__dict__", "__weakref__", "__module__", "__qualname__", "__firstlineno__", "__static_attributes__"}
 _SCRIPTS = ("__main__", "__mp_main__")
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # change without a meaning for simulations
+_opened: dict[str, Opened] = {}  # by code, in this process
 _sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 
 
@@ -86,8 +87,10 @@ class ModelLabel:
     def __init__(self, model: Any, statistic: Any = None) -> None:
         self._statistic = statistic
         self.items = self._present(model)
-        self.opened: Opened | None = None
+        # a module is imported by the first simulation of a process only, so what that opened counts for later labels
+        self.opened: Opened | None = _opened[self.code].read_again() if self.code in _opened else None
         self.complete = not (_has_user_code(model) or (statistic is not None and _defined_by_user(statistic)))
+        self.complete = self.complete or self.opened is not None
 
     @property
     def code(self) -> str:
@@ -102,13 +105,14 @@ class ModelLabel:
 
     @property
     def text(self) -> str:
-        """Digest of the whole label."""
-        return _joined(self.items | ({} if self.opened is None else self.opened.items()))
+        """The whole label: `code`, and a digest of what was opened."""
+        return self.code if self.opened is None else f"{self.code} {_joined(self.opened.items())}"
 
     def complete_with(self, opened: Opened | None) -> None:
         """Add what a simulation of the model opened; only the first time counts."""
         if opened is not None and not self.complete:
             self.opened, self.complete = opened, True
+            _opened[self.code] = opened
 
     def changed(self, model: Any) -> set[str]:
         """Names of the items that differ from what the label says."""
@@ -224,7 +228,7 @@ class _Walk:
         return self._modules.values()
 
     def _digest(self, value: Any) -> str:
-        self._seen, self._hash = {}, blake2b(digest_size=16)
+        self._seen, self._hash = {}, blake2b(digest_size=8)
         try:
             self._add(value)
         except RecursionError:
@@ -252,7 +256,12 @@ class _Walk:
         if id(value) in self._seen or len(self._seen) == MOST_OBJECTS:
             self._text(f"object {self._seen.get(id(value), (0,))[0]}")
             return
-        self._seen[id(value)] = len(self._seen), value
+        if kind not in (
+            tuple,
+            frozenset,
+            types.CodeType,
+        ):  # equal ones may be one object, or several in another process
+            self._seen[id(value)] = len(self._seen), value
         self._text(f"{kind.__module__}.{kind.__qualname__}")
         if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
             self._text(f"{value.dtype.str} {value.shape}")

@@ -196,7 +196,7 @@ def _counts(path: str) -> bool:
     """Whether a file is neither of the system nor of Python or an installed package."""
     if path.startswith(_SYSTEM) or path.endswith((".pyc", "-shm", "-wal")) or "-packages" + os.sep in path:
         return False
-    return not path.startswith(_installed()) and path != os.path.realpath(sys.executable)
+    return not path.startswith(_installed()) and os.path.realpath(path) != os.path.realpath(sys.executable)
 
 
 @functools.cache

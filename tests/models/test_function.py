@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fe_likelihoods.simulation.code_digest import code_digest
 
 from fe_likelihoods import (
     Channel,
@@ -25,7 +26,6 @@ from fe_likelihoods import (
     Record,
     SimulationFailed,
 )
-from fe_likelihoods.simulation.code_digest import code_digest
 from fe_likelihoods.simulation.model import split_seconds
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line, posterior_of, treacherous

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ContinuedResponse, Record, SimulationCache, peak, propagate
+from fe_likelihoods.cache.verification import StaleCache
 from fe_likelihoods.simulation.kept_states import KEPT_STATES
 from fe_likelihoods.simulation.model import SimulationFailed
-from fe_likelihoods.cache.verification import StaleCache
 from tests.prediction.flexible import Flexible
 
 RECORD = Record("base", 0.1, np.sin(np.arange(40.0)))

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.cache.verification import StaleCache
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.distributions import HalfNormal, Uniform
 from fe_likelihoods.probability.failures import TooManyFailures
@@ -22,10 +24,8 @@ from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.faults import ChangedModel
-from fe_likelihoods.cache.verification import StaleCache
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import DiesOnce, Gated, Treacherous, line, posterior_of
 
