@@ -427,8 +427,8 @@ class CacheFile:
             )
         if version not in (SCHEMA_VERSION, *EARLIER) or (version != SCHEMA_VERSION and not self.writable):
             raise ValueError(
-                f"{self.path} is a cache of layout {version}, this release reads {SCHEMA_VERSION} and completes "
-                f"writable files of {EARLIER}; give another path, or remove the file"
+                f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}, and "
+                "completes writable files of earlier ones; give another path, or remove the file"
             )
         # the version was read first, so another process may have completed the file since
         if sorted(layout.values()) != sorted(LAYOUT) and (version == SCHEMA_VERSION or not _is_earlier(layout)):

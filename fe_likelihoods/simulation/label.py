@@ -188,7 +188,8 @@ class _Walk:
         self._packages: set[str] = set()
         self._library: set[str] = set()
         self._words: set[str] = set()
-        self._seen: dict[int, tuple[int, Any]] = {}  # the objects too, so that their ids are not reused
+        self._done: dict[int, tuple[bytes, Any]] = {}
+        self._open: dict[int, int] = {}  # places on the way from the value to what is added now
 
     def items(self, parts: Mapping[str, Any]) -> dict[str, str]:
         """Digests by name."""
@@ -228,7 +229,7 @@ class _Walk:
         return self._modules.values()
 
     def _digest(self, value: Any) -> str:
-        self._seen, self._hash = {}, blake2b(digest_size=8)
+        self._done, self._open, self._hash = {}, {}, blake2b(digest_size=8)
         try:
             self._add(value)
         except RecursionError:
@@ -238,30 +239,33 @@ class _Walk:
     def _text(self, text: str) -> None:
         self._hash.update(text.encode("utf-8", "surrogatepass") + b"\0")
 
-    def _apart(self, value: Any) -> bytes:
-        """Digest of a value in a set, whose order does not count."""
-        outer, self._hash = self._hash, blake2b(digest_size=16)
-        seen, self._seen = self._seen, {}
-        try:
-            self._add(value)
-            return self._hash.digest()
-        finally:
-            self._hash, self._seen = outer, seen
-
     def _add(self, value: Any) -> None:
         kind = type(value)
         if kind in _PLAIN:
             self._text(f"{kind.__name__} {value!r}")
+        elif id(value) in self._open:  # it contains itself
+            self._text(f"the object {len(self._open) - self._open[id(value)]} levels above")
+        elif len(self._done) < MOST_OBJECTS:
+            self._hash.update(self._apart(value))
+
+    def _apart(self, value: Any) -> bytes:
+        """Digest of one value, the same for equal values, whether they are one object or several."""
+        if id(value) not in self._done:
+            outer, self._hash = self._hash, blake2b(digest_size=8)
+            self._open[id(value)] = len(self._open)
+            try:
+                self._add_contents(value)
+                self._done[id(value)] = self._hash.digest(), value  # the object too, so that its id is not reused
+            finally:
+                self._hash = outer
+                del self._open[id(value)]
+        return self._done[id(value)][0]
+
+    def _add_contents(self, value: Any) -> None:
+        kind = type(value)
+        if kind in _PLAIN:
+            self._text(f"{kind.__name__} {value!r}")
             return
-        if id(value) in self._seen or len(self._seen) == MOST_OBJECTS:
-            self._text(f"object {self._seen.get(id(value), (0,))[0]}")
-            return
-        if kind not in (
-            tuple,
-            frozenset,
-            types.CodeType,
-        ):  # equal ones may be one object, or several in another process
-            self._seen[id(value)] = len(self._seen), value
         self._text(f"{kind.__module__}.{kind.__qualname__}")
         if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
             self._text(f"{value.dtype.str} {value.shape}")
@@ -285,9 +289,9 @@ class _Walk:
             self._add_all(value)
         elif kind in (set, frozenset):
             self._text(repr(sorted(map(self._apart, value))))
-        elif isinstance(value, dict):
+        elif isinstance(value, dict | types.MappingProxyType):
             self._add_all([item for pair in value.items() for item in pair])
-            if kind is not dict:
+            if kind not in (dict, types.MappingProxyType):
                 self._add_state(value)
         elif isinstance(value, weakref.ref):
             self._add(value())
@@ -440,7 +444,9 @@ def _is_of_user(module: str, file: str | None, is_loaded: bool) -> bool:
     if not module or top == LIBRARY or top in sys.builtin_module_names:
         return False
     if file is None:  # frozen, a folder of modules, or made by code
-        return is_loaded and top not in sys.stdlib_module_names and not getattr(sys.modules[module], "__path__", None)
+        if top in sys.stdlib_module_names:
+            return False
+        return not is_loaded or not getattr(sys.modules[module], "__path__", None)
     path = Path(file).resolve()
     if {"site-packages", "dist-packages"} & set(path.parts):
         return not _version(top)
