@@ -47,6 +47,8 @@ class ModelGuard:
         What the model is compared with.
     points : list of EarlierPoint
         The first and the latest successful simulation.
+    changing : set of str
+        Items of the label that have changed without an effect.
     unchecked : list of (n, n_structural) ndarray
         Parameters of the simulations since the last comparison.
     compared : int
@@ -58,7 +60,7 @@ class ModelGuard:
     def __init__(self, model: Model, label: ModelLabel) -> None:
         self._fingerprint = model.fingerprint
         self.known = copy.copy(label)  # because the label of stored rows never changes
-        self._changing: set[str] = set()  # items that have changed without an effect
+        self.changing: set[str] = label.changing  # items that have changed without an effect
         self.points: list[EarlierPoint] = []
         self.unchecked: list[np.ndarray] = []
         self.compared, self.seconds = 0, 0.0
@@ -141,7 +143,7 @@ class ModelGuard:
             if not self.points and simulated_here:  # the first simulation has changed what it uses
                 self._accept(run.model, changed)
                 return
-            if changed <= self._changing and self._rows_since < _ROWS_PER_REPETITION:
+            if changed <= self.changing and self._rows_since < _ROWS_PER_REPETITION:
                 return
             if self.points and self._repeat(run):
                 self._accept(run.model, changed)
@@ -157,7 +159,8 @@ class ModelGuard:
         )
 
     def _accept(self, model: Model, changed: set[str]) -> None:
-        self._changing |= changed
+        self.changing |= changed
+        self.known.has_changed_itself(changed)
         self.known.renew(model)
         self._rows_since = 0
         self.unchecked.clear()

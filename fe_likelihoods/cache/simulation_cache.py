@@ -32,53 +32,42 @@ import logging
 import math
 import os
 import sqlite3
-import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..simulation.faults import TransientReason
 from ..simulation.model import Model
+from .generations import Generations
 from .rows import (
     COLUMNS,
     LABEL_COLUMNS,
     MIN_STOPS,
-    OF_EARLIER_RELEASES,
     REMOVE,
     RESPONSE_COLUMNS,
     STORE,
     STORE_FAILURE,
-    STORE_LABEL,
     STORE_RESPONSE,
     CachedRows,
     CacheInfo,
-    StoredLabel,
-    StoredSimulation,
     insert_rows,
     is_undamaged,
-    is_undamaged_label,
     pack_failure,
-    pack_label,
     pack_row,
-    regenerated,
     select_rows,
     simulation_keys,
     source_number,
     unpack_failure,
 )
-from .sqlite_file import CacheFile, is_damage
+from .sqlite_file import CacheFile
 
 __all__ = ["SimulationCache", "rows_to_compare"]
 
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
-RETRY_SECONDS = 60.0  # wait after a failed access to the file
-MAX_CANDIDATES = 5000  # rows among which those to be compared are chosen
-MAX_SOURCES = 8  # of earlier releases that are compared with a model
 CONFIDENCE = 0.95
 STORE_REMARK = "INSERT OR IGNORE INTO remarks (key, source, text) VALUES (?, ?, ?)"
 _KEYED = ("simulations", "responses", "failures", "remarks")
@@ -113,7 +102,7 @@ def rows_to_compare(verify: bool | int | str) -> int:
     )
 
 
-class SimulationCache:
+class SimulationCache(Generations):
     """Cache of the sums of squared residuals of simulations, in one SQLite file.
 
     Any number of threads, processes and programs may use a file at the same time, each process through its own
@@ -207,8 +196,7 @@ class SimulationCache:
         self, path, max_rows, retry_failures, responses, max_response_bytes, timeout, verify, tolerance
     ) -> None:
         """Set all attributes without opening the file."""
-        self.file = CacheFile(path, timeout)
-        self.retry_times: dict[str, float] = {}
+        super().__init__(CacheFile(path, timeout))
         self.max_rows = max_rows
         self.retry_failures = retry_failures
         self.responses = responses
@@ -216,7 +204,6 @@ class SimulationCache:
         self.verify, self.tolerance = verify, tolerance
         self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
         self._waiting: list[tuple] = []
-        self._has_earlier: bool | None = None  # rows of earlier releases, None until it was looked for
         self._warned_read_only = self._said_evicted = False
 
     def __getstate__(self) -> tuple:
@@ -236,11 +223,6 @@ class SimulationCache:
 
     def __repr__(self) -> str:
         return f"SimulationCache({str(self.path)!r})"
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self.file.path
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -485,144 +467,6 @@ class SimulationCache:
         rows = self._try("read", lambda connection: connection.execute(query, (key,)).fetchall(), [])
         return bytes(rows[0][0]).decode("utf-8", "replace") if rows else ""
 
-    # labels and generations ---------------------------------------------------------------------------------------
-
-    def labels_of(self, model: Model) -> list[StoredLabel]:
-        """Labels under which simulations of a model were stored or adopted, those of the latest rows last."""
-        query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
-        source = source_number(model.fingerprint)
-        rows = self._try("read", lambda connection: connection.execute(query, (source,)).fetchall(), [])
-        return [
-            StoredLabel(row[0], row[1], row[2].decode(), row[3].decode(), *row[4:6])
-            for row in rows
-            if is_undamaged_label(*row)
-        ]
-
-    def add_label(self, label: StoredLabel, move: bool = False) -> StoredLabel:
-        """Store a label, unless another process has stored it; return the one that is stored.
-
-        Parameters
-        ----------
-        label : StoredLabel
-        move : bool
-            Replace the generation of a stored one.
-        """
-
-        def add(connection: sqlite3.Connection) -> StoredLabel:
-            connection.execute("BEGIN IMMEDIATE")
-            query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? AND label = ? AND cpu = ?"
-            found = connection.execute(query, (label.source, label.label.encode(), label.cpu.encode())).fetchone()
-            new = label
-            if found is not None and is_undamaged_label(*found):
-                stored = StoredLabel(*found[:2], label.label, label.cpu, *found[4:6])
-                new = label._replace(id=stored.id) if move else stored
-                if not move and label.generation == stored.generation and label.compared > stored.compared:
-                    new = stored._replace(compared=label.compared)
-            connection.execute(STORE_LABEL, pack_label(new))
-            connection.execute("COMMIT")
-            return new
-
-        with self.file.lock:
-            return self._try("written", add, label) if self.file.writable else label
-
-    def generations_of(self, fingerprint: str, table: str = "simulations") -> list[int]:
-        """Generations of the simulations, or of the responses, of one identity, the latest first."""
-        source = source_number(fingerprint)
-        query = f"SELECT generation FROM {table} WHERE source = ? GROUP BY generation ORDER BY max(id) DESC"
-        rows = self._try("read", lambda connection: connection.execute(query, (source,)).fetchall(), [])
-        return [generation for (generation,) in rows]
-
-    def _given_or_latest(self, fingerprint: str, generation: int | None) -> int:
-        if generation is not None:
-            return generation
-        return (self.generations_of(fingerprint) or self.generations_of(fingerprint, "responses") or [1])[0]
-
-    def stored_rows(
-        self, fingerprint: str | int, generation: int, n_channels: int, n_steps: int, most: int = MAX_CANDIDATES
-    ) -> list[StoredSimulation]:
-        """Undamaged simulations of one identity and generation, the latest first, evenly chosen if there are many.
-
-        Parameters
-        ----------
-        fingerprint : str or int
-            As for `look_up`, or the number of a source of an earlier release.
-        generation : int
-        n_channels, n_steps : int
-            Shape of the measurements.
-        most : int
-            Largest number of rows, about.
-        """
-        source = fingerprint if isinstance(fingerprint, int) else source_number(fingerprint)
-
-        def read(connection: sqlite3.Connection) -> list[tuple]:
-            where = "FROM simulations WHERE source = ? AND generation = ?"
-            columns = f"SELECT {COLUMNS} {where}"
-            ((n,),) = connection.execute(f"SELECT count(*) {where}", (source, generation)).fetchall()
-            if n <= most or most == 1:
-                return connection.execute(f"{columns} ORDER BY id DESC LIMIT ?", (source, generation, most)).fetchall()
-            latest = connection.execute(f"{columns} ORDER BY id DESC LIMIT 10", (source, generation)).fetchall()
-            some = f"{columns} AND id % ? = 0 ORDER BY id DESC"
-            return latest + connection.execute(some, (source, generation, n // most + 1)).fetchall()
-
-        rows = self._try("read", read, [])
-        found = {}
-        for row in rows:
-            if is_undamaged(*row) and len(row[3]) == 8 * n_channels and row[4] == n_steps:
-                theta, misfit = (np.frombuffer(data, dtype="<f8") for data in row[2:4])
-                found[row[0]] = StoredSimulation(theta, misfit, row[5].decode("utf-8", "replace"), row[9])
-        return list(found.values())
-
-    def label_of(self, fingerprint: str, theta: np.ndarray, generation: int) -> int:
-        """Id of the label under which a simulation or a response was stored; 0 if it is not known."""
-        (key,) = simulation_keys(fingerprint, theta[None], generation)
-        for table in ("simulations", "responses"):
-            query = f"SELECT label FROM {table} WHERE key = ?"
-            for (label,) in self._try("read", lambda connection, q=query: connection.execute(q, (key,)).fetchall(), []):
-                return label
-        return 0
-
-    def response_points(self, model: Model, generation: int, most: int = MAX_CANDIDATES) -> list[tuple]:
-        """Parameters (n_structural,) and label of stored responses of a model, the latest first."""
-        source = source_number(model.fingerprint)
-        query = "SELECT theta, label FROM responses WHERE source = ? AND generation = ? ORDER BY id DESC LIMIT ?"
-        values = source, generation, most
-        rows = self._try("read", lambda connection: connection.execute(query, values).fetchall(), [])
-        return [(np.frombuffer(theta, dtype="<f8"), label) for theta, label in rows if isinstance(theta, bytes)]
-
-    def earlier_sources(self, n_parameters: int, n_channels: int, n_steps: int) -> list[int]:
-        """Sources of simulations that an earlier release has stored with such shapes, the latest first."""
-        if self._has_earlier is None:
-            query = "SELECT 1 FROM simulations INDEXED BY simulation_generations WHERE generation = ? LIMIT 1"
-            values = (OF_EARLIER_RELEASES,)
-            self._has_earlier = bool(self._try("read", lambda found: found.execute(query, values).fetchall(), []))
-        if not self._has_earlier:
-            return []
-        query = (
-            "SELECT source FROM simulations WHERE generation = ? AND length(theta) = ? AND length(misfit) = ? "
-            "AND n_steps = ? GROUP BY source ORDER BY max(id) DESC LIMIT ?"
-        )
-        values = OF_EARLIER_RELEASES, 8 * n_parameters, 8 * n_channels, n_steps, MAX_SOURCES
-        rows = self._try("read", lambda connection: connection.execute(query, values).fetchall(), [])
-        return [source for (source,) in rows]
-
-    def adopt_earlier(self, source: int, fingerprint: str, generation: int, label: int) -> None:
-        """Make the simulations of an earlier release those of an identity and generation."""
-        update = (
-            "UPDATE OR REPLACE simulations SET key = ?, source = ?, crc = ?, generation = ?, label = ? WHERE key = ?"
-        )
-        query = f"SELECT {COLUMNS} FROM simulations WHERE source = ? AND generation = ?"
-
-        def adopt(connection: sqlite3.Connection) -> None:
-            connection.execute("BEGIN IMMEDIATE")
-            rows = connection.execute(query, (source, OF_EARLIER_RELEASES)).fetchall()
-            good = [regenerated(fingerprint, generation, label, row) for row in rows if is_undamaged(*row)]
-            connection.executemany(update, good)
-            connection.execute("COMMIT")
-
-        with self.file.lock:
-            if self.file.writable:
-                self._try("written", adopt, None)
-
     # the file -----------------------------------------------------------------------------------------------------
 
     def copy(self, path: str | os.PathLike) -> int:
@@ -866,52 +710,6 @@ class SimulationCache:
             return
         delete = f"DELETE FROM {table} WHERE key = ?"
         self._try("repaired", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
-
-    def _try(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
-        """Result of an action on the connection; after an error a warning, `otherwise`, and a pause of this action."""
-        with self.file.lock:
-            if time.monotonic() < self.retry_times.get(what, -np.inf):
-                return otherwise
-            for attempt in range(2):
-                try:
-                    result = action(self.file.connection())
-                    self.retry_times.pop(what, None)
-                    return result
-                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # a damaged size may be huge
-                    self.file.close()  # also ends a transaction
-                    failure = error
-                except BaseException:
-                    self.file.close()
-                    raise
-                if attempt or not self.file.writable or not is_damage(failure):
-                    break
-                try:
-                    self.file.set_aside(str(failure))
-                except (OSError, ValueError) as error:
-                    failure = error
-                    break
-            if what not in self.retry_times:
-                logger.warning(
-                    "%s cannot be %s (%s); the run continues without it and tries again after %g s",
-                    self.path,
-                    what,
-                    failure,
-                    RETRY_SECONDS,
-                )
-            self.retry_times[what] = time.monotonic() + RETRY_SECONDS
-            return otherwise
-
-    def _insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
-        """Result of an action that the user has called explicitly; errors are raised."""
-        with self.file.lock:
-            try:
-                return action(self.file.connection())
-            except (sqlite3.Error, ValueError) as error:
-                self.file.close()
-                raise OSError(f"{self.path} cannot be used: {error}") from error
-            except BaseException:
-                self.file.close()
-                raise
 
 
 def remark_key(source: int) -> bytes:

@@ -80,10 +80,7 @@ class StoredResponses:
         while left:
             rows, left = left[: self._size], left[self._size :]
             start = time.perf_counter()
-            with observing() as observer:
-                batch = simulate_batch(self.model, thetas[rows], self.pool)
-            if self.pool is None and not all(batch.reasons):
-                self._verified.complete(None if self._verified.label.complete else observer.result(), self.model)
+            batch = self._new(thetas[rows])
             seconds = time.perf_counter() - start
             self._store(thetas[rows], batch)
             responses[rows] = batch.response
@@ -97,3 +94,17 @@ class StoredResponses:
         self.simulations += len(thetas)
         run = self._run
         self._verified.store(self.model.fingerprint, thetas, None, batch.reasons, batch.response, 0.0, run)
+
+    def _new(self, thetas: np.ndarray) -> SimulationBatch:
+        """New simulations, the first of which complete the label."""
+        label = self._verified.label
+        if self.pool is not None:
+            return simulate_batch(self.model, thetas, self.pool)
+        try:
+            with observing() as observer:
+                batch = simulate_batch(self.model, thetas)
+        finally:
+            label.has_changed_itself(label.changed(self.model))
+        if not label.complete and not all(batch.reasons):
+            self._verified.complete(observer.result(), self.model)
+        return batch

@@ -34,6 +34,8 @@ from .sample_counts import count_samples
 
 __all__ = ["CachedSimulations"]
 
+_OF_PROCESS = ("_running", "_has_results", "when_simulated")  # not pickled
+
 
 class CachedSimulations(NewSimulations):
     """Base of `FELikelihood`, which documents the attributes: a model's simulations, each of which is run once.
@@ -85,11 +87,11 @@ class CachedSimulations(NewSimulations):
         self.chunk_size = 1
         self.simulations = self.cache_hits = self.disk_hits = 0
         self.seconds = 0.0
-        self._outcomes = 0
+        self._outcomes, self._has_repeated_remark = 0, False
         self.shortened: list[CachedSimulations] = []  # likelihoods of the first parts of the measurements
 
     def __getstate__(self) -> dict:
-        kept = {name: value for name, value in self.__dict__.items() if name not in ("_running", "when_simulated")}
+        kept = {name: value for name, value in self.__dict__.items() if name not in _OF_PROCESS}
         return kept | {"pool": None, "shortened": []}
 
     @property
@@ -454,7 +456,9 @@ class CachedSimulations(NewSimulations):
     def _add_outcomes(self, requested: Requested, rows: np.ndarray) -> None:
         """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
         self._outcomes += len(rows)
-        if len(rows):
+        self._has_results = self._has_results or len(rows) > 0
+        if len(rows) and not self._has_repeated_remark:
+            self._has_repeated_remark = True
             repeat_remark_of(self.model, self.cache)
         for row in rows:
             if requested.reasons[row]:

@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from ..cache.adoption import observed_batch
 from ..cache.guard import EarlierPoint, ModelGuard
 from ..cache.memory import MemoryCache, ResponseMemory
 from ..cache.remarks import store_remark_of
 from ..cache.row_buffer import FinishedRows, RowBuffer
 from ..cache.simulation_cache import SimulationCache
 from ..cache.tolerance import VerifyingRun
-from ..cache.verification import VerifiedCache, observed_batch
+from ..cache.verification import VerifiedCache
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..simulation.faults import ChangedModel
@@ -125,6 +126,8 @@ class NewSimulations:
     _outcomes: int  # simulations of which is known whether they failed: run here, read from disk, or recalled
 
     # called with the number of simulations that have ended, in this process only
+    # whether there are results in memory, of this process
+    _has_results: bool = False
     when_simulated: Callable[[int], None] | None = None
     _running: _Stream | None = None  # not pickled
 
@@ -413,6 +416,7 @@ class NewSimulations:
         if self.when_simulated is not None:
             self.when_simulated(len(thetas))
         self._compare_model(thetas, misfit, reasons, seconds)
+        self._has_results = True
         self.memory_cache.store(keys, misfit)
         if responses:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
@@ -452,7 +456,10 @@ class NewSimulations:
 
     def _label_again(self) -> None:
         """Label the model as it is now, if it has changed since the likelihood was made and nothing was used yet."""
-        if self._guard.known.changed(self.model):
+        changed = self._guard.known.changed(self.model)
+        if changed <= self._guard.changing:
+            self._guard.known.renew(self.model)
+        else:
             label = ModelLabel(self.model, self._statistic)
             if self.cache is not None:
                 self._verified_cache = VerifiedCache(self.cache, self.model, self.pool, label)
@@ -471,7 +478,7 @@ class NewSimulations:
         """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
         self._guard.known.complete_with(self._label.opened)
         if not self._guard.points and check == self._guard.before:
-            if not self._outcomes:
+            if not self._has_results:
                 self._label_again()
                 check = self._guard.before
             else:  # only rows of the disk are known

@@ -22,7 +22,7 @@ import numpy as np
 
 from .changed_model import SentModel
 from .faults import ChangedModel, reason_of
-from .label import LIBRARY, items_of
+from .label import LIBRARY, items_of, note_own_changes, steady_digest
 from .model import Model, SimulationBatch, SimulationFailed, first_part, not_finite, real_response, simulate_batch
 from .threads import run_on_threads
 
@@ -172,8 +172,7 @@ def _identity(model: Model) -> str:
     cls = type(model)
     if cls.__module__.split(".")[0] == LIBRARY:
         return model.fingerprint
-    items = items_of({"class": cls})
-    return f"{model.fingerprint} {items['class']} {sorted(items.items())}"
+    return f"{model.fingerprint} {steady_digest({'class': cls})}"
 
 
 def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> list[_Start]:
@@ -195,12 +194,14 @@ def _run(
 ) -> list[tuple[np.ndarray | None, np.ndarray | None, str]]:
     """Response (if `responses` are wanted), state at the end and reason of the failure of each simulation."""
     items = [(theta.copy(), start) for theta, start in zip(thetas, starts, strict=True)]
+    before = items_of({"class": type(model)})
     if pool is not None:
         outcomes = list(pool.map(partial(_continue_sent, responses, SentModel(model)), items)) if items else []
     elif getattr(model, "runs_on_threads", False):
         outcomes = run_on_threads(partial(_continue, responses, model), items)
     else:
         outcomes = [_continue(responses, model, item) for item in items]
+    note_own_changes(before, items_of({"class": type(model)}))
     return [(*(found or (None, None)), reason) for found, reason in outcomes]
 
 

@@ -37,7 +37,16 @@ import numpy as np
 from ..kernels.jit import KERNEL_HASH
 from .opened import Opened, file_digest
 
-__all__ = ["LIBRARY", "ModelLabel", "cpu_name", "is_of_user", "items_of", "value_digest"]
+__all__ = [
+    "LIBRARY",
+    "ModelLabel",
+    "cpu_name",
+    "is_of_user",
+    "items_of",
+    "note_own_changes",
+    "steady_digest",
+    "value_digest",
+]
 
 LIBRARY = __name__.split(".")[0]
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,8 +69,11 @@ _WRAPPERS = (
     types.CellType,
 )
 _OF_CLASSES = {"__dict__", "__weakref__", "__module__", "__qualname__", "__firstlineno__", "__static_attributes__"}
+_DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # of a class, which it may change when it runs
 _SCRIPTS = ("__main__", "__mp_main__")
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # change without a meaning for simulations
+_PARTS = {"function", "class", "output", "statistic", "library", "python"}
+_first: dict[str, str] = {}  # digests of values that code changes when it runs, at the time of the first label
 _opened: dict[str, Opened] = {}  # by code, in this process
 _sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 
@@ -86,7 +98,8 @@ class ModelLabel:
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
         self._statistic = statistic
-        self.items = self._present(model)
+        now = self._present(model)
+        self.items = now | {name: digest for name, digest in _first.items() if name in now}
         # a module is imported by the first simulation of a process only, so what that opened counts for later labels
         self.opened: Opened | None = _opened[self.code].read_again() if self.code in _opened else None
         self.complete = not (_has_user_code(model) or (statistic is not None and _defined_by_user(statistic)))
@@ -121,6 +134,15 @@ class ModelLabel:
             known, now = known | self.opened.items(), now | self.opened.read_again().items()
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
+    def has_changed_itself(self, names: Iterable[str]) -> None:
+        """State that simulations change some items, which keep their first digests in later labels of this process."""
+        note_own_changes(self.items, dict.fromkeys(names, ""))
+
+    @property
+    def changing(self) -> set[str]:
+        """Names of items that simulations of this process have changed."""
+        return self.items.keys() & _first.keys()
+
     def renew(self, model: Any) -> None:
         """Take the present state of everything as the label."""
         known, now = self.items, self._present(model)
@@ -133,10 +155,16 @@ class ModelLabel:
     def _present(self, model: Any) -> dict[str, str]:
         parts: dict[str, Any] = model.code_parts() if hasattr(model, "code_parts") else {}
         if is_of_user(type(model).__module__):
-            parts = parts | {"class": type(model)} | {f"self.{name}": part for name, part in _state(model).items()}
+            parts = parts | _parts_of(model)
         if self._statistic is not None and _defined_by_user(self._statistic):
             parts = parts | {"statistic": self._statistic}
         return (items_of(parts) if parts else {}) | {"library": _library_digest()}
+
+
+def _parts_of(model: Any) -> dict[str, Any]:
+    """Class of the user, and attributes of an object."""
+    name = type(model).__qualname__
+    return {"class": type(model)} | {f"{name}().{attribute}": value for attribute, value in _state(model).items()}
 
 
 def _defined_by_user(function: Any) -> bool:
@@ -172,6 +200,19 @@ def value_digest(value: Any) -> str:
 def items_of(parts: Mapping[str, Any]) -> dict[str, str]:
     """Digests of some values, and of the functions, values, files, packages and variables that their code names."""
     return _Walk().items(parts)
+
+
+def steady_digest(parts: Mapping[str, Any]) -> str:
+    """Digest of `items_of`, in which values that simulations of this process have changed are those before them."""
+    items = items_of(parts)
+    return _joined(items | {name: digest for name, digest in _first.items() if name in items})
+
+
+def note_own_changes(before: Mapping[str, str], after: Mapping[str, str]) -> None:
+    """State that simulations have changed what differs between two results of `items_of`."""
+    for name in before.keys() & after.keys() - _PARTS:
+        if before[name] != after[name]:
+            _first.setdefault(name, before[name])
 
 
 def _joined(items: Mapping[str, str]) -> str:
@@ -338,8 +379,12 @@ class _Walk:
         if type(cls) is not type:
             self._add(type(cls))
         for name, member in sorted(vars(cls).items()):
-            if name not in _OF_CLASSES and not isinstance(member, types.MemberDescriptorType):
-                self._text(name)
+            if name in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
+                continue
+            self._text(name)
+            if isinstance(member, _DATA) and "<locals>" not in cls.__qualname__:
+                self._waiting.setdefault(f"{cls.__module__}.{cls.__qualname__}.{name}", member)
+            else:
                 self._add(member)
 
     def _add_module(self, module: types.ModuleType) -> None:

@@ -130,7 +130,8 @@ def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
 
 def test_a_batch_needs_three_queries_and_one_write(path, thetas):
     likelihood = likelihood_of(Batched(), path)
-    likelihood.misfit(thetas[:1] + 1.0)  # finds the generation
+    for shift in (1.0, 2.0):  # the first begins a generation, the second finds it
+        likelihood.misfit(thetas[:1] + shift)
     statements = []
     likelihood.cache.file.connection().set_trace_callback(statements.append)
     likelihood.chunk_size = 1000
@@ -510,7 +511,7 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     likelihood = likelihood_of(Line(), cache, memory_rows=0)
     likelihood.misfit(thetas)
     data = pickle.dumps(likelihood)
-    assert len(data) < 6000
+    assert len(data) < 6500
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     copy = pickle.loads(data)

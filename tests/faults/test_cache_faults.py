@@ -18,13 +18,13 @@ import h5py
 import numpy as np
 import pytest
 
+from fe_likelihoods.cache import guarded_file
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.cache.sqlite_file import APPLICATION_ID, SCHEMA_VERSION, CacheFile
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.cache import simulation_cache
 
 from . import cached_run
 
@@ -553,7 +553,7 @@ def test_a_full_disk_does_not_stop_the_run(path, thetas, expected, caplog, full,
     likelihood.cache.file.close()
     likelihood.misfit(thetas[300:310])
     assert likelihood.cache.info().simulations == stored  # writing is not tried again before the pause ends
-    monkeypatch.setattr(simulation_cache, "RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(guarded_file, "RETRY_SECONDS", 0.0)
     likelihood.cache.retry_times["written"] = time.monotonic()
     likelihood.misfit(thetas[310:320])
     again = likelihood_of(path)
