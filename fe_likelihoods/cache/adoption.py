@@ -32,17 +32,21 @@ MAX_OWN = 200_000  # keys of 16 bytes, about 100 bytes each in memory
 PAUSE_SECONDS = 60.0  # before another attempt, where no simulation could be compared
 
 
-def observed_batch(run: VerifyingRun, thetas: np.ndarray) -> tuple[np.ndarray, list[str], Opened | None]:
-    """Statistics and reasons of simulations, and what the first successful one opened; None if nothing is known."""
+def observed_batch(
+    run: VerifyingRun, thetas: np.ndarray, label: ModelLabel
+) -> tuple[np.ndarray, list[str], Opened | None]:
+    """Statistics and reasons of simulations, and what they opened; None for nothing new."""
+    if not label.observes:
+        return *misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic), None
     if run.pool is None:
         with observing() as observer:
             misfit, reasons = misfit_batch(run.model, thetas, run.measured, None, run.statistic)
-        return misfit, reasons, observer.result() if not all(reasons) else None
+        return misfit, reasons, observer.result(label.known)
     function = Observed(sent_simulation(run.model, run.measured, run.statistic))
-    misfit, reasons, opened = np.full((len(thetas), run.n_numbers), np.nan), [], None
+    misfit, reasons, opened = np.full((len(thetas), run.n_numbers), np.nan), [], Opened({})
     for row, ((values, reason), found) in zip(misfit, run.pool.map(function, list(thetas)), strict=True):
         reasons.append(reason)
-        opened = opened or found
+        opened = opened if found is None else opened | found
         if values is not None:
             row[...] = values
     return misfit, reasons, opened
@@ -68,10 +72,11 @@ class Adoption:
     def __setstate__(self, state: tuple) -> None:
         self._set_up(*state)
 
-    def complete(self, opened: Opened | None, model: Model) -> None:
-        """Complete the label of the model by what a simulation opened."""
-        with self._trust.lock:
-            self._trust.complete(self.cache, model, opened)
+    def complete(self, opened: Opened | None) -> None:
+        """Add to the label of the model what simulations opened."""
+        if opened is not None:
+            with self._trust.lock:
+                self._trust.complete(self.cache, opened)
 
     @property
     def label(self) -> ModelLabel:
@@ -157,17 +162,14 @@ class Adoption:
             return None if stored is None else stored.generation
         if time.monotonic() < trust.pause_ends:
             return None
-        if not trust.label.complete and n:
-            self._complete_label(fingerprint, present, earlier, rows_of, run)
-        stored = trust.find(self.cache, run.model, incomplete=True)
+        stored = trust.find(self.cache, run.model)
         if not n:
             if stored is None:
                 trust.adopt(self.cache, run.model, present[0] if present else self._begun(run.model), 0)
             return trust.stored.generation
         if stored is not None:
             if stored.generation in present and stored.compared < n:
-                same = stored.label, trust.label.code
-                labels = {each.id for each in self.cache.labels_of(run.model) if each.label in same}
+                labels = {each.id for each in self.cache.labels_of(run.model) if each.label == stored.label}
                 rows = [row for row in rows_of(stored.generation, n + MAX_ATTEMPTS) if row.label not in labels]
                 left = min(n, len(rows)) - stored.compared
                 if left > 0 and not self._adopts(fingerprint, stored.generation, rows_of, left, run):
@@ -213,19 +215,6 @@ class Adoption:
             thetas, misfit = (np.array([row[place] for row in new]) for place in (0, 1))
             self.store(fingerprint, thetas, misfit, [row.reason for row in new], None, 0.0, run)
         self._trust.simulated.clear()
-
-    def _complete_label(
-        self, fingerprint: str, present: list[int], earlier: list[int], rows_of: Callable, run: VerifyingRun
-    ) -> None:
-        """Simulate the latest success again, which completes the label by what it opens."""
-        stored = [row for generation in present[:1] for row in rows_of(generation, LATEST)]
-        if not stored:
-            n_steps = measured_values(run.measured).shape[1]
-            stored = self.cache.stored_rows(earlier[0], OF_EARLIER_RELEASES, run.n_numbers, n_steps, LATEST)
-        for row in [row for row in stored if not row.reason][:MAX_ATTEMPTS]:
-            self._simulate_again(fingerprint, [row], run)
-            if self._trust.label.complete:
-                return
 
     def _adopt_earlier(self, fingerprint: str, earlier: list[int], run: VerifyingRun, n: int) -> bool:
         """Compare rows of earlier releases, and take those that agree into the generation of the model."""
@@ -299,11 +288,10 @@ class Adoption:
         left = [row.theta for row in rows if (*key, row.theta.tobytes()) not in simulated]
         if left:
             thetas, start = np.array(left), time.perf_counter()
-            if not self.label.complete:
-                misfit, reasons, opened = observed_batch(run, thetas)
-                self.complete(opened, run.model)
-            else:
-                misfit, reasons = misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic)
+            misfit, reasons, opened = observed_batch(run, thetas, self.label)
+            self.complete(opened)
+            if run.pool is None and self.label.observes:
+                self.label.has_changed_itself(self.label.changed(run.model))
             self._count(start, reasons)
             for theta, values, reason in zip(thetas, misfit, reasons, strict=True):
                 simulated[(*key, theta.tobytes())] = StoredSimulation(theta, values, reason)

@@ -19,6 +19,7 @@ from .rows import (
     regenerated,
     simulation_keys,
     source_number,
+    unpack_label,
 )
 from .sqlite_file import CacheFile
 
@@ -40,11 +41,7 @@ class Generations(GuardedFile):
         query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
         source = source_number(model.fingerprint)
         rows = self._try("read", lambda connection: connection.execute(query, (source,)).fetchall(), [])
-        return [
-            StoredLabel(row[0], row[1], row[2].decode(), row[3].decode(), *row[4:6])
-            for row in rows
-            if is_undamaged_label(*row)
-        ]
+        return [unpack_label(*row) for row in rows if is_undamaged_label(*row)]
 
     def add_label(self, label: StoredLabel, move: bool = False) -> StoredLabel:
         """Store a label, unless another process has stored it; return the one that is stored.
@@ -62,7 +59,7 @@ class Generations(GuardedFile):
             found = connection.execute(query, (label.source, label.label.encode(), label.cpu.encode())).fetchone()
             new = label
             if found is not None and is_undamaged_label(*found):
-                stored = StoredLabel(*found[:2], label.label, label.cpu, *found[4:6])
+                stored = unpack_label(*found)
                 new = label._replace(id=stored.id) if move else stored
                 if not move and label.generation == stored.generation and label.compared > stored.compared:
                     new = stored._replace(compared=label.compared)
@@ -72,6 +69,18 @@ class Generations(GuardedFile):
 
         with self.file.lock:
             return self._try("written", add, label) if self.file.writable else label
+
+    def update_label(self, label: StoredLabel) -> StoredLabel:
+        """Replace the text and the files of a stored label."""
+
+        def update(connection: sqlite3.Connection) -> StoredLabel:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute(STORE_LABEL, pack_label(label))
+            connection.execute("COMMIT")
+            return label
+
+        with self.file.lock:
+            return self._try("written", update, label) if self.file.writable else label
 
     def generations_of(self, fingerprint: str, table: str = "simulations") -> list[int]:
         """Generations of the simulations, or of the responses, of one identity, the latest first."""

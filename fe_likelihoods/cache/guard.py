@@ -143,7 +143,7 @@ class ModelGuard:
             if not self.points and simulated_here:  # the first simulation has changed what it uses
                 self._accept(run.model, changed)
                 return
-            if changed <= self.changing and self._rows_since < _ROWS_PER_REPETITION:
+            if changed <= self.changing and (not self.points or self._rows_since < _ROWS_PER_REPETITION):
                 return
             if self.points and self._repeat(run):
                 self._accept(run.model, changed)

@@ -1,6 +1,7 @@
 """Rows of the simulation cache: their keys, checksums and SQL statements, and what a cache returns of them."""
 
 import hashlib
+import json
 import sqlite3
 import struct
 import zlib
@@ -38,12 +39,13 @@ __all__ = [
     "select_rows",
     "simulation_keys",
     "source_number",
+    "unpack_label",
     "unpack_failure",
 ]
 
 COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc, generation, label"
 RESPONSE_COLUMNS = "key, source, theta, n_channels, size, crc, response, generation, label"
-LABEL_COLUMNS = "id, source, label, cpu, generation, compared, crc"
+LABEL_COLUMNS = "id, source, label, cpu, generation, compared, files, crc"
 OF_EARLIER_RELEASES = 0  # the generation of rows whose keys contain a digest that is not computed any more
 KEY_BYTES = 16
 KEYS_PER_QUERY = 500  # keys in one SELECT
@@ -60,7 +62,7 @@ STORE = (
 )
 # replaces a response that an earlier version stored in single precision
 STORE_RESPONSE = f"INSERT OR REPLACE INTO responses ({RESPONSE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
-STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
 REMOVE = {
     table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses", "failures", "remarks")
 }
@@ -130,6 +132,8 @@ class StoredLabel(NamedTuple):
         The rows that belong together: all labels of a generation gave equal results where they were compared.
     compared : int
         Number of rows that were compared before those of other labels were adopted.
+    files : tuple of str
+        Paths of the files that simulations opened.
     """
 
     id: int
@@ -138,6 +142,7 @@ class StoredLabel(NamedTuple):
     cpu: str
     generation: int
     compared: int
+    files: tuple[str, ...] = ()
 
 
 class CacheInfo(NamedTuple):
@@ -238,8 +243,15 @@ def is_undamaged_response(*row: Any) -> bool:
 
 def pack_label(label: StoredLabel) -> tuple:
     """A label as it is stored: the values of `LABEL_COLUMNS`, with texts as bytes and the checksum last."""
-    values = (label.id, label.source, label.label.encode(), label.cpu.encode(), label.generation, label.compared)
+    texts = label.label.encode(), label.cpu.encode()
+    files = json.dumps(label.files).encode()
+    values = (label.id, label.source, *texts, label.generation, label.compared, files)
     return (*values, zlib.crc32(repr(values).encode()))
+
+
+def unpack_label(*row: Any) -> StoredLabel:
+    """An undamaged label, given by the values of `LABEL_COLUMNS`."""
+    return StoredLabel(*row[:2], row[2].decode(), row[3].decode(), *row[4:6], tuple(json.loads(row[6])))
 
 
 def is_undamaged_label(*row: Any) -> bool:

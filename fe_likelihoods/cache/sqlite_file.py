@@ -57,7 +57,8 @@ LAYOUT = (
     "text BLOB NOT NULL)",
     # labels of models, and the generation of simulations that belongs to them
     "CREATE TABLE labels (id INTEGER PRIMARY KEY, source INTEGER NOT NULL, label BLOB NOT NULL, cpu BLOB NOT NULL, "
-    "generation INTEGER NOT NULL, compared INTEGER NOT NULL, crc INTEGER NOT NULL, UNIQUE (source, label, cpu))",
+    "generation INTEGER NOT NULL, compared INTEGER NOT NULL, files BLOB NOT NULL, crc INTEGER NOT NULL, "
+    "UNIQUE (source, label, cpu))",
 )
 # what earlier layouts lack, in the form in which SQLite adds it
 COMPLETION = (

@@ -105,6 +105,6 @@ class StoredResponses:
                 batch = simulate_batch(self.model, thetas)
         finally:
             label.has_changed_itself(label.changed(self.model))
-        if not label.complete and not all(batch.reasons):
-            self._verified.complete(observer.result(), self.model)
+        if label.observes:
+            self._verified.complete(observer.result(label.known))
         return batch

@@ -1,5 +1,6 @@
 """What a process knows of the stored simulations of one model: its label, their generation, and how many were used."""
 
+import copy
 import os
 import secrets
 import threading
@@ -36,7 +37,7 @@ class Trust:
     Parameters
     ----------
     label : ModelLabel
-        Completed by the first simulation.
+        Completed by simulations.
     is_local : bool
         Whether simulations run on this machine, so that the processor is known.
     token : str
@@ -81,20 +82,28 @@ class Trust:
         """Name of the processor; empty if simulations run on other machines."""
         return cpu_name() if self.is_local else ""
 
-    def find(self, cache: SimulationCache, model: Model, incomplete: bool = False) -> StoredLabel | None:
-        """The label as it is in the file; None if it is unknown there, or not complete.
+    def find(self, cache: SimulationCache, model: Model) -> StoredLabel | None:
+        """The label as it is in the file; None if it is unknown there.
 
-        With `incomplete`, where no simulation could complete it, the latest label with the same code.
+        Files that earlier simulations have opened are part of it, as they are now.
         """
-        if self.stored is None and (self.label.complete or incomplete):
-            text, code = self.label.text, self.label.code
-            known = [stored for stored in cache.labels_of(model) if stored.label == text]
-            if not known and not self.label.complete:
-                known = [stored for stored in cache.labels_of(model) if stored.label.startswith(code)]
-            if known:
-                here = [stored for stored in known if stored.cpu == self.cpu]
-                self.stored = here[0] if here else self._add(cache, model, known[-1].generation, known[-1].compared)
+        if self.stored is not None:
+            return self.stored
+        labels = cache.labels_of(model)
+        paths = {path: "" for each in labels for path in each.files}
+        self.label.add(Opened(paths).read_again(), here=False)
+        known = [each for each in labels if each.label == self.text_with(each.files)]
+        if known:
+            here = [each for each in known if each.cpu == self.cpu]
+            self.stored = here[0] if here else self._add(cache, model, known[-1].generation, known[-1].compared)
+            self._update(cache)
         return self.stored
+
+    def text_with(self, files: tuple[str, ...]) -> str:
+        """Text of the label, if these files were all that simulations opened."""
+        known = copy.copy(self.label)
+        known.opened = Opened({path: self.label.opened.files.get(path, "") for path in files})
+        return known.text
 
     def adopt(self, cache: SimulationCache, model: Model, generation: int, compared: int) -> None:
         """Enter the label in the file as one of a generation, of which some rows were compared."""
@@ -110,22 +119,22 @@ class Trust:
         self.stored = self._add(cache, model, generation, OWN, move)
         self.generations.clear()
 
-    def complete(self, cache: SimulationCache, model: Model, opened: Opened | None) -> None:
-        """Complete the label; if rows were stored before, their generation is that of the complete label too."""
-        if opened is None or self.label.complete:
-            return
-        self.label.complete_with(opened)
-        earlier, self.stored = self.stored, None
-        if self.find(cache, model) is None and earlier is not None:
-            self.stored = self._add(cache, model, earlier.generation, earlier.compared)
-        if earlier is not None and self.stored.generation != earlier.generation:
-            self.generations.clear()
+    def complete(self, cache: SimulationCache, opened: Opened | None) -> None:
+        """Add to the label what simulations opened."""
+        if self.label.add(opened):
+            self._update(cache)
+
+    def _update(self, cache: SimulationCache) -> None:
+        if self.stored is not None and self.stored.label != self.label.text:
+            files = tuple(sorted(self.label.opened.files))
+            self.stored = cache.update_label(self.stored._replace(label=self.label.text, files=files))
 
     def _add(
         self, cache: SimulationCache, model: Model, generation: int, compared: int, move: bool = False
     ) -> StoredLabel:
         source = source_number(model.fingerprint)
-        new = StoredLabel(secrets.randbits(62) | 1, source, self.label.text, self.cpu, generation, compared)
+        files = tuple(sorted(self.label.opened.files))
+        new = StoredLabel(secrets.randbits(62) | 1, source, self.label.text, self.cpu, generation, compared, files)
         return cache.add_label(new, move)
 
 

@@ -12,7 +12,7 @@ with new simulations. How many is decided by the label of the model (`fe_likelih
   as one of their generation. If one differs, a new generation begins: the earlier rows stay in the file and are not
   used. Both are logged.
 
-The row that is simulated first also completes the label, by what it opens while it runs. Files of earlier releases have
+All simulations complete the label, by what they open while they run. Files of earlier releases have
 rows without a label. Those with the right numbers of parameters, channels and samples are compared in the same way.
 
 Failures count only where there is no successful simulation, since a changed model often fails at the same points.
@@ -330,8 +330,7 @@ class VerifiedCache(Adoption):
         served = self._trust.served.total()
         self._start_again()
         stored = self._trust.stored
-        same = () if stored is None else (stored.label, self.label.code)  # the second, before it was completed
-        of_others = {each.id for each in self.cache.labels_of(run.model) if each.label not in same}
+        of_others = {each.id for each in self.cache.labels_of(run.model) if stored and each.label != stored.label}
         if label in of_others and not scatter:
             # the label was adopted, but the model has changed in a part of the space where no row was compared
             self._begin(fingerprint, run)

@@ -239,15 +239,6 @@ class CachedSimulations(NewSimulations):
             return np.zeros(len(thetas), dtype=bool)
         return self._verified_cache.are_stored(self.cache_keys, thetas, self.model)
 
-    def latest_stored(self) -> np.ndarray | None:
-        """Structural parameters of the successful simulation that the cache on disk stored last; None if none is."""
-        for generation in [] if self.cache is None else self.cache.generations_of(self.simulation_key):
-            shape = self._width, self.measurements.n_steps
-            for row in self.cache.stored_rows(self.simulation_key, generation, *shape, most=100):
-                if not row.reason:
-                    return row.theta
-        return None
-
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache statistics that are known from an earlier run in memory, without a simulation.
 

@@ -31,7 +31,6 @@ from ..simulation.model import (
     Model,
     SimulationBatch,
     has_batch_method,
-    misfit_batch,
     misfit_of_responses,
     sent_simulation,
     simulate_batch,
@@ -382,14 +381,12 @@ class NewSimulations:
         if self._runs_responses(responses):
             with observing() as observer:
                 batch = simulate_batch(self.model, thetas, self.pool)
-            if not self._label.complete and self.pool is None and not all(batch.reasons):
-                self._complete_label(observer.result())
+            if self._label.observes and self.pool is None:
+                self._complete_label(observer.result(self._label.known))
             misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self._statistic)
-        elif not self._label.complete:
-            misfit, reasons, opened = observed_batch(self._verifying_run, thetas)
-            self._complete_label(opened)
         else:
-            misfit, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self._statistic)
+            misfit, reasons, opened = observed_batch(self._verifying_run, thetas, self._label)
+            self._complete_label(opened)
         result = self._record(keys, thetas, misfit, reasons, batch, responses, time.perf_counter() - start)
         self.write_simulations()
         return result
@@ -447,12 +444,11 @@ class NewSimulations:
         return self._own_label if self._verified_cache is None else self._verified_cache.label
 
     def _complete_label(self, opened: Opened | None) -> None:
-        """Complete the label of the model by what its first simulation opened."""
-        if opened is not None and not self._label.complete:
-            if self._verified_cache is None:
-                self._own_label.complete_with(opened)
-            else:
-                self._verified_cache.complete(opened, self.model)
+        """Add to the label of the model what simulations opened."""
+        if self._verified_cache is None:
+            self._own_label.add(opened)
+        else:
+            self._verified_cache.complete(opened)
 
     def _label_again(self) -> None:
         """Label the model as it is now, if it has changed since the likelihood was made and nothing was used yet."""
@@ -476,7 +472,8 @@ class NewSimulations:
 
     def _check_model(self, check: Callable, *arguments: Any) -> Any:
         """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
-        self._guard.known.complete_with(self._label.opened)
+        self._guard.known.add(self._label.opened)
+        self._guard.changing |= self._label.changing
         if not self._guard.points and check == self._guard.before:
             if not self._has_results:
                 self._label_again()

@@ -10,7 +10,7 @@ need. It contains
 * the source files of the user's modules among them, without comments, and the versions of installed packages,
 * environment variables whose names occur in this code,
 * the source files of this library that simulations depend on,
-* what the first simulation of a model opened while it ran (`fe_likelihoods.simulation.opened`).
+* what simulations of the model opened while they ran (`fe_likelihoods.simulation.opened`).
 
 The bytes of cloudpickle are not used, because they are not the same in two processes: they contain random identifiers
 of classes, the order of sets, and the file names of notebook cells.
@@ -79,7 +79,7 @@ _sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 
 
 class ModelLabel:
-    """Label of a model as it is now, completed by its first simulation.
+    """Label of a model as it is now, completed by its simulations.
 
     Parameters
     ----------
@@ -92,18 +92,19 @@ class ModelLabel:
     ----------
     items : dict of str to str
         Digests of everything that is known without a simulation.
-    opened : Opened or None
-        What a simulation opened; None until one was observed.
+    opened : Opened
+        What simulations opened.
+    observes : bool
+        Whether simulations are observed, since they may run code of the user.
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
         self._statistic = statistic
         now = self._present(model)
         self.items = now | {name: digest for name, digest in _first.items() if name in now}
+        self.observes = _has_user_code(model) or (statistic is not None and _defined_by_user(statistic))
         # a module is imported by the first simulation of a process only, so what that opened counts for later labels
-        self.opened: Opened | None = _opened[self.code].read_again() if self.code in _opened else None
-        self.complete = not (_has_user_code(model) or (statistic is not None and _defined_by_user(statistic)))
-        self.complete = self.complete or self.opened is not None
+        self.opened, self._was_observed = _opened.get(self.code, Opened({})).read_again(), False
 
     @property
     def code(self) -> str:
@@ -119,19 +120,26 @@ class ModelLabel:
     @property
     def text(self) -> str:
         """The whole label: `code`, and a digest of what was opened."""
-        return self.code if self.opened is None else f"{self.code} {_joined(self.opened.items())}"
+        return f"{self.code} {_joined(self.opened.items())}"
 
-    def complete_with(self, opened: Opened | None) -> None:
-        """Add what a simulation of the model opened; only the first time counts."""
-        if opened is not None and not self.complete:
-            self.opened, self.complete = opened, True
-            _opened[self.code] = opened
+    @property
+    def known(self) -> Opened | None:
+        """What simulations of this process opened; None before the first."""
+        return self.opened if self._was_observed else None
+
+    def add(self, opened: Opened | None, here: bool = True) -> bool:
+        """Add what simulations opened, in this process or `here` = False earlier; returns whether it was new."""
+        self._was_observed = self._was_observed or (here and opened is not None)
+        if opened is None or opened.files.keys() <= self.opened.files.keys():
+            return False
+        self.opened = opened | self.opened
+        _opened[self.code] = self.opened
+        return True
 
     def changed(self, model: Any) -> set[str]:
         """Names of the items that differ from what the label says."""
-        known, now = self.items, self._present(model)
-        if self.opened is not None:
-            known, now = known | self.opened.items(), now | self.opened.read_again().items()
+        known = self.items | self.opened.items()
+        now = self._present(model) | self.opened.read_again().items()
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
@@ -149,8 +157,7 @@ class ModelLabel:
         # the same objects where nothing has changed, so that pickles stay small
         same = {name: digest for name, digest in known.items() if now.get(name) == digest}
         self.items = same | {name: digest for name, digest in now.items() if name not in same}
-        if self.opened is not None:
-            self.opened = self.opened.read_again()
+        self.opened = self.opened.read_again()
 
     def _present(self, model: Any) -> dict[str, str]:
         parts: dict[str, Any] = model.code_parts() if hasattr(model, "code_parts") else {}

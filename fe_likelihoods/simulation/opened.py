@@ -1,9 +1,8 @@
 """What a simulation opens while it runs: files, modules, shared libraries and programs.
 
-A hook of the interpreter (`sys.addaudithook`) is told of every file that Python code opens. It listens only while a
-simulation is observed: the first of a model in each process, in this process, in a worker of a pool or in the process
-of an isolated function. Files that the simulation writes itself do not count, nor do those of Python and of installed
-packages.
+A hook of the interpreter (`sys.addaudithook`) is told of every file that Python code opens. It listens while a
+simulation runs, in this process, in a worker of a pool or in the process of an isolated function. Files that the
+simulation writes itself do not count, nor do those of Python and of installed packages.
 """
 
 import contextlib
@@ -29,7 +28,7 @@ _SYSTEM = ("/proc/", "/sys/", "/dev/", "/usr/", "/lib", "/etc/", "/bin/", "/opt/
 _observers: "list[_Observer]" = []
 _lock = threading.Lock()
 _has_hook = False
-_known: set[str] = set()  # tokens of functions whose first call in this process is over
+_known: "dict[str, Opened]" = {}  # what functions have opened in this process, by their tokens
 _digests: dict[str, tuple[tuple, float, str]] = {}
 
 
@@ -51,6 +50,9 @@ class Opened(NamedTuple):
             found.setdefault(f"opened {os.path.basename(path)}", []).append(digest)
         return {name: " ".join(sorted(digests)) for name, digests in found.items()}
 
+    def __or__(self, other: "Opened") -> "Opened":
+        return Opened(self.files | other.files)
+
     def read_again(self) -> "Opened":
         """The same files as they are now; those of another machine are not found and not changed."""
         return Opened({path: _digest_or(path, digest) for path, digest in self.files.items()})
@@ -65,8 +67,12 @@ class _Observer:
         self.noted: dict[str, str] = {}
         self.modules = set(sys.modules)
 
-    def result(self) -> Opened:
-        """Files that were read and not written, of new modules too, and the shared libraries in use."""
+    def result(self, known: Opened | None = None) -> Opened | None:
+        """Files that were read and not written, of new modules too, and shared libraries; None for no unknown ones."""
+        files = {} if known is None else known.files
+        if known is not None and not self.noted and len(sys.modules) == len(self.modules):
+            if not any(path not in files and _counts(path) for path in self.read - self.written):
+                return None
         new = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]
         read = self.read | {file for file in new if isinstance(file, str)} | set(_mapped())
         files = {path: _digest_or(path, "") for path in read - self.written if _counts(path)}
@@ -74,7 +80,7 @@ class _Observer:
 
 
 class Observed:
-    """A function that is sent to other processes; its results say what its first call in a process opened.
+    """A function that is sent to other processes; its results say what it has opened there.
 
     Parameters
     ----------
@@ -83,8 +89,7 @@ class Observed:
 
     Notes
     -----
-    A call returns the result and an `Opened`, or the result and None. A call that raises, or returns a tuple that
-    begins with None, as a failed simulation does, is not the first.
+    A call returns the result, and an `Opened` of files that no earlier call in this process has opened, or None.
     """
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
@@ -99,14 +104,12 @@ class Observed:
 
     def __call__(self, item: Any) -> tuple[Any, Opened | None]:
         """The result for an item, and what the call opened."""
-        if self._token in _known:
-            return self.function(item), None
         with observing() as observer:
             result = self.function(item)
-        if isinstance(result, tuple) and result and result[0] is None:
-            return result, None
-        _known.add(self._token)
-        return result, observer.result()
+        opened = observer.result(_known.get(self._token))
+        if opened is not None:
+            _known[self._token] = opened | _known.get(self._token, Opened({}))
+        return result, opened
 
 
 def _observed(function: Callable[[Any], Any], token: str) -> Observed:

@@ -16,6 +16,7 @@ import pytest
 
 from fe_likelihoods.cache import rows as cache_rows
 from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.command.caches import latest_stored
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal, Uniform
@@ -321,10 +322,10 @@ def test_forget_deletes_the_simulations_of_one_model(path, thetas):
     forgotten.misfit(thetas)
     stored = forgotten.cache.info()
     last = thetas[np.isfinite(forgotten.misfit(thetas)).all(axis=1)][-1]
-    assert forgotten.latest_stored().tolist() == last.tolist()
+    assert latest_stored(forgotten).tolist() == last.tolist()
     assert forgotten.cache.forget(*forgotten.cache_keys) == stored.simulations - 1 + stored.responses + stored.failures
     assert (forgotten.cache.info().simulations, forgotten.cache.info().responses) == (1, 0)
-    assert forgotten.latest_stored() is None
+    assert latest_stored(forgotten) is None
     again = oscillator(path)
     again.misfit([[1.1, 0.9]])
     assert again.disk_hits == 1

@@ -210,11 +210,10 @@ def test_a_model_that_is_not_repeatable_is_named(path, thetas):
     assert "has changed" not in str(caught.value)
 
 
-def test_failures_for_other_measurements_are_not_used_before_a_simulation_succeeds(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.simulation.label._opened", {})  # as in a new process
+def test_failures_for_other_measurements_are_verified(path, thetas):
     likelihood_of(Scaled(limit=0.0), path).misfit(thetas)
-    other = likelihood_of(Scaled(), path, noise=AutoregressiveNoise(CHANNELS))
-    assert np.isfinite(other.misfit(thetas)).all()
+    with pytest.raises(StaleCache, match="simulated again, it succeeded"):
+        likelihood_of(Scaled(), path, noise=AutoregressiveNoise(CHANNELS)).misfit(thetas)
 
 
 def test_stored_responses_are_verified(path, thetas):
