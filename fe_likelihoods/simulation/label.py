@@ -68,7 +68,16 @@ _WRAPPERS = (
     type(functools.lru_cache(len)),
     types.CellType,
 )
-_OF_CLASSES = {"__dict__", "__weakref__", "__module__", "__qualname__", "__firstlineno__", "__static_attributes__"}
+_OF_CLASSES = {
+    "__slotnames__",
+    "_abc_impl",
+    "__dict__",
+    "__weakref__",
+    "__module__",
+    "__qualname__",
+    "__firstlineno__",
+    "__static_attributes__",
+}
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # of a class, which it may change when it runs
 _SCRIPTS = ("__main__", "__mp_main__")
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # change without a meaning for simulations
