@@ -12,7 +12,7 @@ from ..signals.comparison import measured_values
 from ..simulation.faults import TransientReason
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_batch, misfit_of_responses, sent_simulation
-from ..simulation.opened import Observed, Opened, observing
+from ..simulation.opened import Observed, Opened, observing, unpack
 from ..simulation.residual_statistics import needs_response
 from .coverage import choose_rows
 from .generations import MAX_CANDIDATES
@@ -44,7 +44,8 @@ def observed_batch(
         return misfit, reasons, observer.result(label.known)
     function = Observed(sent_simulation(run.model, run.measured, run.statistic))
     misfit, reasons, opened = np.full((len(thetas), run.n_numbers), np.nan), [], Opened({})
-    for row, ((values, reason), found) in zip(misfit, run.pool.map(function, list(thetas)), strict=True):
+    for row, outcome in zip(misfit, run.pool.map(function, list(thetas)), strict=True):
+        (values, reason), found = unpack(outcome)
         reasons.append(reason)
         opened = opened if found is None else opened | found
         if values is not None:

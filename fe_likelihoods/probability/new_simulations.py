@@ -35,7 +35,7 @@ from ..simulation.model import (
     sent_simulation,
     simulate_batch,
 )
-from ..simulation.opened import Observed, Opened, observing
+from ..simulation.opened import Observed, Opened, observing, unpack
 from ..simulation.residual_statistics import Statistic
 from .failures import FailureLog
 from .requested_simulations import Requested, Simulated
@@ -212,7 +212,7 @@ class NewSimulations:
                     running.received = True
                     stream.running.pop((running.key, responses), None)
                     try:
-                        outcome, opened = running.future.result()
+                        outcome, opened = unpack(running.future.result())
                         self._complete_label(opened)
                         outcomes.append(outcome)
                         some.append(running)

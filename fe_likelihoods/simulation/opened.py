@@ -19,7 +19,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["Observed", "Opened", "file_digest", "note", "observing"]
+__all__ = ["Observed", "Opened", "file_digest", "note", "observing", "unpack"]
 
 _CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again without another time of modification
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -110,6 +110,11 @@ class Observed:
         if opened is not None:
             _known[self._token] = opened | _known.get(self._token, Opened({}))
         return result, opened
+
+
+def unpack(outcome: tuple) -> tuple[Any, Opened | None]:
+    """Result of a simulation in a worker and what it opened; the pool reports a lost worker by a result alone."""
+    return (outcome, None) if isinstance(outcome[1], str) else outcome
 
 
 def _observed(function: Callable[[Any], Any], token: str) -> Observed:
