@@ -37,7 +37,7 @@ class Generations(GuardedFile):
         self._has_earlier: bool | None = None  # rows of earlier releases, None until it was looked for
 
     def labels_of(self, model: Model) -> list[StoredLabel]:
-        """Labels under which simulations of a model were stored or adopted, those of the latest rows last."""
+        """Labels under which simulations of a model were stored or adopted."""
         query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
         source = source_number(model.fingerprint)
         rows = self._try("read", lambda connection: connection.execute(query, (source,)).fetchall(), [])
@@ -92,7 +92,8 @@ class Generations(GuardedFile):
     def _given_or_latest(self, fingerprint: str, generation: int | None) -> int:
         if generation is not None:
             return generation
-        return (self.generations_of(fingerprint) or self.generations_of(fingerprint, "responses") or [1])[0]
+        tables = ("simulations", "responses", "labels")
+        return next((found[0] for table in tables if (found := self.generations_of(fingerprint, table))), 1)
 
     def stored_rows(
         self, fingerprint: str | int, generation: int, n_channels: int, n_steps: int, most: int = MAX_CANDIDATES

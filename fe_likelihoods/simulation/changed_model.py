@@ -1,7 +1,8 @@
 """Models in worker processes whose code is not that of the process that sent them."""
 
 import logging
-from functools import cached_property
+import weakref
+from functools import partial
 from typing import Any
 
 from .faults import ChangedModel
@@ -12,6 +13,7 @@ __all__ = ["SentModel"]
 logger = logging.getLogger(__name__)
 
 _CODE = ("source of ", "function", "class", "output")  # items of a label that are the same in every worker
+_sent: dict[int, tuple[weakref.ref, dict[str, str]]] = {}  # by the id of a model
 _compared: set[str] = set()  # items with which those of this process were compared
 
 
@@ -31,12 +33,21 @@ class SentModel:
     def __init__(self, model: Any) -> None:
         self.model = model
 
-    @cached_property
+    @property
     def _items(self) -> dict[str, str]:
-        return ModelLabel(self.model).items
+        """Items of the label when the model was sent first, so that equal functions have equal bytes."""
+        known = _sent.get(id(self.model))
+        if known is None or known[0]() is not self.model:
+            forget = partial(_forget, id(self.model))
+            known = _sent[id(self.model)] = weakref.ref(self.model, forget), ModelLabel(self.model).items
+        return known[1]
 
     def __reduce__(self) -> tuple:
         return _receive_model, (self.model, self.model.fingerprint, self._items)
+
+
+def _forget(model_id: int, _: weakref.ref) -> None:
+    _sent.pop(model_id, None)
 
 
 def _receive_model(model: Any, fingerprint: str, items: dict[str, str]) -> SentModel:

@@ -34,7 +34,6 @@ from typing import Any
 
 import numpy as np
 
-from ..kernels.jit import KERNEL_HASH
 from .opened import Opened, file_digest
 
 __all__ = [
@@ -123,6 +122,8 @@ class ModelLabel:
     @property
     def identity(self) -> str:
         """Digest of the code and values alone, without versions of Python and of this library."""
+        from ..kernels.jit import KERNEL_HASH  # late, because it imports numba
+
         items = {name: digest for name, digest in self.items.items() if name not in ("python", "library")}
         return _joined(items or {"kernels": KERNEL_HASH})
 
@@ -178,9 +179,10 @@ class ModelLabel:
 
 
 def _parts_of(model: Any) -> dict[str, Any]:
-    """Class of the user, and attributes of an object."""
+    """Class of the user, and attributes of an object; a time limit changes no response."""
     name = type(model).__qualname__
-    return {"class": type(model)} | {f"{name}().{attribute}": value for attribute, value in _state(model).items()}
+    attributes = {attribute: value for attribute, value in _state(model).items() if attribute != "time_limit"}
+    return {"class": type(model)} | {f"{name}().{attribute}": value for attribute, value in attributes.items()}
 
 
 def _defined_by_user(function: Any) -> bool:
@@ -323,7 +325,7 @@ class _Walk:
         if kind in _PLAIN:
             self._text(f"{kind.__name__} {value!r}")
             return
-        self._text(f"{kind.__module__}.{kind.__qualname__}")
+        self._text(f"{_name_of(kind.__module__)}.{kind.__qualname__}")
         if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
             self._text(f"{value.dtype.str} {value.shape}")
             self._hash.update(np.ascontiguousarray(value).tobytes())
@@ -374,7 +376,7 @@ class _Walk:
 
     def _add_function(self, function: types.FunctionType) -> None:
         module = function.__module__ or ""
-        self._text(f"{module}.{function.__qualname__}")
+        self._text(f"{_name_of(module)}.{function.__qualname__}")
         if not is_of_user(module):
             self._refer(module)
             return
@@ -383,10 +385,10 @@ class _Walk:
         self._add_all({name: value for name, value in vars(function).items() if name != "__wrapped__"}.items())
         self._add(_attribute(function, "__wrapped__"))
         for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
-            self._waiting.setdefault(f"{module}.{name}", function.__globals__[name])
+            self._waiting.setdefault(f"{_name_of(module)}.{name}", function.__globals__[name])
 
     def _add_class(self, cls: type) -> None:
-        self._text(f"{cls.__module__}.{cls.__qualname__}")
+        self._text(f"{_name_of(cls.__module__)}.{cls.__qualname__}")
         if not is_of_user(cls.__module__):
             self._refer(cls.__module__)
             return
@@ -399,7 +401,7 @@ class _Walk:
                 continue
             self._text(name)
             if isinstance(member, _DATA) and "<locals>" not in cls.__qualname__:
-                self._waiting.setdefault(f"{cls.__module__}.{cls.__qualname__}.{name}", member)
+                self._waiting.setdefault(f"{_name_of(cls.__module__)}.{cls.__qualname__}.{name}", member)
             else:
                 self._add(member)
 
@@ -444,6 +446,11 @@ class _Walk:
             self._library.add(module)
         elif top and top not in sys.stdlib_module_names:
             self._packages.add(top)
+
+
+def _name_of(module: str) -> str:
+    """Name of a module; a script has another one in worker processes."""
+    return "__main__" if module in _SCRIPTS else module
 
 
 def _parts(reduced: Any) -> list[Any]:
