@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says the same
     from . import problems
     from .adapters import nautilus_prior, serve, to_bilby, to_pints, to_pymc
+    from .cache.simulation_cache import SimulationCache
+    from .cache.verification import StaleCache
     from .data.make_isolated_bridge import table_motion
     from .emulation.emulator import ResponseEmulator
     from .emulation.guide import ResponseGuide
@@ -98,11 +100,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time `_EXPORTS` says 
     from .signals.records import DisplacementHistory, Record
     from .signals.response_spectrum import ResponseSpectrum, response_spectrum
     from .simulation.dask_executor import DaskExecutor
-    from .simulation.disk_cache import SimulationCache
     from .simulation.faults import TransientReason
     from .simulation.local_pool import LocalPool
     from .simulation.model import ContinuedResponse, Model, SimulationFailed
-    from .simulation.verification import StaleCache
     from .units import from_si, to_si
 
 __all__ = [
@@ -454,7 +454,8 @@ _EXPORTS = {
         "response_spectrum",
     ),
     "simulation.dask_executor": ("DaskExecutor",),
-    "simulation.disk_cache": ("SimulationCache",),
+    "cache.simulation_cache": ("SimulationCache",),
+    "cache.verification": ("StaleCache",),
     "simulation.faults": ("TransientReason",),
     "simulation.local_pool": ("LocalPool",),
     "simulation.model": (
@@ -462,7 +463,6 @@ _EXPORTS = {
         "Model",
         "SimulationFailed",
     ),
-    "simulation.verification": ("StaleCache",),
     "units": (
         "from_si",
         "to_si",

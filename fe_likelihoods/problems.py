@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from .cache.simulation_cache import SimulationCache
 from .models.isolated_bridge_channels import CHANNEL_SETS
 from .probability.autoregressive_noise import AutoregressiveNoise
 from .probability.likelihood import FELikelihood
@@ -41,7 +42,6 @@ from .signals.channels import Channel, Measurements
 from .signals.datasets import Dataset, read_dataset
 from .signals.events import Events
 from .signals.records import Record
-from .simulation.disk_cache import SimulationCache
 from .units import to_si
 
 __all__ = [

@@ -46,6 +46,7 @@ ORDER = {
         ("models",),
         ("probability",),
         ("emulation",),
+        ("cache",),
         ("simulation",),
         ("signals",),
         ("plots",),

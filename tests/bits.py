@@ -236,12 +236,12 @@ def cached() -> Results:
     prior = {"a": TruncatedNormal(1.0, 0.3), "b": TruncatedNormal(0.2, 0.3), "sigma_x": HalfNormal(0.1)}
     points = Prior(prior).rvs(40, 4)
     with tempfile.TemporaryDirectory() as folder:
-        paths = [str(Path(folder) / name) for name in ("one.db", "export.h5", "two.db")]
+        paths = [str(Path(folder) / name) for name in ("one.db", "copy.db", "two.db")]
         posterior = Posterior(FELikelihood(model, measured, cache=paths[0]), Prior(prior))
         first = posterior(points)
-        posterior.likelihood.cache.export_hdf5(paths[1])
+        posterior.likelihood.cache.copy(paths[1])
         second = SimulationCache(paths[2])
-        second.import_hdf5(paths[1])
+        second.add(paths[1])
         again = Posterior(FELikelihood(model, measured, cache=second), Prior(prior))
         found = {"cache: log_prob": first, "cache: read back": again(points)}
         found["cache: simulations"] = np.array([posterior.likelihood.simulations, again.likelihood.simulations])

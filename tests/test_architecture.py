@@ -154,7 +154,7 @@ def test_file_formats_have_their_places():
                 "fe_likelihoods/simulation/cache_",
             )
             assert name(path).startswith(places), name(path)
-        assert "sqlite3" not in used or folder(path) == "simulation", name(path)
+        assert "sqlite3" not in used or folder(path) == "cache", name(path)
 
 
 def test_kernels_import_numba_numpy_and_each_other_alone():

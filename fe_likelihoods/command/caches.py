@@ -3,11 +3,14 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from ..simulation.disk_cache import SimulationCache
-from ..simulation.salvage import number_or_unknown, salvage
-from ..simulation.sqlite_file import CacheFile
+import numpy as np
 
-__all__ = ["Verified", "describe", "export_cache", "salvage_cache", "verify_cache"]
+from ..cache.salvage import number_or_unknown, salvage
+from ..cache.simulation_cache import SimulationCache
+from ..cache.sqlite_file import CacheFile
+from ..probability.likelihood import FELikelihood
+
+__all__ = ["Verified", "describe", "export_cache", "latest_stored", "salvage_cache", "verify_cache"]
 
 TIMEOUT = 30.0  # of another writer [s]
 
@@ -82,24 +85,23 @@ def _simulated_again(cache: SimulationCache, settings: Path) -> int:
     from .models import make_problem
 
     likelihood = make_problem(read_job(settings), cache).posterior.likelihood
-    shape = likelihood.measurements.n_channels, likelihood.measurements.n_steps
-    stored = cache.latest_success(likelihood.simulation_key, *shape)
+    stored = latest_stored(likelihood)
     if stored is None:
         raise ValueError(
             f"{cache.path} has no simulations of the model in {settings.name}; give the TOML file of its run"
         )
-    likelihood.misfit(stored.theta[None, :])
+    likelihood.misfit(stored[None, :])
     return cache.verified
 
 
 def export_cache(file: Path, out: Path) -> str:
-    """Write the simulations of a cache to an HDF5 file; what was done as a sentence."""
+    """Copy an undamaged cache to a new file, without its log; what was done as a sentence."""
     if out.exists():
         raise ValueError(f"{out} exists; give another file with --out")
     cache = _opened(file)
-    n = cache.export_hdf5(out)
+    n = cache.copy(out)
     cache.close()
-    return f"{n} simulations written to {out}"
+    return f"{n} simulations copied to {out}"
 
 
 def salvage_cache(file: Path, out: Path) -> str:
@@ -117,3 +119,14 @@ def salvage_cache(file: Path, out: Path) -> str:
         f"{found.rows} simulations copied to {out}, {number_or_unknown(found.lost)} could not be read; "
         f"{found.responses} responses copied, {number_or_unknown(found.lost_responses)} could not be read"
     )
+
+
+def latest_stored(likelihood: FELikelihood) -> np.ndarray | None:
+    """Structural parameters of the successful simulation that the cache of a likelihood stored last, if any."""
+    cache, key = likelihood.cache, likelihood.simulation_key
+    width = likelihood.statistics(np.zeros((0, len(likelihood.model.parameter_names)))).shape[1]
+    for generation in cache.generations_of(key):
+        for row in cache.stored_rows(key, generation, width, likelihood.measurements.n_steps, most=100):
+            if not row.reason:
+                return row.theta
+    return None

@@ -184,12 +184,12 @@ def verify(file: Path, settings: Path | None) -> None:
 
 
 @_cache_command("export")
-@click.option("--out", type=_FILE, help="HDF5 file.", show_default="FILE with the ending .h5")
+@click.option("--out", type=_FILE, help="New file.", show_default="FILE with -copy in its name")
 def export(file: Path, out: Path | None) -> None:
-    """Write all simulations of FILE to an HDF5 file, to archive or to copy them."""
+    """Write a copy of FILE, with all of its rows, to archive it or to take it to another machine."""
     from .caches import export_cache
 
-    click.echo(export_cache(file, out or file.with_suffix(".h5")))
+    click.echo(export_cache(file, out or file.with_name(f"{file.stem}-copy{file.suffix}")))
 
 
 @_cache_command("salvage")

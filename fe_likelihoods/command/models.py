@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..cache.simulation_cache import SimulationCache
 from ..models.external import UserModel
 from ..probability.distributions import Distribution, HalfNormal, Uniform
 from ..probability.likelihood import FELikelihood
@@ -20,7 +21,6 @@ from ..probability.parameters import channels_of_deviations
 from ..probability.posterior import Posterior
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
-from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model, SimulationFailed
 from .data import is_dataset, read_base_motion, read_bundled, read_measured
 from .job import Job

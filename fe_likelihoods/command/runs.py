@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..cache.simulation_cache import SimulationCache
 from ..prediction.prediction import Prediction
 from ..reporting.run import FinishedRun, read_run
 from ..signals.hdf5_files import DAMAGE
-from ..simulation.disk_cache import SimulationCache
 from .events import (
     Event,
     describe_events,

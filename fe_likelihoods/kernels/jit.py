@@ -129,7 +129,7 @@ class _Announcer(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         """A function begins to be compiled."""
-        package = event.data["dispatcher"].py_func.__module__.rpartition(".")[0]
+        package = (event.data["dispatcher"].py_func.__module__ or "").rpartition(".")[0]
         if self._has_announced or package != __package__ or CACHE_FOLDER is None or _is_worker():
             return
         self._has_announced = True

@@ -114,7 +114,6 @@ class BuiltInModel(StructuralModel):
     response_tolerance: ClassVar[float] = 0.0  # the same bits in every process
     _nominal_units: ClassVar[dict[str, str]] = {}
     _display_fields: ClassVar[tuple[str, ...]] = ("outputs", "unit", "units")
-    _code_version: ClassVar[str] = ""
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -133,8 +132,8 @@ class BuiltInModel(StructuralModel):
 
     @property
     def fingerprint(self) -> str:
-        """Digest that changes with everything that changes a response: arguments, excitation, kernels."""
-        parts = [type(self).__name__, self._code_version, repr([channel.name for channel in self.channels])]
+        """Digest of everything that is declared: arguments and excitation, not the code of this library."""
+        parts = [type(self).__name__, repr([channel.name for channel in self.channels])]
         for field in fields(self):
             if field.name not in self._display_fields:
                 parts.append(f"{field.name}={_text(getattr(self, field.name))}")

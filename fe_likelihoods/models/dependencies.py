@@ -3,35 +3,15 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterable
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from ..simulation.code_digest import code_digest
+from ..simulation.label import value_digest
+from ..simulation.opened import file_digest
 
-__all__ = ["Dependencies", "content_digest", "file_digest"]
-
-_CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again without another time of modification
-_digests: dict[str, tuple[tuple, float, str]] = {}
-
-
-def file_digest(path: str | os.PathLike) -> str:
-    """Digest of the content of a file, read again only after a change of its size or time of modification."""
-    name = os.fspath(path)
-    status = os.stat(name)
-    stamp = status.st_size, status.st_mtime_ns, status.st_ino
-    known = _digests.get(name)
-    if known is not None and known[0] == stamp and known[1] - status.st_mtime > _CLOCK_TICK:
-        return known[2]
-    now = time.time()
-    digest = blake2b(digest_size=16)
-    with open(name, "rb") as file:
-        while block := file.read(2**20):
-            digest.update(block)
-    _digests[name] = stamp, now, digest.hexdigest()
-    return digest.hexdigest()
+__all__ = ["Dependencies", "content_digest"]
 
 
 class Dependencies:
@@ -79,7 +59,7 @@ class Dependencies:
                 texts.append(content_digest(next(paths)))
                 continue
             try:
-                texts.append(code_digest(thing))
+                texts.append(value_digest(thing))
             except ValueError as error:
                 raise ValueError(
                     f"{self._kind}: no digest of {thing!r} in depends_on can be computed; give numbers, texts, arrays "

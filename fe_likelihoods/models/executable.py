@@ -21,7 +21,6 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..simulation.code_digest import code_digest
 from ..simulation.faults import RunFailed, TransientReason, reason_of
 from ..simulation.model import SimulationFailed
 from ..simulation.programs import run_program
@@ -93,10 +92,10 @@ class ExecutableModel(UserModel):
         variables of this process at each run, which are not part of the fingerprint: name those that matter in
         `depends_on`, since a cache compares only some of its rows with new runs.
     hash_executable : bool
-        Whether the fingerprint contains the content of the program, and of files that an argument names by an absolute
+        Whether the label contains the content of the program, and of files that an argument names by an absolute
         path, alone or as in ``--script=/path``. For large installations use `version` instead.
     written : sequence of Path, optional
-        Files among these that the program itself writes, such as a log; the fingerprint does not contain them.
+        Files among these that the program itself writes, such as a log; the label does not contain them.
     version : str, optional
         Text that enters the fingerprint; change it whenever the program computes something else for a reason that the
         files do not show. If `output` is a function, it replaces the code of the function.
@@ -117,8 +116,6 @@ class ExecutableModel(UserModel):
     ...     (Channel("top", "relative displacement", "mm"),), 0.01, 2000, time_limit=60.0,
     ... )
     """
-
-    change_advice = " A file that the program itself writes belongs in written=."
 
     def __init__(
         self,
@@ -180,33 +177,24 @@ class ExecutableModel(UserModel):
         written = {Path(file).resolve() for file in written}
         named = _named_files(self.command) if hash_executable else []
         self._named = tuple(file for file in named if file.resolve() not in written)
-        self.watched_files = (*self._named, *self.files.values(), *self._dependencies.paths)
         self._prepare()
 
     def _files(self) -> tuple[Path, ...]:
         return *self._named, *map(Path, self.files.values()), *self._dependencies.paths
 
     def _prepare(self) -> None:
-        self.fingerprint = self.current_fingerprint()
-
-    def current_fingerprint(self) -> str:
-        """Digest of everything that a response depends on, with the files as they are now."""
-        version = self.version
-        contents = [content_digest(path) for path in self._named]
-        copied = {name: content_digest(path) for name, path in sorted(self.files.items())}
-        parse: Any = [self.output, self.columns]
-        if callable(self.output):
-            try:
-                parse = version if version is not None else code_digest(self.output)
-            except ValueError as error:
-                raise ValueError(
-                    "ExecutableModel: no digest of the function output can be computed; give version=, a text to be "
-                    f"changed whenever the function changes: {error}"
-                ) from error
+        output = "function" if callable(self.output) else self.output
         stated = [] if self.env is None else [sorted(self.env.items())]
         if self.record is not None:
             stated.append(["record", self.record_file, self.record.fingerprint])
-        return self._digest(self.command, contents, sorted(self.templates.items()), copied, parse, version, *stated)
+        self.fingerprint = self._digest(output, self.columns, self.version, *stated)
+
+    def code_parts(self) -> dict[str, Any]:
+        """Program, input files and code of the user as they are now, for the label of stored simulations."""
+        contents = {f"file {path.name}": content_digest(path) for path in self._named}
+        copied = {f"copied {name}": content_digest(path) for name, path in self.files.items()}
+        templates = {f"template {name}": text for name, text in self.templates.items()}
+        return {"command": " ".join(self.command), "output": self.output, **templates, **contents, **copied}
 
     def _check_placeholders(self) -> None:
         """Raise ValueError unless every placeholder is a parameter and every parameter has a placeholder."""

@@ -6,7 +6,6 @@ simulation. The process is reused for the next run, which adds a fraction of a m
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,20 +13,12 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..simulation.by_value import is_worker
-from ..simulation.code_digest import describe_code
+from ..simulation.opened import Observed, note
 from ..simulation.sandbox import Sandbox
 from .external import UserModel
 from .validation import positive_float
 
 __all__ = ["FunctionModel"]
-
-logger = logging.getLogger(__name__)
-
-# fingerprints of functions that have run in this process, and of those that change what they use when they run
-_observed: set[str] = set()
-# (True: all that they change is known from their code)
-_changes_itself: dict[str, bool] = {}
 
 
 class _UnderRecord:
@@ -64,9 +55,9 @@ class FunctionModel(UserModel):
         Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
         another record then need no `from_state`.
     version : str, optional
-        Text that replaces the code in the fingerprint; change it whenever the function computes something else. By
-        default the fingerprint contains a digest of the code and of everything it uses
-        (`fe_likelihoods.simulation.code_digest`).
+        Text in the fingerprint; with another text, no simulation that is stored in a cache is used. Without it, a
+        change of the code, or of anything that it uses or opens, is noticed by the label of the model
+        (`fe_likelihoods.simulation.label`), and stored simulations are used where some of them agree with new ones.
     depends_on : sequence, optional
         What the response depends on besides the code, as part of the fingerprint: a Path stands for the content of a
         file or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
@@ -83,8 +74,7 @@ class FunctionModel(UserModel):
     Raises
     ------
     ValueError
-        If the function cannot be called, a limit is not positive, no stable digest of the code can be computed and
-        `version` is not given, or another argument is wrong.
+        If the function cannot be called, a limit is not positive, or another argument is wrong.
 
     Examples
     --------
@@ -131,87 +121,27 @@ class FunctionModel(UserModel):
         self.runs_per_process = runs_per_process
         settings = (time_limit, memory_limit, runs_per_process)
         self.isolated = bool(isolated) or any(setting is not None for setting in settings)
-        self.watched_files = tuple(map(str, self._dependencies.paths))
-        self._steady_at_start = ""
-        self._code_at_start = self._code()
         self._prepare()
 
     def _prepare(self) -> None:
-        self.fingerprint = self._digest(*self._identity(self._code_at_start))
+        stated = [] if self.version is None else [["version", str(self.version)]]
+        if self.record is not None:
+            stated.append(["record", self.record.fingerprint])
+        self.fingerprint = self._digest(*stated)
         self._run = self.function if self.record is None else _UnderRecord(self.function, self.record)
         if self.isolated:
+            observed = Observed(self._run)
             self._run = Sandbox(
-                self._run, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process
+                observed, self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process
             )
 
-    def current_fingerprint(self) -> str:
-        """The fingerprint of the function as it is now, computed again.
-
-        If the function itself changes what it uses, such as a counter or a table of earlier results, these values count
-        as unchanged: no other change of them can be told from that.
-        """
-        known = _changes_itself.get(self.fingerprint)
-        same = self.version is None and (known is False or (known and self._steady() == self._steady_at_start))
-        return self._digest(*self._identity(self._code_at_start if same else self._code()))
-
-    def only_own_changes(self) -> bool:
-        """Whether nothing has changed but values that the function may itself change when it runs."""
-        same_inputs = self._digest(*self._identity(self._code_at_start)) == self.fingerprint
-        return same_inputs and (self.version is not None or self._steady() == self._steady_at_start)
-
-    def accept_own_changes(self) -> None:
-        """State that the function has changed what it uses; these values are then not compared any more."""
-        if self.isolated or self.version is not None or self.fingerprint in _changes_itself:
-            return
-        _changes_itself[self.fingerprint] = self._steady() == self._steady_at_start
-        logger.info(
-            "%s changes what it uses when it runs, such as a counter or a table of earlier results; other changes of "
-            "these values are not noticed during a run. version= replaces its digest",
-            getattr(self.function, "__qualname__", self.function),
-        )
-
-    @property
-    def _fingerprinted(self) -> Callable:
-        """The function whose code is part of the fingerprint."""
-        return self.function
-
-    def _code(self) -> str:
-        """Digest of the code, empty if there is a version; ValueError if it has none."""
-        if self.version is not None:
-            return ""
-        try:
-            code = describe_code(self._fingerprinted)
-        except ValueError as error:
-            raise ValueError(
-                f"{type(self).__name__}: no digest of the function can be computed; give version=, a text to be "
-                f"changed whenever the function changes: {error}"
-            ) from error
-        self.watched_files = tuple(code.files) + tuple(map(str, self._dependencies.paths))
-        self._steady_at_start = self._steady_at_start or code.steady
-        return code.digest
-
-    def _steady(self) -> str:
-        """Digest of the code as it is now, without the values that it may itself change."""
-        return describe_code(self._fingerprinted, strict=False).steady
-
-    def _identity(self, code: str) -> list[Any]:
-        """Texts that identify what the function computes."""
-        identity = ["code", code] if self.version is None else ["version", str(self.version)]
-        return [identity] if self.record is None else [identity, ["record", self.record.fingerprint]]
+    def code_parts(self) -> dict[str, Any]:
+        """Code of the user, for the label of stored simulations."""
+        return {"function": self.function}
 
     def _respond(self, theta: np.ndarray) -> Any:
-        if self.isolated or self.version is not None or self.fingerprint in _observed or is_worker():
+        if not self.isolated:
             return self._run(theta)
-        before = self._code_or_error()
-        try:
-            return self._run(theta)
-        finally:
-            _observed.add(self.fingerprint)
-            if self._code_or_error() != before:
-                self.accept_own_changes()
-
-    def _code_or_error(self) -> str:
-        try:
-            return self._code()
-        except ValueError as error:
-            return str(error)
+        response, opened = self._run(theta)
+        note(opened)
+        return response

@@ -25,7 +25,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..kernels.jit import KERNEL_HASH
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import same_sampling, sample_window
@@ -103,7 +102,7 @@ class LinearStructure(ExternalModel):
         self.unit = unit
         self.lead = float(lead)
         self._acceleration = np.stack([support.acceleration for support in supports])
-        self.fingerprint = self._digest(KERNEL_HASH, repr(parts), self._window.start, [s.fingerprint for s in supports])
+        self.fingerprint = self._digest(repr(parts), self._window.start, [s.fingerprint for s in supports])
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """Return the same structure under other accelerations of its supports; errors as for a new one.

@@ -131,9 +131,6 @@ class OpenSeesModel(FunctionModel):
             runs_per_process=runs_per_process,
         )
 
-    @property
-    def _fingerprinted(self) -> Callable:
-        return self.function.build_and_run
-
-    def _identity(self, code: str) -> list[Any]:
-        return [*super()._identity(code), "openseespy", metadata.version("openseespy")]
+    def code_parts(self) -> dict[str, Any]:
+        """Code of the user and version of OpenSees, for the label of stored simulations."""
+        return {"function": self.function.build_and_run, "openseespy": metadata.version("openseespy")}

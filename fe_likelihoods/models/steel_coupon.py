@@ -14,7 +14,6 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels import reinforcing_steel
-from ..kernels.jit import KERNEL_HASH
 from ..signals.channels import Channel
 from ..signals.sampling import sample_window
 from ..simulation.model import SimulationFailed
@@ -65,7 +64,6 @@ class SteelCoupon(BuiltInModel):
     parameters: tuple[str, ...] = tuple(PARAMETERS)
     unit: str = "MPa"
 
-    _code_version: ClassVar[str] = KERNEL_HASH
     _time_label: ClassVar[str] = "step"
     _nominal_units: ClassVar[dict[str, str]] = {"fy": "MPa", "fu": "MPa", "Es": "GPa", "Esh": "GPa"}
 

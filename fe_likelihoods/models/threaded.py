@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..kernels.jit import KERNEL_HASH
 from ..simulation.model import MisfitBatch, SimulationBatch
 from ..simulation.threads import map_threads
 from .base import BuiltInModel
@@ -29,7 +28,6 @@ class ThreadedModel(BuiltInModel):
     """
 
     runs_on_threads: ClassVar[bool] = True
-    _code_version: ClassVar[str] = KERNEL_HASH
 
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
         """Simulate many sets of parameters on as many threads as numba uses.

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..cache.stored_responses import StoredResponses
 from ..signals.records import Record
 from ..simulation.kept_states import simulate_last_part
 from ..simulation.model import Model, SimulationBatch, simulate_batch
-from ..simulation.stored_responses import StoredResponses
 
 __all__ = ["STATES", "Excitation", "chosen_state", "excite", "under_record"]
 

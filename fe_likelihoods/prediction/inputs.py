@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..cache.memory import distinct_keys
 from ..probability.event_noise import EventNoise, find_events
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
@@ -17,7 +18,6 @@ from ..probability.likelihood import FELikelihood
 from ..probability.marginal_noise import sampled_noise
 from ..probability.noise_draws import SampleNoise, sample_noise
 from ..simulation.executors import as_executor
-from ..simulation.memory_cache import distinct_keys
 from ..simulation.model import Model
 from .model_error import ModelError, model_error
 

@@ -30,16 +30,16 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ..cache.simulation_cache import SimulationCache
+from ..cache.stored_responses import StoredResponses
 from ..probability.inputs import as_points
 from ..probability.noise import noise_time_shifts, noise_under, remark_on_gaps
 from ..probability.time_shift_noise import TimeShiftNoise
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
-from ..simulation.disk_cache import SimulationCache
 from ..simulation.kept_states import KEPT_STATES
 from ..simulation.model import Model, SimulationFailed
-from ..simulation.stored_responses import StoredResponses
 from .accumulator import Accumulator
 from .excitation import chosen_state, excite, under_record
 from .inputs import (

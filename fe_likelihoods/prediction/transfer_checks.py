@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..cache.verification import StaleCache
 from ..probability.autoregressive_noise import AutoregressiveNoise
 from ..probability.band_noise import BandNoise
 from ..probability.event_noise import find_events
@@ -26,7 +27,6 @@ from ..probability.relative_noise import RelativeNoise
 from ..probability.residuals import effective_samples, innovations, residual_checks
 from ..signals.channels import Channel, Measurements
 from ..simulation.faults import ChangedModel
-from ..simulation.verification import StaleCache
 from .inputs import PredictionSource
 from .model_error import follows_response
 from .prediction import Prediction

@@ -14,22 +14,17 @@ from typing import Any
 
 import numpy as np
 
+from ..cache.guard import ModelGuard
+from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys
+from ..cache.remarks import repeat_remark_of
+from ..cache.simulation_cache import SimulationCache
+from ..cache.verification import StaleCache, VerifiedCache
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
-from ..simulation.changed_model import ModelGuard
-from ..simulation.disk_cache import SimulationCache
 from ..simulation.executors import as_executor
-from ..simulation.fingerprint import read_attributes_again, simulation_fingerprint
-from ..simulation.memory_cache import MemoryCache, ResponseMemory, distinct_keys
-from ..simulation.model import (
-    Model,
-    SimulationBatch,
-    misfit_of_responses,
-)
-from ..simulation.remarks import repeat_remark_of
-from ..simulation.repeated_points import RepeatedPoints
+from ..simulation.label import ModelLabel
+from ..simulation.model import Model, SimulationBatch, misfit_of_responses
 from ..simulation.residual_statistics import Statistic, statistic_width
-from ..simulation.verification import StaleCache, VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .inputs import as_rows, check_statistic, name_of_statistic
 from .new_simulations import NewSimulations
@@ -38,6 +33,8 @@ from .running_requests import RunningRequests
 from .sample_counts import count_samples
 
 __all__ = ["CachedSimulations"]
+
+_OF_PROCESS = ("_running", "_has_results", "when_simulated")  # not pickled
 
 
 class CachedSimulations(NewSimulations):
@@ -81,25 +78,27 @@ class CachedSimulations(NewSimulations):
         self.memory_cache = MemoryCache(memory_rows)
         self.response_memory = ResponseMemory(memory_bytes)
         self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
-        self._verified_cache = None if self.cache is None else VerifiedCache(self.cache, model, self.pool)
-        self._guard, self._repeated_points = ModelGuard(model), RepeatedPoints()
-        read_attributes_again(model)
+        self._own_label = label = ModelLabel(model, statistic)
+        self._verified_cache = None if self.cache is None else VerifiedCache(self.cache, model, self.pool, label)
+        if self._verified_cache is not None:
+            self._own_label = label = self._verified_cache.label  # an equal one
+        self._guard = ModelGuard(model, label)
         self._key = None if cache is None else self.simulation_key
         self.chunk_size = 1
         self.simulations = self.cache_hits = self.disk_hits = 0
         self.seconds = 0.0
-        self._outcomes = 0
+        self._outcomes, self._has_repeated_remark = 0, False
         self.shortened: list[CachedSimulations] = []  # likelihoods of the first parts of the measurements
 
     def __getstate__(self) -> dict:
-        kept = {name: value for name, value in self.__dict__.items() if name not in ("_running", "when_simulated")}
+        kept = {name: value for name, value in self.__dict__.items() if name not in _OF_PROCESS}
         return kept | {"pool": None, "shortened": []}
 
     @property
     def verifications(self) -> int:
         """Number of earlier simulations that were compared with a new one, besides `simulations`."""
         stored = 0 if self._verified_cache is None else self._verified_cache.compared
-        return stored + self._repeated_points.compared
+        return stored + self._guard.compared
 
     @property
     def unverified(self) -> int:
@@ -128,24 +127,24 @@ class CachedSimulations(NewSimulations):
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest of everything the cached statistics depend on: model, measurements, statistic of the noise.
+        """Hex digest of everything that is known of what the statistics depend on: `simulation_key` and code.
 
-        The source files of the library are not part of it; they are part of `simulation_key`.
+        The code and values of the user are those at the time when the likelihood was made.
         """
+        return hashlib.blake2b(f"{self.simulation_key} {self._label.identity}".encode(), digest_size=16).hexdigest()
+
+    @property
+    def simulation_key(self) -> str:
+        """Declared identity under which a `SimulationCache` stores the statistics: model, measurements, statistic."""
         text = f"{self.model.fingerprint} {self.measurements.fingerprint}{name_of_statistic(self._statistic)}"
         if isinstance(self.measured, Comparison):
             text += self.measured.description
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
-    def simulation_key(self) -> str:
-        """Key under which a `SimulationCache` stores the statistics: `fingerprint` and digest of the source files."""
-        return f"{self.fingerprint} {simulation_fingerprint(self.model, self._statistic)}"
-
-    @property
     def cache_keys(self) -> tuple[str, str]:
         """Keys under which a `SimulationCache` stores the statistics and the responses, as `forget` takes them."""
-        return self.simulation_key, simulation_fingerprint(self.model)
+        return self.simulation_key, self.model.fingerprint
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals, without unknown time shifts: the first columns of `statistics`.
@@ -233,6 +232,12 @@ class CachedSimulations(NewSimulations):
         requested = self._requested(keys, misfit, np.array(known, dtype=bool), response)
         self._read(requested)
         return requested.cached
+
+    def are_stored(self, thetas: np.ndarray) -> np.ndarray:
+        """Whether the cache on disk has a simulation, a response or a failure (n,), which is not read or verified."""
+        if self.cache is None:
+            return np.zeros(len(thetas), dtype=bool)
+        return self._verified_cache.are_stored(self.cache_keys, thetas, self.model)
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache statistics that are known from an earlier run in memory, without a simulation.
@@ -376,10 +381,9 @@ class CachedSimulations(NewSimulations):
 
     def _verified(self, look_up: Callable, *arguments: Any) -> Any:
         """Rows from the disk, of which some are simulated again; if these differ, the caches in memory are emptied."""
-        run = VerifyingRun(self.model, self.pool, self.measured, self._statistic, self._width)
         earlier = self._verified_cache.seconds
         try:
-            return look_up(*arguments, run)
+            return look_up(*arguments, self._verifying_run)
         except StaleCache:
             self.memory_cache.clear()
             self.response_memory.clear()
@@ -423,8 +427,10 @@ class CachedSimulations(NewSimulations):
                     requested.response[row] = np.nan
             self._add_outcomes(requested, rows[new])
             if self.cache is not None:
-                n_steps = self.measurements.n_steps
-                self.cache.store(self._key, requested.thetas[rows[new]], n_steps, misfit, reasons_of_new, 0.0)
+                run = self._verifying_run
+                self._verified_cache.store(
+                    self._key, requested.thetas[rows[new]], misfit, reasons_of_new, None, 0.0, run
+                )
         requested.cached[rows] = True
 
     def _read_failures(self, requested: Requested, rows: np.ndarray) -> None:
@@ -441,7 +447,9 @@ class CachedSimulations(NewSimulations):
     def _add_outcomes(self, requested: Requested, rows: np.ndarray) -> None:
         """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
         self._outcomes += len(rows)
-        if len(rows):
+        self._has_results = self._has_results or len(rows) > 0
+        if len(rows) and not self._has_repeated_remark:
+            self._has_repeated_remark = True
             repeat_remark_of(self.model, self.cache)
         for row in rows:
             if requested.reasons[row]:

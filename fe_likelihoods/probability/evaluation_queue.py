@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..simulation.memory_cache import distinct_keys
+from ..cache.memory import distinct_keys
 from ..simulation.model import has_batch_method
 from .inputs import as_points
 from .joint import JointLikelihood
@@ -53,7 +53,6 @@ class _Part:
         self.likelihood, self.columns = likelihood, columns
         self.running: dict[RunningSimulation, list[_Point]] = {}
         self.unstarted: deque[list[_Point]] = deque()  # without a pool, or stored on disk, or after an error
-        self._cache_keys = () if likelihood.cache is None else likelihood.cache_keys
 
     def thetas(self, points: Sequence[_Point]) -> np.ndarray:
         """Structural parameters (n, n_structural)."""
@@ -62,9 +61,7 @@ class _Part:
 
     def are_stored(self, thetas: np.ndarray) -> np.ndarray:
         """Whether the cache on disk has rows (n,), which are not read yet, since that may take a verification."""
-        if self.likelihood.cache is None:
-            return np.zeros(len(thetas), dtype=bool)
-        return self.likelihood.cache.are_stored(self._cache_keys, thetas)
+        return self.likelihood.are_stored(thetas)
 
     def value(self, point: _Point, misfit: np.ndarray) -> float:
         """Log-likelihood of a point from the statistics (n_numbers,) of its simulation."""

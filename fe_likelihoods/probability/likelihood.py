@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from ..cache.simulation_cache import SimulationCache
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.sampling import same_step
-from ..simulation.disk_cache import SimulationCache
 from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
 from .cached_simulations import CachedSimulations
 from .data_identity import combined_digest, data_digests
@@ -426,5 +426,5 @@ class FELikelihood(CachedSimulations):
         )
         other.pool, other.response_memory = self.pool, self.response_memory
         if self._verified_cache is not None:
-            other._verified_cache.share_schedule(self._verified_cache)
+            other._verified_cache.share_trust(self._verified_cache)
         return other

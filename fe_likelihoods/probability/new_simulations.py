@@ -15,29 +15,30 @@ from typing import Any
 
 import numpy as np
 
+from ..cache.adoption import observed_batch
+from ..cache.guard import EarlierPoint, ModelGuard
+from ..cache.memory import MemoryCache, ResponseMemory
+from ..cache.remarks import store_remark_of
+from ..cache.row_buffer import FinishedRows, RowBuffer
+from ..cache.simulation_cache import SimulationCache
+from ..cache.tolerance import VerifyingRun
+from ..cache.verification import VerifiedCache
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
-from ..simulation.changed_model import ModelGuard
-from ..simulation.disk_cache import SimulationCache
 from ..simulation.faults import ChangedModel
-from ..simulation.fingerprint import simulation_fingerprint
-from ..simulation.memory_cache import MemoryCache, ResponseMemory
+from ..simulation.label import ModelLabel
 from ..simulation.model import (
     Model,
     SimulationBatch,
     has_batch_method,
-    misfit_batch,
     misfit_of_responses,
     sent_simulation,
     simulate_batch,
 )
-from ..simulation.remarks import store_remark_of
-from ..simulation.repeated_points import RepeatedPoints
+from ..simulation.opened import Observed, Opened, observing, unpack
 from ..simulation.residual_statistics import Statistic
-from ..simulation.verification import VerifiedCache, VerifyingRun
 from .failures import FailureLog
 from .requested_simulations import Requested, Simulated
-from .row_buffer import FinishedRows, RowBuffer
 
 __all__ = ["NewSimulations", "RunningSimulation", "take_all"]
 
@@ -114,15 +115,18 @@ class NewSimulations:
     seconds: float
     _statistic: Statistic | None
     _width: int
+    _n_structural: int
     _response_shape: tuple[int, int]
     _failures: FailureLog
     _guard: ModelGuard
-    _repeated_points: RepeatedPoints
+    _own_label: ModelLabel
     _verified_cache: VerifiedCache | None
     _key: str | None
     _outcomes: int  # simulations of which is known whether they failed: run here, read from disk, or recalled
 
     # called with the number of simulations that have ended, in this process only
+    # whether there are results in memory, of this process
+    _has_results: bool = False
     when_simulated: Callable[[int], None] | None = None
     _running: _Stream | None = None  # not pickled
 
@@ -208,7 +212,9 @@ class NewSimulations:
                     running.received = True
                     stream.running.pop((running.key, responses), None)
                     try:
-                        outcomes.append(running.future.result())
+                        outcome, opened = unpack(running.future.result())
+                        self._complete_label(opened)
+                        outcomes.append(outcome)
                         some.append(running)
                     except CancelledError:
                         running.error = RuntimeError("the pool was closed before a simulation had finished")
@@ -274,7 +280,7 @@ class NewSimulations:
         stream, full = self._stream, self._runs_responses(responses)
         if stream.function is None or stream.function[0] is not self.model or stream.function[1] != full:
             sent = sent_simulation(self.model, *(() if full else (self.measured, self._statistic)))
-            stream.function = self.model, full, sent
+            stream.function = self.model, full, Observed(sent)
         return stream.function[2]
 
     def _runs_responses(self, responses: bool) -> bool:
@@ -373,10 +379,14 @@ class NewSimulations:
         start = time.perf_counter()
         batch = None
         if self._runs_responses(responses):
-            batch = simulate_batch(self.model, thetas, self.pool)
+            with observing() as observer:
+                batch = simulate_batch(self.model, thetas, self.pool)
+            if self._label.observes and self.pool is None:
+                self._complete_label(observer.result(self._label.known))
             misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self._statistic)
         else:
-            misfit, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self._statistic)
+            misfit, reasons, opened = observed_batch(self._verifying_run, thetas, self._label)
+            self._complete_label(opened)
         result = self._record(keys, thetas, misfit, reasons, batch, responses, time.perf_counter() - start)
         self.write_simulations()
         return result
@@ -402,8 +412,8 @@ class NewSimulations:
                 self._failures.add(theta, reason)
         if self.when_simulated is not None:
             self.when_simulated(len(thetas))
-        self._compare_model(thetas, seconds)
-        self._repeated_points.add(thetas, misfit, reasons, unchanged=not self._guard.unchecked)
+        self._compare_model(thetas, misfit, reasons, seconds)
+        self._has_results = True
         self.memory_cache.store(keys, misfit)
         if responses:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
@@ -418,34 +428,69 @@ class NewSimulations:
 
     def _write_rows(self, rows: FinishedRows) -> None:
         """Write simulations to the cache on disk."""
-        if rows.response is not None:
-            # before the statistics, which are computed from them if the program is killed in between
-            self.cache.store_responses(self.model, rows.thetas, rows.response)
-        self.cache.store(self._key, rows.thetas, self.measurements.n_steps, rows.misfit, rows.reasons, rows.seconds)
-        self.cache.store_failures(self.model, rows.thetas, rows.reasons)
+        self._verified_cache.store(
+            self._key, rows.thetas, rows.misfit, rows.reasons, rows.response, rows.seconds, self._verifying_run
+        )
         store_remark_of(self.model, self.cache)
-        self._verified_cache.add_own(rows.thetas, self._key, simulation_fingerprint(self.model))
 
-    def _compare_model(self, thetas: np.ndarray, seconds: float) -> None:
+    @property
+    def _verifying_run(self) -> VerifyingRun:
+        tolerance = None if self.cache is None else self.cache.tolerance
+        return VerifyingRun(self.model, self.pool, self.measured, self._statistic, self._width, tolerance)
+
+    @property
+    def _label(self) -> ModelLabel:
+        """Label of the model, which likelihoods of one model and file share."""
+        return self._own_label if self._verified_cache is None else self._verified_cache.label
+
+    def _complete_label(self, opened: Opened | None) -> None:
+        """Add to the label of the model what simulations opened."""
+        if self._verified_cache is None:
+            self._own_label.add(opened)
+        else:
+            self._verified_cache.complete(opened)
+
+    def _label_again(self) -> None:
+        """Label the model as it is now, if it has changed since the likelihood was made and nothing was used yet."""
+        changed = self._guard.known.changed(self.model)
+        if changed <= self._guard.changing:
+            self._guard.known.renew(self.model)
+        else:
+            label = ModelLabel(self.model, self._statistic)
+            if self.cache is not None:
+                self._verified_cache = VerifiedCache(self.cache, self.model, self.pool, label)
+                label = self._verified_cache.label
+            self._own_label, self._guard = label, ModelGuard(self.model, label)
+
+    def _compare_model(self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float) -> None:
         """Compare the model after simulations, if that is due."""
         stream, last = self._stream, not self._stream.running
         if self.streams:
             seconds = time.perf_counter() - stream.compared_at
-        if self._check_model(self._guard.after, thetas, self.pool is None, seconds, last):
+        if self._check_model(self._guard.after, thetas, misfit, reasons, seconds, last):
             stream.compared_at = time.perf_counter()
 
     def _check_model(self, check: Callable, *arguments: Any) -> Any:
         """Raise `ChangedModel` if the model has changed; simulations since the last check are then dropped."""
-        run = VerifyingRun(self.model, self.pool, self.measured, self._statistic, self._width)
+        self._guard.known.add(self._label.opened)
+        self._guard.changing |= self._label.changing
+        if not self._guard.points and check == self._guard.before:
+            if not self._has_results:
+                self._label_again()
+                check = self._guard.before
+            else:  # only rows of the disk are known
+                known = self.memory_cache.successes(self._n_structural)[:1]
+                statistics, _ = self.memory_cache.look_up([theta.tobytes() for theta in known], self._width)
+                self._guard.points += map(EarlierPoint, known, statistics)
         try:
-            return check(self.model, partial(self._repeated_points.agree, run, self.cache), *arguments)
+            return check(self._verifying_run, *arguments)
         except ChangedModel:
             self.memory_cache.clear()
             self.response_memory.clear()
             if self.cache is not None and self._guard.unchecked:
                 self.write_simulations()
                 unchecked = np.concatenate(self._guard.unchecked)
-                self.cache.discard(unchecked, self._key, simulation_fingerprint(self.model))
+                self._verified_cache.discard(unchecked, self._key, self.model.fingerprint)
             raise
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..simulation.memory_cache import distinct_keys
+from ..cache.memory import distinct_keys
 from .new_simulations import RunningSimulation, take_all
 
 __all__ = ["RunningRequests"]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..simulation.remarks import RemarkTable
+from ..cache.simulation_cache import SimulationCache
 from .failures import Failures
 from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits
 from .run import LONGEST_AUTOCORRELATION, FinishedRun
@@ -289,7 +289,7 @@ def _of_the_model(run: FinishedRun) -> list[Advice]:
     found, likelihoods = [], [] if run.likelihood is None else [each for each, _ in run.likelihood.parts()]
     for likelihood in likelihoods:
         text = getattr(likelihood.model, "range_remark", "")
-        if not text and isinstance(likelihood.cache, RemarkTable) and hasattr(likelihood.model, "range_remark"):
+        if not text and isinstance(likelihood.cache, SimulationCache) and hasattr(likelihood.model, "range_remark"):
             text = likelihood.cache.look_up_remark(likelihood.model)
         if text:
             action = "See whether samples of the posterior are concerned, or only draws far from it."

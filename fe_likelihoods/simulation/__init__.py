@@ -1,1 +1,1 @@
-"""How simulations are run and stored: model protocol, executors, processes and caches."""
+"""How simulations are run and stored: model protocol, executors, processes, and labels of code."""

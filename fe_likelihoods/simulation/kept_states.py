@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .code_digest import describe_code
 from .faults import raise_if_it_ends_the_run, reason_of
+from .label import LIBRARY, items_of, note_own_changes, steady_digest
 from .model import Model, SimulationBatch, SimulationFailed, first_part, not_finite, real_response, simulate_batch
-from .source_digest import LIBRARY
 from .threads import run_on_threads
 
 __all__ = ["KEPT_STATES", "StateMemory", "simulate_last_part"]
@@ -172,7 +171,7 @@ def _identity(model: Model) -> str:
     cls = type(model)
     if cls.__module__.split(".")[0] == LIBRARY:
         return model.fingerprint
-    return f"{model.fingerprint} {describe_code([cls], strict=False, user=cls).steady}"
+    return f"{model.fingerprint} {steady_digest({'class': cls})}"
 
 
 def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> list[_Start]:
@@ -194,12 +193,14 @@ def _run(
 ) -> list[tuple[np.ndarray | None, np.ndarray | None, str]]:
     """Response (if `responses` are wanted), state at the end and reason of the failure of each simulation."""
     items = [(theta.copy(), start) for theta, start in zip(thetas, starts, strict=True)]
+    before = items_of({"class": type(model)})
     if pool is not None:
         outcomes = list(pool.map(partial(_continue, responses, model), items)) if items else []
     elif getattr(model, "runs_on_threads", False):
         outcomes = run_on_threads(partial(_continue, responses, model), items)
     else:
         outcomes = [_continue(responses, model, item) for item in items]
+    note_own_changes(before, items_of({"class": type(model)}))
     return [(*(found or (None, None)), reason) for found, reason in outcomes]
 
 

@@ -9,9 +9,9 @@ from statistics import median
 
 import numpy as np
 
+from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.problems import bridge_column
-from fe_likelihoods.simulation.disk_cache import SimulationCache
 
 from .rows import Row
 

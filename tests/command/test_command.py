@@ -218,7 +218,7 @@ def test_caches(folder):
     assert "simulations " in call("cache", "info", file)
     assert "0 of which do not match" in call("cache", "verify", file)
     assert "stored points were simulated again" in call("cache", "verify", file, "--settings", "oscillator.toml")
-    assert "simulations written to all.h5" in call("cache", "export", file, "--out", "all.h5")
+    assert "simulations copied to all.sqlite" in call("cache", "export", file, "--out", "all.sqlite")
     assert "0 could not be read" in call("cache", "salvage", file, "--out", "new.sqlite")
     told, copied = (call("cache", "info", name).splitlines() for name in (file, "new.sqlite"))
     assert told[1] == copied[1] and told[3] == copied[3] and not told[3].startswith("responses    0,")

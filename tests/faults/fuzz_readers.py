@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
 
 from fe_likelihoods import (
     Channel,
@@ -39,7 +40,6 @@ from fe_likelihoods import (
     read_v2,
     write_dataset,
 )
-from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
 from tests.signals.network_files import esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
 

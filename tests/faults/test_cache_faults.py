@@ -18,13 +18,13 @@ import h5py
 import numpy as np
 import pytest
 
+from fe_likelihoods.cache import guarded_file
+from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.cache.sqlite_file import APPLICATION_ID, SCHEMA_VERSION, CacheFile
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation import guarded_file
-from fe_likelihoods.simulation.disk_cache import SimulationCache
-from fe_likelihoods.simulation.sqlite_file import APPLICATION_ID, SCHEMA_VERSION, CacheFile
 
 from . import cached_run
 

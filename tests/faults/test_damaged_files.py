@@ -5,9 +5,9 @@ import time
 import h5py
 import numpy as np
 import pytest
+from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
 
 from fe_likelihoods import Channel, Measurements, Record, read_at2, read_csv, read_dataset, read_v2, write_dataset
-from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
 from tests.faults.fuzz_readers import fuzz, zipped
 from tests.signals.test_readers import cosmos
 

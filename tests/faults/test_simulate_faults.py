@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.channels import Measurements
-from fe_likelihoods.simulation.disk_cache import SimulationCache
 from tests.faults import cached_run, guided_run
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, DiesOnce, Treacherous, line

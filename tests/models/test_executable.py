@@ -13,6 +13,7 @@ import pytest
 from fe_likelihoods import ExecutableModel, LocalPool, SimulationFailed
 from fe_likelihoods.simulation import programs
 from fe_likelihoods.simulation.faults import TransientReason
+from fe_likelihoods.simulation.label import ModelLabel
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
 
@@ -250,7 +251,7 @@ def test_wrong_arguments_are_rejected(options, advice):
         model_of(**options)
 
 
-def test_fingerprint_depends_on_everything_that_is_run(tmp_path):
+def test_fingerprint_and_label_depend_on_everything_that_is_run(tmp_path):
     script, template, data = tmp_path / "solver", tmp_path / "template", tmp_path / "data"
     script.write_text("#!/bin/sh\necho 1\n")
     script.chmod(0o755)
@@ -259,7 +260,8 @@ def test_fingerprint_depends_on_everything_that_is_run(tmp_path):
 
     def fingerprint(**options):
         settings = {"command": [str(script), "-x"], "templates": {"in.txt": template}, "files": {"d": data}}
-        return model_of(**settings | options).fingerprint
+        model = model_of(**settings | options)
+        return model.fingerprint, ModelLabel(model).code
 
     first = fingerprint()
     assert first == fingerprint() == fingerprint(time_limit=1.0, keep_failures=tmp_path)
@@ -274,6 +276,7 @@ def test_fingerprint_depends_on_everything_that_is_run(tmp_path):
         path.write_text(text)
         prints.add(fingerprint())
     assert len(prints) == 10
+    assert len({declared for declared, _ in prints}) == 5  # output, version, columns, function
     unhashed = fingerprint(hash_executable=False)
     script.write_text("#!/bin/sh\necho 3\n")
     assert fingerprint(hash_executable=False) == unhashed

@@ -6,6 +6,7 @@ import signal
 import numpy as np
 import pytest
 
+from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
@@ -18,7 +19,6 @@ from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.disk_cache import SimulationCache
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
 
 RECORD = Record("pulse", 0.01, np.sin(np.arange(40) / 3))
@@ -228,7 +228,7 @@ def test_responses_are_not_pickled(thetas):
     small = len(pickle.dumps(likelihood))
     likelihood.simulate(np.column_stack([np.arange(1000.0), np.full(1000, 0.5)]))
     copy = pickle.loads(pickle.dumps(likelihood))
-    assert len(pickle.dumps(likelihood)) < small + 100
+    assert len(pickle.dumps(likelihood)) < small + 300  # 1000 responses have 128 000 bytes
     assert (len(copy.response_memory), copy.response_memory.max_bytes) == (0, 2**28)
 
 

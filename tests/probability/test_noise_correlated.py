@@ -9,6 +9,7 @@ import pytest
 from scipy import linalg, stats
 
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
+from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.scores import interval_score
@@ -20,7 +21,6 @@ from fe_likelihoods.probability.residuals import effective_samples, lag_one_sums
 from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.disk_cache import SimulationCache
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))

@@ -33,8 +33,8 @@ from fe_likelihoods import (
     propagate,
     residual_checks,
 )
+from fe_likelihoods.cache.tolerance import largest_difference
 from fe_likelihoods.emulation.target import ResponseTarget
-from fe_likelihoods.simulation.tolerance import largest_difference
 
 N, DT = 240, 0.02
 CHANNELS = (Channel("top", "acceleration", "m/s2"), Channel("base", "displacement", "mm"))

@@ -12,10 +12,12 @@ import zlib
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
+from fe_likelihoods.cache import rows as cache_rows
+from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.command.caches import latest_stored
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal, Uniform
@@ -24,8 +26,7 @@ from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation import cache_rows, source_digest
-from fe_likelihoods.simulation.disk_cache import SimulationCache
+from fe_likelihoods.simulation import label
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
 
 SINE = np.sin(np.arange(50.0))
@@ -131,6 +132,8 @@ def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
 
 def test_a_batch_needs_three_queries_and_one_write(path, thetas):
     likelihood = likelihood_of(Batched(), path)
+    for shift in (1.0, 2.0):  # the first begins a generation, the second finds it
+        likelihood.misfit(thetas[:1] + shift)
     statements = []
     likelihood.cache.file.connection().set_trace_callback(statements.append)
     likelihood.chunk_size = 1000
@@ -197,12 +200,12 @@ def test_settings_of_the_integrator_are_part_of_the_key(path, change):
         assert (likelihood.simulations, likelihood.disk_hits) == (1, 0)
 
 
-def test_other_code_of_the_model_is_another_simulation(path, monkeypatch):
+def test_other_code_of_the_library_is_verified_and_adopted(path, monkeypatch):
     oscillator(path).misfit([[1.1, 0.9]])
-    monkeypatch.setattr(source_digest, "source_digest", lambda *modules: "other code")
-    changed = oscillator(path)
-    changed.misfit([[1.1, 0.9]])
-    assert (changed.simulations, changed.disk_hits) == (1, 0)
+    monkeypatch.setattr(label, "_library_digest", lambda: "other code")
+    same = oscillator(path)
+    same.misfit([[1.1, 0.9]])
+    assert (same.simulations, same.disk_hits, same.verifications) == (0, 1, 1)
 
 
 def test_noise_prior_and_display_units_change_nothing(path):
@@ -222,7 +225,7 @@ def test_noise_prior_and_display_units_change_nothing(path):
 
 
 def test_a_model_that_changes_during_the_run_is_an_error(path, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.simulation.changed_model._SHARE_OF_TIME", np.inf)  # checked every time
+    monkeypatch.setattr("fe_likelihoods.cache.guard._SHARE_OF_TIME", np.inf)  # checked every time
     likelihood = oscillator(path)
     likelihood.misfit([[1.0, 1.0]])
     likelihood.model.period = 0.7
@@ -320,56 +323,30 @@ def test_forget_deletes_the_simulations_of_one_model(path, thetas):
     forgotten.misfit(thetas)
     stored = forgotten.cache.info()
     last = thetas[np.isfinite(forgotten.misfit(thetas)).all(axis=1)][-1]
-    assert forgotten.cache.latest_success(forgotten.simulation_key, 2, 8).theta.tolist() == last.tolist()
+    assert latest_stored(forgotten).tolist() == last.tolist()
     assert forgotten.cache.forget(*forgotten.cache_keys) == stored.simulations - 1 + stored.responses + stored.failures
     assert (forgotten.cache.info().simulations, forgotten.cache.info().responses) == (1, 0)
-    assert forgotten.cache.latest_success(forgotten.simulation_key, 2, 8) is None
+    assert latest_stored(forgotten) is None
     again = oscillator(path)
     again.misfit([[1.1, 0.9]])
     assert again.disk_hits == 1
 
 
-def test_export_and_import(tmp_path, path, thetas):
+def test_a_copy_and_the_rows_of_another_file(tmp_path, path, thetas):
     first = likelihood_of(Line(), path)
     first.misfit(thetas)
-    wide = LinearOscillator(Record("sine", 0.02, SINE))
-    FELikelihood(wide, Measurements(wide.channels, 0.02, np.ones((2, 50))), cache=path).misfit([[1.0, 1.0]])
-    assert SimulationCache(path).export_hdf5(tmp_path / "out.h5") == 301
-    other = SimulationCache(tmp_path / "other.sqlite")
-    other.store(likelihood_of(Line()).simulation_key, thetas[:1], 8, np.ones((1, 2)), [""], 1.0)
-    assert other.import_hdf5(tmp_path / "out.h5") == 301
-    other.verify = False  # one row is not that of the model
-    likelihood = likelihood_of(Line(), other)
-    misfit = likelihood.misfit(thetas)
-    assert likelihood.simulations == 0
-    np.testing.assert_array_equal(misfit[1:], likelihood_of(Line()).misfit(thetas)[1:])
-    assert (misfit[0] == 1.0).all()  # stored rows are not changed
-    assert likelihood.failure_reasons == first.failure_reasons
-    assert other.info().seconds > 1.0
-    empty = SimulationCache(tmp_path / "empty.sqlite")
-    assert empty.export_hdf5(tmp_path / "empty.h5") == other.import_hdf5(tmp_path / "empty.h5") == 0
-
-
-def test_exports_that_cannot_be_imported(tmp_path, path, thetas):
-    likelihood_of(Line(), path).misfit(thetas)
-    cache = SimulationCache(path)
+    oscillator(path).misfit([[1.0, 1.0]])
+    assert SimulationCache(path).copy(tmp_path / "copy.sqlite") == 301
+    other = likelihood_of(Line(), tmp_path / "other.sqlite")
+    other.misfit(thetas[:50])
+    assert (other.cache.add(tmp_path / "copy.sqlite"), other.cache.add(path)) == (251, 0)
+    again = likelihood_of(Line(), tmp_path / "other.sqlite")
+    np.testing.assert_array_equal(again.misfit(thetas), first.misfit(thetas))
+    assert (again.simulations, again.verifications) == (0, 2)
+    with pytest.raises(ValueError, match="path of a new file"):
+        other.cache.copy(path)
     with pytest.raises(ValueError, match="the cache itself"):
-        cache.export_hdf5(path)
-    with pytest.raises(ValueError, match="no folder"):
-        cache.export_hdf5(tmp_path / "nowhere" / "out.h5")
-    with pytest.raises(ValueError, match="not a complete export"):
-        cache.import_hdf5(path)
-    exported = tmp_path / "out.h5"
-    cache.export_hdf5(exported)
-    with h5py.File(exported, "r+") as file:
-        file["misfit"][17] *= 1.0 + 1e-12
-    with pytest.raises(ValueError, match="do not match their checksums"):
-        SimulationCache(tmp_path / "new.sqlite").import_hdf5(exported)
-    with h5py.File(exported, "r+") as file:
-        file.attrs["schema_version"] = 3
-    with pytest.raises(ValueError, match="version 2, got .* version 3"):
-        cache.import_hdf5(exported)
-    assert cache.info().simulations == 300
+        other.cache.add(tmp_path / "other.sqlite")
 
 
 @pytest.mark.parametrize("name", ["max_rows", "max_response_bytes"])
@@ -536,7 +513,7 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     likelihood = likelihood_of(Line(), cache, memory_rows=0)
     likelihood.misfit(thetas)
     data = pickle.dumps(likelihood)
-    assert len(data) < 5000
+    assert len(data) < 6500
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     copy = pickle.loads(data)
@@ -549,7 +526,7 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
 
 def test_the_key_is_the_same_in_another_process():
     code = (
-        "import numpy as np; from fe_likelihoods.simulation.cache_rows import simulation_keys; "
+        "import numpy as np; from fe_likelihoods.cache.rows import simulation_keys; "
         "print(b''.join(simulation_keys('any', np.array([[1.5, -0.0], [2.0, np.pi]]))).hex())"
     )
     root = Path(__file__).resolve().parents[2]

@@ -19,7 +19,7 @@ RETRY_SECONDS = 60.0  # wait after a failed access to the file
 
 
 class GuardedFile:
-    """Base of `SimulationCache`: access to its file that continues after errors.
+    """Base of `Generations`: access to its file that continues after errors.
 
     Parameters
     ----------

@@ -2,7 +2,6 @@
 
 import multiprocessing
 import os
-import sqlite3
 from dataclasses import replace
 
 import numpy as np
@@ -72,27 +71,3 @@ def test_forgotten_with_the_rows_of_the_model(path):
     assert first.cache.look_up_remark(first.model) == "" != other.cache.look_up_remark(other.model)
     first.cache.clear()
     assert other.cache.look_up_remark(other.model) == ""
-
-
-@pytest.mark.parametrize("writable", [True, False])
-def test_files_of_the_earlier_layout_work(writable, path, caplog):
-    """Their rows are used; the table of remarks is added where the file can be written."""
-    first = likelihood(path)
-    first.misfit(THETAS)
-    first.cache.close()
-    with sqlite3.connect(path) as connection:
-        connection.execute("DROP TABLE remarks")
-        connection.execute("PRAGMA user_version = 2")
-    connection.close()
-    caplog.clear()
-    again = likelihood(path)
-    if not writable:
-        again.cache.file.close()
-        again.cache.file._open = again.cache.file._open_to_read
-    again.misfit(THETAS)
-    assert (again.simulations, again.disk_hits) == (0, 2) and not caplog.records
-    again.cache.store_remark(again.model, "beyond")
-    assert again.cache.look_up_remark(again.model) == ("beyond" if writable else "")
-    if writable:  # the first one stays
-        again.cache.store_remark(again.model, "farther")
-        assert again.cache.look_up_remark(again.model) == "beyond"

@@ -33,17 +33,21 @@ __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
 logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
-SCHEMA_VERSION = 3
-WITHOUT_REMARKS = 2  # layout of earlier files, to which the last table is added
+SCHEMA_VERSION = 4
+EARLIER = (2, 3)  # layouts of earlier releases, which are completed: without remarks, and without labels
+GENERATION = "generation INTEGER NOT NULL DEFAULT 0"
+LABEL = "label INTEGER NOT NULL DEFAULT 0"
+ADDED = (GENERATION, LABEL)
 LAYOUT = (
     # the id orders rows by age
     "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "theta BLOB NOT NULL, misfit BLOB NOT NULL, n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, "
-    "crc INTEGER NOT NULL)",
+    f"crc INTEGER NOT NULL, {GENERATION}, {LABEL})",
     "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "theta BLOB NOT NULL, n_channels INTEGER NOT NULL, size INTEGER NOT NULL, crc INTEGER NOT NULL, "
-    "response BLOB NOT NULL)",
-    "CREATE INDEX simulation_sources ON simulations (source)",  # to find the last simulation of a model, or all of them
+    f"response BLOB NOT NULL, {GENERATION}, {LABEL})",
+    # to find the last simulation of a model, or all of them
+    "CREATE INDEX simulation_generations ON simulations (source, generation)",
     "CREATE INDEX response_sizes ON responses (size)",  # for their sum without reading the responses
     # simulations that failed, for any measurements; a time limit of 0 is an answer of the model
     "CREATE TABLE failures (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
@@ -51,6 +55,19 @@ LAYOUT = (
     # what models said about their simulations
     "CREATE TABLE remarks (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "text BLOB NOT NULL)",
+    # labels of models, and the generation of simulations that belongs to them
+    "CREATE TABLE labels (id INTEGER PRIMARY KEY, source INTEGER NOT NULL, label BLOB NOT NULL, cpu BLOB NOT NULL, "
+    "generation INTEGER NOT NULL, compared INTEGER NOT NULL, files BLOB NOT NULL, crc INTEGER NOT NULL, "
+    "UNIQUE (source, label, cpu))",
+)
+# what earlier layouts lack, in the form in which SQLite adds it
+COMPLETION = (
+    LAYOUT[-2].replace("TABLE", "TABLE IF NOT EXISTS"),
+    *(f"ALTER TABLE {table} ADD COLUMN {column}" for table in ("simulations", "responses") for column in ADDED),
+    "DROP INDEX simulation_sources",
+    LAYOUT[2],
+    LAYOUT[-1],
+    "DELETE FROM failures",  # their keys contain a digest that is not computed any more, and they have no parameters
 )
 CHECK_SECONDS = 2.0  # limit of the integrity check on opening; rows have checksums of their own
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -97,6 +114,14 @@ def is_damage(error: Exception) -> bool:
     if isinstance(error, UnicodeDecodeError):  # SQLite's message quotes damaged contents
         return True
     return _code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+def _is_earlier(layout: dict[str, str]) -> bool:
+    """Whether tables and indices, by name, are those of an earlier release."""
+    expected = {"simulations": LAYOUT[0], "responses": LAYOUT[1], "response_sizes": LAYOUT[3], "failures": LAYOUT[4]}
+    expected = {name: sql.replace(f", {GENERATION}, {LABEL}", "") for name, sql in expected.items()}
+    expected["simulation_sources"] = "CREATE INDEX simulation_sources ON simulations (source)"
+    return layout in (expected, expected | {"remarks": LAYOUT[5]})
 
 
 class _Damaged(sqlite3.DatabaseError):
@@ -364,14 +389,19 @@ class CacheFile:
         connection.execute("COMMIT")
 
     def _complete(self, connection: sqlite3.Connection) -> None:
-        """Add the table of remarks to a file without it, in one transaction."""
+        """Add to a file of an earlier release what it lacks, in one transaction."""
         version = "PRAGMA user_version"
         if connection.execute(version).fetchone() == (SCHEMA_VERSION,):
             return
         self._execute_with_retry(connection, "BEGIN IMMEDIATE")
         if connection.execute(version).fetchone() != (SCHEMA_VERSION,):  # another process may have done it
-            connection.execute(LAYOUT[-1])
+            for statement in COMPLETION:
+                connection.execute(statement)
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            logger.warning(
+                "%s is of an earlier release: its simulations are kept, and those that agree with new ones are used",
+                self.path,
+            )
         connection.execute("COMMIT")
 
     def _execute_with_retry(self, connection: sqlite3.Connection, statement: str) -> None:
@@ -396,14 +426,13 @@ class CacheFile:
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
                 f"{APPLICATION_ID:#x}; tables and indices {', '.join(sorted(layout)) or 'none'}); give another path"
             )
-        if version not in (SCHEMA_VERSION, WITHOUT_REMARKS):
+        if version not in (SCHEMA_VERSION, *EARLIER) or (version != SCHEMA_VERSION and not self.writable):
             raise ValueError(
-                f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}; give "
-                "another path, or remove the file"
+                f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}, and "
+                "completes writable files of earlier ones; give another path, or remove the file"
             )
-        # the version was read first, so another process may have added the table since
-        allowed = [LAYOUT] if version == SCHEMA_VERSION else [LAYOUT, LAYOUT[:-1]]
-        if sorted(layout.values()) not in map(sorted, allowed):
+        # the version was read first, so another process may have completed the file since
+        if sorted(layout.values()) != sorted(LAYOUT) and (version == SCHEMA_VERSION or not _is_earlier(layout)):
             raise _Damaged("its tables are not those of a cache")
 
     @staticmethod
@@ -437,10 +466,7 @@ class CacheFile:
         if size % PAGE_SIZE == 0 and not any(page):
             return
         if page.startswith(HDF5_SIGNATURE):
-            raise ValueError(
-                f"{self.path} is an HDF5 file, not a cache; give another path, and read a file that "
-                "SimulationCache.export_hdf5 wrote with import_hdf5"
-            ) from None
+            raise ValueError(f"{self.path} is an HDF5 file, not a cache; give another path") from None
         raise ValueError(
             f"{self.path} is not a cache of simulations, and is not changed; give another path, such as "
             "'cache.sqlite'. If it is a cache with a damaged header, remove it"

@@ -1,26 +1,67 @@
 """How much two simulations with the same parameters may differ."""
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from ..signals.comparison import Comparison, measured_values
-from .model import Model
-from .source_digest import inherits_fingerprint
+from ..simulation.label import is_of_user
+from ..simulation.model import Model
+from ..simulation.residual_statistics import Statistic, needs_response
 
-__all__ = ["largest_difference", "response_tolerance"]
+__all__ = ["DEFAULT_TOLERANCE", "VerifyingRun", "agree", "largest_difference", "response_tolerance"]
 
 DEFAULT_TOLERANCE = 1e-9
+
+
+class VerifyingRun(NamedTuple):
+    """What a simulation for verification needs.
+
+    Attributes
+    ----------
+    model : Model
+    pool : executor or None
+        Where the simulations of the likelihood run.
+    measured : (n_channels, n_steps) float, or Comparison
+        Measured response [SI].
+    statistic : Statistic or None
+        Statistic of the residuals that is stored; None for the sums of squares.
+    n_numbers : int
+        Length of the statistic.
+    tolerance : float or None
+        As for `SimulationCache`.
+    """
+
+    model: Model
+    pool: Any
+    measured: np.ndarray | Comparison
+    statistic: Statistic | None
+    n_numbers: int
+    tolerance: float | None = None
 
 
 def response_tolerance(model: Model) -> float:
     """Relative difference of responses with the same parameters that a model may have.
 
     It is the attribute ``response_tolerance`` of the model: zero for the compiled models of this library, whose
-    responses are the same to the last bit. For models without the attribute, and for subclasses of the user, it is
-    1e-9, because sums of several threads may differ in their last digits.
+    responses are the same to the last bit on the same processor. For models without the attribute, and for subclasses
+    of the user that do not define it, it is 1e-9, because sums of several threads may differ in their last digits.
     """
-    if inherits_fingerprint(type(model)):
-        return DEFAULT_TOLERANCE
+    cls = type(model)
+    if is_of_user(cls.__module__):
+        defined = [base for base in cls.__mro__ if "response_tolerance" in vars(base)]
+        if (
+            defined
+            and not is_of_user(defined[0].__module__)
+            and "response_tolerance" not in getattr(model, "__dict__", {})
+        ):
+            return DEFAULT_TOLERANCE
     return float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
+
+
+def agree(stored: np.ndarray, new: np.ndarray, run: VerifyingRun, tolerance: float) -> bool:
+    """Whether the statistics of two simulations with the same parameters agree."""
+    return largest_difference(stored, new, run.measured, tolerance, needs_response(run.statistic)) is None
 
 
 def largest_difference(

@@ -1,6 +1,7 @@
 """Rows of the simulation cache: their keys, checksums and SQL statements, and what a cache returns of them."""
 
 import hashlib
+import json
 import sqlite3
 import struct
 import zlib
@@ -9,46 +10,59 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .faults import MisfitReason, TransientReason
+from ..simulation.faults import MisfitReason, TransientReason
 
 __all__ = [
     "COLUMNS",
+    "LABEL_COLUMNS",
     "MIN_STOPS",
+    "OF_EARLIER_RELEASES",
     "REMOVE",
     "RESPONSE_COLUMNS",
     "STORE",
     "STORE_FAILURE",
+    "STORE_LABEL",
     "STORE_RESPONSE",
     "CacheInfo",
     "CachedRows",
+    "StoredLabel",
     "StoredSimulation",
     "checksum",
     "insert_rows",
     "is_undamaged",
+    "is_undamaged_label",
     "is_undamaged_response",
     "pack_failure",
+    "pack_label",
     "pack_row",
+    "regenerated",
     "select_rows",
     "simulation_keys",
     "source_number",
+    "unpack_label",
     "unpack_failure",
 ]
 
-COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc"
-RESPONSE_COLUMNS = "key, source, theta, n_channels, size, crc, response"
+COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc, generation, label"
+RESPONSE_COLUMNS = "key, source, theta, n_channels, size, crc, response, generation, label"
+LABEL_COLUMNS = "id, source, label, cpu, generation, compared, files, crc"
+OF_EARLIER_RELEASES = 0  # the generation of rows whose keys contain a digest that is not computed any more
 KEY_BYTES = 16
 KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_REASON_LENGTH = 2000
 NUMBERS = struct.Struct("<qqd")
+LABEL_NUMBERS = struct.Struct("<qq")
 
 
 STORE = (
-    f"INSERT INTO simulations ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?) "
+    f"INSERT INTO simulations ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) "
     "ON CONFLICT (key) DO UPDATE SET misfit = excluded.misfit, n_steps = excluded.n_steps, reason = excluded.reason, "
-    "seconds = excluded.seconds, crc = excluded.crc WHERE length(reason) > 0"  # a success is never overwritten
+    "seconds = excluded.seconds, crc = excluded.crc, label = excluded.label "
+    "WHERE length(reason) > 0"  # a success is never overwritten
 )
 # replaces a response that an earlier version stored in single precision
-STORE_RESPONSE = f"INSERT OR REPLACE INTO responses ({RESPONSE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+STORE_RESPONSE = f"INSERT OR REPLACE INTO responses ({RESPONSE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
 REMOVE = {
     table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses", "failures", "remarks")
 }
@@ -91,11 +105,44 @@ class StoredSimulation(NamedTuple):
         Sums of squared residuals [SI unit of the channel, squared]; NaN where the simulation failed.
     reason : str
         Reason of the failure; empty where the simulation succeeded.
+    label : int
+        Id of the `StoredLabel` under which it was stored.
     """
 
     theta: np.ndarray
     misfit: np.ndarray
     reason: str
+    label: int = 0
+
+
+class StoredLabel(NamedTuple):
+    """A label under which simulations of a model were stored or adopted.
+
+    Attributes
+    ----------
+    id : int
+        What rows name it by.
+    source : int
+        Of the model.
+    label : str
+        See `fe_likelihoods.simulation.label.ModelLabel`.
+    cpu : str
+        Name of the processor.
+    generation : int
+        The rows that belong together: all labels of a generation gave equal results where they were compared.
+    compared : int
+        Number of rows that were compared before those of other labels were adopted.
+    files : tuple of str
+        Paths of the files that simulations opened.
+    """
+
+    id: int
+    source: int
+    label: str
+    cpu: str
+    generation: int
+    compared: int
+    files: tuple[str, ...] = ()
 
 
 class CacheInfo(NamedTuple):
@@ -132,22 +179,24 @@ class CacheInfo(NamedTuple):
     verified: int
 
 
-def simulation_keys(fingerprint: str, thetas: np.ndarray) -> list[bytes]:
+def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -> list[bytes]:
     """Keys of simulations.
 
     Parameters
     ----------
     fingerprint : str
-        Everything but the parameters that a simulation depends on.
+        Everything declared that a simulation depends on, but the parameters.
     thetas : (n, n_structural) float
         Structural parameters; -0.0 and 0.0 have the same key.
+    generation : int
+        See `StoredLabel`.
 
     Returns
     -------
     list of n bytes
         Digests of 128 bits.
     """
-    start = hashlib.blake2b(fingerprint.encode() + b"\0", digest_size=KEY_BYTES)
+    start = hashlib.blake2b(f"{fingerprint}\0{generation}\0".encode(), digest_size=KEY_BYTES)
     keys = []
     for row in np.asarray(thetas, dtype="<f8") + 0.0:  # adding zero makes 0.0 of -0.0
         digest = start.copy()
@@ -161,23 +210,53 @@ def source_number(fingerprint: str) -> int:
     return int.from_bytes(hashlib.blake2b(fingerprint.encode(), digest_size=8).digest(), signed=True)
 
 
-def checksum(key: bytes, source: int, theta: bytes, misfit: bytes, n_steps: int, reason: bytes, seconds: float) -> int:
+def checksum(
+    key: bytes,
+    source: int,
+    theta: bytes,
+    misfit: bytes,
+    n_steps: int,
+    reason: bytes,
+    seconds: float,
+    generation: int,
+    label: int,
+) -> int:
     """CRC-32 of a stored simulation, its key included, so that values of another key are found to be damaged."""
-    return zlib.crc32(b"".join((key, NUMBERS.pack(source, n_steps, seconds), theta, misfit, reason)))
+    # earlier releases stored no generation and no label
+    numbers = NUMBERS.pack(source, n_steps, seconds) + (LABEL_NUMBERS.pack(generation, label) if generation else b"")
+    return zlib.crc32(b"".join((key, numbers, theta, misfit, reason)))
 
 
 def is_undamaged(*row: Any) -> bool:
     """Whether a stored simulation, given by the values of `COLUMNS`, matches its checksum."""
     try:
-        return row[-1] == checksum(*row[:-1])
+        return row[7] == checksum(*row[:7], *row[8:])
     except (TypeError, struct.error):  # damage may change the type of a value
         return False
 
 
 def is_undamaged_response(*row: Any) -> bool:
     """Whether a stored response, given by the values of `RESPONSE_COLUMNS`, matches its checksum and its size."""
-    key, *_, size, crc, data = row
+    key, _, _, _, size, crc, data, _, _ = row
     return isinstance(data, bytes) and len(data) == size and isinstance(key, bytes) and crc == zlib.crc32(key + data)
+
+
+def pack_label(label: StoredLabel) -> tuple:
+    """A label as it is stored: the values of `LABEL_COLUMNS`, with texts as bytes and the checksum last."""
+    texts = label.label.encode(), label.cpu.encode()
+    files = json.dumps(label.files).encode()
+    values = (label.id, label.source, *texts, label.generation, label.compared, files)
+    return (*values, zlib.crc32(repr(values).encode()))
+
+
+def unpack_label(*row: Any) -> StoredLabel:
+    """An undamaged label, given by the values of `LABEL_COLUMNS`."""
+    return StoredLabel(*row[:2], row[2].decode(), row[3].decode(), *row[4:6], tuple(json.loads(row[6])))
+
+
+def is_undamaged_label(*row: Any) -> bool:
+    """Whether a stored label, given by the values of `LABEL_COLUMNS`, matches its checksum."""
+    return row[-1] == zlib.crc32(repr(row[:-1]).encode())
 
 
 def pack_failure(key: bytes, source: int, reason: str) -> tuple | None:
@@ -212,19 +291,44 @@ def _encoded(reason: str) -> bytes:
 
 
 def pack_row(
-    key: bytes, source: int, theta: np.ndarray, misfit: np.ndarray, n_steps: int, reason: str, seconds: float
+    key: bytes,
+    source: int,
+    theta: np.ndarray,
+    misfit: np.ndarray,
+    n_steps: int,
+    reason: str,
+    seconds: float,
+    generation: int = 1,
+    label: int = 0,
 ) -> tuple:
-    """A simulation as it is stored: the values of `COLUMNS`, with arrays and reason as bytes and the checksum last."""
-    values = (
-        key,
-        source,
-        np.asarray(theta, dtype="<f8").tobytes(),
-        np.asarray(misfit, dtype="<f8").tobytes(),
-        int(n_steps),
-        _encoded(reason),
-        float(seconds),
-    )
-    return (*values, checksum(*values))
+    """A simulation as it is stored: the values of `COLUMNS`, with arrays and reason as bytes."""
+    point, sums = (np.asarray(values, dtype="<f8").tobytes() for values in (theta, misfit))
+    values = key, source, point, sums, int(n_steps), _encoded(reason), float(seconds)
+    return (*values, checksum(*values, generation, label), generation, label)
+
+
+def regenerated(fingerprint: str, generation: int, label: int, row: tuple) -> tuple:
+    """A stored simulation or response as one of another identity and generation: the new values, without arrays.
+
+    Parameters
+    ----------
+    fingerprint, generation, label
+        Of the new row.
+    row : tuple
+        The values of `COLUMNS` or of `RESPONSE_COLUMNS`.
+
+    Returns
+    -------
+    tuple
+        Key, source, checksum, generation, label, and the key that the row had.
+    """
+    (key,) = simulation_keys(fingerprint, np.frombuffer(row[2], dtype="<f8")[None], generation)
+    source = source_number(fingerprint)
+    if len(row) == len(COLUMNS.split(",")):
+        crc = checksum(key, source, *row[2:7], generation, label)
+    else:
+        crc = zlib.crc32(key + row[6])
+    return key, source, crc, generation, label, row[0]
 
 
 def select_rows(

@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from .disk_cache import SimulationCache
-from .fingerprint import read_attributes_again, simulation_fingerprint
-from .model import Model, SimulationBatch, simulate_batch
-from .verification import VerifiedCache, VerifyingRun
+from ..simulation.label import ModelLabel
+from ..simulation.model import Model, SimulationBatch, simulate_batch
+from ..simulation.opened import observing
+from .simulation_cache import SimulationCache
+from .tolerance import VerifyingRun
+from .verification import VerifiedCache
 
 __all__ = ["StoredResponses"]
 
@@ -38,10 +40,9 @@ class StoredResponses:
     """
 
     def __init__(self, model: Model, pool: Any, cache: SimulationCache) -> None:
-        read_attributes_again(model)
         self.model, self.pool, self.cache = model, pool, cache
         self.simulations = 0
-        self._verified = VerifiedCache(cache, model, pool)
+        self._verified = VerifiedCache(cache, model, pool, ModelLabel(model))
         shape = len(model.channels), model.n_steps
         self._run = VerifyingRun(model, pool, np.zeros(shape), None, len(model.channels))
         self._least = 1
@@ -79,7 +80,7 @@ class StoredResponses:
         while left:
             rows, left = left[: self._size], left[self._size :]
             start = time.perf_counter()
-            batch = simulate_batch(self.model, thetas[rows], self.pool)
+            batch = self._new(thetas[rows])
             seconds = time.perf_counter() - start
             self._store(thetas[rows], batch)
             responses[rows] = batch.response
@@ -91,6 +92,19 @@ class StoredResponses:
 
     def _store(self, thetas: np.ndarray, batch: SimulationBatch) -> None:
         self.simulations += len(thetas)
-        self.cache.store_responses(self.model, thetas, batch.response)
-        self.cache.store_failures(self.model, thetas, batch.reasons)
-        self._verified.add_own(thetas, simulation_fingerprint(self.model))
+        run = self._run
+        self._verified.store(self.model.fingerprint, thetas, None, batch.reasons, batch.response, 0.0, run)
+
+    def _new(self, thetas: np.ndarray) -> SimulationBatch:
+        """New simulations, the first of which complete the label."""
+        label = self._verified.label
+        if self.pool is not None:
+            return simulate_batch(self.model, thetas, self.pool)
+        try:
+            with observing() as observer:
+                batch = simulate_batch(self.model, thetas)
+        finally:
+            label.has_changed_itself(label.changed(self.model))
+        if label.observes:
+            self._verified.complete(observer.result(label.known))
+        return batch

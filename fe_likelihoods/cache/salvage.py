@@ -2,8 +2,9 @@
 
 A damaged page of an SQLite file makes every query fail that reads it, so one bad page would lose all rows. Ranges of
 row numbers are read, and halved where they fail, until only the rows of the damaged pages are left out. Each row has a
-checksum of its own, so nothing wrong is copied. Simulations and responses are copied. Failures that are stored for any
-measurements, and remarks, are not: they can be simulated again.
+checksum of its own, so nothing wrong is copied. Simulations and responses are copied, and labels if they can be read:
+rows of an unknown label are verified. Failures that are stored for any measurements, and remarks, are not: they can be
+simulated again.
 """
 
 import contextlib
@@ -14,12 +15,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from .cache_rows import (
+from .rows import (
     COLUMNS,
+    LABEL_COLUMNS,
     RESPONSE_COLUMNS,
     STORE,
+    STORE_LABEL,
     STORE_RESPONSE,
     is_undamaged,
+    is_undamaged_label,
     is_undamaged_response,
 )
 
@@ -43,6 +47,7 @@ class _Table(NamedTuple):
 
 _SIMULATIONS = _Table("simulations", COLUMNS, STORE, is_undamaged, 1000)
 _RESPONSES = _Table("responses", RESPONSE_COLUMNS, STORE_RESPONSE, is_undamaged_response, 20)
+_ADDED = "generation, label"  # columns that files of earlier releases do not have
 
 
 class Salvaged(NamedTuple):
@@ -80,6 +85,7 @@ def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
     Salvaged
         The counts.
     """
+    _copy_labels(damaged, connection)
     return Salvaged(*_copy(damaged, connection, _SIMULATIONS), *_copy(damaged, connection, _RESPONSES))
 
 
@@ -100,6 +106,7 @@ def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple
         with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
             source.text_factory = bytes
             source.execute("PRAGMA writable_schema = ON")  # a file that was cut off is read as far as it goes
+            table = _as_stored(source, table)
             if (largest := _largest_id(source, table.name)) is None:
                 known, largest = False, damaged.stat().st_size // FEWEST_BYTES
             for rows, missing in _ranges(source, damaged, table, largest):
@@ -117,6 +124,26 @@ def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple
         logger.warning("%s: no more %s can be salvaged (%s)", damaged.name, table.name, error)
         known = False
     return kept, lost if known else None
+
+
+def _as_stored(source: sqlite3.Connection, table: _Table) -> _Table:
+    """The table with the columns that it has in a file, and zeros in place of those that are not there."""
+    try:
+        source.execute(f"SELECT {_ADDED} FROM {table.name} LIMIT 0")
+    except sqlite3.OperationalError as error:
+        if "no such column" in str(error):
+            return table._replace(columns=table.columns.replace(_ADDED, "0, 0"))
+    except sqlite3.DatabaseError:
+        pass
+    return table
+
+
+def _copy_labels(damaged: Path, connection: sqlite3.Connection) -> None:
+    with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError):
+        with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
+            source.execute("PRAGMA writable_schema = ON")
+            rows = source.execute(f"SELECT {LABEL_COLUMNS} FROM labels").fetchall()
+        connection.executemany(STORE_LABEL, [row for row in rows if is_undamaged_label(*row)])
 
 
 def _ranges(

@@ -1,0 +1,717 @@
+"""Cache of simulations on disk, shared by runs, samplers, processes and programs.
+
+The sums of squared residuals of a simulation are stored, one number per channel. They depend neither on the noise nor
+on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
+simulation is a digest of the declared identity of model and measurements (fingerprints), of the generation, and of the
+structural parameters to the last bit. A generation contains the simulations of one state of the model's code; which
+labels of the code belong to it is in the table of labels (`fe_likelihoods.cache.verification` decides it). Rows of
+another generation stay in the file and are not used. Results that are no longer used are evicted in the end, oldest
+first.
+
+Hits are exact. They occur when only the noise parameters change, in resumed and repeated runs, for duplicates, and when
+samplers are compared from the same start.
+
+Responses are stored where they were requested, as a guide does, or for every simulation. They depend on the model alone
+and are stored as computed, in double precision. In single precision, a response with an offset of a million times its
+noise would lose its digits, and the cache knows neither noise nor measurements. Compression without loss would save 10
+to 25 % of their size and is not used.
+
+Failures are stored as well if they are answers of the model: under a key of the model, so that they hold for any
+measurements. Faults of the infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run simulates
+the point again. A simulation that was stopped at a time limit is stored together with this limit. A later run with a
+longer limit simulates it again. A run with the same or a shorter limit simulates it again once, because a busy machine
+may have been the cause. After the second stop at one limit, it fails without a simulation in all runs with this limit
+or a shorter one.
+
+A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
+aside, and while the file cannot be written, rows wait in memory.
+"""
+
+import contextlib
+import logging
+import math
+import os
+import sqlite3
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..simulation.faults import TransientReason
+from ..simulation.model import Model
+from .generations import Generations
+from .rows import (
+    COLUMNS,
+    LABEL_COLUMNS,
+    MIN_STOPS,
+    REMOVE,
+    RESPONSE_COLUMNS,
+    STORE,
+    STORE_FAILURE,
+    STORE_RESPONSE,
+    CachedRows,
+    CacheInfo,
+    insert_rows,
+    is_undamaged,
+    pack_failure,
+    pack_row,
+    select_rows,
+    simulation_keys,
+    source_number,
+    unpack_failure,
+)
+from .sqlite_file import CacheFile
+
+__all__ = ["SimulationCache", "rows_to_compare"]
+
+logger = logging.getLogger(__name__)
+
+MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
+CONFIDENCE = 0.95
+STORE_REMARK = "INSERT OR IGNORE INTO remarks (key, source, text) VALUES (?, ?, ?)"
+_KEYED = ("simulations", "responses", "failures", "remarks")
+
+
+def rows_to_compare(verify: bool | int | str) -> int:
+    """Number of rows that are simulated again before rows of an unknown label are used.
+
+    Parameters
+    ----------
+    verify : bool, int or str
+        As for `SimulationCache`. A share such as "5 %" stands for the number of rows with which a change of that share
+        of the space is found with a probability of 95 %.
+
+    Raises
+    ------
+    ValueError
+        For anything else.
+    """
+    if isinstance(verify, bool):
+        return rows_to_compare("5 %") if verify else 0
+    if isinstance(verify, int | np.integer) and verify >= 1:
+        return int(verify)
+    if isinstance(verify, str) and verify.rstrip().endswith("%"):
+        with contextlib.suppress(ValueError):
+            share = float(verify.rstrip()[:-1]) / 100.0
+            if 0.0 < share < 1.0:
+                return math.ceil(math.log(1.0 - CONFIDENCE) / math.log(1.0 - share))
+    raise ValueError(
+        "SimulationCache: verify must be True, False, a number of rows of 1 or more, or a share of the space like "
+        f"'5 %'; got {verify!r}"
+    )
+
+
+class SimulationCache(Generations):
+    """Cache of the sums of squared residuals of simulations, in one SQLite file.
+
+    Any number of threads, processes and programs may use a file at the same time, each process through its own
+    connection. The object may be forked and pickled: another process opens the file by its path. The file must be on a
+    local disk, because SQLite's shared memory does not work on network file systems. On a cluster let the parent
+    process own the cache (``FELikelihood(..., pool=...)``); its workers return sums.
+
+    Stored rows survive the death of the process, also by ``kill -9``; a power failure may lose the last seconds.
+
+    Parameters
+    ----------
+    path : path
+        The file; created if it does not exist. A read-only file is used for reading, with a warning.
+    max_rows : int
+        Largest number of stored simulations, of about 160 bytes each. Every write evicts the oldest beyond it.
+    retry_failures : bool
+        Run failed simulations again, after a change that no fingerprint contains (an external program, a licence).
+    responses : bool
+        Store the response of every simulation. By default only the responses that are requested are stored
+        (`FELikelihood.simulate`, guides).
+    max_response_bytes : int
+        Largest size of the stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted, with a
+        message at level INFO at the first one.
+    timeout : float
+        How long to wait for another writer [s].
+    verify : bool, int or str
+        How many stored rows are simulated again before the others are used (`fe_likelihoods.cache.verification`). Where
+        the label of the model is known: two rows per process, and one of every 1000. Where it is unknown, because code,
+        a file or a package has changed: so many that a change in 5 % of the space is found with a probability of 95 %
+        (59 rows, or all there are). Another share, such as "2 %", or a number of rows; False: none.
+    tolerance : float, optional
+        Accepted difference of a response that is simulated again, relative to the norm of the response. By default 0
+        for the compiled models of this library on the same processor, 1e-9 on another one and for other models, or
+        their attribute ``response_tolerance``.
+
+    Attributes
+    ----------
+    hits, misses : int
+        Rows found and not found by this object in this process.
+    evictions : int
+        Rows evicted by this object.
+    damaged : int
+        Rows that were damaged and deleted.
+    verified : int
+        Rows that were simulated again by likelihoods in this process and did not differ.
+    file : CacheFile
+        The SQLite file and its connection.
+    retry_times : dict of str to float
+        Actions on the file that failed, and the monotonic time [s] before which they are not tried again.
+
+    Raises
+    ------
+    ValueError
+        If a bound is not positive, if the tolerance is negative, if the path is a folder or in no existing folder, or
+        if the file cannot be read or created, is not a cache, belongs to another program, or has the layout of a later
+        release. Such a file is not changed. A file of an earlier release is completed; its rows are kept.
+
+    Examples
+    --------
+    >>> likelihood = FELikelihood(model, measurements, cache="column.sqlite")
+    >>> likelihood.cache.info().simulations
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        *,
+        max_rows: int = 1_000_000,
+        retry_failures: bool = False,
+        responses: bool = False,
+        max_response_bytes: int = 2**30,
+        timeout: float = 30.0,
+        verify: bool | int | str = True,
+        tolerance: float | None = None,
+    ) -> None:
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"SimulationCache: expected the path of a file; got {path!r}")
+        for name, value in (("max_rows", max_rows), ("max_response_bytes", max_response_bytes)):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ValueError(f"SimulationCache: {name} must be a whole number of 1 or more; got {value!r}")
+        if tolerance is not None and not 0.0 <= tolerance < np.inf:
+            raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more, or None; got {tolerance!r}")
+        rows_to_compare(verify)  # raises what is wrong with it
+        bounds = int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes)
+        self._set_up(path, *bounds, timeout, verify, tolerance)
+        self.file.check()
+        if not self.file.writable:
+            self._warn_read_only()
+
+    def _set_up(
+        self, path, max_rows, retry_failures, responses, max_response_bytes, timeout, verify, tolerance
+    ) -> None:
+        """Set all attributes without opening the file."""
+        super().__init__(CacheFile(path, timeout))
+        self.max_rows = max_rows
+        self.retry_failures = retry_failures
+        self.responses = responses
+        self.max_response_bytes = max_response_bytes
+        self.verify, self.tolerance = verify, tolerance
+        self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
+        self._waiting: list[tuple] = []
+        self._warned_read_only = self._said_evicted = False
+
+    def __getstate__(self) -> tuple:
+        return (
+            self.path,
+            self.max_rows,
+            self.retry_failures,
+            self.responses,
+            self.max_response_bytes,
+            self.file.timeout,
+            self.verify,
+            self.tolerance,
+        )
+
+    def __setstate__(self, state: tuple) -> None:
+        self._set_up(*state)  # opens the file when it is needed; a run continues without it if that fails
+
+    def __repr__(self) -> str:
+        return f"SimulationCache({str(self.path)!r})"
+
+    # simulations --------------------------------------------------------------------------------------------------
+
+    def look_up(
+        self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int, generation: int | None = None
+    ) -> CachedRows:
+        """Look up simulations, with few queries for the whole batch.
+
+        Parameters
+        ----------
+        fingerprint : str
+            Everything declared, but the parameters, that the sums depend on, such as `FELikelihood.simulation_key`.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        n_channels, n_steps : int
+            Shape of the measurements; rows of another shape count as damaged.
+        generation : int
+            See `StoredLabel`; by default the latest.
+
+        Returns
+        -------
+        CachedRows
+        """
+        keys = simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
+        misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
+        with self.file.lock:
+            found, bad = {}, []
+            for row in self._try("read", lambda connection: select_rows(connection, keys), []):
+                key, _, _, sums, steps, reason = row[:6]
+                if not is_undamaged(*row) or len(sums) != 8 * n_channels or steps != n_steps:
+                    bad.append(key)
+                elif not (reason and self.retry_failures):
+                    found[key] = sums, reason
+            for place, key in enumerate(keys):
+                if key in found:
+                    sums, reason = found[key]
+                    misfit[place] = np.frombuffer(sums, dtype="<f8")
+                    reasons[place] = reason.decode("utf-8", "replace")
+                    known[place] = True
+            self.hits += int(known.sum())
+            self.misses += int((~known).sum())
+            self._drop("simulations", bad)
+        return CachedRows(misfit, reasons, known)
+
+    def store(
+        self,
+        fingerprint: str,
+        thetas: np.ndarray,
+        n_steps: int,
+        misfit: np.ndarray,
+        reasons: Sequence[str],
+        seconds: float,
+        generation: int | None = None,
+        label: int = 0,
+    ) -> None:
+        """Store simulations in one transaction that also evicts; failed ones unless the reason is a `TransientReason`.
+
+        Parameters
+        ----------
+        fingerprint : str
+            As for `look_up`.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        n_steps : int
+            Number of samples of the measurements.
+        misfit : (n, n_channels) float
+            Sums of squared residuals [SI unit of the channel, squared].
+        reasons : sequence of n str
+            Reasons of failures; empty where the simulation succeeded.
+        seconds : float
+            Wall time of all simulations together [s].
+        generation, label : int
+            See `StoredLabel`; by default the latest.
+        """
+        generation = self._given_or_latest(fingerprint, generation)
+        keys, source = simulation_keys(fingerprint, thetas, generation), source_number(fingerprint)
+        rows = [
+            pack_row(key, source, theta, sums, n_steps, reason, seconds / len(keys), generation, label)
+            for key, theta, sums, reason in zip(keys, thetas, misfit, reasons, strict=True)
+            if not isinstance(reason, TransientReason)
+        ]
+        self._write(STORE, rows)
+
+    def store_responses(
+        self, model: Model, thetas: np.ndarray, responses: np.ndarray, generation: int | None = None, label: int = 0
+    ) -> None:
+        """Store responses in double precision, in one transaction that also evicts.
+
+        Parameters
+        ----------
+        model : Model
+            The responses do not depend on the measurements.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        responses : (n, n_channels, n_steps) float
+            [SI]. Responses that are not finite are not stored.
+        generation, label : int
+            See `StoredLabel`; by default the latest.
+        """
+        rows = []
+        generation = self._given_or_latest(model.fingerprint, generation)
+        keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
+        for key, theta, response in zip(keys, thetas, responses, strict=True):
+            if np.isfinite(response).all():
+                data = np.asarray(response, dtype="<f8").tobytes()
+                point = np.asarray(theta, dtype="<f8").tobytes()
+                crc = zlib.crc32(key + data)
+                rows.append((key, source, point, len(response), len(data), crc, data, generation, label))
+        if rows:
+            self._write(STORE_RESPONSE, rows)
+
+    def look_up_responses(
+        self, model: Model, thetas: np.ndarray, generation: int | None = None
+    ) -> list[np.ndarray | None]:
+        """Look up responses of a model.
+
+        Parameters
+        ----------
+        model : Model
+        thetas : (n, n_structural) float
+            Structural parameters.
+        generation : int
+            See `StoredLabel`; by default the latest.
+
+        Returns
+        -------
+        list of n (n_channels, n_steps) float, or None
+            [SI]; None where the response is not stored, or in single precision, by an earlier version.
+        """
+        shape = len(model.channels), model.n_steps
+        size = 8 * shape[0] * shape[1]
+        keys = simulation_keys(model.fingerprint, thetas, self._given_or_latest(model.fingerprint, generation))
+        query = "key, crc, response FROM responses"
+        found, bad = {}, []
+        with self.file.lock:
+            for key, crc, data in self._try("read", lambda connection: select_rows(connection, keys, query), []):
+                if not isinstance(data, bytes) or crc != zlib.crc32(key + data) or len(data) not in (size, size // 2):
+                    bad.append(key)
+                elif len(data) == size:
+                    found[key] = np.frombuffer(data, dtype="<f8").reshape(shape)
+            self._drop("responses", bad)
+        return [found.get(key) for key in keys]
+
+    def are_stored(self, fingerprints: Sequence[str], thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
+        """Whether a simulation, a response or a failure is stored, under one of several fingerprints.
+
+        Parameters
+        ----------
+        fingerprints : sequence of str
+            As for `look_up`.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        generation : int
+            See `StoredLabel`; by default the latest.
+
+        Returns
+        -------
+        (n,) bool
+            The rows are neither verified nor checked for damage, and not counted.
+        """
+        tables, stored = ("simulations", "responses", "failures"), np.zeros(len(thetas), dtype=bool)
+        for fingerprint in fingerprints:
+            keys = simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
+
+            def find(connection: sqlite3.Connection, keys: list[bytes] = keys) -> set:
+                return {row for table in tables for (row,) in select_rows(connection, keys, f"key FROM {table}")}
+
+            found = self._try("read", find, set())
+            stored |= [key in found for key in keys]
+        return stored
+
+    # failures and remarks --------------------------------------------------------------------------------------------
+
+    def store_failures(
+        self, model: Model, thetas: np.ndarray, reasons: Sequence[str], generation: int | None = None
+    ) -> None:
+        """Store failures of a model for any measurements, and simulations that were stopped at a time limit.
+
+        Parameters
+        ----------
+        model : Model
+        thetas : (n, n_structural) float
+            Structural parameters.
+        reasons : sequence of n str
+            Reasons of failures; empty where the simulation succeeded. A `MisfitReason` is not stored, nor is a
+            `TransientReason` without a time limit.
+        generation : int
+            See `StoredLabel`; by default the latest.
+        """
+        generation = self._given_or_latest(model.fingerprint, generation)
+        keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
+        rows = [pack_failure(key, source, reason) for key, reason in zip(keys, reasons, strict=True)]
+        if any(rows):
+            self._write(STORE_FAILURE, [row for row in rows if row is not None])
+
+    def look_up_failures(self, model: Model, thetas: np.ndarray, generation: int | None = None) -> list[str]:
+        """Look up failures of a model that are answers for any measurements.
+
+        Parameters
+        ----------
+        model : Model
+            Its attribute ``time_limit`` [s], if there is one, is compared with that of the stored failures.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        generation : int
+            See `StoredLabel`; by default the latest.
+
+        Returns
+        -------
+        list of n str
+            Reasons; empty where the simulation has to be run.
+        """
+        if self.retry_failures:
+            return [""] * len(thetas)
+        limit = getattr(model, "time_limit", None) or np.inf
+        keys = simulation_keys(model.fingerprint, thetas, self._given_or_latest(model.fingerprint, generation))
+        query = "key, source, reason, time_limit, crc, stops FROM failures"
+        found, bad = {}, []
+        with self.file.lock:
+            for *row, stops in self._try("read", lambda connection: select_rows(connection, keys, query), []):
+                reason = unpack_failure(*row)
+                if reason is None:
+                    bad.append(row[0])
+                elif not isinstance(reason, TransientReason) or (limit <= reason.time_limit and stops >= MIN_STOPS):
+                    found[row[0]] = reason
+            self._drop("failures", bad)
+        return [found.get(key, "") for key in keys]
+
+    def store_remark(self, model: Model, text: str) -> None:
+        """Store the remark of a model, unless there is one or the file is read-only."""
+        source = source_number(model.fingerprint)
+        row = remark_key(source), source, text.encode("utf-8", "backslashreplace")
+        with self.file.lock:
+            if self.file.writable:
+                self._try("written", lambda connection: connection.execute(STORE_REMARK, row), None)
+
+    def look_up_remark(self, model: Model) -> str:
+        """Remark of a model; empty if there is none."""
+        key = remark_key(source_number(model.fingerprint))
+
+        query = "SELECT text FROM remarks WHERE key = ?"
+        rows = self._try("read", lambda connection: connection.execute(query, (key,)).fetchall(), [])
+        return bytes(rows[0][0]).decode("utf-8", "replace") if rows else ""
+
+    # the file -----------------------------------------------------------------------------------------------------
+
+    def copy(self, path: str | os.PathLike) -> int:
+        """Write a copy of the cache, with all rows, to a new file: to archive it, or to take it to another machine.
+
+        Parameters
+        ----------
+        path : path
+            The new file.
+
+        Returns
+        -------
+        int
+            Number of simulations.
+
+        Raises
+        ------
+        ValueError
+            If the file exists, or its folder does not.
+        OSError
+            If either file cannot be used.
+        """
+        target = Path(path).resolve()
+        if target.exists() or not target.parent.is_dir():
+            raise ValueError(f"{path}: expected the path of a new file in an existing folder")
+        self._insist(lambda connection: connection.execute("VACUUM INTO ?", (str(target),)))
+        return self.info().simulations
+
+    def add(self, path: str | os.PathLike) -> int:
+        """Add the rows of another cache; rows that are stored already are not changed.
+
+        Parameters
+        ----------
+        path : path
+            The other file, which no other process uses. One of an earlier release is completed.
+
+        Returns
+        -------
+        int
+            Number of simulations added.
+
+        Raises
+        ------
+        ValueError
+            If the other file is not a cache.
+        OSError
+            If either file cannot be used.
+        """
+        other = SimulationCache(path)
+        if other.path == self.path:
+            raise ValueError(f"{path} is the cache itself; give another file")
+        other.close()
+        columns = {"simulations": COLUMNS, "responses": RESPONSE_COLUMNS, "labels": LABEL_COLUMNS}
+
+        def insert(connection: sqlite3.Connection) -> int:
+            connection.execute("ATTACH ? AS other", (str(other.path),))
+            try:
+                connection.execute("BEGIN IMMEDIATE")
+                added = [
+                    connection.execute(f"INSERT OR IGNORE INTO {t} ({c}) SELECT {c} FROM other.{t}").rowcount
+                    for t, c in columns.items()
+                ]
+                connection.execute("COMMIT")
+            finally:
+                if connection.in_transaction:
+                    connection.execute("ROLLBACK")
+                connection.execute("DETACH other")
+            return added[0]
+
+        return self._insist(insert)
+
+    def info(self) -> CacheInfo:
+        """State of the cache, and counts of this object."""
+
+        def ask(connection: sqlite3.Connection) -> tuple:
+            ((n, failures, seconds),) = connection.execute(
+                "SELECT count(*), total(length(reason) > 0), total(seconds) FROM simulations"
+            )
+            ((responses, response_bytes),) = connection.execute("SELECT count(*), total(size) FROM responses")
+            return n, int(failures), responses, int(response_bytes), seconds
+
+        with self.file.lock:
+            counted = self._try("read", ask, (0, 0, 0, 0, 0.0))
+            size = self.path.stat().st_size if self.path.exists() else 0
+            counts = self.hits, self.misses, self.evictions, self.damaged, self.verified
+            return CacheInfo(self.path, *counted, size, *counts)
+
+    def check_rows(self) -> tuple[int, int]:
+        """Compare all simulations with their checksums; no row is changed.
+
+        Returns
+        -------
+        rows, damaged : int
+            Numbers of simulations, and of those that do not match their checksums.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read.
+        """
+        count = "SELECT count(*) FROM simulations"
+        (rows,) = self._insist(lambda connection: connection.execute(count).fetchone())
+        return rows, rows - sum(len(page) for page in self._pages())
+
+    def clear(self) -> None:
+        """Delete all rows, for all users of the file; the caches in memory of likelihoods are not affected.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+
+        def delete(connection: sqlite3.Connection) -> None:
+            connection.execute("BEGIN IMMEDIATE")
+            for table in REMOVE:
+                connection.execute(f"DELETE FROM {table}")
+            connection.execute("COMMIT")
+
+        with self.file.lock:
+            self._insist(delete)
+            self._waiting.clear()
+            # returns the space to the disk; may fail while others read
+            self._try("vacuumed", lambda connection: connection.execute("VACUUM"), None)
+
+    def forget(self, *fingerprints: str) -> int:
+        """Delete the simulations and responses of some models, of all generations, for all users of the file.
+
+        The caches in memory of likelihoods are not affected: make a new likelihood.
+
+        Parameters
+        ----------
+        *fingerprints : str
+            As for `look_up`; ``cache.forget(*likelihood.cache_keys)`` deletes what a likelihood uses.
+
+        Returns
+        -------
+        int
+            Number of rows deleted.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        sources = [(source_number(fingerprint),) for fingerprint in fingerprints]
+
+        def delete(connection: sqlite3.Connection) -> int:
+            connection.execute("BEGIN IMMEDIATE")
+            deleted = sum(connection.executemany(statement, sources).rowcount for statement in REMOVE.values())
+            connection.execute("COMMIT")
+            return deleted
+
+        with self.file.lock:
+            self._waiting = [row for row in self._waiting if (row[1],) not in sources]
+            return self._insist(delete)
+
+    def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int | None = None) -> None:
+        """Delete the rows of some simulations, if possible.
+
+        Parameters
+        ----------
+        thetas : (n, n_structural) float
+            Structural parameters.
+        *fingerprints : str
+            As for `look_up`.
+        generation : int
+            See `StoredLabel`; by default the latest.
+        """
+        keys = [
+            (key,)
+            for fingerprint in fingerprints
+            for key in simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
+        ]
+
+        def delete(connection: sqlite3.Connection) -> None:
+            connection.execute("BEGIN IMMEDIATE")
+            for table in _KEYED:
+                connection.executemany(f"DELETE FROM {table} WHERE key = ?", keys)
+            connection.execute("COMMIT")
+
+        with self.file.lock:
+            self._waiting = [row for row in self._waiting if (row[0],) not in set(keys)]
+            if self.file.writable:
+                self._try("repaired", delete, None)
+
+    def close(self) -> None:
+        """Store waiting rows, if possible, and close the connection of this process; the next use opens a new one."""
+        with self.file.lock:
+            self.retry_times.clear()
+            if self._waiting:
+                self._write(STORE, [])
+            self.file.close()
+
+    def _pages(self) -> Iterator[list[tuple]]:
+        """All undamaged rows, oldest first."""
+        last = 0
+        while True:
+            query = f"SELECT id, {COLUMNS} FROM simulations WHERE id > ? ORDER BY id LIMIT 10000"
+            page = self._insist(lambda connection, q=query, i=last: connection.execute(q, (i,)).fetchall())
+            if not page:
+                return
+            last = page[-1][0]
+            yield [row[1:] for row in page if is_undamaged(*row[1:])]
+
+    def _insert(self, connection: sqlite3.Connection, statement: str, rows: list[tuple]) -> None:
+        evicted, responses = insert_rows(connection, statement, rows, self.max_rows, self.max_response_bytes)
+        self.evictions += evicted + responses
+        if responses and not self._said_evicted:
+            self._said_evicted = True
+            logger.info(
+                "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)",
+                self.path,
+                self.max_response_bytes,
+            )
+
+    def _write(self, statement: str, rows: list[tuple]) -> None:
+        with self.file.lock:
+            if not self.file.writable:
+                self._warn_read_only()
+                return
+            if statement is STORE:  # responses can be computed again and do not wait
+                rows = self._waiting = (self._waiting + rows)[-MAX_WAITING_ROWS:]
+            if self._try("written", lambda connection: self._insert(connection, statement, rows) or True, False):
+                if statement is STORE:
+                    self._waiting = []
+
+    def _warn_read_only(self) -> None:
+        if not self._warned_read_only:
+            logger.warning("%s is read-only: new simulations are not stored. Change its permissions or path", self.path)
+        self._warned_read_only = True
+
+    def _drop(self, table: str, keys: list[bytes]) -> None:
+        """Delete rows that do not match their checksum."""
+        if not keys:
+            return
+        if not self.damaged:
+            logger.warning("%s has damaged rows; they are simulated again, see SimulationCache.damaged", self.path)
+        self.damaged += len(keys)
+        if not self.file.writable:
+            return
+        delete = f"DELETE FROM {table} WHERE key = ?"
+        self._try("repaired", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
+
+
+def remark_key(source: int) -> bytes:
+    """Key of the remark of a model."""
+    return source.to_bytes(8, "little", signed=True)

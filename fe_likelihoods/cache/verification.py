@@ -1,0 +1,386 @@
+"""Verification of a cache: stored simulations are run again and compared before they are trusted.
+
+Stored simulations belong to the declared identity of a model. Nothing that can be computed from code and files tells
+with certainty whether the model behind that identity still computes the same. Therefore rows of a file are compared
+with new simulations. How many is decided by the label of the model (`fe_likelihoods.simulation.label`):
+
+* The label is known in the file: two rows before the first row is used in a process (the one that was stored last, and
+  one at random of those that are requested), and one more for every 1000 rows used. A difference is an error,
+  `StaleCache`: something that the label does not contain has changed.
+* The label is unknown: so many rows, chosen to cover the space of the parameters, that a change in 5 % of the space is
+  found with a probability of 95 % (59 rows, or all there are). If all agree, the rows are adopted: the label is entered
+  as one of their generation. If one differs, a new generation begins: the earlier rows stay in the file and are not
+  used. Both are logged.
+
+All simulations complete the label, by what they open while they run. Files of earlier releases have
+rows without a label. Those with the right numbers of parameters, channels and samples are compared in the same way.
+
+Failures count only where there is no successful simulation, since a changed model often fails at the same points.
+Likelihoods that are made with one model object, pool and file share their comparisons. Rows that the same likelihood
+has stored itself need no verification.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+
+from ..signals.comparison import measured_values
+from ..simulation.model import misfit_batch
+from .adoption import LATEST, MAX_ATTEMPTS, Adoption, difference_of, is_transient, row_of_response
+from .rows import CachedRows, StoredSimulation, simulation_keys
+from .tolerance import DEFAULT_TOLERANCE, VerifyingRun
+
+__all__ = ["StaleCache", "VerifiedCache"]
+
+logger = logging.getLogger(__name__)
+
+FIRST_ROWS = 2  # verified before the first row is used, where the label is known
+ROWS_PER_VERIFICATION = 1000
+LARGEST_ROUNDING = 1e-4  # relative difference of responses that may come from rounding and iterations
+CHANGED = (
+    "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
+    "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
+)
+MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used for a while without verification
+PAUSE_SECONDS = 60.0  # after failed attempts; at least
+PAUSE_RATIO = 20.0  # of the duration of the last attempt
+
+
+class StaleCache(ValueError):
+    """A stored simulation differs from a new one with the same parameters. The message says what to do.
+
+    It is raised again, for any row, as long as that simulation is stored and the model is the same object.
+
+    Attributes
+    ----------
+    theta : (n_structural,) float
+        Structural parameters of the simulation.
+    ends_run : bool
+        True: samplers stop, since no other point can be evaluated either.
+    """
+
+    ends_run = True
+
+    def __init__(self, message: str, theta: np.ndarray) -> None:
+        super().__init__(message)
+        self.theta = theta
+
+    def __reduce__(self) -> tuple:
+        return type(self), (str(self), self.theta)
+
+
+class VerifiedCache(Adoption):
+    """A `SimulationCache` whose rows are verified before they are used.
+
+    Copies in another process verify rows of their own, once for all copies of that process.
+
+    Parameters
+    ----------
+    cache : SimulationCache
+        Its settings `verify` and `tolerance` apply.
+    model : Model
+        As it is when the likelihood is made. Objects for the same model, pool and file share what they have verified.
+    pool : executor or None
+    label : ModelLabel
+        Label of the model.
+
+    Attributes
+    ----------
+    compared : int
+        Rows that were compared with a new simulation.
+    unverified : int
+        Rows whose new simulation was stopped for another reason than the model, so that it could not be compared.
+    seconds : float
+        Wall time of the simulations for verification [s].
+    """
+
+    # rows ---------------------------------------------------------------------------------------------------------
+
+    def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
+        """Rows of `SimulationCache.look_up`, of which some are verified.
+
+        Parameters
+        ----------
+        fingerprint : str
+            As for `SimulationCache.look_up`.
+        thetas : (n, n_structural) float
+            Structural parameters.
+        run : VerifyingRun
+
+        Raises
+        ------
+        StaleCache
+            If a stored row and a new simulation differ, although the label of the model is known.
+        """
+        self._notice_other_model(run)
+        n_steps = measured_values(run.measured).shape[1]
+        while True:
+            generation = self._generation(fingerprint, run)
+            if generation is None:
+                self.cache.misses += len(thetas)
+                shape = len(thetas), run.n_numbers
+                return CachedRows(np.full(shape, np.nan), [""] * len(thetas), np.zeros(len(thetas), bool))
+            rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps, generation)
+            if self._verify_rows(fingerprint, thetas, rows, generation, run):
+                return rows
+
+    def _verify_rows(
+        self, fingerprint: str, thetas: np.ndarray, rows: CachedRows, generation: int, run: VerifyingRun
+    ) -> bool:
+        """Verify some of the rows that were found; False if another generation is to be used."""
+        known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist(), generation)
+        if not known:
+            return True
+        failed = [row for row in known if rows.reasons[row]]
+        succeeded = [row for row in known if not rows.reasons[row]]
+        first = not self._trust.served["simulations", fingerprint]
+        latest = None
+        if first or not succeeded:
+            n_steps = measured_values(run.measured).shape[1]
+            stored = self.cache.stored_rows(fingerprint, generation, run.n_numbers, n_steps, LATEST)
+            others = (row for row in stored if not row.reason)
+            latest = next(others, None)
+            if latest is not None and not self._of_others(fingerprint, latest.theta[None], [0], generation):
+                latest = None
+        # failures alone do not verify successful rows, which may be used later
+        table = "failed simulations" if first and latest is None and not succeeded else "simulations"
+
+        def candidates() -> Iterator[StoredSimulation]:
+            if latest is not None:
+                yield latest
+            for some in (succeeded, failed):
+                for row in self._in_random_order(thetas, some):
+                    if latest is None or not np.array_equal(latest.theta, thetas[row]):
+                        yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row], -1)
+
+        return self._verify_due(table, fingerprint, len(known), candidates, run)
+
+    def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | None]:
+        """Responses of `SimulationCache.look_up_responses`, of which some are verified by their statistics.
+
+        Raises
+        ------
+        StaleCache
+            If the statistics of a stored response and of a new simulation differ, although the label is known.
+        """
+        self._notice_other_model(run)
+        fingerprint = run.model.fingerprint
+        while True:
+            generation = self._generation(fingerprint, run, of_responses=True)
+            if generation is None:
+                return [None] * len(thetas)
+            responses = self.cache.look_up_responses(run.model, thetas, generation)
+            known = [place for place, response in enumerate(responses) if response is not None]
+            known = self._of_others(fingerprint, thetas, known, generation)
+
+            def candidates(known: list = known, responses: list = responses) -> Iterator[StoredSimulation]:
+                for row in self._in_random_order(thetas, known):
+                    yield row_of_response(thetas[row], responses[row], -1, run)
+
+            if not known or self._verify_due("responses", fingerprint, len(known), candidates, run):
+                return responses
+
+    def look_up_failures(self, thetas: np.ndarray, run: VerifyingRun) -> list[str]:
+        """Reasons of `SimulationCache.look_up_failures`, of which some are verified.
+
+        Those that name a time limit are not, because each would take as long as the limit.
+
+        Raises
+        ------
+        StaleCache
+            If the new simulation succeeds.
+        """
+        self._notice_other_model(run)
+        with self._trust.lock:
+            stored = self._trust.find(self.cache, run.model)
+        if stored is None:
+            return [""] * len(thetas)
+        reasons = self.cache.look_up_failures(run.model, thetas, stored.generation)
+        known = [row for row, reason in enumerate(reasons) if reason and not is_transient(reason)]
+        known = self._of_others(run.model.fingerprint, thetas, known, stored.generation)
+
+        def candidates() -> Iterator[StoredSimulation]:
+            for row in self._random.sample(known, len(known)):
+                yield StoredSimulation(thetas[row], np.full(run.n_numbers, np.nan), reasons[row], -1)
+
+        if known and not self._verify_due("failures", run.model.fingerprint, len(known), candidates, run):
+            return [""] * len(thetas)
+        return reasons
+
+    # the usual few ------------------------------------------------------------------------------------------------
+
+    def _of_others(self, fingerprint: str, thetas: np.ndarray, rows: list[int], generation: int) -> list[int]:
+        """Those of some rows that were not stored here; none if the cache is not to be verified."""
+        if not self.cache.verify or not rows:
+            return []
+        own = self._own_rows()
+        if not own:
+            return rows
+        keys = simulation_keys(fingerprint, thetas[rows], generation)
+        return [row for row, key in zip(rows, keys, strict=True) if key not in own]
+
+    def _verify_due(
+        self, table: str, fingerprint: str, n: int, candidates: Callable[[], Iterator], run: VerifyingRun
+    ) -> bool:
+        """Verify as many rows as are due now that `n` more are used; False if another generation is to be used."""
+        trust = self._trust
+        with trust.lock:
+            if trust.stale is not None:
+                differing, error = trust.stale
+                generation = trust.generations.get(differing, 0 if trust.stored is None else trust.stored.generation)
+                if self.cache.are_stored([differing], error.theta[None], generation)[0]:
+                    raise StaleCache(str(error), error.theta)
+                trust.stale = None
+            if trust.rows_in_pause < ROWS_PER_VERIFICATION and time.monotonic() < trust.pause_ends:
+                trust.rows_in_pause += n
+                return True
+            before = trust.served[table, fingerprint]
+            first = before == 0
+            # one row suffices for responses and for shorter records, if others of the same code were verified
+            first_rows = 1 if trust.served else FIRST_ROWS
+            due = first_rows if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
+            start = time.monotonic()
+            try:
+                compared = not due or self._verify(candidates(), due, fingerprint, run)
+            except StaleCache as error:
+                trust.stale = fingerprint, error
+                raise
+            finally:
+                trust.simulated.clear()
+            if compared is None:
+                return False
+            if not compared:
+                trust.failed_attempts += 1
+                if trust.failed_attempts >= MAX_FAILED_ATTEMPTS:
+                    now = time.monotonic()
+                    trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
+                    trust.rows_in_pause = 0
+                return True  # verified with the next rows, or after a pause
+            if due:
+                trust.failed_attempts = 0
+            trust.served[table, fingerprint] = before + n
+            return True
+
+    def _verify(self, rows: Iterable[StoredSimulation], due: int, fingerprint: str, run: VerifyingRun) -> bool | None:
+        """Simulate the first `due` rows again, and further ones in place of those whose simulation is stopped.
+
+        Returns whether a row was compared; two failures do not count if successful rows could not be compared. None if
+        a row of another label differs, and a new generation has begun.
+        """
+        rows, done, succeeded, reasons = iter(rows), 0, 0, []
+        attempts = max(due, MAX_ATTEMPTS)
+        while done < due and attempts > 0:
+            chosen = [row for row, _ in zip(rows, range(min(due - done, attempts)), strict=False)]
+            if not chosen:
+                break
+            attempts -= len(chosen)
+            for row, new in zip(chosen, self._simulate_again(fingerprint, chosen, run), strict=True):
+                if is_transient(new.reason):
+                    reasons.append(new.reason)
+                elif self._differs(row, new.misfit, new.reason, fingerprint, run):
+                    return None
+                else:
+                    done += 1
+                    succeeded += not row.reason
+        self.cache.verified += done
+        if reasons:
+            logger.warning(
+                "%s: %d of %d stored simulations could not be verified, because the new simulation was stopped (%s)%s",
+                self.cache.path,
+                len(reasons),
+                len(reasons) + done,
+                reasons[0],
+                "" if done else ". Rows are used without verification; the next ones are verified instead",
+            )
+        return bool(succeeded or (done and not reasons))
+
+    def _differs(
+        self, row: StoredSimulation, new: np.ndarray, reason: str, fingerprint: str, run: VerifyingRun
+    ) -> bool:
+        """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows."""
+        if row.reason and reason:
+            return False
+        label = self._label_of(row, fingerprint, run)
+        names = [channel.name for channel in run.model.channels]
+        if row.reason or reason:
+            was, now = (f"failed ({text})" if text else "succeeded" for text in (row.reason, reason))
+            difference, advice = f"the stored simulation {was}; simulated again, it {now}", ""
+            if row.reason:
+                advice = ". If failures depend on anything but the parameters, set retry_failures=True"
+        else:
+            tolerances = self._tolerances(run)
+            found = difference_of(row.misfit, new, run, tolerances.get(label, max(tolerances[0], DEFAULT_TOLERANCE)))
+            if found is None:
+                return False
+            index, change = found
+            what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
+            difference = (
+                f"channel {names[index % len(names)]!r}, {what}: stored {row.misfit[index]:.17g}, simulated again "
+                f"{new[index]:.17g}"
+            )
+            advice = ""
+            if change < LARGEST_ROUNDING:
+                advice = (
+                    ". If the model is not exactly repeatable, for example on another machine, accept differences of "
+                    f"this size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
+                )
+        scatter = self._scatter(row.theta, new, reason, run)
+        served = self._trust.served.total()
+        self._start_again()
+        stored = self._trust.stored
+        of_others = {each.id for each in self.cache.labels_of(run.model) if stored and each.label != stored.label}
+        if label in of_others and not scatter:
+            # the label was adopted, but the model has changed in a part of the space where no row was compared
+            self._begin(fingerprint, run)
+            if not served:
+                return True
+        point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
+        rest = f", and discard this run, which has used {served} rows" if served else ""
+        raise StaleCache(
+            f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
+            f"{difference}. {scatter or CHANGED}{rest}{'' if scatter else advice}",
+            row.theta,
+        )
+
+    def _label_of(self, row: StoredSimulation, fingerprint: str, run: VerifyingRun) -> int:
+        """Id of the label under which a row was stored; 0 if it is not known."""
+        if row.label != -1:
+            return row.label
+        generation = self._trust.generations.get(fingerprint)
+        return 0 if generation is None else self.cache.label_of(fingerprint, row.theta, generation)
+
+    def _scatter(self, theta: np.ndarray, earlier: np.ndarray, reason: str, run: VerifyingRun) -> str:
+        """Advice for a model whose new simulations differ among themselves, after one more; empty if they agree."""
+        start = time.perf_counter()
+        (new,), (new_reason,) = misfit_batch(run.model, theta[None], run.measured, run.pool, run.statistic)
+        self.seconds += time.perf_counter() - start
+        if is_transient(new_reason) or (reason and new_reason):
+            return ""
+        text = "The model is not repeatable: one more simulation at this point "
+        if reason or new_reason:
+            outcome = f"failed ({new_reason})" if new_reason else "succeeded"
+            return f"{text}{outcome}. Make it depend on its parameters alone, for example with a fixed seed"
+        found = difference_of(earlier, new, run, self._tolerances(run)[0])
+        if found is None:
+            return ""
+        index, change = found
+        return (
+            f"{text}gave {new[index]:.17g} instead of {earlier[index]:.17g}, a change of {change:.1e} of the response. "
+            "Make it depend on its parameters alone, for example with a fixed seed, or accept such differences with "
+            f"SimulationCache(path, tolerance={10.0 * change:.1e})"
+        )
+
+    def _notice_other_model(self, run: VerifyingRun) -> None:
+        """Start again with the first verification if another model object was set."""
+        if run.model is not self._model:
+            if self._model is not None:
+                with self._trust.lock:
+                    self._start_again()
+                    self._trust.stale = None
+            self._model = run.model
+
+    def _start_again(self) -> None:
+        self._trust.served.clear()
+        self._trust.restarts += 1

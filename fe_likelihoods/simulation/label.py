@@ -1,0 +1,591 @@
+"""Label of a model: what its results are seen to depend on besides its declared identity.
+
+Stored simulations belong to a declared identity, the fingerprint of the model: class, parameters, channels, excitation,
+``version=`` and ``depends_on=``. Whether the code behind it still computes the same is decided by simulating some of
+them again (`fe_likelihoods.cache.verification`). The label only asks for it: rows that were stored under a known label
+are trusted after a few simulations, an unknown label needs many. So a label may miss something, and may change without
+need. It contains
+
+* the user's functions, classes and values by value: those of the model, and those that their code names,
+* the source files of the user's modules among them, without comments, and the versions of installed packages,
+* environment variables whose names occur in this code,
+* the source files of this library that simulations depend on,
+* what simulations of the model opened while they ran (`fe_likelihoods.simulation.opened`).
+
+The bytes of cloudpickle are not used, because they are not the same in two processes: they contain random identifiers
+of classes, the order of sets, and the file names of notebook cells.
+"""
+
+import ast
+import functools
+import importlib.metadata
+import logging
+import os
+import platform
+import re
+import sys
+import sysconfig
+import types
+import weakref
+from collections.abc import Iterable, Mapping
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .opened import Opened, file_digest
+
+__all__ = [
+    "LIBRARY",
+    "ModelLabel",
+    "cpu_name",
+    "is_of_user",
+    "items_of",
+    "note_own_changes",
+    "steady_digest",
+    "value_digest",
+]
+
+LIBRARY = __name__.split(".")[0]
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = (
+    *("kernels/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "simulation/residual_statistics.py"),
+    *("probability/*noise*.py", "probability/response_levels.py", "units.py"),
+)
+MOST_OBJECTS = 1_000_000  # of one value; the rest is left out
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))
+_WRAPPED = ("__func__", "__self__", "fget", "fset", "fdel", "func", "args", "keywords", "__wrapped__", "cell_contents")
+_WRAPPERS = (
+    types.MethodType,
+    staticmethod,
+    classmethod,
+    property,
+    functools.partial,
+    functools.partialmethod,
+    functools.cached_property,
+    type(functools.lru_cache(len)),
+    types.CellType,
+)
+_OF_CLASSES = {
+    "__slotnames__",
+    "_abc_impl",
+    "__dict__",
+    "__weakref__",
+    "__module__",
+    "__qualname__",
+    "__firstlineno__",
+    "__static_attributes__",
+}
+_DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # of a class, which it may change when it runs
+_SCRIPTS = ("__main__", "__mp_main__")
+_OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # change without a meaning for simulations
+_PARTS = {"function", "class", "output", "statistic", "library", "python"}
+_first: dict[str, str] = {}  # digests of values that code changes when it runs, at the time of the first label
+_opened: dict[str, Opened] = {}  # by code, in this process
+_sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
+
+
+class ModelLabel:
+    """Label of a model as it is now, completed by its simulations.
+
+    Parameters
+    ----------
+    model : Model
+        Its own code is the mapping ``code_parts()`` where it has this method; for other models of the user, the object.
+    statistic : function, optional
+        The statistic of the residuals that is stored.
+
+    Attributes
+    ----------
+    items : dict of str to str
+        Digests of everything that is known without a simulation.
+    opened : Opened
+        What simulations opened.
+    observes : bool
+        Whether simulations are observed, since they may run code of the user.
+    """
+
+    def __init__(self, model: Any, statistic: Any = None) -> None:
+        self._statistic = statistic
+        now = self._present(model)
+        self.items = now | {name: digest for name, digest in _first.items() if name in now}
+        self.observes = _has_user_code(model) or (statistic is not None and _defined_by_user(statistic))
+        # a module is imported by the first simulation of a process only, so what that opened counts for later labels
+        self.opened, self._was_observed = _opened.get(self.code, Opened({})).read_again(), False
+
+    @property
+    def code(self) -> str:
+        """Digest of `items`."""
+        return _joined(self.items)
+
+    @property
+    def identity(self) -> str:
+        """Digest of the code and values alone, without versions of Python and of this library."""
+        from ..kernels.jit import KERNEL_HASH  # late, because it imports numba
+
+        items = {name: digest for name, digest in self.items.items() if name not in ("python", "library")}
+        return _joined(items or {"kernels": KERNEL_HASH})
+
+    @property
+    def text(self) -> str:
+        """The whole label: `code`, and a digest of what was opened."""
+        return f"{self.code} {_joined(self.opened.items())}"
+
+    @property
+    def known(self) -> Opened | None:
+        """What simulations of this process opened; None before the first."""
+        return self.opened if self._was_observed else None
+
+    def add(self, opened: Opened | None, here: bool = True) -> bool:
+        """Add what simulations opened, in this process or `here` = False earlier; returns whether it was new."""
+        self._was_observed = self._was_observed or (here and opened is not None)
+        if opened is None or opened.files.keys() <= self.opened.files.keys():
+            return False
+        self.opened = opened | self.opened
+        _opened[self.code] = self.opened
+        return True
+
+    def changed(self, model: Any) -> set[str]:
+        """Names of the items that differ from what the label says."""
+        known = self.items | self.opened.items()
+        now = self._present(model) | self.opened.read_again().items()
+        return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
+
+    def has_changed_itself(self, names: Iterable[str]) -> None:
+        """State that simulations change some items, which keep their first digests in later labels of this process."""
+        note_own_changes(self.items, dict.fromkeys(names, ""))
+
+    @property
+    def changing(self) -> set[str]:
+        """Names of items that simulations of this process have changed."""
+        return self.items.keys() & _first.keys()
+
+    def renew(self, model: Any) -> None:
+        """Take the present state of everything as the label."""
+        known, now = self.items, self._present(model)
+        # the same objects where nothing has changed, so that pickles stay small
+        same = {name: digest for name, digest in known.items() if now.get(name) == digest}
+        self.items = same | {name: digest for name, digest in now.items() if name not in same}
+        self.opened = self.opened.read_again()
+
+    def _present(self, model: Any) -> dict[str, str]:
+        parts: dict[str, Any] = model.code_parts() if hasattr(model, "code_parts") else {}
+        if is_of_user(type(model).__module__):
+            parts = parts | _parts_of(model)
+        if self._statistic is not None and _defined_by_user(self._statistic):
+            parts = parts | {"statistic": self._statistic}
+        return (items_of(parts) if parts else {}) | {"library": _library_digest()}
+
+
+def _parts_of(model: Any) -> dict[str, Any]:
+    """Class of the user, and attributes of an object; a time limit changes no response."""
+    name = type(model).__qualname__
+    attributes = {attribute: value for attribute, value in _state(model).items() if attribute != "time_limit"}
+    return {"class": type(model)} | {f"{name}().{attribute}": value for attribute, value in attributes.items()}
+
+
+def _defined_by_user(function: Any) -> bool:
+    return is_of_user(getattr(function, "__module__", None) or type(function).__module__)
+
+
+def _has_user_code(model: Any) -> bool:
+    """Whether a model may run code of the user."""
+    return hasattr(model, "code_parts") or is_of_user(type(model).__module__)
+
+
+def cpu_name() -> str:
+    """Name of the processor that simulations run on; results on another one may differ in their last digits."""
+    asked = [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "OPENBLAS_CORETYPE")]
+    return " ".join(filter(None, [_processor(), *asked]))
+
+
+def value_digest(value: Any) -> str:
+    """Digest of a value, a function or a class, with everything that its code names.
+
+    Raises
+    ------
+    ValueError
+        If the value contains an object of which only the type is known, such as an open file.
+    """
+    walk = _Walk()
+    items = walk.items({"value": value})
+    if walk.opaque:
+        raise ValueError(f"an object of the type {', '.join(sorted(walk.opaque))} has no value that can be compared")
+    return _joined(items)
+
+
+def items_of(parts: Mapping[str, Any]) -> dict[str, str]:
+    """Digests of some values, and of the functions, values, files, packages and variables that their code names."""
+    return _Walk().items(parts)
+
+
+def steady_digest(parts: Mapping[str, Any]) -> str:
+    """Digest of `items_of`, in which values that simulations of this process have changed are those before them."""
+    items = items_of(parts)
+    return _joined(items | {name: digest for name, digest in _first.items() if name in items})
+
+
+def note_own_changes(before: Mapping[str, str], after: Mapping[str, str]) -> None:
+    """State that simulations have changed what differs between two results of `items_of`."""
+    for name in before.keys() & after.keys() - _PARTS:
+        if before[name] != after[name]:
+            _first.setdefault(name, before[name])
+
+
+def _joined(items: Mapping[str, str]) -> str:
+    return blake2b(repr(sorted(items.items())).encode(), digest_size=16).hexdigest()
+
+
+class _Walk:
+    """Digests of values. Named functions, classes and variables of the user's modules become items of their own."""
+
+    def __init__(self) -> None:
+        self.opaque: set[str] = set()
+        self._waiting: dict[str, Any] = {}
+        self._modules: dict[str, types.ModuleType] = {}
+        self._packages: set[str] = set()
+        self._library: set[str] = set()
+        self._words: set[str] = set()
+        self._done: dict[int, tuple[bytes, Any]] = {}
+        self._open: dict[int, int] = {}  # places on the way from the value to what is added now
+
+    def items(self, parts: Mapping[str, Any]) -> dict[str, str]:
+        """Digests by name."""
+        items = {"python": f"{platform.python_implementation()} {platform.python_version()} {platform.machine()}"}
+        self._waiting.update(parts)
+        while self._waiting:
+            name, value = self._waiting.popitem()
+            if name not in items:
+                items[name] = self._digest(value)
+                if isinstance(value, str):  # a command or an input file of a program
+                    self._words |= set(re.findall(r"\w+", value))
+        for module in self._all_modules():
+            if module.__name__ not in _SCRIPTS:  # a script is represented by what the model uses
+                items[f"source of {module.__name__}"], words = _source(module)
+                self._words |= words
+        for module in self._library:
+            items[f"source of {module}"] = _source(sys.modules[module])[0]
+        for package in self._packages:
+            items[f"package {package}"] = _version(package)
+        for name in self._words & os.environ.keys() - _OF_SHELLS:
+            items[f"environment {name}"] = os.environ[name]
+        return items
+
+    def _all_modules(self) -> Iterable[types.ModuleType]:
+        """The user's modules that were met, and those that they name."""
+        waiting = list(self._modules)
+        while waiting:
+            module = self._modules[waiting.pop()]
+            for value in [] if module.__name__ in _SCRIPTS else list(vars(module).values()):
+                name = value.__name__ if isinstance(value, types.ModuleType) else _attribute(value, "__module__")
+                if isinstance(name, str) and name not in self._modules and name in sys.modules:
+                    if is_of_user(name):
+                        self._modules[name] = sys.modules[name]
+                        waiting.append(name)
+                    elif name.partition(".")[0] != LIBRARY:
+                        self._refer(name)
+        return self._modules.values()
+
+    def _digest(self, value: Any) -> str:
+        self._done, self._open, self._hash = {}, {}, blake2b(digest_size=8)
+        try:
+            self._add(value)
+        except RecursionError:
+            self._text(f"deeper than {sys.getrecursionlimit()}")
+        return self._hash.hexdigest()
+
+    def _text(self, text: str) -> None:
+        self._hash.update(text.encode("utf-8", "surrogatepass") + b"\0")
+
+    def _add(self, value: Any) -> None:
+        kind = type(value)
+        if kind in _PLAIN:
+            self._text(f"{kind.__name__} {value!r}")
+        elif id(value) in self._open:  # it contains itself
+            self._text(f"the object {len(self._open) - self._open[id(value)]} levels above")
+        elif len(self._done) < MOST_OBJECTS:
+            self._hash.update(self._apart(value))
+
+    def _apart(self, value: Any) -> bytes:
+        """Digest of one value, the same for equal values, whether they are one object or several."""
+        if id(value) not in self._done:
+            outer, self._hash = self._hash, blake2b(digest_size=8)
+            self._open[id(value)] = len(self._open)
+            try:
+                self._add_contents(value)
+                self._done[id(value)] = self._hash.digest(), value  # the object too, so that its id is not reused
+            finally:
+                self._hash = outer
+                del self._open[id(value)]
+        return self._done[id(value)][0]
+
+    def _add_contents(self, value: Any) -> None:
+        kind = type(value)
+        if kind in _PLAIN:
+            self._text(f"{kind.__name__} {value!r}")
+            return
+        self._text(f"{_name_of(kind.__module__)}.{kind.__qualname__}")
+        if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
+            self._text(f"{value.dtype.str} {value.shape}")
+            self._hash.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, types.CodeType):
+            self._add_code(value)
+        elif isinstance(value, types.FunctionType):
+            self._add_function(value)
+        elif isinstance(value, type):
+            self._add_class(value)
+        elif isinstance(value, types.ModuleType):
+            self._add_module(value)
+        elif isinstance(value, _WRAPPERS):
+            for name in _WRAPPED:
+                self._add(_attribute(value, name))
+        elif isinstance(value, types.BuiltinFunctionType | types.BuiltinMethodType | types.WrapperDescriptorType):
+            self._text(value.__qualname__)
+            if not isinstance(getattr(value, "__self__", None), types.ModuleType | None):
+                self._add(value.__self__)
+        elif kind in (list, tuple):
+            self._add_all(value)
+        elif kind in (set, frozenset):
+            self._text(repr(sorted(map(self._apart, value))))
+        elif isinstance(value, dict | types.MappingProxyType):
+            self._add_all([item for pair in value.items() for item in pair])
+            if kind not in (dict, types.MappingProxyType):
+                self._add_state(value)
+        elif isinstance(value, weakref.ref):
+            self._add(value())
+        elif isinstance(value, logging.Logger):
+            self._text(value.name)
+        elif kind.__module__.partition(".")[0] == "numba":  # what was compiled changes with its use
+            self._add(_attribute(value, "py_func") or _attribute(_attribute(value, "_dispatcher"), "py_func"))
+        else:
+            self._add_object(value)
+
+    def _add_all(self, values: Iterable[Any]) -> None:
+        for value in values:
+            self._add(value)
+        self._text("end")
+
+    def _add_code(self, code: types.CodeType) -> None:
+        """Without the names of local variables, lines, and the name of the file."""
+        arguments = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+        self._text(repr((code.co_name, code.co_names, arguments, code.co_freevars, code.co_flags)))
+        self._hash.update(code.co_code)
+        self._words.update(text for text in code.co_consts if isinstance(text, str))
+        self._add_all(code.co_consts)
+
+    def _add_function(self, function: types.FunctionType) -> None:
+        module = function.__module__ or ""
+        self._text(f"{_name_of(module)}.{function.__qualname__}")
+        if not is_of_user(module):
+            self._refer(module)
+            return
+        self._meet(module)
+        self._add_all((function.__code__, function.__defaults__, function.__kwdefaults__, function.__closure__))
+        self._add_all({name: value for name, value in vars(function).items() if name != "__wrapped__"}.items())
+        self._add(_attribute(function, "__wrapped__"))
+        for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
+            self._waiting.setdefault(f"{_name_of(module)}.{name}", function.__globals__[name])
+
+    def _add_class(self, cls: type) -> None:
+        self._text(f"{_name_of(cls.__module__)}.{cls.__qualname__}")
+        if not is_of_user(cls.__module__):
+            self._refer(cls.__module__)
+            return
+        self._meet(cls.__module__)
+        self._add_all(cls.__bases__)
+        if type(cls) is not type:
+            self._add(type(cls))
+        for name, member in sorted(vars(cls).items()):
+            if name in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
+                continue
+            self._text(name)
+            if isinstance(member, _DATA) and "<locals>" not in cls.__qualname__:
+                self._waiting.setdefault(f"{_name_of(cls.__module__)}.{cls.__qualname__}.{name}", member)
+            else:
+                self._add(member)
+
+    def _add_module(self, module: types.ModuleType) -> None:
+        """Data of a module of the user by value; its functions and classes are in its source."""
+        self._text(module.__name__)
+        if not is_of_user(module.__name__):
+            self._refer(module.__name__)
+            return
+        self._meet(module.__name__)
+        for name, value in list(vars(module).items()):
+            if not name.startswith("__") and not isinstance(value, types.ModuleType | type | types.FunctionType):
+                self._waiting.setdefault(f"{module.__name__}.{name}", value)
+
+    def _add_object(self, value: Any) -> None:
+        self._add(type(value))
+        if is_of_user(type(value).__module__) or isinstance(value, types.SimpleNamespace):
+            self._add_state(value)
+            return
+        try:  # the parts from which pickle would make it
+            for part in _parts(value.__reduce_ex__(2)):
+                self._add(part)
+        except RecursionError:
+            raise
+        except Exception:  # foreign code
+            self.opaque.add(f"{type(value).__module__}.{type(value).__qualname__}")
+            self._add_state(value)
+
+    def _add_state(self, value: Any) -> None:
+        for name, part in sorted(_state(value).items()):
+            self._text(name)
+            self._add(part)
+
+    def _meet(self, module: str) -> None:
+        if module in sys.modules:
+            self._modules[module] = sys.modules[module]
+
+    def _refer(self, module: str) -> None:
+        """A package is represented by its version, the standard library by the version of Python."""
+        top = module.partition(".")[0]
+        if top == LIBRARY and module in sys.modules:
+            self._library.add(module)
+        elif top and top not in sys.stdlib_module_names:
+            self._packages.add(top)
+
+
+def _name_of(module: str) -> str:
+    """Name of a module; a script has another one in worker processes."""
+    return "__main__" if module in _SCRIPTS else module
+
+
+def _parts(reduced: Any) -> list[Any]:
+    """Parts of the result of ``__reduce_ex__``, its iterators as lists."""
+    if isinstance(reduced, str):
+        return [reduced]
+    return [list(part) if place in (3, 4) and part is not None else part for place, part in enumerate(reduced)]
+
+
+def _state(value: Any) -> dict[str, Any]:
+    """Attributes of an object, those in slots included."""
+    found = dict(_attribute(value, "__dict__") or {})
+    for cls in type(value).__mro__:
+        slots = vars(cls).get("__slots__", ())
+        for name in (slots,) if isinstance(slots, str) else slots:
+            private = name.startswith("__") and not name.endswith("__")
+            found[name] = _attribute(value, f"_{cls.__name__.lstrip('_')}{name}" if private else name)
+    return found
+
+
+def _attribute(value: Any, name: str) -> Any:
+    """An attribute that is found without code of the user; None if there is none."""
+    try:
+        return object.__getattribute__(value, name)
+    except (AttributeError, ValueError):  # an empty cell raises ValueError
+        return None
+
+
+def _global_names(code: types.CodeType) -> set[str]:
+    """Names in a code and in the codes inside it."""
+    names = set(code.co_names)
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            names |= _global_names(constant)
+    return names
+
+
+def _has_weakref(model: Any) -> bool:
+    try:
+        weakref.ref(model)
+    except TypeError:
+        return False
+    return True
+
+
+def is_of_user(module: str) -> bool:
+    """Whether a module is neither installed nor in the standard library, so that it changes without a version."""
+    if not isinstance(module, str):
+        return False
+    if module in _SCRIPTS:
+        return True
+    found = sys.modules.get(module)
+    return _is_of_user(module, getattr(found, "__file__", None), found is not None)
+
+
+@functools.cache
+def _is_of_user(module: str, file: str | None, is_loaded: bool) -> bool:
+    top = module.partition(".")[0]
+    if not module or top == LIBRARY or top in sys.builtin_module_names:
+        return False
+    if file is None:  # frozen, a folder of modules, or made by code
+        if top in sys.stdlib_module_names:
+            return False
+        return not is_loaded or not getattr(sys.modules[module], "__path__", None)
+    path = Path(file).resolve()
+    if {"site-packages", "dist-packages"} & set(path.parts):
+        return not _version(top)
+    return not any(path.is_relative_to(folder) for folder in _standard_folders())
+
+
+@functools.cache
+def _standard_folders() -> tuple[Path, ...]:
+    return tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
+
+
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    return importlib.metadata.packages_distributions()
+
+
+def _version(top: str) -> str:
+    """Version of an installed package; empty for others."""
+    try:
+        return importlib.metadata.version(top)
+    except (importlib.metadata.PackageNotFoundError, ValueError):
+        pass
+    try:
+        return " ".join(map(importlib.metadata.version, _distributions().get(top, ())))
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
+    """Digest of the source file of a module, as it was when it was first read, and the words in it."""
+    file = getattr(module, "__file__", None)
+    if file is None:
+        return "", frozenset()
+    known = _sources.get((file, id(module)))
+    if known is None:
+        known = _sources[file, id(module)] = _read_source(file)
+    return known
+
+
+def _read_source(file: str) -> tuple[str, frozenset[str]]:
+    try:
+        content = Path(file).read_bytes()
+        if not file.endswith(".py"):
+            return file_digest(file), frozenset()
+        text = ast.dump(ast.parse(content))  # without comments and blank lines
+    except OSError:
+        return "", frozenset()
+    except (SyntaxError, ValueError, RecursionError):
+        text = content.decode("utf-8", "replace")
+    words = frozenset(re.findall(r"\w+", content.decode("utf-8", "replace")))
+    return blake2b(text.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest(), words
+
+
+@functools.cache
+def _library_digest() -> str:
+    """Digest of the source files of this library that a simulation may depend on."""
+    digest = blake2b(digest_size=16)
+    for file in sorted(file for pattern in SOURCES for file in ROOT.glob(pattern)):
+        digest.update(f"{file.relative_to(ROOT).as_posix()}\0".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+@functools.cache
+def _processor() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        text = ""
+    patterns = (rf"^(?:{key})\s*:\s*(.+)$" for key in ("model name|CPU part", "flags|Features"))
+    name, flags = (re.search(pattern, text, re.MULTILINE) for pattern in patterns)
+    if name is None:
+        return f"{platform.machine()} {platform.processor()}"
+    # virtual machines give different processors one name
+    return name.group(1) + (f" {blake2b(flags.group(1).encode(), digest_size=4).hexdigest()}" if flags else "")

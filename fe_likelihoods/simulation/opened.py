@@ -1,0 +1,222 @@
+"""What a simulation opens while it runs: files, modules, shared libraries and programs.
+
+A hook of the interpreter (`sys.addaudithook`) is told of every file that Python code opens. It listens while a
+simulation runs, in this process, in a worker of a pool or in the process of an isolated function. Files that the
+simulation writes itself do not count, nor do those of Python and of installed packages.
+"""
+
+import contextlib
+import functools
+import os
+import shutil
+import sys
+import sysconfig
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+__all__ = ["Observed", "Opened", "file_digest", "note", "observing", "unpack"]
+
+_CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again without another time of modification
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+_SYSTEM = ("/proc/", "/sys/", "/dev/", "/usr/", "/lib", "/etc/", "/bin/", "/opt/", "/memfd:", "/SYSV", "/run/")
+
+_observers: "list[_Observer]" = []
+_lock = threading.Lock()
+_has_hook = False
+_known: "dict[str, Opened]" = {}  # what functions have opened in this process, by their tokens
+_digests: dict[str, tuple[tuple, float, str]] = {}
+
+
+class Opened(NamedTuple):
+    """What one simulation opened.
+
+    Attributes
+    ----------
+    files : dict of str to str
+        Digests of the contents, by path.
+    """
+
+    files: dict[str, str]
+
+    def items(self) -> dict[str, str]:
+        """Digests by names that are the same in another folder."""
+        found: dict[str, list[str]] = {}
+        for path, digest in self.files.items():
+            found.setdefault(f"opened {os.path.basename(path)}", []).append(digest)
+        return {name: " ".join(sorted(digests)) for name, digests in found.items()}
+
+    def __or__(self, other: "Opened") -> "Opened":
+        return Opened(self.files | other.files)
+
+    def read_again(self) -> "Opened":
+        """The same files as they are now; those of another machine are not found and not changed."""
+        return Opened({path: _digest_or(path, digest) for path, digest in self.files.items()})
+
+
+class _Observer:
+    """What is opened while it is in the list of observers."""
+
+    def __init__(self) -> None:
+        self.read: set[str] = set()
+        self.written: set[str] = set()
+        self.noted: dict[str, str] = {}
+        self.modules = set(sys.modules)
+
+    def result(self, known: Opened | None = None) -> Opened | None:
+        """Files that were read and not written, of new modules too, and shared libraries; None for no unknown ones."""
+        files = {} if known is None else known.files
+        if known is not None and not self.noted and len(sys.modules) == len(self.modules):
+            if not any(path not in files and _counts(path) for path in self.read - self.written):
+                return None
+        new = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]
+        read = self.read | {file for file in new if isinstance(file, str)} | set(_mapped())
+        files = {path: _digest_or(path, "") for path in read - self.written if _counts(path)}
+        return Opened({path: digest for path, digest in files.items() if digest} | self.noted)
+
+
+class Observed:
+    """A function that is sent to other processes; its results say what it has opened there.
+
+    Parameters
+    ----------
+    function : callable
+        Of one item.
+
+    Notes
+    -----
+    A call returns the result, and an `Opened` of files that no earlier call in this process has opened, or None.
+    """
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self.function, self._token = function, uuid.uuid4().hex
+        self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+    def __reduce__(self) -> tuple:
+        return _observed, (self.function, self._token)
+
+    def __call__(self, item: Any) -> tuple[Any, Opened | None]:
+        """The result for an item, and what the call opened."""
+        with observing() as observer:
+            result = self.function(item)
+        opened = observer.result(_known.get(self._token))
+        if opened is not None:
+            _known[self._token] = opened | _known.get(self._token, Opened({}))
+        return result, opened
+
+
+def unpack(outcome: tuple) -> tuple[Any, Opened | None]:
+    """Result of a simulation in a worker and what it opened; the pool reports a lost worker by a result alone."""
+    return (outcome, None) if isinstance(outcome[1], str) else outcome
+
+
+def _observed(function: Callable[[Any], Any], token: str) -> Observed:
+    observed = Observed(function)
+    observed._token = token
+    return observed
+
+
+@contextlib.contextmanager
+def observing() -> Iterator[_Observer]:
+    """Observe what this process opens."""
+    global _has_hook
+    observer = _Observer()
+    with _lock:
+        if not _has_hook:
+            sys.addaudithook(_hook)  # for the life of the process
+            _has_hook = True
+        _observers.append(observer)
+    try:
+        yield observer
+    finally:
+        with _lock:
+            _observers.remove(observer)
+
+
+def note(opened: Opened | None) -> None:
+    """Tell those who observe this process what another process has opened for it."""
+    if opened is not None:
+        for observer in list(_observers):
+            observer.noted.update(opened.files)
+
+
+def file_digest(path: str | os.PathLike) -> str:
+    """Digest of the content of a file, read again only after a change of its size or time of modification."""
+    name = os.fspath(path)
+    status = os.stat(name)
+    stamp = status.st_size, status.st_mtime_ns, status.st_ino
+    known = _digests.get(name)
+    if known is not None and known[0] == stamp and known[1] - status.st_mtime > _CLOCK_TICK:
+        return known[2]
+    now = time.time()
+    digest = blake2b(digest_size=16)
+    with open(name, "rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    _digests[name] = stamp, now, digest.hexdigest()
+    return digest.hexdigest()
+
+
+def _hook(event: str, arguments: tuple) -> None:
+    if not _observers:
+        return
+    try:
+        if event == "open":
+            path, mode, flags = arguments
+            writes = any(letter in mode for letter in "wax+") if isinstance(mode, str) else bool(flags & _WRITING)
+            _add(path, writes)
+        elif event in ("ctypes.dlopen", "sqlite3.connect"):
+            _add(arguments[0], False)
+        elif event == "subprocess.Popen":
+            program, command, folder, _ = arguments
+            words = [command] if isinstance(command, str | bytes | os.PathLike) else list(command)
+            for word in filter(None, [shutil.which(os.fsdecode(program or words[0])), *words]):
+                _add(os.path.join(folder or "", os.fsdecode(word)), False)
+    except Exception:  # never disturb the code that is observed
+        pass
+
+
+def _add(path: Any, writes: bool) -> None:
+    if isinstance(path, str | bytes | os.PathLike):
+        path = os.path.abspath(os.fsdecode(path))
+        for observer in list(_observers):
+            (observer.written if writes else observer.read).add(path)
+
+
+def _mapped() -> list[str]:
+    """Files that are mapped into the memory of this process, such as shared libraries; on Linux only."""
+    try:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+    except OSError:
+        return []
+    paths = [line.split(None, 5)[5:] for line in lines]
+    return [path for (path,) in filter(None, paths) if path.startswith("/") and not path.endswith("(deleted)")]
+
+
+def _counts(path: str) -> bool:
+    """Whether a file is neither of the system nor of Python or an installed package."""
+    if path.startswith(_SYSTEM) or path.endswith((".pyc", "-shm", "-wal")) or "-packages" + os.sep in path:
+        return False
+    return not path.startswith(_installed()) and os.path.realpath(path) != os.path.realpath(sys.executable)
+
+
+@functools.cache
+def _installed() -> tuple[str, ...]:
+    library = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    prefixes = [os.path.join(prefix, "lib") for prefix in (sys.prefix, sys.base_prefix)]
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes, *map(sysconfig.get_path, names)))
+
+
+def _digest_or(path: str, otherwise: str) -> str:
+    try:
+        return file_digest(path) if os.path.isfile(path) else otherwise
+    except OSError:
+        return otherwise

@@ -1,0 +1,428 @@
+"""A model that has changed between two runs, or during one: stored rows are verified, adopted, or not used."""
+
+import importlib
+import os
+import pickle
+import sqlite3
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache
+from fe_likelihoods.cache import trust
+from fe_likelihoods.cache.coverage import choose_rows
+from fe_likelihoods.cache.rows import StoredSimulation
+from fe_likelihoods.cache.simulation_cache import rows_to_compare
+from fe_likelihoods.cache.sqlite_file import APPLICATION_ID
+from fe_likelihoods.cache.verification import StaleCache
+from fe_likelihoods.simulation import label
+from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.label import ModelLabel, items_of, value_digest
+from fe_likelihoods.simulation.opened import Observed
+
+CHANNELS = (Channel("u", "displacement", "m"),)
+TIME = np.linspace(0.0, 1.0, 20)
+MEASURED = Measurements(CHANNELS, 0.01, TIME[None])
+POINTS = np.random.default_rng(3).uniform(0.0, 1.0, size=(300, 1))
+HELPER = "import math\nE = 2.5\ndef law(a):\n    return E * a\n"
+MODEL = '''
+import numpy as np
+import helper
+TIME = np.linspace(0.0, 1.0, 20)[None]
+class Steel:
+    """Steel of the bars."""
+    def __init__(self, k): self.k = k
+    def stress(self, e): return self.k * e
+STEEL = Steel(2.0)
+NAMES = {"b", "a", "c"}
+def f(theta):
+    """Response."""
+    x = STEEL.stress(theta[0])
+    return helper.law(x) * TIME * len(NAMES)
+'''
+
+
+class Workshop:
+    """A folder with modules of a user, which are imported anew for every run."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.write(model=MODEL, helper=HELPER)
+
+    def write(self, **texts):
+        for name, text in texts.items():
+            (self.folder / f"{name}.py").write_text(textwrap.dedent(text))
+
+    def run(self, pool=None, points=POINTS, **options):
+        """Likelihood of a new process, so to speak, that has evaluated all points."""
+        for name in ("model", "helper"):
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+        self.module = importlib.import_module("model")
+        model = FunctionModel(self.module.f, ("a",), CHANNELS, 0.01, 20, **options)
+        cache = SimulationCache(self.folder / "cache.sqlite")
+        likelihood = FELikelihood(model, MEASURED, cache=cache, pool=pool, memory_rows=0)
+        likelihood.statistics(points)
+        return likelihood
+
+
+@pytest.fixture
+def workshop(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield Workshop(tmp_path)
+    for name in ("model", "helper"):
+        sys.modules.pop(name, None)
+
+
+def true_values(workshop):
+    return FELikelihood(FunctionModel(workshop.module.f, ("a",), CHANNELS, 0.01, 20), MEASURED).statistics(POINTS)
+
+
+HARMLESS = {
+    "docstring": {"model": MODEL.replace('"""Response."""', '"""Response [m]."""')},
+    "renamed local variable": {"model": MODEL.replace("x = ", "strain = ").replace("law(x)", "law(strain)")},
+    "log call": {"model": MODEL.replace("    x = ", "    import logging; logging.debug('run')\n    x = ")},
+    "unused method": {"model": MODEL.replace("STEEL = ", "    def plot(self): pass\nSTEEL = ")},
+    "unused function": {"helper": HELPER + "def other(): return 7\n"},
+    "factor in another place": {"helper": HELPER.replace("E * a", "(a * E)")},
+}
+
+
+@pytest.mark.parametrize("texts", HARMLESS.values(), ids=HARMLESS)
+def test_rows_are_adopted_after_a_harmless_edit(workshop, texts, caplog):
+    first = workshop.run()
+    workshop.write(**texts)
+    second = workshop.run()
+    assert (first.simulations, second.simulations) == (300, 0)
+    assert second.verifications == 59
+    assert "up to 59 of them are simulated again" in caplog.text
+    assert "59 stored simulations of this FunctionModel agree with new ones: all are used" in caplog.text
+    third = workshop.run()  # the label is known now
+    assert (third.simulations, third.verifications) == (0, 2)
+
+
+def test_an_unchanged_model_has_the_same_label_in_every_process(workshop):
+    code = (
+        "import model; from fe_likelihoods.simulation.label import items_of;"
+        "print(sorted(items_of({'function': model.f}).items()))"
+    )
+    found = set()
+    for seed in ("1", "2"):
+        path = os.pathsep.join([str(workshop.folder), *sys.path])
+        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": path}
+        for options in ([], ["-B"]):
+            command = [sys.executable, *options, "-c", code]
+            found.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+    assert len(found) == 1
+
+
+CHANGES = {
+    "everywhere": {"helper": HELPER.replace("2.5", "3.5")},
+    "a value": {"model": MODEL.replace("Steel(2.0)", "Steel(2.1)")},
+    "5 % of the space": {"helper": HELPER.replace("return E * a", "return (E if a < 1.9 else 2.6) * a")},
+    "5 % within the space": {"helper": HELPER.replace("return E * a", "return (2.6 if 0.8 < a < 0.9 else E) * a")},
+    "failures": {"helper": HELPER.replace("return", "if a > 1.9: raise ArithmeticError('yield')\n    return")},
+}
+
+
+@pytest.mark.parametrize("texts", CHANGES.values(), ids=CHANGES)
+def test_a_new_generation_begins_after_a_change(workshop, texts, caplog):
+    first = workshop.run()
+    workshop.write(**texts)
+    second = workshop.run()
+    assert "differ from new ones; they stay in the file and are not used" in caplog.text
+    np.testing.assert_array_equal(second.statistics(POINTS), true_values(workshop))
+    assert second.cache.info().simulations == 600
+    assert second.verifications <= 59
+    workshop.write(model=MODEL, helper=HELPER)  # back to the earlier code, whose rows are still there
+    third = workshop.run()
+    assert (third.simulations, third.verifications) == (0, 2)
+    np.testing.assert_array_equal(third.statistics(POINTS), first.statistics(POINTS))
+
+
+OPENED = {
+    "file": ("return t[0] * np.loadtxt('k.txt') * TIME", "k.txt", "2.5", "3.5"),
+    "module": ("import late; return t[0] * late.k * TIME", "late.py", "k = 2.5", "k = 3.5 "),
+    "program": (
+        "import subprocess; return t[0] * float(subprocess.check_output(['sh', 'k.sh'])) * TIME",
+        "k.sh",
+        "echo 2.5",
+        "echo 3.5",
+    ),
+}
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+@pytest.mark.parametrize("what", OPENED)
+def test_what_a_simulation_opens_belongs_to_the_label(workshop, what, isolated):
+    """A change in a part of the space, which the usual few rows would not show."""
+    sys.modules.pop("late", None)  # of another test; it would be sent by value
+    body, name, before, after = OPENED[what]
+    body = body.replace("t[0] *", "t[0] * (t[0] > 0.99) *") if isolated else body
+    workshop.write(model=f"import numpy as np\nTIME = np.linspace(0.0, 1.0, 20)[None]\ndef f(t):\n    {body}\n")
+    (workshop.folder / name).write_text(before)
+    points = POINTS[:20]
+    first = workshop.run(points=points, isolated=isolated)
+    assert list(first._label.opened.items()) == [f"opened {name}"]
+    same = workshop.run(points=points, isolated=isolated)
+    assert (same.simulations, same.verifications) == (0, 2)
+    (workshop.folder / name).write_text(after)
+    sys.modules.pop("late", None)
+    label._opened.clear()  # as in a new process
+    second = workshop.run(points=points, isolated=isolated)
+    assert second.verifications > 2 or second.simulations > 0
+
+
+def test_workers_of_a_pool_tell_what_they_open(workshop):
+    workshop.write(
+        model="import numpy as np\ndef f(t):\n    return t[0] * np.loadtxt('k.txt') * np.linspace(0, 1, 20)[None]\n"
+    )
+    (workshop.folder / "k.txt").write_text("2.5")
+    likelihood = workshop.run(pool=2)
+    likelihood.pool.close()
+    assert list(likelihood._label.opened.items()) == ["opened k.txt"]
+    alone = workshop.run()
+    assert (alone.simulations, alone.verifications) == (0, 2)
+
+
+def test_variables_of_the_environment_that_the_code_names(workshop, monkeypatch):
+    workshop.write(
+        model="import os, numpy as np\ndef f(t):\n    k = float(os.environ['GAIN']) if t[0] > 0.75 else 1.0\n"
+        "    return k * t[0] * np.linspace(0, 1, 20)[None]\n"
+    )
+    monkeypatch.setenv("GAIN", "2.5")
+    workshop.run()
+    monkeypatch.setenv("GAIN", "3.5")
+    second = workshop.run()
+    np.testing.assert_array_equal(second.statistics(POINTS), true_values(workshop))
+
+
+def test_a_program_that_was_compiled_again_is_verified(workshop):
+    script = workshop.folder / "solver.sh"
+
+    def run(text):
+        script.write_text(f"{text}\nawk '{{for (i = 0; i < 20; i++) print $1 * i / 19}}' in.txt > out.txt\n")
+        model = ExecutableModel(
+            ["sh", script], {"in.txt": "$a"}, "out.txt", ("a",), CHANNELS, 0.01, 20, time_limit=60.0
+        )
+        likelihood = FELikelihood(model, MEASURED, cache=workshop.folder / "cache.sqlite")
+        likelihood.statistics(POINTS[:10])
+        return likelihood.simulations, likelihood.verifications
+
+    assert run("# version 1") == (10, 0)
+    assert run("# version 2") == (0, 10)
+    assert run("# version 2") == (0, 2)
+
+
+def test_versions_and_dependencies_are_declared(workshop):
+    options = [{}, {"version": "2"}, {"depends_on": [3.0]}]
+    assert [workshop.run(**each).simulations for each in options] == [300] * 3
+    assert [workshop.run(**each).verifications for each in options] == [2] * 3
+
+
+def test_another_processor_may_differ_in_the_last_digits(workshop, monkeypatch):
+    first = workshop.run()
+    monkeypatch.setattr(trust, "cpu_name", lambda: "another")
+    monkeypatch.setattr(FunctionModel, "response_tolerance", 0.0, raising=False)
+    law = type(first.model)._respond
+    monkeypatch.setattr(FunctionModel, "_respond", lambda self, theta: law(self, theta) * (1.0 + 1e-13))
+    assert workshop.run().simulations == 0
+    monkeypatch.undo()
+    monkeypatch.setattr(FunctionModel, "response_tolerance", 0.0, raising=False)
+    monkeypatch.setattr(FunctionModel, "_respond", lambda self, theta: law(self, theta) * (1.0 + 1e-13))
+    sys.path.insert(0, str(workshop.folder))
+    with pytest.raises(StaleCache):
+        workshop.run()
+    sys.path.remove(str(workshop.folder))
+
+
+# coverage -------------------------------------------------------------------------------------------------------------
+
+
+def test_how_many_rows():
+    assert [rows_to_compare(verify) for verify in (True, "5 %", "2%", 7, False)] == [59, 59, 149, 7, 0]
+    for wrong in (0, -1, "5", "0 %", "100 %", None, 2.5):
+        with pytest.raises(ValueError, match="verify must be"):
+            rows_to_compare(wrong)
+
+
+@pytest.mark.parametrize("ndim", [1, 3, 6])
+def test_changes_of_5_percent_are_found(ndim, rng):
+    thetas = rng.normal(size=(2000, ndim))
+    rows = [StoredSimulation(theta, np.array([1.0]), "") for theta in thetas]
+    found = trials = 0
+    for _ in range(200):
+        if rng.random() < 0.5:  # a ball around a row
+            distance = np.linalg.norm(thetas - thetas[rng.integers(2000)], axis=1)
+        else:  # rows anywhere
+            distance = rng.random(2000)
+        changed = set(np.argsort(distance)[:100].tolist())
+        index = {id(row): place for place, row in enumerate(rows)}
+        chosen = {index[id(row)] for row in choose_rows(rows, 59, rng)}
+        assert len(chosen) == 59
+        found, trials = found + bool(chosen & changed), trials + 1
+    assert found / trials > 0.95 - 2 * np.sqrt(0.95 * 0.05 / trials)
+
+
+def test_special_rows_are_among_them(rng):
+    thetas = rng.uniform(size=(1000, 2))
+    rows = [StoredSimulation(t, np.array([t[0]]), "yield" if t[1] > 0.9 else "") for t in thetas]
+    chosen = {id(row) for row in choose_rows(rows, 59, rng)}
+    special = {
+        0,
+        *thetas.argmin(axis=0),
+        *thetas.argmax(axis=0),
+        np.argmax(np.where(thetas[:, 1] > 0.9, 0, thetas[:, 0])),
+    }
+    assert sum(id(rows[place]) in chosen for place in special) >= len(special) - 1  # two may share a cell
+
+
+# during a run ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_value_that_is_set_between_two_batches_is_an_error(workshop, monkeypatch):
+    monkeypatch.setattr("fe_likelihoods.cache.guard._NO_TIME", np.inf)
+    likelihood = workshop.run(points=POINTS[:10])
+    sys.modules["helper"].E = 3.0
+    with pytest.raises(ChangedModel, match=r"helper.E, and an earlier simulation gives another result"):
+        likelihood.statistics(POINTS[10:20])
+    assert likelihood.cache.info().simulations == 10
+    again = FELikelihood(likelihood.model, MEASURED, cache=likelihood.cache)
+    again.statistics(POINTS[:10])
+    assert again.cache.info().simulations == 20  # a generation of its own
+
+
+def test_a_value_that_is_set_before_the_first_batch_belongs_to_the_label(workshop):
+    likelihood = workshop.run(points=POINTS[:0])
+    sys.modules["helper"].E = 3.0
+    likelihood.statistics(POINTS)
+    np.testing.assert_array_equal(workshop.run().statistics(POINTS), true_values(workshop))
+
+
+COUNTERS = {
+    "counter": "calls = 0\ndef law(a):\n    global calls\n    calls += 1\n    return 2.5 * a\n",
+    "earlier results": "D = {}\ndef law(a):\n    return D.setdefault(float(a), 2.5 * a)\n",
+    "rare": "D = []\ndef law(a):\n    if a > 1.0: D.append(a)\n    return 2.5 * a\n",
+}
+
+
+@pytest.mark.parametrize("helper", COUNTERS.values(), ids=COUNTERS)
+def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
+    monkeypatch.setattr("fe_likelihoods.cache.guard._NO_TIME", np.inf)
+    workshop.write(helper=helper)
+    likelihood = workshop.run(points=POINTS[:10])
+    for start in range(10, 300, 10):
+        likelihood.statistics(POINTS[start : start + 10])
+        workshop.module.f(POINTS[start] / 3.0)
+    assert (likelihood.simulations, likelihood.cache.info().simulations) == (300, 300)
+    assert likelihood.verifications <= 20
+    assert workshop.run().verifications == 2  # the label is that of the beginning
+
+
+# labels ---------------------------------------------------------------------------------------------------------------
+
+
+class Counted:
+    calls = 0
+
+
+def test_values_and_code_are_compared_by_value():
+    def made(k, names=("a", "b"), label="x"):
+        def function(t):
+            return k * t * len(names)
+
+        function.label = label
+        return function
+
+    one, same, other = (items_of({"f": made(k)})["f"] for k in (2.0, 2.0, 3.0))
+    assert one == same != other
+    assert (
+        len({value_digest(value) for value in (1, 1.0, True, "1", b"1", None, [1], (1,), {1}, {1: 1}, np.ones(1))})
+        == 11
+    )
+    assert value_digest({"a", "b", "c"}) == value_digest({"c", "b", "a"})
+    looped: list = []
+    looped.append(looped)
+    assert value_digest(looped) == value_digest(looped)
+    with pytest.raises(ValueError, match="no value that can be compared"):
+        value_digest(open(os.devnull))
+    thing = Counted()
+    known = ModelLabel(thing)
+    thing.calls = 3
+    assert known.changed(thing) == {"Counted().calls"}
+    assert pickle.loads(pickle.dumps(known)).text == known.text
+
+
+def test_files_that_a_simulation_writes_do_not_count(tmp_path):
+    (tmp_path / "read.txt").write_text("1")
+
+    def simulate(item):
+        (tmp_path / "written.txt").write_text("2")
+        return (tmp_path / "read.txt").read_text() + (tmp_path / "written.txt").read_text() + str(item)
+
+    observed = Observed(simulate)
+    result, opened = observed(3)
+    assert result == "123" and list(opened.files) == [str(tmp_path / "read.txt")]
+    assert observed(4) == ("124", None)
+
+
+# files of earlier releases --------------------------------------------------------------------------------------------
+
+LAYOUT_3 = (
+    "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "theta BLOB NOT NULL, misfit BLOB NOT NULL, n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, "
+    "crc INTEGER NOT NULL)",
+    "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "theta BLOB NOT NULL, n_channels INTEGER NOT NULL, size INTEGER NOT NULL, crc INTEGER NOT NULL, "
+    "response BLOB NOT NULL)",
+    "CREATE INDEX simulation_sources ON simulations (source)",
+    "CREATE INDEX response_sizes ON responses (size)",
+    "CREATE TABLE failures (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "reason BLOB NOT NULL, time_limit REAL NOT NULL, stops INTEGER NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE remarks (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
+    "text BLOB NOT NULL)",
+)
+
+
+def earlier_file(path, misfit, version):
+    """A file as an earlier release has written it, with rows at `POINTS`."""
+    from fe_likelihoods.cache.rows import checksum
+
+    connection = sqlite3.connect(path, isolation_level=None)
+    for statement in LAYOUT_3[: 3 + version]:
+        connection.execute(statement)
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute(f"PRAGMA user_version = {version}")
+    for n, (theta, sums) in enumerate(zip(POINTS, misfit, strict=True)):
+        row = n.to_bytes(16), 17, theta.tobytes(), sums.tobytes(), 20, b"", 0.1
+        connection.execute(
+            "INSERT INTO simulations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", (None, *row, checksum(*row, 0, 0))
+        )
+    connection.close()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("factor", [1.0, 1.01], ids=["same", "other"])
+def test_rows_of_an_earlier_release_are_adopted_if_they_agree(workshop, version, factor, caplog):
+    reference = workshop.run()
+    true = reference.statistics(POINTS)
+    reference.cache.close()
+    (workshop.folder / "cache.sqlite").unlink()
+    trust._of_models.clear()
+    earlier_file(workshop.folder / "cache.sqlite", true * factor, version)
+    likelihood = workshop.run()
+    np.testing.assert_array_equal(likelihood.statistics(POINTS), true)
+    assert "is of an earlier release: its simulations are kept" in caplog.text
+    if factor == 1.0:
+        assert (likelihood.simulations, likelihood.verifications) == (0, 59)
+        assert "59 simulations of an earlier release agree" in caplog.text
+    else:
+        assert likelihood.simulations > 290
+    assert likelihood.cache.check_rows() == (likelihood.cache.info().simulations, 0)
+    again = workshop.run()
+    assert (again.simulations, again.verifications) == (0, 2)
