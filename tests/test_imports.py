@@ -47,20 +47,6 @@ def test_import_brings_what_it_needs(code, allowed):
     assert brought or not allowed  # where something is allowed it is there: what is looked for can be found
 
 
-@pytest.mark.parametrize("package", ["fe_likelihoods"])
-def test_every_module_and_folder_is_an_attribute_of_the_package(package):
-    names = sorted(
-        path.stem for path in (ROOT / package).iterdir() if (path / "__init__.py").exists() or path.suffix == ".py"
-    )
-    names.remove("__init__")
-    assert len(names) > 5
-    code = (
-        f"import {package} as package; names = {names}; "
-        "assert set(names) <= set(dir(package)); print([getattr(package, name).__name__ for name in names])"
-    )
-    assert fresh(code).strip() == str([f"{package}.{name}" for name in names])
-
-
 @pytest.mark.parametrize("package", ["fe_likelihoods", "samplers"])
 def test_every_public_name_is_there(package):
     names = sorted(__import__(package).__all__)
@@ -69,32 +55,20 @@ def test_every_public_name_is_there(package):
     assert fresh(f"from {package} import *; print({names[0]} is not None)").strip() == "True"
 
 
-@pytest.mark.parametrize("package", ["fe_likelihoods"])
-def test_editors_see_the_names_that_exist_at_run_time(package):
-    """The imports under TYPE_CHECKING, `__all__` and `_EXPORTS` list the same names from the same modules."""
-    tree = ast.parse((ROOT / package / "__init__.py").read_text())
-    (guarded,) = [node for node in tree.body if isinstance(node, ast.If)]
-    static = {alias.name: node.module for node in guarded.body for alias in node.names}
-    exported = {name: module for module, names in __import__(package)._EXPORTS.items() for name in names}
-    modules = {name for name, module in static.items() if module is None}
-    assert {name: module for name, module in static.items() if module is not None} == exported
-    assert set(__import__(package).__all__) == set(static) == set(exported) | modules
-    assert set(static) <= set(dir(__import__(package)))
-
-
-def test_the_stub_lists_what_it_imports():
-    """`__all__` of the stub, which type checkers read, has the names that exist at run time, about twenty of them."""
-    tree = ast.parse((ROOT / "samplers" / "__init__.pyi").read_text())
+@pytest.mark.parametrize(("package", "most"), [(samplers, 21), (fe_likelihoods, 170)])
+def test_the_stub_lists_what_it_imports(package, most):
+    """`__all__` of the stub, which type checkers read, has the names that exist at run time."""
+    tree = ast.parse((ROOT / package.__name__ / "__init__.pyi").read_text())
     imported = {alias.name for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names}
     (declared,) = [ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)]
-    assert imported == set(declared) == set(samplers.__all__) <= set(dir(samplers))
-    assert len(declared) < 22
+    assert imported == set(declared) == set(package.__all__) <= set(dir(package))
+    assert len(declared) <= most
 
 
 @pytest.mark.parametrize("package", [fe_likelihoods, samplers])
 def test_unknown_name_is_an_attribute_error(package):
     assert not hasattr(package, "absent")
-    with pytest.raises(AttributeError, match="(no|No samplers) attribute .*absent"):
+    with pytest.raises(AttributeError, match=f"No {package.__name__} attribute .*absent"):
         package.absent  # noqa: B018
 
 
