@@ -1,7 +1,7 @@
 """Every mode of the samplers on the targets: evaluations, errors of the result, and whether the run warned.
 
-The default TMCMC and SMC without recycling give equal figures: a coefficient of variation of 1 is an effective sample
-size of half the walkers, and everything else is the same.
+SMC by moves and TMCMC have equal weights, since a coefficient of variation of 1 is an effective sample size of half the
+walkers. They differ in the moves: TMCMC grows chains from leaders before it sweeps all points.
 """
 
 import time
