@@ -7,6 +7,7 @@ The longest tests come first, and `make test` distributes tests by stealing: no 
 """
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -49,6 +50,12 @@ def figures_are_closed():
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
+
+
+def pytest_configure():
+    """Let Ctrl-C end runs also where the tests are in the background of a shell, which ignores it there."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_terminal_summary(terminalreporter):

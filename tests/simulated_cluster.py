@@ -136,7 +136,8 @@ class SimulatedPool(PoolExecutor):
         futures = []
         for item in items:
             outcome, future = function(item), Future()
-            share = function.args[-1].model.n_steps / self._n_steps
+            sent = getattr(function, "function", function)  # without the observer of opened files
+            share = sent.args[-1].n_steps / self._n_steps
             length = share * float(self._length(np.asarray(item)))
             end = max(heapq.heappop(self._free), self.now) + length
             heapq.heappush(self._free, end)

@@ -163,18 +163,18 @@ class Adoption:
             return None if stored is None else stored.generation
         if time.monotonic() < trust.pause_ends:
             return None
-        stored = trust.find(self.cache, run.model)
+        stored, before = trust.find(self.cache, run.model), trust.stored
         if not n:
             if stored is None:
                 trust.adopt(self.cache, run.model, present[0] if present else self._begun(run.model), 0)
-            return trust.stored.generation
+            return trust.find(self.cache, run.model).generation
         if stored is not None:
             if stored.generation in present and stored.compared < n:
                 labels = {each.id for each in self.cache.labels_of(run.model) if each.label == stored.label}
                 rows = [row for row in rows_of(stored.generation, n + MAX_ATTEMPTS) if row.label not in labels]
                 left = min(n, len(rows)) - stored.compared
                 if left > 0 and not self._adopts(fingerprint, stored.generation, rows_of, left, run):
-                    return trust.stored.generation if trust.stored is not stored else None
+                    return trust.stored.generation if trust.stored is not before else None
             if stored.generation not in present and earlier:
                 self._adopt_earlier(fingerprint, earlier, run, n)
             return stored.generation
@@ -302,10 +302,11 @@ class Adoption:
         """The label under which new simulations are stored; None while it is not known which rows agree with them."""
         trust = self._trust
         with trust.lock:
-            if trust.find(self.cache, model) is None:
-                if time.monotonic() < trust.pause_ends and not trust.generations:
-                    return None
-                trust.begin(self.cache, model, set())
+            if (stored := trust.find(self.cache, model)) is not None:
+                return stored
+            if time.monotonic() < trust.pause_ends and not trust.generations:
+                return None
+            trust.begin(self.cache, model, set())
             return trust.stored
 
     def _tolerances(self, run: VerifyingRun) -> dict[int, float]:

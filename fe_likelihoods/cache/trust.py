@@ -56,6 +56,7 @@ class Trust:
     def __init__(self, label: ModelLabel, is_local: bool, token: str) -> None:
         self.label, self.is_local, self.token = label, is_local, token
         self.stored: StoredLabel | None = None
+        self._of_others: dict[int, StoredLabel] = {}  # the label for further models, by their sources in the file
         self.generations: dict[str, int] = {}
         self.served: Counter[tuple[str, str]] = Counter()
         self.restarts = 0
@@ -87,6 +88,11 @@ class Trust:
 
         Files that earlier simulations have opened are part of it, as they are now.
         """
+        source = source_number(model.fingerprint)
+        if self.stored is not None and source != self.stored.source:  # another length of the record, for example
+            if source not in self._of_others:
+                self._of_others[source] = self._add(cache, model, self.stored.generation, self.stored.compared)
+            return self._of_others[source]
         if self.stored is not None:
             return self.stored
         labels = cache.labels_of(model)
@@ -107,6 +113,7 @@ class Trust:
 
     def adopt(self, cache: SimulationCache, model: Model, generation: int, compared: int) -> None:
         """Enter the label in the file as one of a generation, of which some rows were compared."""
+        self._of_others.clear()
         self.stored = self._add(cache, model, generation, compared)
 
     def begin(self, cache: SimulationCache, model: Model, used: set[int]) -> None:
@@ -116,6 +123,7 @@ class Trust:
         if generation in used:  # rows of this label that differ
             generation = secrets.randbits(62) | 1
         move = self.stored is not None
+        self._of_others.clear()
         self.stored = self._add(cache, model, generation, OWN, move)
         self.generations.clear()
 
@@ -126,8 +134,10 @@ class Trust:
 
     def _update(self, cache: SimulationCache) -> None:
         if self.stored is not None and self.stored.label != self.label.text:
-            files = tuple(sorted(self.label.opened.files))
-            self.stored = cache.update_label(self.stored._replace(label=self.label.text, files=files))
+            new = {"label": self.label.text, "files": tuple(sorted(self.label.opened.files))}
+            self.stored = cache.update_label(self.stored._replace(**new))
+            for source, stored in self._of_others.items():
+                self._of_others[source] = cache.update_label(stored._replace(**new))
 
     def _add(
         self, cache: SimulationCache, model: Model, generation: int, compared: int, move: bool = False

@@ -191,7 +191,7 @@ class Arrived:
 def dumps(thing: Any) -> bytes:
     """Pickle an object, with code and values of the user by value."""
     with _lock:
-        loaded = list(sys.modules.items())
+        loaded = list(sys.modules.copy().items())  # other threads may import while the items are read
         for name, module in loaded:
             if name not in _of_user:
                 _of_user[name] = is_of_user(module) and module.__name__ == name

@@ -20,6 +20,7 @@ from fe_likelihoods import (
 from fe_likelihoods.command.hints import in_toml_terms
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
+from fe_likelihoods.models import linear_oscillator
 from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
 from tests.reporting.report_page import read_page
 
@@ -86,8 +87,8 @@ def test_events_are_predicted_and_scored(events):
 def test_report_makes_events_again_without_simulations(events, monkeypatch):
     call("run", "oscillator.toml", "--out", "r", "--quiet")
     first = (events / "r" / "event-after.csv").read_text()
-    simulated, one = [], LinearOscillator.simulate
-    monkeypatch.setattr(LinearOscillator, "simulate", lambda self, theta: simulated.append(theta) or one(self, theta))
+    simulated, one = [], linear_oscillator.respond
+    monkeypatch.setattr(linear_oscillator, "respond", lambda *args: simulated.append(args) or one(*args))
     (events / "r" / "event-after.csv").unlink()
     said = call("report", "r")
     assert "event-after.csv" in said and (events / "r" / "event-after.csv").read_text() == first
@@ -192,8 +193,8 @@ def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events, monkey
     problem = make_problem(job, SimulationCache(events / "simulations.sqlite", verify=False))
     samples = problem.posterior.sample_prior(12, 1)
     found = read_events(job, problem)
-    simulated, one = [], LinearOscillator.simulate
-    monkeypatch.setattr(LinearOscillator, "simulate", lambda self, theta: simulated.append(theta) or one(self, theta))
+    simulated, one = [], linear_oscillator.respond
+    monkeypatch.setattr(linear_oscillator, "respond", lambda *args: simulated.append(args) or one(*args))
     predicted = predict_events(job, found, problem, samples, False)
     assert 24 <= len(simulated) <= 26  # and the response of the calibration, whose residuals are checked
     for event in found:

@@ -65,6 +65,10 @@ def test_a_report_of_a_folder_of_a_stranger_runs_no_code(kind, folder, monkeypat
     means = [float(row.split(",")[1]) for row in rows[0][1:]]
     assert means == pytest.approx([float(row.split(",")[1]) for row in before[1:]], rel=1e-6)  # of the same samples
     if kind == "function":
-        call("report", "r", "--run-code")
+        assert "contains another run" in call("report", "r", "--run-code", code=1)  # the code differs
         assert (folder / "was_run").exists()  # the test can fail
+        (folder / "was_run").unlink()
+        sys.modules.pop(name, None)
+        source.write_text(FUNCTION)
+        call("report", "r", "--run-code")
         assert (folder / "r" / "fit.csv").exists()

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
 
 from fe_likelihoods import (
     Channel,
@@ -112,8 +111,6 @@ def cases(folder):
     ]
     record, measured = Record("a", 0.01, values), Measurements((TOP,), 0.01, values[None])
     write_dataset(folder / "valid.h5", record, measured, {"truth": [1.0, 2.0]})
-    row = (bytes(range(16)), 1, values[:2].tobytes(), values[:1].tobytes(), 23, b"", 0.1)
-    write_rows(folder / "cache.h5", [[row, row]])
     forms = [csmip(1, values, 0.0125, " .013 sec, in cm/sec2. (8f10.6)"), cosmos(1, values, 0.005)]
     v2 = ["\n".join(lines).encode() for lines in forms]
     archives = [zipped([("a.v2", v2[0]), ("inner.zip", zipped([("b.V2", v2[-1])]))])]
@@ -132,7 +129,6 @@ def cases(folder):
         Case("csv", read_csv, csv),
         Case("columns.csv", lambda path: read_columns(path, [TOP], ["acc_g"]), csv[1:2]),
         Case("h5", read_dataset, [(folder / "valid.h5").read_bytes()]),
-        Case("cache.h5", read_rows, [(folder / "cache.h5").read_bytes()]),
     ]
 
 

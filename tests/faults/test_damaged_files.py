@@ -5,7 +5,6 @@ import time
 import h5py
 import numpy as np
 import pytest
-from fe_likelihoods.simulation.cache_exchange import read_rows, write_rows
 
 from fe_likelihoods import Channel, Measurements, Record, read_at2, read_csv, read_dataset, read_v2, write_dataset
 from tests.faults.fuzz_readers import fuzz, zipped
@@ -106,17 +105,3 @@ def test_hdf5_that_declares_more_than_it_contains(tmp_path):
         del file["record/acceleration"]
         file.create_dataset("record/acceleration", (10**11,), dtype="<f8", chunks=(1024,)).attrs.update(attributes)
     refused(read_dataset, path, path.read_bytes(), "declares 100000000000 numbers, more than the file can contain")
-
-
-@pytest.mark.parametrize("name", ["key", "source", "theta", "n_channels", "seconds"])
-def test_an_export_of_a_cache_with_columns_of_different_length(name, tmp_path):
-    import zlib
-
-    path = tmp_path / "cache.h5"
-    row = (bytes(range(16)), 1, np.ones(2).tobytes(), np.ones(1).tobytes(), 23, b"failed", 0.1)
-    write_rows(path, [[row, row]])
-    assert len(read_rows(path)) == 2
-    with h5py.File(path, "a") as file:
-        file[name].resize((len(file[name]) - 1,))
-        file[name].attrs["crc32"] = zlib.crc32(file[name][()].tobytes())
-    refused(read_rows, path, path.read_bytes(), "simulations need")

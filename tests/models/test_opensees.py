@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import LinearOscillator, LocalPool, OpenSeesModel, Record, SimulationFailed
+from fe_likelihoods.simulation.label import ModelLabel
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.opensees_column import require_opensees
 from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD, Oscillator
@@ -82,10 +83,12 @@ def test_same_bits_in_two_workers(model, rng):
     np.testing.assert_array_equal(batch.response, expected)
 
 
-def test_fingerprint_depends_on_the_function_and_its_data(model, record):
-    assert model.fingerprint == model_of(record, 5).fingerprint
-    assert model.fingerprint != model_of(record, 6).fingerprint
-    assert model.fingerprint != model_of(record.scale(2.0), 5).fingerprint
+def test_label_depends_on_the_function_and_its_data(model, record):
+    """The record is a value of the function here, and nothing that the model declares."""
+    others = model_of(record, 5), model_of(record, 6), model_of(record.scale(2.0), 5)
+    assert {other.fingerprint for other in others} == {model.fingerprint}
+    label, *labels = (ModelLabel(each).code for each in (model, *others))
+    assert [other == label for other in labels] == [True, False, False]
 
 
 def test_wrong_arguments_are_rejected(record, monkeypatch):
