@@ -91,8 +91,8 @@ class Output:
         """Note in the record what the chain ends with, since a process that is killed may store half of a step."""
         self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
         if isinstance(self._backend, HDFBackend):
-            self._summed = _checksum_of_steps(self._backend, *self._summed)
-            self._record.note(STORED, np.array([self._summed[1], _checksum_of_rest(self._backend)]))
+            *self._summed, rest = _checksums(self._backend, *self._summed)
+            self._record.note(STORED, np.array([self._summed[1], rest]))
 
     def undo_half_a_step(self) -> None:
         """Leave no step that was not stored as a whole, after an error or Ctrl-C in the middle of it."""
@@ -184,8 +184,11 @@ class Output:
             self.step_stored()
 
 
-def _checksum_of_steps(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int]:
-    """Number of steps of a chain, and the CRC-32 of all of them; from the `checksum` of the first `known` steps."""
+def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int, int]:
+    """Number of steps of a chain, CRC-32 of all of them, and CRC-32 of counts, state to go on from and random state.
+
+    The second one is computed from the `checksum` of the first `known` steps.
+    """
     with backend.open() as file:
         group = file[backend.name]
         steps = int(group.attrs["iteration"])
@@ -197,22 +200,15 @@ def _checksum_of_steps(backend: HDFBackend, known: int = 0, checksum: int = 0) -
             for step in zip(*parts, strict=True):
                 for part in step:
                     checksum = zlib.crc32(part.tobytes(), checksum)
-    return steps, checksum
-
-
-def _checksum_of_rest(backend: HDFBackend) -> int:
-    """CRC-32 of what a chain ends with: counts, state to go on from, random state."""
-    with backend.open() as file:
-        group, checksum = file[backend.name], 0
         stored = json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
-        parts = [int(group.attrs["iteration"]), stored.get("first_step"), stored.get("provisional")]
+        parts, rest = [steps, stored.get("first_step"), stored.get("provisional")], 0
         parts += [group["accepted"][...]]
         parts += [group.attrs[name] for name in sorted(group.attrs) if name.startswith("random_state_")]
         parts += [dataset[...] for _, dataset in sorted(group.get("restart", {}).items())]
         for part in parts:
             data = part.tobytes() if isinstance(part, np.ndarray | np.generic) else repr(part).encode()
-            checksum = zlib.crc32(data, checksum)
-    return checksum
+            rest = zlib.crc32(data, rest)
+    return steps, checksum, rest
 
 
 def is_whole(backend: HDFBackend, record: Record) -> bool:
@@ -223,7 +219,7 @@ def is_whole(backend: HDFBackend, record: Record) -> bool:
             if group.attrs["iteration"] == 0 and "restart" not in group and not np.any(group["accepted"]):
                 return True
         noted = record.noted(STORED)
-        return noted is not None and noted.tolist() == [_checksum_of_steps(backend)[1], _checksum_of_rest(backend)]
+        return noted is not None and tuple(noted.tolist()) == _checksums(backend)[1:]
     except BlockingIOError:  # another process writes to it
         raise
     except Exception:  # HDF5 raises nearly anything

@@ -353,6 +353,7 @@ def row_of_response(theta: np.ndarray, response: np.ndarray, label: int, run: Ve
 
 
 def difference_of(stored: np.ndarray, new: np.ndarray, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
+    """Channel and size of the largest difference of two rows beyond a tolerance; None if they agree."""
     return largest_difference(stored, new, run.measured, tolerance, needs_response(run.statistic))
 
 
