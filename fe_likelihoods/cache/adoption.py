@@ -13,15 +13,14 @@ from ..simulation.faults import TransientReason
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_batch, misfit_of_responses, sent_simulation
 from ..simulation.opened import Observed, Opened, observing, unpack
-from ..simulation.residual_statistics import needs_response
 from .coverage import choose_rows
 from .generations import MAX_CANDIDATES
 from .rows import OF_EARLIER_RELEASES, StoredLabel, StoredSimulation, simulation_keys
 from .simulation_cache import SimulationCache, rows_to_compare
-from .tolerance import DEFAULT_TOLERANCE, VerifyingRun, largest_difference, response_tolerance
+from .tolerance import DEFAULT_TOLERANCE, VerifyingRun, difference_of, response_tolerance
 from .trust import OWN, shared_trust
 
-__all__ = ["LATEST", "MAX_ATTEMPTS", "Adoption", "difference_of", "is_transient", "observed_batch", "row_of_response"]
+__all__ = ["LATEST", "MAX_ATTEMPTS", "Adoption", "is_transient", "observed_batch", "row_of_response"]
 
 logger = logging.getLogger(__name__)
 
@@ -350,11 +349,6 @@ def row_of_response(theta: np.ndarray, response: np.ndarray, label: int, run: Ve
     batch = SimulationBatch(response[None], [""])
     misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
     return StoredSimulation(theta, misfit[0], reason, label)
-
-
-def difference_of(stored: np.ndarray, new: np.ndarray, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
-    """Channel and size of the largest difference of two rows beyond a tolerance; None if they agree."""
-    return largest_difference(stored, new, run.measured, tolerance, needs_response(run.statistic))
 
 
 def is_transient(reason: str) -> bool:

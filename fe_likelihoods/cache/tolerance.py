@@ -9,7 +9,7 @@ from ..simulation.label import is_of_user
 from ..simulation.model import Model
 from ..simulation.residual_statistics import Statistic, needs_response
 
-__all__ = ["DEFAULT_TOLERANCE", "VerifyingRun", "agree", "largest_difference", "response_tolerance"]
+__all__ = ["DEFAULT_TOLERANCE", "VerifyingRun", "agree", "difference_of", "largest_difference", "response_tolerance"]
 
 DEFAULT_TOLERANCE = 1e-9
 
@@ -59,9 +59,14 @@ def response_tolerance(model: Model) -> float:
     return float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
 
 
+def difference_of(stored: np.ndarray, new: np.ndarray, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
+    """Channel and size of the largest difference of two rows beyond a tolerance; None if they agree."""
+    return largest_difference(stored, new, run.measured, tolerance, needs_response(run.statistic))
+
+
 def agree(stored: np.ndarray, new: np.ndarray, run: VerifyingRun, tolerance: float) -> bool:
     """Whether the statistics of two simulations with the same parameters agree."""
-    return largest_difference(stored, new, run.measured, tolerance, needs_response(run.statistic)) is None
+    return difference_of(stored, new, run, tolerance) is None
 
 
 def largest_difference(

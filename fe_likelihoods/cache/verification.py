@@ -28,9 +28,9 @@ import numpy as np
 
 from ..signals.comparison import measured_values
 from ..simulation.model import misfit_batch
-from .adoption import LATEST, MAX_ATTEMPTS, Adoption, difference_of, is_transient, row_of_response
+from .adoption import LATEST, MAX_ATTEMPTS, Adoption, is_transient, row_of_response
 from .rows import CachedRows, StoredSimulation, simulation_keys
-from .tolerance import DEFAULT_TOLERANCE, VerifyingRun
+from .tolerance import DEFAULT_TOLERANCE, VerifyingRun, difference_of
 
 __all__ = ["StaleCache", "VerifiedCache"]
 
