@@ -40,7 +40,7 @@ tutorials: $(READY) ## run every tutorial that needs no other data than the bund
 	for t in tutorials/0[1-5]*.py tutorials/1[01]*.py; do $(BIN)/python $$t || exit 1; done
 
 bench: $(READY)  ## measure speed against OpenSees, scipy and other samplers; prints one table
-	$(BIN)/python -m tests.benchmarks
+	$(BIN)/python -m benchmarks
 
 size: $(READY)   ## print the size of the project: lines, names, settings, frames, prose
 	$(BIN)/python -m tests.size

@@ -5,7 +5,7 @@ factor g. A Gaussian posterior in d dimensions keeps a share :math:`(\sqrt{2 g -
 size. Annealing by moves keeps a stated share of the walkers, which gives g. The growth of recycling was measured on
 Gaussian posteriors: :math:`\ln g = \min(1.7, 2.9 d^{-0.55})`. The number of stages is the logarithm of one over the
 first beta divided by the logarithm of g; the first beta is inversely proportional to the spread of the log-likelihood
-over the prior. The constants are means over ``python -m tests.benchmarks expected``.
+over the prior. The constants are means over ``python -m benchmarks expected``.
 
 The wall time is the number of evaluations times their mean duration, divided by the number of workers.
 """

@@ -205,7 +205,7 @@ def frames_to_kernels() -> str:
 
 def rows():
     """Pairs of label and value, in the order of the table."""
-    for folder in (*PACKAGES, "tests", "tests/benchmarks", "benchmarks", "tutorials"):
+    for folder in (*PACKAGES, "tests", "benchmarks", "tutorials"):
         if (ROOT / folder).is_dir():
             files, lines, code = lines_of(folder)
             yield f"{folder}: files, lines, lines of code", f"{files}, {lines}, {code}"

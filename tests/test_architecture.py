@@ -89,6 +89,13 @@ def test_only_the_report_of_fe_likelihoods_imports_from_modules_of_samplers():
     assert inside.search("from samplers.judgement.failures import NearFailures")
 
 
+def test_tests_import_no_benchmark():
+    """Benchmarks import helpers of the tests; what a test needs is in `tests`."""
+    used = re.compile(r"^\s*(from|import) benchmarks\b", re.MULTILINE)
+    assert not [name(path) for path in (ROOT / "tests").rglob("*.py") if used.search(path.read_text())]
+    assert any(used.search(path.read_text()) for path in (ROOT / "benchmarks").glob("test_*.py"))  # control
+
+
 def test_folders_import_only_from_folders_below_them():
     for package, order in ORDER.items():
         graph = package_graph(package)

@@ -24,7 +24,7 @@ trimmed squares, which ignores a minority of the points.
    component, which were estimated from few effective points, a component is made from the quadratic too.
 
 The new components only decide where draws are made. The weights of the draws are exact, whatever is proposed.
-Constants are our choice, from trials on two and three modes (``python -m tests.benchmarks truth``).
+Constants are our choice, from trials on two and three modes (``python -m benchmarks truth``).
 
 References
 ----------

@@ -11,7 +11,7 @@ from samplers.estimates.importance import EvidenceCheck, expected_efficiency
 from samplers.judgement.checks import check_evidence, check_fallback
 from samplers.proposals.mixture import fit_mixture, log_density
 from samplers.reports import Stage
-from tests.benchmarks import truth_targets
+from tests.statistics import analytic_posteriors as analytic
 
 
 def _check(log_evidence, error=0.05, effective=200.0, shape=0.3):
@@ -57,7 +57,7 @@ def test_evidence_that_moves_lose_after_recycling_is_reported(recycled, check_of
 @pytest.mark.parametrize(("Sampler", "walkers", "seed"), [(TMCMCSampler, 500, 1), (SMCSampler, 250, 80)])
 def test_run_that_does_not_reach_heavy_tails_says_so(Sampler, walkers, seed):
     """Annealing by moves ends with tenfold standard deviations on a Student t in a wide box; nothing said so before."""
-    posterior = truth_targets.student(seed)
+    posterior = analytic.student(seed)
     sampler = Sampler(
         walkers,
         posterior.ndim,
@@ -73,7 +73,7 @@ def test_run_that_does_not_reach_heavy_tails_says_so(Sampler, walkers, seed):
 
 
 def test_runs_by_moves_on_a_gaussian_are_not_doubted():
-    posterior = truth_targets.gaussian(1, ndim=4)
+    posterior = analytic.gaussian(1, ndim=4)
     sampler = SMCSampler(300, 4, posterior, vectorize=True, recycle=False, seed=1)
     with warnings.catch_warnings():
         warnings.simplefilter("error", SamplingWarning)
@@ -91,7 +91,7 @@ def test_expected_efficiency_is_that_of_fits_to_gaussian_draws(rng):
     assert np.mean(yields) == pytest.approx(expected_efficiency(6, mixture.dof, 1, 400), rel=0.05)
 
 
-@pytest.mark.parametrize("posterior", [truth_targets.rosenbrock(1), truth_targets.rotated_banana(6)])
+@pytest.mark.parametrize("posterior", [analytic.rosenbrock(1), analytic.rotated_banana(6)])
 def test_ends_of_a_bent_posterior_that_may_be_missing_are_reported(posterior):
     sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=4)
     with pytest.warns(SamplingWarning, match="Ends of the posterior may be missing"):
@@ -102,8 +102,13 @@ def test_ends_of_a_bent_posterior_that_may_be_missing_are_reported(posterior):
 
 @pytest.mark.parametrize(
     "posterior",
-    [truth_targets.gaussian(1), truth_targets.bounds(1), truth_targets.banana(1), truth_targets.student(1)]
-    + [truth_targets.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal"), truth_targets.rough(1, 1.0)],
+    [
+        analytic.gaussian(1),
+        analytic.bounds(1),
+        analytic.banana(1),
+        analytic.student(1),
+    ]
+    + [analytic.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal"), analytic.rough(1, 1.0)],
 )
 def test_posteriors_that_are_followed_are_not_doubted(posterior):
     sampler = SMCSampler(250, posterior.ndim, posterior, vectorize=True, seed=2)
@@ -117,7 +122,7 @@ def _largest_shares(dimensions, walkers, seeds, Sampler, **settings):
     """Error of the share of the larger one of two modes, and the verdict, for several runs."""
     found = []
     for seed in seeds:
-        posterior = truth_targets.modes(seed, 2, dimensions, 15.0, 2.0, 1.0, "box")
+        posterior = analytic.modes(seed, 2, dimensions, 15.0, 2.0, 1.0, "box")
         sampler = Sampler(walkers, dimensions, posterior, vectorize=True, seed=seed, **settings)
         with warnings.catch_warnings(record=True):
             sampler.run_mcmc(None, 1)

@@ -7,7 +7,7 @@ import pytest
 from samplers import SMCSampler, compare_models, ladder_table
 from samplers.estimates.genealogy import worst_effective_sample_size
 from samplers.judgement.modes import find_modes
-from tests.benchmarks import truth_targets
+from tests.statistics import analytic_posteriors as analytic
 
 
 def run(posterior, walkers=300, seed=1, steps=3, **settings):
@@ -18,7 +18,7 @@ def run(posterior, walkers=300, seed=1, steps=3, **settings):
 
 @pytest.fixture(scope="module")
 def two_modes():
-    return truth_targets.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal")
+    return analytic.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal")
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_modes_have_their_shares_and_places(two_modes, sampler):
     assert difference == pytest.approx(10.0, rel=0.15)
 
 
-@pytest.mark.parametrize("posterior", [truth_targets.gaussian(1), truth_targets.banana(1), truth_targets.bounds(1)])
+@pytest.mark.parametrize("posterior", [analytic.gaussian(1), analytic.banana(1), analytic.bounds(1)])
 def test_one_mode_stays_one(posterior):
     assert len(run(posterior).verdict.modes) == 1
 

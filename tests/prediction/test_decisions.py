@@ -28,9 +28,9 @@ from fe_likelihoods.probability.relative_noise import RelativeNoise
 from fe_likelihoods.probability.stored_posterior import StoredPosterior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from tests.benchmarks.decisions import fragility_twin
 from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible
 from tests.prediction.test_new_event import SHAPE, Amplified, hierarchy  # noqa: F401  a fixture
+from tests.prediction.twins import fragility_twin
 
 LOGS = np.array([0.1, -0.05, 0.2, 0.0])
 RATIOS = EventRatios(np.exp(LOGS))

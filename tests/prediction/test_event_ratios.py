@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from fe_likelihoods.prediction.event_ratios import EventRatios, LevelRatios
 from fe_likelihoods.prediction.reliability import exceedance
-from tests.benchmarks.decisions import ratio_twin
+from tests.prediction.twins import ratio_twin
 
 
 @pytest.fixture

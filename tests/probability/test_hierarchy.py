@@ -27,7 +27,7 @@ from fe_likelihoods.probability.hierarchical_posterior import _correlation_facto
 from fe_likelihoods.probability.pareto_smoothing import pareto_shape
 from fe_likelihoods.probability.scales import scales_of
 from fe_likelihoods.probability.stored_posterior import describe
-from tests.benchmarks.hierarchy_warnings import RIGHT, WRONG, problem, solve
+from tests.probability.hierarchy_problems import RIGHT, WRONG, problem, solve
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests
 ERRORS = np.array([[0.04, 0.03], [0.03, 0.09]])  # their covariance
@@ -288,7 +288,7 @@ def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, i
     assert (shift > 0.3) == is_named and (checks.mean_errors["mean_a"] > 0.2) == is_named
 
 
-# the seeds of problems of `python -m tests.benchmarks hierarchy_warnings`
+# the seeds of problems of `python -m benchmarks hierarchy_warnings`
 @pytest.mark.parametrize("seed", [328, 359, 415])
 def test_right_results_have_no_warning(seed):
     """Weighted samples, a chain, many samples: the population is narrow, and the result right all the same."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from fe_likelihoods import Posterior, problems, propagate, report
 from samplers import SMCSampler
-from tests.benchmarks import opensees_frame
+from tests import opensees_frame
 
 __all__ = ["EXAMPLES", "make_report"]
 

@@ -11,10 +11,10 @@ from fe_likelihoods import FELikelihood, JointLikelihood, LocalPool, Posterior
 from samplers import SMCSampler
 from samplers.tempering.guided import Batch
 from samplers.tempering.pending_points import PendingPoints
-from tests.benchmarks import truth_targets
 from tests.contract.targets import Gaussian
 from tests.probability.linear_gaussian import KnownNoise, exact_log_evidence, likelihood_of
 from tests.simulated_cluster import SimulatedCluster
+from tests.statistics import analytic_posteriors as analytic
 from tests.tempering.guides import LearningGuide
 
 SEEDS = range(4)
@@ -24,7 +24,7 @@ SEEDS = range(4)
 def test_a_narrow_mode_with_long_runs_is_kept():
     """Its evaluations take 100 times as long: proposals made of early arrivals lost it in 20 of 20 runs."""
     for seed in SEEDS:
-        target = truth_targets.modes(seed, 2, 4, 18.0, 3.0, 20.0, "normal")
+        target = analytic.modes(seed, 2, 4, 18.0, 3.0, 20.0, "normal")
         cluster = SimulatedCluster(
             target, 64, lambda x, t=target: np.where(t.responsibilities(x)[:, 1] > 0.5, 100.0, 1.0)
         )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from tests.benchmarks.guided import compare, run
+from tests.statistics.guided_runs import compare, run
 
 from .brute_force import Reference, log_prob_function, reference
 from .hard_posteriors import CASES, hash_uniform

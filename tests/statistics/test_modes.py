@@ -10,7 +10,8 @@ from scipy.stats import multivariate_normal
 from samplers import SMCSampler, TMCMCSampler
 from samplers.moves.kernels import MixtureMove
 from samplers.tempering import recycling
-from tests.benchmarks import truth, truth_targets
+from tests.statistics import analytic_posteriors as analytic
+from tests.statistics import analytic_runs
 
 NDIM = 10
 WIDTHS = np.array([0.01, 0.0125])  # a ratio of volumes of 9
@@ -108,12 +109,12 @@ def test_a_mode_that_is_met_at_the_end_is_explored(rounds, found, monkeypatch):
     """One draw of the last round before the check hits the flank of the narrow mode."""
     monkeypatch.setattr(recycling, "SEARCH_DRAWS", 0.0)
     monkeypatch.setattr(recycling, "MOST_BASIN_ROUNDS", rounds)
-    result = truth.run(truth.Cell("two", 100.0, "SMC", 500), 4, 1, {})
+    result = analytic_runs.run(analytic_runs.Cell("two", 100.0, "SMC", 500), 4, 1, {})
     assert (min(result["shares"]) > 0.15) == found
 
 
 def test_search_draws_are_spread_over_the_stages(monkeypatch):
-    posterior = truth_targets.gaussian(1)
+    posterior = analytic.gaussian(1)
     runs = []
     for share in (0.0, 3.0):
         monkeypatch.setattr(recycling, "SEARCH_DRAWS", share)

@@ -7,7 +7,8 @@ import pytest
 from emcee.backends import HDFBackend
 
 from samplers import SamplingWarning, SMCSampler
-from tests.benchmarks import truth, truth_targets
+from tests.statistics import analytic_posteriors as analytic
+from tests.statistics.analytic_runs import Cell, is_doubted, is_lost, run
 
 
 def finish(posterior, runs, nwalkers=250, seed=1, **options):
@@ -19,9 +20,9 @@ def finish(posterior, runs, nwalkers=250, seed=1, **options):
 
 
 def test_a_mode_that_one_run_loses_is_kept_and_reported():
-    single, both = (truth.run(truth.Cell("two", 100.0, "SMC", 250), 7, 2, {"runs": runs}) for runs in (1, 2))
-    assert truth.is_lost(single) and not truth.is_doubted(single)  # negative control
-    assert not truth.is_lost(both) and both["status"] == "not usable"
+    single, both = (run(Cell("two", 100.0, "SMC", 250), 7, 2, {"runs": runs}) for runs in (1, 2))
+    assert is_lost(single) and not is_doubted(single)  # negative control
+    assert not is_lost(both) and both["status"] == "not usable"
     assert any(
         "the runs 1 and 2 of the annealing disagree: a part of the posterior" in each for each in both["warnings"]
     )
@@ -30,7 +31,11 @@ def test_a_mode_that_one_run_loses_is_kept_and_reported():
 
 @pytest.mark.parametrize(
     "posterior",
-    [truth_targets.gaussian(1), truth_targets.bounds(1), truth_targets.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal")],
+    [
+        analytic.gaussian(1),
+        analytic.bounds(1),
+        analytic.modes(4, 2, 4, 10.0, 3.0, 1.0, "normal"),
+    ],
     ids=["sharp", "bounds", "two modes"],
 )
 def test_runs_that_agree_are_not_doubted(posterior):
@@ -44,7 +49,7 @@ def test_runs_that_agree_are_not_doubted(posterior):
 @pytest.mark.parametrize("limit", [1100, 1900], ids=["first", "second"])
 def test_a_limit_in_one_of_the_runs(limit):
     """In the first run, its points are weighted; in the second, those of the first, which has reached beta = 1."""
-    posterior = truth_targets.gaussian(1, 2)
+    posterior = analytic.gaussian(1, 2)
     sampler, messages = finish(posterior, 2, max_simulations=limit)
     assert any("limit of simulations" in message for message in messages)
     assert sampler.verdict.status == "usable" and sampler.log_evidence_error < 0.3
@@ -52,7 +57,7 @@ def test_a_limit_in_one_of_the_runs(limit):
 
 
 def test_an_interrupted_second_run_goes_on(tmp_path):
-    posterior, left = truth_targets.gaussian(1), [14]
+    posterior, left = analytic.gaussian(1), [14]
 
     def interrupted(x):
         left[0] -= 1
@@ -80,4 +85,4 @@ def test_an_interrupted_second_run_goes_on(tmp_path):
 
 def test_runs_that_cannot_act_are_refused():
     with pytest.raises(ValueError, match="runs=2 cannot act here: it belongs to recycling"):
-        finish(truth_targets.gaussian(1), 2, recycle=False)
+        finish(analytic.gaussian(1), 2, recycle=False)

@@ -1,0 +1,232 @@
+"""Overhead of the executors of ``pool=`` per simulation, and their behaviour when a worker or the parent is killed.
+
+The model takes almost no time, so the result is the overhead of sending and receiving. Each case runs in a separate
+process, ``python -m benchmarks.executors WHAT POOL REPEATS``, which is killed if it hangs.
+"""
+
+import contextlib
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from fe_likelihoods.models.executable import ExecutableModel
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.simulation.executors import as_executor
+from fe_likelihoods.simulation.model import simulate_batch
+from tests.faults.pooled_run import NAMES, POOLS, WORKERS, at_work
+from tests.faults.treacherous import CHANNELS, DT, KILLED, N_STEPS, DiesOnce, Treacherous, descendants, gone, line
+
+from .rows import Row
+
+__all__ = ["executors"]
+
+ROOT = Path(__file__).resolve().parents[1]
+MODULES = {"dask": "distributed", "mpi": "mpi4py", "loky": "joblib"}
+ITEMS, LIMIT = 1000, 60.0
+THREADS = 64
+
+
+def executors(repeats: int) -> list[Row]:
+    """One row per pool and question."""
+    rows = []
+    for name in POOLS:
+        if name in MODULES and importlib.util.find_spec(MODULES[name]) is None:
+            rows.append(Row("executor", name, None, "", f"not installed: {MODULES[name]}"))
+            continue
+        answer = _answer("overhead", name, repeats)
+        case = f"{name}, {WORKERS} workers"
+        rows.append(
+            Row("executor: overhead per simulation", case, answer.get("microseconds"), "us", answer.get("note", ""))
+        )
+        answer = _answer("death", name, repeats)
+        rows.append(Row("executor: a worker is killed (SIGKILL)", case, answer.get("seconds"), "s", answer["note"]))
+        rows.append(Row("executor: the parent is killed (SIGKILL)", case, *_left_over(name)))
+    for name in ("isolated function", "program"):
+        answer = _answer("overhead", name, repeats)
+        rows.append(Row("executor: overhead per simulation", f"{name}, no pool", answer.get("microseconds"), "us"))
+    if importlib.util.find_spec("distributed"):
+        answer = _answer("cluster", "dask", repeats)
+        case = f"dask, {THREADS} sleeping threads in {WORKERS} processes"
+        rows.append(
+            Row(
+                "executor: overhead of a simulation of 1 s",
+                case,
+                answer.get("microseconds"),
+                "us",
+                answer.get("note", ""),
+            )
+        )
+    return rows
+
+
+def _command(module: str, name: str, *arguments: object) -> list[str]:
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    if name != "mpi":
+        return command
+    mpiexec = Path(sys.executable).with_name("mpiexec")
+    first = [str(mpiexec) if mpiexec.exists() else "mpiexec", "--oversubscribe", "-n", str(WORKERS + 1)]
+    return [*first, sys.executable, "-m", "mpi4py.futures", *command[1:]]
+
+
+ENVIRONMENT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+
+
+def _start(command: list[str], output: Any) -> subprocess.Popen:
+    options = {"stdout": output, "stderr": subprocess.STDOUT, "start_new_session": True}
+    return subprocess.Popen(command, cwd=ROOT, env=os.environ | ENVIRONMENT, **options)
+
+
+def _kill(process: subprocess.Popen) -> int:
+    """Kill a process with its session; returns its exit code."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    return process.wait()
+
+
+def _answer(what: str, name: str, repeats: int) -> dict:
+    """The last line of JSON that the process of one case prints, or how the process ended."""
+    with tempfile.TemporaryFile("w+") as output:
+        command = _command("benchmarks.executors", name, what, name, repeats)
+        process = _start(command, output)
+        stop = time.monotonic() + LIMIT
+        while process.poll() is None and time.monotonic() < stop:
+            time.sleep(0.05)
+        hangs = process.poll() is None
+        exit_code = _kill(process)
+        output.seek(0)
+        found = [row for row in output.read().splitlines() if row.startswith('{"')]
+    if found:
+        return json.loads(found[-1])
+    return {"note": f"hangs: stopped after {LIMIT:g} s" if hangs else f"everything ends (exit code {exit_code})"}
+
+
+def _left_over(name: str) -> tuple[float | None, str, str]:
+    """Number of processes left ten seconds after the process with the pool was killed."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = _command("tests.faults.pooled_run", name, name, folder)
+        parent = _start(command, subprocess.DEVNULL)
+        try:
+            stop = time.monotonic() + LIMIT
+            while len(at_work(Path(folder))) < WORKERS:
+                if parent.poll() is not None or time.monotonic() > stop:
+                    return None, "processes left", "did not start"
+                time.sleep(0.05)
+            children = descendants(parent.pid)
+            if name == "mpi":  # the first rank, which is the parent of the pool, not that of the processes
+                (first, *_) = sorted(set(_ranks(children)) - at_work(Path(folder)))
+                os.kill(first, 9)
+            else:
+                parent.kill()
+            gone(children, 10.0)
+            left = [pid for pid in children if not gone([pid], 0.0)]
+            return len(left), "processes left", f"of {len(children)}"
+        finally:
+            _kill(parent)
+
+
+def _ranks(pids: list[int]) -> list[int]:
+    return [pid for pid in pids if b"mpi4py.futures" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def _thetas() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.0, 1.0, size=(ITEMS, 2))
+
+
+def _seconds(model, thetas: np.ndarray, executor, repeats: int) -> float:
+    """Median wall time per simulation, with workers that have started and loaded the model."""
+    simulate_batch(model, thetas[:50], executor)
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        batch = simulate_batch(model, thetas, executor)
+        times.append((time.perf_counter() - start) / len(thetas))
+        if any(batch.reasons):
+            raise RuntimeError(f"a run failed: {next(filter(None, batch.reasons))}")
+    return median(times)
+
+
+def _overhead(name: str, repeats: int) -> dict:
+    thetas = _thetas()
+    cheap = _seconds(Treacherous(), thetas, None, repeats)
+    if name == "isolated function":
+        model = FunctionModel(line, NAMES, CHANNELS, DT, N_STEPS, isolated=True)
+        seconds = _seconds(model, thetas, None, repeats)
+    elif name == "program":
+        settings = {"columns": [0], "time_limit": 60.0}
+        command = ["cp", "in.txt", "out.txt"]
+        template = {"in.txt": "1 # $offset $slope\n" * N_STEPS}
+        model = ExecutableModel(command, template, "out.txt", NAMES, CHANNELS, DT, N_STEPS, **settings)
+        seconds = _seconds(model, thetas[:100], None, repeats)
+    else:
+        seconds = _seconds(Treacherous(), thetas, as_executor(POOLS[name]()), repeats)
+    return {"microseconds": 1e6 * (seconds - cheap)}
+
+
+class Sleeper(Treacherous):
+    """A model that takes a second of somebody else's time."""
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        """A straight line, later."""
+        time.sleep(1.0)
+        return line(theta)
+
+
+def _cluster() -> dict:
+    """Four rounds of a model that sleeps for a second on a cluster of many threads, as far as two cores carry it."""
+    from distributed import Client, LocalCluster
+
+    cluster = LocalCluster(n_workers=WORKERS, threads_per_worker=THREADS // WORKERS, dashboard_address=None)
+    executor = as_executor(Client(cluster))
+    thetas = _thetas()[: 4 * THREADS]
+    simulate_batch(Sleeper(), thetas[:THREADS], executor)
+    start = time.perf_counter()
+    batch = simulate_batch(Sleeper(), thetas, executor)
+    seconds = time.perf_counter() - start
+    if any(batch.reasons):
+        return {"note": f"a run failed: {next(filter(None, batch.reasons))}"}
+    efficiency = len(thetas) / THREADS / seconds
+    note = f"{len(thetas)} runs in {seconds:.2f} s, {100 * efficiency:.0f} % of {THREADS} threads used"
+    return {"microseconds": 1e6 * (seconds - len(thetas) / THREADS) / len(thetas), "note": note}
+
+
+def _death(name: str) -> dict:
+    """Two of twenty items kill their worker, the first time that they are tried."""
+    thetas = _thetas()[:20]
+    thetas[[4, 11], 0] += KILLED
+    executor = as_executor(POOLS[name]())
+    simulate_batch(Treacherous(), _thetas()[:10], executor)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        try:
+            batch = simulate_batch(DiesOnce(Path(folder)), thetas, executor)
+        except Exception as error:
+            return {"seconds": time.perf_counter() - start, "note": f"error: {type(error).__name__}"}
+        seconds = time.perf_counter() - start
+    right = batch.reasons == [""] * 20 and np.array_equal(batch.response, [line(theta) for theta in thetas])
+    return {"seconds": seconds, "note": "goes on, all results right" if right else "goes on, with failures"}
+
+
+def main() -> None:
+    """One case: print its answer as JSON, and end without waiting for the pool."""
+    what, name, repeats = sys.argv[1:]
+    answer = {"overhead": lambda: _overhead(name, int(repeats)), "death": lambda: _death(name), "cluster": _cluster}[
+        what
+    ]()
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
+    if name != "mpi":
+        os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

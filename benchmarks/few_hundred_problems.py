@@ -1,0 +1,197 @@
+"""Posteriors on which few simulations are counted: every problem is a function of a seed.
+
+Seed 1 is the bundled data set where there is one; other seeds have new noise. Measured data are the same for all
+seeds.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fe_likelihoods import (
+    FELikelihood,
+    GaussianNoise,
+    HalfNormal,
+    LinearOscillator,
+    Measurements,
+    Posterior,
+    TruncatedNormal,
+    problems,
+    read_csv,
+)
+from tests import opensees_frame
+
+from . import tested_column
+from .targets import SHARED
+
+__all__ = ["PROBLEMS", "Problem"]
+
+REAL_RECORD = SHARED / "records" / "loma_prieta_1989_apeel2_redwood_city_43.csv"
+
+
+class Problem(NamedTuple):
+    """A posterior by seed, and what is known of it.
+
+    Attributes
+    ----------
+    what : str
+        Description.
+    posterior : callable
+        Function of the seed.
+    starts : callable
+        Function of the posterior that returns points near every mode (n_modes, d), for the reference.
+    goal : int
+        Simulations of the whole record in which 100 effective samples are wanted.
+    labels : callable, optional
+        Function of samples (n, ndim) that returns the number of the mode (n,).
+    needs : callable
+        Returns why the problem cannot be run here, or an empty string.
+    walkers : int
+        Of the default sampler.
+    measured : bool
+        Whether the data are measured ones, the same for every seed, so that all seeds have one reference.
+    reference_draws, reference_rounds : int
+        Draws per round of the reference by importance sampling, and rounds. No draws: the reference is a longer run of
+        the default sampler, where importance sampling from a known mode fails (many local modes).
+    """
+
+    what: str
+    posterior: Callable[[int], Posterior]
+    starts: Callable[[Posterior], np.ndarray]
+    goal: int
+    labels: Callable[[np.ndarray], np.ndarray] | None = None
+    needs: Callable[[], str] = str
+    walkers: int = 500
+    measured: bool = False
+    reference_draws: int = 400
+    reference_rounds: int = 8
+
+
+def oscillator(seed: int) -> Posterior:
+    """Linear oscillator under the table motion of the isolated bridge, noise of 10 % of the root mean square."""
+    model = LinearOscillator(problems.isolated_bridge_data().record, period=0.5)
+    clean = model.simulate(np.array([1.15, 0.8]))
+    rms = np.sqrt(np.square(clean).mean(axis=1, keepdims=True))
+    values = clean + 0.1 * rms * np.random.default_rng(seed).standard_normal(clean.shape)
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.5)}
+    prior |= {f"sigma_{c.name}": HalfNormal(float(scale)) for c, scale in zip(model.channels, rms[:, 0], strict=True)}
+    measured = Measurements(model.channels, model.dt, values, f"SYNTHETIC, seed {seed}")
+    return Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()
+
+
+def bridge(data: str, seed: int) -> Posterior:
+    """Isolated bridge with new noise."""
+    if seed == 1:
+        return problems.isolated_bridge(data=data, noise="marginal")
+    record = problems.isolated_bridge_data(data).record
+    measurements = problems.isolated_bridge_measurements(
+        record,
+        theta=problems.ISOLATED_BRIDGE_TRUTH[data],
+        outputs=problems.ISOLATED_BRIDGE_OUTPUTS[data],
+        noise=problems.ISOLATED_BRIDGE_NOISE[data],
+        seed=seed,
+    )
+    channels = 6 if data == "twin" else None
+    return problems.isolated_bridge(record=record, measurements=measurements, channels=channels, noise="marginal")
+
+
+def bridge_twin(seed: int) -> Posterior:
+    """Ten parameters, one mode."""
+    return bridge("twin", seed)
+
+
+def bridge_means(seed: int) -> Posterior:
+    """Ten parameters, two modes."""
+    return bridge("means", seed)
+
+
+def column(seed: int, every: int = 1) -> Posterior:
+    """Bridge column with new noise."""
+    if seed == 1:
+        return problems.bridge_column(every=every, noise="marginal")
+    record = problems.bridge_column_data().record
+    measurements = problems.bridge_column_measurements(record, seed=seed)
+    return problems.bridge_column(record=record, measurements=measurements, every=every, noise="marginal")
+
+
+def column_one_in_four(seed: int) -> Posterior:
+    """Bridge column, one sample in four."""
+    return column(seed, every=4)
+
+
+def column_real_record(seed: int) -> Posterior:
+    """Bridge column under a measured ground motion; the responses are synthetic."""
+    return problems.bridge_column(record=read_csv(REAL_RECORD), seed=seed, noise="marginal")
+
+
+def _twin_truth(posterior: Posterior) -> np.ndarray:
+    return np.array([list(problems.ISOLATED_BRIDGE_TRUTH["twin"].values())])
+
+
+def _means_truth(posterior: Posterior) -> np.ndarray:
+    truth = np.array(list(problems.ISOLATED_BRIDGE_TRUTH["means"].values()))
+    return np.stack([truth, posterior.likelihood.model.exchange_piers(truth)])
+
+
+def _column_truth(posterior: Posterior) -> np.ndarray:
+    return np.array([[problems.BRIDGE_COLUMN_MEANS[name] for name in posterior.likelihood.model.parameter_names]])
+
+
+def _pier_with_more_friction(samples: np.ndarray) -> np.ndarray:
+    return (samples[:, 1] >= samples[:, 4]).astype(int)
+
+
+def _real_record() -> str:
+    return "" if REAL_RECORD.exists() else f"the record {REAL_RECORD} is missing: set FE_SHARED to its folder"
+
+
+def _oscillator_truth(posterior: Posterior) -> np.ndarray:
+    return np.array([[1.15, 0.8]])
+
+
+PROBLEMS = {
+    "oscillator": Problem("linear oscillator, 2 parameters", oscillator, _oscillator_truth, 100, reference_rounds=3),
+    "twin": Problem("isolated bridge, 10 parameters", bridge_twin, _twin_truth, 280),
+    "means": Problem(
+        "isolated bridge, means of both piers: 10 parameters, 2 modes",
+        bridge_means,
+        _means_truth,
+        800,
+        labels=_pier_with_more_friction,
+        reference_draws=600,
+    ),
+    "column4": Problem("bridge column, one sample in 4, 5 parameters", column_one_in_four, _column_truth, 400),
+    "column": Problem("bridge column, all data, 5 parameters", column, _column_truth, 750),
+    "real": Problem(
+        "bridge column, measured record, 5 parameters", column_real_record, _column_truth, 750, needs=_real_record
+    ),
+    "opensees": Problem(
+        "OpenSees frame of fiber beams, 5 parameters",
+        opensees_frame.posterior,
+        opensees_frame.truth,
+        500,
+        needs=opensees_frame.missing,
+        walkers=100,
+        reference_draws=150,
+    ),
+    "lehman_white": Problem(
+        "tested column (Lehman 415), 7 parameters, white noise",
+        tested_column.white,
+        tested_column.start,
+        800,
+        needs=tested_column.missing,
+        measured=True,
+        reference_draws=0,
+    ),
+    "lehman_ar1": Problem(
+        "tested column (Lehman 415), 7 parameters and 2 of autoregressive noise",
+        tested_column.autoregressive,
+        tested_column.start,
+        800,
+        needs=tested_column.missing,
+        measured=True,
+        reference_draws=0,
+    ),
+}
+"""All problems by name."""

@@ -1,0 +1,221 @@
+"""Tables of the benchmarks: runs without a result have a row, and weighted samples are scored correctly."""
+
+import json
+import zipfile
+
+import emcee
+import numpy as np
+import pytest
+
+from benchmarks import job, noises, peers, transfer, transfer_twins, truth
+from benchmarks.comparison import compare
+from benchmarks.growth import exponent
+from benchmarks.rows import Row, as_table, machine, write_json
+from benchmarks.targets import as_row, errors, target_named
+from fe_likelihoods import (
+    BridgeDeck,
+    EventRatios,
+    FELikelihood,
+    HalfNormal,
+    LinearStructure,
+    Measurements,
+    Posterior,
+    Record,
+    RelativeNoise,
+)
+from fe_likelihoods.models.linear_system import respond_structure
+from samplers import SMCSampler
+from tests.contract.targets import Gaussian
+
+ANSWER = {
+    "evaluations": 100,
+    "microseconds": 5.0,
+    "z": 0.3,
+    "sd": 0.04,
+    "evidence": -0.2,
+    "error": 0.1,
+    "warned": False,
+}
+STOPPED = {"evaluations": 900, "reason": "stopped at 150 s"}
+
+
+def test_row_scores_the_results_and_names_the_runs_without_one():
+    row = as_row("peer", "T1", [ANSWER, STOPPED, ANSWER | {"z": 0.4, "evidence": 0.5, "warned": True}])
+    assert row.value == pytest.approx(1100 / 3)
+    assert row.note == (
+        f"z {np.sqrt((0.3**2 + 0.4**2) / 2):.3f}; sd 4.0 %; log Z -0.20(0.10) +0.50(0.10); 5.0 us CPU; "
+        "1 of 3 stopped at 150 s; warned"
+    )
+
+
+def test_row_of_runs_that_all_failed_is_still_there():
+    assert as_row("peer", "T1", [STOPPED, STOPPED]).note == "2 of 2 stopped at 150 s"
+
+
+def test_peer_that_is_not_installed_has_a_row(monkeypatch, tmp_path):
+    monkeypatch.setattr(peers, "PEERS", {"absent": peers.Peer("no_such_module", peers.run_emcee)})
+    (row,) = peers.rows(1)
+    assert row == Row("absent: evaluations", "", None, "", "not installed: pip install '.[peers]'")
+    assert as_table([row]).splitlines()[-1].split()[:3] == ["absent:", "evaluations", "-"]
+    write_json(tmp_path / "rows.json", [row], [machine()])
+    assert json.loads((tmp_path / "rows.json").read_text())["rows"][0]["value"] is None
+
+
+def test_run_is_stopped_at_the_limit(monkeypatch):
+    monkeypatch.setattr(peers, "LIMIT", 0.1)  # less than the imports of a new process take
+    assert peers.run_peer("emcee, stretch move", "T3", 1) == {"evaluations": 0, "reason": "stopped at 0 s"}
+
+
+def test_errors_of_weighted_samples_are_those_of_repeated_ones(shared, rng):
+    target = target_named("T2")
+    samples, counts = target.mean + target.sd * rng.standard_normal((500, target.ndim)), rng.integers(0, 4, 500)
+    weighted, repeated = errors(target, samples, counts / 7), errors(target, np.repeat(samples, counts, axis=0))
+    assert weighted == pytest.approx(repeated)
+    assert weighted != pytest.approx(errors(target, samples))
+
+
+def test_target_counts_every_point_of_the_likelihood_and_none_outside_the_prior(shared):
+    target = target_named("T3")
+    target(np.array([[0.0, 0, 0, 0], [9.0, 0, 0, 0]]))
+    assert target.evaluations == 1
+    target.log_likelihood(np.zeros((5, 4)))
+    assert target.evaluations == 6
+
+
+def test_table_separates_its_groups_and_shows_whole_numbers_in_full():
+    table = as_table([Row("runs", "a", 234567.0, "", "x")], [Row("time", "b", 0.0012345, "s")]).splitlines()
+    assert [line.split() for line in table[2:]] == [["runs", "a", "234567", "x"], [], ["time", "b", "0.00123", "s"]]
+
+
+def test_two_files_side_by_side(tmp_path):
+    before = [Row("time", "a", 2.0, "s"), Row("time", "b", 1.0, "s"), Row("time", "gone", 1.0, "s")]
+    after = [Row("time", "a", 1.0, "s"), Row("time", "b", 1.05, "s"), Row("time", "c", None, "s", "stopped")]
+    for name, rows, cpu in (("before", before, "one"), ("after", after, "another")):
+        write_json(tmp_path / name, rows, [machine() | {"cpu": cpu}])
+    lines = compare(tmp_path / "before", tmp_path / "after").splitlines()
+    assert "the processors differ" in lines[2]
+    assert [line.split() for line in lines[5:]] == [
+        ["time", "a", "2", "1", "s", "0.5", "*"],
+        ["time", "b", "1", "1.05", "s", "1.05"],
+        ["time", "c", "-", "-", "s", "-"],
+        ["time", "gone", "1", "-", "s", "-"],
+    ]
+
+
+@pytest.mark.parametrize("content", [None, "not JSON", "[]", '{"rows": []}'])
+def test_file_that_cannot_be_compared_is_named(tmp_path, content):
+    if content is not None:
+        (tmp_path / "other").write_text(content)
+    with pytest.raises(ValueError, match="other: expected a file that"):
+        compare(tmp_path / "other", tmp_path / "other")
+
+
+def test_exponent_of_a_power_law():
+    assert exponent([10, 20, 40], [9.0, 3.0 * 20**1.5, 3.0 * 40**1.5]) == pytest.approx(1.5)
+
+
+def test_run_over_its_limit_is_stopped_and_has_a_row():
+    rows = job.job(1, limit=0.2)  # less than the imports take
+    assert [row.value for row in rows] == [None, None]
+    assert all(row.note == "stopped at 0.2 s, after 0 evaluations" for row in rows)
+
+
+def test_row_of_a_stopped_run_gives_the_evaluations_made(tmp_path):
+    backend = emcee.backends.HDFBackend(tmp_path / "chain.h5")
+    sampler = SMCSampler(50, 2, Gaussian(2), vectorize=True, seed=1, backend=backend)
+    sampler.run_mcmc(None, 1)
+    assert job.evaluations_made(tmp_path / "chain.h5") == f"after {sampler.evaluations} evaluations"
+
+
+def test_two_settings_are_compared_in_cost_and_result():
+    default = {"simulations": 10, "seconds": 2.0, "cpu": 2.0, "mean": [1.0, 5.0], "sd": [1.0, 2.0]}
+    paper = {"simulations": 40, "seconds": 6.0, "cpu": 4.0, "mean": [1.5, 4.0], "sd": [1.1, 1.0]}
+    assert [row.value for row in job.compare_settings(default, paper, "")] == pytest.approx([4.0, 3.0, 2.0, 0.5, 50.0])
+
+
+def test_run_of_the_truth_benchmark_is_compared_with_the_truth():
+    (cell,) = truth.cells(["sharp"], ["SMC"], [300], everything=False)
+    right = truth.run(cell, 1, steps=2)
+    assert not truth.is_lost(right)
+    assert not truth.is_doubted(right)
+    wrong = right | {"log_evidence_error": 20.0 * right["stated_error"] + 1.0}
+    lost = right | {"shares": [0.3, 0.7], "true_shares": [0.5, 0.5], "status": "usable"}
+    line = truth.table([right, wrong, lost]).splitlines()[-1].split()
+    assert line[:8] == ["sharp", "SMC", "300", "3", "2", "1", "1", "0"]  # runs, lost, silent, doubted, false
+
+
+def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, monkeypatch):
+    monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
+    for benchmark in (transfer.transfer, transfer.transfer_median):
+        (row,) = benchmark()
+        assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+    monkeypatch.setattr(noises, "_FOLDER", tmp_path)
+    for part in (noises._painter_street, noises._meloland):
+        (row,) = part(1)
+        assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+
+
+def test_left_out_ratios_have_the_t_distribution_of_event_ratios(rng):
+    logs = 0.1 * rng.standard_normal(11)
+    t, scale = transfer_twins.leave_one_out_t(logs[None])
+    ratios = EventRatios(np.exp(np.delete(logs, 3)))
+    assert scale[0, 3] == pytest.approx(ratios.scale)
+    assert t[0, 3] == pytest.approx((logs[3] - np.log(ratios.median)) / ratios.scale)
+
+
+def test_files_that_cannot_be_used_are_named_and_left_out(tmp_path, monkeypatch):
+    """A record without one of the channels, and a page that was stored in the place of a file."""
+    monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
+    (tmp_path / "page_ce89324p.zip").write_text("<html>log in first</html>")
+    with zipfile.ZipFile(tmp_path / "channels_ce89324p.zip", "w") as archive:
+        archive.writestr("CHAN003.V2", "no record")
+    left_out = transfer.read_events()[1]
+    assert [row.case for row in left_out] == ["LEFT OUT"] * 2
+    assert left_out[0].note.startswith("channels_ce89324p.zip: no channel 3: ")
+    assert left_out[1].note.startswith("page_ce89324p.zip: no channel 3: ")
+    *first, last = transfer.transfer()
+    assert first == left_out and last.case == "SKIPPED"
+
+
+def test_the_amplitude_dependent_posterior_of_one_event_is_that_of_its_linear_model(rng):
+    """Equal likelihoods, and weights with a determinant by differences of the level."""
+    supports = [Record(str(number), 0.02, rng.standard_normal(200)) for number in transfer._INPUTS]
+    model = LinearStructure(BridgeDeck("ch7"), supports)
+    (response,) = model.simulate([4.0, 0.08, 0.7])
+    measured = Measurements(model.channels, 0.02, [response + 0.2 * response.std() * rng.standard_normal(200)])
+    likelihood = FELikelihood(model, measured, RelativeNoise.of(measured))
+    spread = np.exp([0.005, 0.02, 0.01, 0.02] * rng.standard_normal((100, 4)))  # stands for posterior samples
+    posterior = Posterior(likelihood, transfer._PRIOR | {"share_ch7": HalfNormal(1.0)})
+    linear = transfer._Fit(posterior, np.array([4.0, 0.08, 0.7, 0.2]) * spread, 0.0, 0.0)
+    found = transfer._amplitude_dependent(linear, 1)
+    rows = np.arange(0, 100, 20)
+    amplitude, plain = found.posterior.likelihood, linear.posterior.likelihood
+    np.testing.assert_allclose(
+        amplitude.log_likelihood(found.samples[rows]), plain.log_likelihood(linear.samples[rows]), rtol=1e-9
+    )
+    acceleration = np.stack([support.acceleration for support in model.supports])
+
+    def mapped(frequency, damping, share, p, q):
+        system = model.parts.assemble(np.array([frequency, damping, share]))
+        displacement = respond_structure(system, acceleration, 0.02).displacement[0]
+        ratio = np.sqrt((displacement**4).sum() / (displacement**2).sum()) / transfer._REFERENCE
+        return np.array([frequency * ratio ** (p / 2), damping * ratio**-q])
+
+    for row in rows:
+        f, zeta, share, noise = linear.samples[row]
+        p, q = found.samples[row, 3:5]
+        steps = [1e-4 * f, 1e-4 * zeta]
+        columns = [
+            (mapped(f + steps[0], zeta, share, p, q) - mapped(f - steps[0], zeta, share, p, q)) / (2 * steps[0]),
+            (mapped(f, zeta + steps[1], share, p, q) - mapped(f, zeta - steps[1], share, p, q)) / (2 * steps[1]),
+        ]
+        before = linear.posterior.prior.logpdf(linear.samples[row])
+        after = sum(
+            distribution.logpdf(value)
+            for distribution, value in zip(
+                found.posterior.prior.distributions.values(), found.samples[row], strict=True
+            )
+        )
+        powers = sum(prior.logpdf(value) for prior, value in zip(transfer._POWERS.values(), (p, q), strict=True))
+        expected = after - before - powers + np.log(np.linalg.det(columns))
+        assert found.log_weights[row] == pytest.approx(expected, abs=1e-4)
