@@ -39,7 +39,7 @@ from fe_likelihoods import (
     propagate,
     read_v2,
 )
-from fe_likelihoods.probability.noise_draws import sample_noise
+from fe_likelihoods.noise.draws import sample_noise
 from samplers import SMCSampler, compare_models
 
 from .rows import Row

@@ -21,6 +21,15 @@ from .models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycle
 from .models.steel_coupon import SteelCoupon
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
+from .noise.autoregressive import AutoregressiveNoise
+from .noise.bands import BandNoise
+from .noise.events import EventNoise
+from .noise.gaussian import GaussianNoise, Noise, SharedGaussianNoise
+from .noise.marginal import MarginalNoise
+from .noise.modulated import ModulatedNoise
+from .noise.relative import RelativeNoise
+from .noise.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
+from .noise.time_shifts import TimeShiftNoise
 from .plots.damage import plot_damage
 from .plots.histories import plot_histories, plot_loop
 from .plots.materials import plot_material, plot_moment_curvature
@@ -43,30 +52,21 @@ from .prediction.reliability import Exceedance, exceedance
 from .prediction.score_tables import HistoryScores, QuantityScores
 from .prediction.scores import crps_normal, crps_samples, interval_score, log_score_normal, share_within
 from .probability.agreement import Agreement, compare_tests
-from .probability.autoregressive_noise import AutoregressiveNoise
-from .probability.band_noise import BandNoise
 from .probability.block_likelihood import BlockLogLikelihood
 from .probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
-from .probability.event_noise import EventNoise
 from .probability.failures import TooManyFailures
 from .probability.hierarchical_posterior import HierarchicalPosterior, Varying
 from .probability.hierarchy import Hierarchy
 from .probability.joint import JointLikelihood
 from .probability.leave_one_out import leave_one_out
 from .probability.likelihood import FELikelihood
-from .probability.marginal_noise import MarginalNoise
 from .probability.mixture_prior import MixtureDistribution, fit_mixture
-from .probability.modulated_noise import ModulatedNoise
 from .probability.multivariate import MultivariateDistribution, MultivariateNormal, TruncatedMultivariateNormal
-from .probability.noise import GaussianNoise, Noise, SharedGaussianNoise
 from .probability.parameters import Parameter
 from .probability.posterior import Posterior
 from .probability.predictive_draws import MeasuredData, MeasuredHistory, PredictiveDraws
 from .probability.priors import Prior
-from .probability.relative_noise import RelativeNoise
-from .probability.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
 from .probability.stored_posterior import StoredPosterior
-from .probability.time_shift_noise import TimeShiftNoise
 from .reporting.report import report
 from .signals.alignment import Alignment, align
 from .signals.channels import Channel, Measurements

@@ -33,9 +33,9 @@ import numpy as np
 
 from .cache.simulation_cache import SimulationCache
 from .models.isolated_bridge_channels import CHANNEL_SETS
-from .probability.autoregressive_noise import AutoregressiveNoise
+from .noise.autoregressive import AutoregressiveNoise
+from .noise.gaussian import GaussianNoise, SharedGaussianNoise
 from .probability.likelihood import FELikelihood
-from .probability.noise import GaussianNoise, SharedGaussianNoise
 from .probability.posterior import Posterior
 from .probability.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
 from .signals.channels import Channel, Measurements

@@ -48,6 +48,7 @@ ORDER = {
         ("emulation",),
         ("cache",),
         ("simulation",),
+        ("noise",),
         ("signals",),
         ("plots",),
         ("kernels",),

@@ -14,9 +14,9 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..models.external import UserModel
+from ..noise.gaussian import SharedGaussianNoise
 from ..probability.distributions import Distribution, HalfNormal, Uniform
 from ..probability.likelihood import FELikelihood
-from ..probability.noise import SharedGaussianNoise
 from ..probability.parameters import channels_of_deviations
 from ..probability.posterior import Posterior
 from ..signals.channels import Channel, Measurements

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from ..probability.autoregressive_noise import AutoregressiveNoise
-from ..probability.band_noise import BandNoise
-from ..probability.modulated_noise import ModulatedNoise
-from ..probability.noise import GaussianNoise, SharedGaussianNoise
-from ..probability.relative_noise import RelativeNoise
+from ..noise.autoregressive import AutoregressiveNoise
+from ..noise.bands import BandNoise
+from ..noise.gaussian import GaussianNoise, SharedGaussianNoise
+from ..noise.modulated import ModulatedNoise
+from ..noise.relative import RelativeNoise
 from ..signals.channels import Channel, Measurements
 from ..simulation.model import Model
 from .job import Job

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..probability.noise_draws import SampleNoise
+from ..noise.draws import SampleNoise
 from ..simulation.model import split_seconds
 from .model_error import ModelError
 from .streaming import RetainedResults, RunningMoments

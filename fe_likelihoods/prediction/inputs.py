@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.memory import distinct_keys
-from ..probability.event_noise import EventNoise, find_events
+from ..noise.draws import SampleNoise, sample_noise
+from ..noise.events import EventNoise
+from ..noise.marginal import sampled_noise
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
-from ..probability.marginal_noise import sampled_noise
-from ..probability.noise_draws import SampleNoise, sample_noise
+from ..signals.events import find_events
 from ..simulation.executors import as_executor
 from ..simulation.model import Model
 from .model_error import ModelError, model_error

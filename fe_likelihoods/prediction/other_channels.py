@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..noise.gaussian import noise_channels, noise_under
 from ..probability.inputs import as_points, check_model
-from ..probability.noise import noise_channels, noise_under
 from ..simulation.model import Model
 from .inputs import PredictionSource, split_samples
 

@@ -32,9 +32,9 @@ from tqdm import tqdm
 
 from ..cache.simulation_cache import SimulationCache
 from ..cache.stored_responses import StoredResponses
+from ..noise.gaussian import noise_time_shifts, noise_under, remark_on_gaps
+from ..noise.time_shifts import TimeShiftNoise
 from ..probability.inputs import as_points
-from ..probability.noise import noise_time_shifts, noise_under, remark_on_gaps
-from ..probability.time_shift_noise import TimeShiftNoise
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..probability.residuals import effective_samples
+from ..noise.residuals import effective_samples
 from ..signals.channels import Channel
 from ..signals.error_measures import rrmse
 from ..text_tables import text_table

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from ..cache.verification import StaleCache
-from ..probability.autoregressive_noise import AutoregressiveNoise
-from ..probability.band_noise import BandNoise
-from ..probability.event_noise import find_events
+from ..noise.autoregressive import AutoregressiveNoise
+from ..noise.bands import BandNoise
+from ..noise.gaussian import GaussianNoise, SharedGaussianNoise
+from ..noise.marginal import sampled_noise
+from ..noise.modulated import ModulatedNoise
+from ..noise.relative import RelativeNoise
+from ..noise.residuals import effective_samples, innovations, residual_checks
 from ..probability.failures import TooManyFailures
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
-from ..probability.marginal_noise import sampled_noise
-from ..probability.modulated_noise import ModulatedNoise
-from ..probability.noise import GaussianNoise, SharedGaussianNoise
-from ..probability.relative_noise import RelativeNoise
-from ..probability.residuals import effective_samples, innovations, residual_checks
 from ..signals.channels import Channel, Measurements
+from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from .inputs import PredictionSource
 from .model_error import follows_response

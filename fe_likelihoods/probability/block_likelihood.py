@@ -22,13 +22,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..noise.bands import BandNoise
+from ..noise.gaussian import GaussianNoise, Noise, SharedGaussianNoise, noise_of_part, noise_statistic
+from ..noise.modulated import ModulatedNoise
+from ..noise.relative import RelativeNoise
+from ..noise.residuals import effective_samples
+from ..noise.sample_counts import count_samples, samples_per_channel
 from ..signals.channels import Measurements
-from .band_noise import BandNoise
-from .modulated_noise import ModulatedNoise
-from .noise import GaussianNoise, Noise, SharedGaussianNoise, noise_of_part, noise_statistic
-from .relative_noise import RelativeNoise
-from .residuals import effective_samples
-from .sample_counts import count_samples, samples_per_channel
 
 __all__ = ["BlockLogLikelihood", "block_log_likelihood", "choose_blocks", "describe_blocks"]
 

@@ -19,6 +19,7 @@ from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys
 from ..cache.remarks import repeat_remark_of
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedCache
+from ..noise.sample_counts import count_samples
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
@@ -30,7 +31,6 @@ from .inputs import as_rows, check_statistic, name_of_statistic
 from .new_simulations import NewSimulations
 from .requested_simulations import Requested
 from .running_requests import RunningRequests
-from .sample_counts import count_samples
 
 __all__ = ["CachedSimulations"]
 

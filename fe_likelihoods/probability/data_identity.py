@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..signals.channels import Measurements
+from ..signals.events import find_events
 from ..simulation.model import Model
-from .event_noise import find_events
 
 __all__ = ["combined_digest", "data_digests"]
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ..noise.gaussian import Noise, noise_channels, noise_time_shifts
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.sampling import same_step
 from ..simulation.model import Model
 from ..simulation.residual_statistics import Statistic, apply_statistic
-from .noise import Noise, noise_channels, noise_time_shifts
 
 __all__ = [
     "as_points",

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from ..noise.marginal import sampled_noise
 from .data_identity import combined_digest
 from .distributions import Distribution, RandomState
 from .inputs import as_points
 from .likelihood import FELikelihood
-from .marginal_noise import sampled_noise
 from .parameters import Parameter, channels_of_deviations
 from .report import simulation_report
 

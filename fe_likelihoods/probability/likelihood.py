@@ -2,7 +2,7 @@
 
 The steps are: structural parameters to the response of the model, response to the sums of squared residuals J per
 channel, J and the parameters of the noise to the log-likelihood. (A noise may need more numbers than J, its statistic
-of the residuals, see `fe_likelihoods.probability.noise`.) The simulations are run and cached by the base class, in
+of the residuals, see `fe_likelihoods.noise.gaussian`.) The simulations are run and cached by the base class, in
 `fe_likelihoods.probability.cached_simulations`. The equations are on the page ``docs/theory/likelihood.rst``.
 """
 
@@ -16,17 +16,19 @@ from typing import Any
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..noise.events import named_noise
+from ..noise.gaussian import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
+from ..noise.marginal import MarginalNoise
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
+from ..signals.events import join_measurements
 from ..signals.sampling import same_step
 from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
 from .cached_simulations import CachedSimulations
 from .data_identity import combined_digest, data_digests
-from .distributions import Distribution, RandomState
-from .event_noise import join_measurements, named_noise
+from .distributions import Distribution, RandomState, uniform_numbers
 from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
-from .marginal_noise import MarginalNoise
-from .noise import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
+from .multivariate import as_distribution
 from .parameters import Parameter, describe_parameters
 from .report import simulation_report
 
@@ -49,7 +51,7 @@ class FELikelihood(CachedSimulations):
         step and start: the response is interpolated at the times of its samples, without a filter
         (`fe_likelihoods.signals.comparison`).
     noise : Noise or "per event", optional
-        A noise of `fe_likelihoods.probability.noise` or any object with that protocol; by default `GaussianNoise` of
+        A noise of `fe_likelihoods.noise.gaussian` or any object with that protocol; by default `GaussianNoise` of
         the model's channels. "per event" is an `EventNoise`, with a level per channel and event.
     pool : int, or object with ``map(function, items)``, optional
         Runs the simulations in parallel: a number of processes of this machine, a client of dask.distributed, an
@@ -378,7 +380,8 @@ class FELikelihood(CachedSimulations):
                 f"{', '.join(joint)} have a joint prior distribution and cannot be integrated out; give them "
                 "independent priors"
             )
-        return self.with_noise(MarginalNoise(self.noise, {name: priors[name] for name in names}))
+        known = {name: as_distribution(name, priors[name]) for name in names}
+        return self.with_noise(MarginalNoise(self.noise, known))
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
@@ -388,8 +391,10 @@ class FELikelihood(CachedSimulations):
                 "draw_noise is for posteriors from which they are integrated out, see marginal()"
             )
         points = np.atleast_2d(as_points(x, self.parameter_names))
-        sigmas = self.noise.draw(self.misfit(points), self.n_samples, rng)
-        names = (*self.parameter_names, *self.noise.noise.parameter_names)
+        drawn = self.noise.noise.parameter_names
+        uniform = uniform_numbers((len(points), len(drawn)), rng)
+        sigmas = self.noise.draw(self.misfit(points), self.n_samples, uniform)
+        names = (*self.parameter_names, *drawn)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 
     def fault(self, x: Any) -> str:

@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..noise.bands import BandNoise
+from ..noise.events import EventNoise
+from ..noise.gaussian import Noise, SharedGaussianNoise, noise_channels
+from ..noise.marginal import sampled_noise
 from ..signals.channels import Channel
 from ..simulation.model import Model
 from ..units import UNITS, find_unit
-from .band_noise import BandNoise
-from .event_noise import EventNoise
-from .marginal_noise import sampled_noise
-from .noise import Noise, SharedGaussianNoise, noise_channels
 
 __all__ = ["Parameter", "channels_of_deviations", "describe_parameters"]
 

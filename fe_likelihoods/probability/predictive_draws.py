@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..noise.draws import SampleNoise, sample_noise
+from ..noise.events import EventNoise
+from ..noise.marginal import MarginalNoise
+from ..noise.relative import RelativeNoise
+from ..noise.time_shifts import TimeShiftNoise
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from .block_likelihood import BlockLogLikelihood, block_log_likelihood, choose_blocks, describe_blocks
-from .event_noise import EventNoise
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
-from .marginal_noise import MarginalNoise
-from .noise_draws import SampleNoise, sample_noise
-from .relative_noise import RelativeNoise
-from .time_shift_noise import TimeShiftNoise
 
 if TYPE_CHECKING:
-    from .noise import Noise
+    from ..noise.gaussian import Noise
 
 __all__ = ["MeasuredData", "MeasuredHistory", "PredictiveDraws", "measured_data", "predictive_draws"]
 

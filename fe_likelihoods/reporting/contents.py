@@ -4,9 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..noise.marginal import sampled_noise
 from ..prediction.prediction import Prediction
 from ..probability.likelihood import FELikelihood
-from ..probability.marginal_noise import sampled_noise
 from .advice import SAME_AS_PRIOR, residual_sentence
 from .fits import Fits
 from .run import FinishedRun

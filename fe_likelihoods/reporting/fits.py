@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..probability.autoregressive_noise import AutoregressiveNoise
-from ..probability.band_noise import BandNoise
-from ..probability.event_noise import find_events
+from ..noise.autoregressive import AutoregressiveNoise
+from ..noise.bands import BandNoise
+from ..noise.marginal import sampled_noise
+from ..noise.residuals import ResidualChecks, innovations, residual_checks
 from ..probability.likelihood import FELikelihood
-from ..probability.marginal_noise import sampled_noise
-from ..probability.residuals import ResidualChecks, innovations, residual_checks
 from ..signals.channels import Channel, Measurements
+from ..signals.events import find_events
 from .run import FinishedRun
 
 __all__ = ["SMALL_PROBABILITY", "ChannelFit", "Fit", "Fits", "fit_data_sets"]

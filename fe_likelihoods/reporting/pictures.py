@@ -129,7 +129,7 @@ def draw_fit(fit: Fit) -> list[Picture]:
 
 def draw_residuals(fit: Fit) -> list[Picture]:
     """Residuals against time, their autocorrelation and quantiles."""
-    from ..probability.residuals import plot_residuals
+    from ..noise.residuals import plot_residuals
 
     if fit.residuals is None or not fit.measurements.simultaneous:
         return []

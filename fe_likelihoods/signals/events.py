@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from .channels import Channel, Measurements
 from .records import Record
 from .sampling import rest_samples, same_step
 
-__all__ = ["EventWindow", "Events"]
+__all__ = ["EventWindow", "Events", "events_of", "find_events", "join_measurements"]
 
 
 class EventWindow(NamedTuple):
@@ -296,3 +296,36 @@ def _checked_names(names: Sequence[str], n: int) -> list[str]:
     if len(given) != n or len(set(given)) != n or not all(isinstance(name, str) and name for name in given):
         raise ValueError(f"names must be {n} different texts, one for each event; got {names!r}")
     return given
+
+
+def find_events(model: Any) -> Events | None:
+    """The events that are the excitation of a model, None if it is another one."""
+    for name in ("record", "loading", "supports"):  # of the models of this package; optional in others
+        excitation = getattr(model, name, None)
+        for each in excitation if isinstance(excitation, tuple | list) else (excitation,):
+            if isinstance(each, Events):
+                return each
+    return None
+
+
+def events_of(model: Any) -> Events:
+    """The events that are the excitation of a model; raise ValueError if it is another one."""
+    events = find_events(model)
+    if events is None:
+        raise ValueError(
+            f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]); that of this "
+            f"{type(model).__name__} is not"
+        )
+    missing = events.duration - (model.n_steps - 1) * model.dt
+    if missing > 1.000001 * model.dt:
+        raise ValueError(
+            f"measurements and noise per event need a response to all {events.duration:g} s of the events, and that of "
+            f"this {type(model).__name__} lacks {missing:g} s; leave out its lead, and put NaN where the measurements "
+            "of the first event are not to be compared"
+        )
+    return events
+
+
+def join_measurements(model: Any, measurements: Measurements | Mapping[str, Measurements]) -> Measurements:
+    """Measurements over the excitation of a model; those of single events, given by name, are joined."""
+    return events_of(model).join(measurements) if isinstance(measurements, Mapping) else measurements

@@ -51,7 +51,7 @@ LIBRARY = __name__.split(".")[0]
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = (
     *("kernels/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "simulation/residual_statistics.py"),
-    *("probability/*noise*.py", "probability/response_levels.py", "units.py"),
+    *("noise/*.py", "units.py"),
 )
 MOST_OBJECTS = 1_000_000  # of one value; the rest is left out
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.emulation.quadratic import bilinear_form, check_quadratic, sums_of_squares
-from fe_likelihoods.probability.residuals import lag_one_sums
+from fe_likelihoods.noise.residuals import lag_one_sums
 
 
 @pytest.mark.parametrize("statistic", [sums_of_squares, lag_one_sums])

@@ -9,7 +9,7 @@ from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.models.steel_coupon import SteelCoupon
-from fe_likelihoods.probability.autoregressive_noise import AutoregressiveNoise
+from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements

@@ -7,8 +7,8 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.noise.residuals import autocorrelation, plot_residuals, residual_checks
 from fe_likelihoods.plots.histories import plot_histories, plot_loop, plot_record, plot_spectra
-from fe_likelihoods.probability.residuals import autocorrelation, plot_residuals, residual_checks
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0

@@ -5,6 +5,8 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.noise.modulated import ModulatedNoise
+from fe_likelihoods.noise.relative import RelativeNoise
 from fe_likelihoods.prediction.event_ratios import EventRatios
 from fe_likelihoods.prediction.new_event import event_ratio, predict_new_event
 from fe_likelihoods.prediction.quantities import peak, rms
@@ -12,10 +14,8 @@ from fe_likelihoods.probability.distributions import HalfNormal, LogNormal
 from fe_likelihoods.probability.hierarchical_posterior import HierarchicalPosterior, Varying
 from fe_likelihoods.probability.hierarchy import Hierarchy
 from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.modulated_noise import ModulatedNoise
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import Prior
-from fe_likelihoods.probability.relative_noise import RelativeNoise
 from fe_likelihoods.signals.channels import Channel, Measurements
 
 TOP = Channel("top", "displacement", "mm")

@@ -9,6 +9,7 @@ from scipy import integrate, stats
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.noise.relative import RelativeNoise
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import final_value, peak, rms
 from fe_likelihoods.prediction.score_tables import envelope, score_values, strong_part
@@ -24,7 +25,6 @@ from fe_likelihoods.prediction.scores import (
 from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.relative_noise import RelativeNoise
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.interpolation import interpolate, make_interpolation
 

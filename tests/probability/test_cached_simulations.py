@@ -13,7 +13,7 @@ from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.models.steel_coupon import SteelCoupon
-from fe_likelihoods.probability.autoregressive_noise import AutoregressiveNoise
+from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.probability.failures import TooManyFailures
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.problems import isolated_bridge

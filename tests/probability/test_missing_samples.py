@@ -29,8 +29,8 @@ from fe_likelihoods import (
     residual_checks,
     rrmse,
 )
-from fe_likelihoods.probability.residuals import autocorrelation, lag_one_sums
-from fe_likelihoods.probability.sample_counts import SampleCounts, count_samples
+from fe_likelihoods.noise.residuals import autocorrelation, lag_one_sums
+from fe_likelihoods.noise.sample_counts import SampleCounts, count_samples
 from fe_likelihoods.simulation.model import SimulationBatch
 from tests.emulation.problems import CHANNELS as MODES_CHANNELS
 from tests.emulation.problems import DT, N_STEPS, free_vibration

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods.probability.noise import GaussianNoise, SharedGaussianNoise
+from fe_likelihoods.noise.gaussian import GaussianNoise, SharedGaussianNoise
 from fe_likelihoods.signals.channels import Channel, Measurements
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))

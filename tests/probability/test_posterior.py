@@ -14,10 +14,10 @@ import pytest
 from scipy import optimize, stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.noise.gaussian import SharedGaussianNoise
 from fe_likelihoods.probability.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.failures import FailureLog, reason_without_numbers
 from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.noise import SharedGaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
 from fe_likelihoods.probability.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements

@@ -7,14 +7,14 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
+from fe_likelihoods.noise.gaussian import GaussianNoise
+from fe_likelihoods.noise.relative import RelativeNoise, local_level
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import rms
 from fe_likelihoods.probability.block_likelihood import block_log_likelihood
 from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.noise import GaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.relative_noise import RelativeNoise, local_level
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 

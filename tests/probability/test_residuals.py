@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from fe_likelihoods import FELikelihood, FunctionModel, LocalPool, Measurements
-from fe_likelihoods.probability.residuals import (
+from fe_likelihoods.noise.residuals import (
     autocorrelation,
     effective_samples,
     innovations,

@@ -18,7 +18,7 @@ from fe_likelihoods import (
     RelativeNoise,
     TruncatedNormal,
 )
-from fe_likelihoods.probability.noise_draws import sample_noise
+from fe_likelihoods.noise.draws import sample_noise
 from fe_likelihoods.reporting.contents import residual_sentences
 from fe_likelihoods.reporting.fits import fit_data_sets
 from fe_likelihoods.reporting.run import read_run

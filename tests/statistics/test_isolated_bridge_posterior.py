@@ -19,8 +19,8 @@ from scipy import stats
 
 from fe_likelihoods import problems
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
+from fe_likelihoods.noise.gaussian import SharedGaussianNoise
 from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.noise import SharedGaussianNoise
 from fe_likelihoods.probability.posterior import Posterior
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.presets import CHING_CHEN_2007

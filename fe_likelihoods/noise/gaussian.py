@@ -24,20 +24,19 @@ Which noise to take:
 
 Real measurements differ from a model by more than the noise of a sensor, and the differences are correlated in time.
 White noise counts the n samples of a channel as n independent observations, which makes the posterior too narrow. The
-module `fe_likelihoods.probability.residuals` has checks of this assumption and estimates the effective number of
-samples. `AutoregressiveNoise` is in `fe_likelihoods.probability.autoregressive_noise`, `RelativeNoise` in
-`fe_likelihoods.probability.relative_noise`.
+module `fe_likelihoods.noise.residuals` has checks of this assumption and estimates the effective number of
+samples. `AutoregressiveNoise` is in `fe_likelihoods.noise.autoregressive`, `RelativeNoise` in
+`fe_likelihoods.noise.relative`.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from ..simulation.residual_statistics import Statistic
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = [
@@ -60,6 +59,7 @@ __all__ = [
 ]
 
 PerChannel = Mapping[str, float] | Sequence[float] | None
+Statistic = Callable[..., np.ndarray]
 HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -75,7 +75,7 @@ class Noise(Protocol):
       statistic with an attribute ``of_response`` that is true also takes the response at the samples, as a second
       argument.
     * ``time_shifts``, the largest unknown time shifts of channels [s] by name, with the statistics of
-      `fe_likelihoods.probability.time_shift_noise.TimeShiftNoise`.
+      `fe_likelihoods.noise.time_shifts.TimeShiftNoise`.
     * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
       errors (n, n_channels) [SI]; needed for predictions with noise.
     * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
@@ -168,7 +168,7 @@ class GaussianNoise:
         sigma_total^2 = sensor^2 + sigma^2.
     effective_samples : mapping of channel names to float, or sequence of float, optional
         Number of independent samples that each channel is worth, as estimated by
-        `fe_likelihoods.probability.residuals.effective_samples`; the number of samples where it is smaller or the name
+        `fe_likelihoods.noise.residuals.effective_samples`; the number of samples where it is smaller or the name
         is left out.
 
     Raises

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .event_noise import find_events
+from ..signals.events import find_events
 
 __all__ = ["Excited", "excited_parts", "imposed_deformation", "squared_levels"]
 

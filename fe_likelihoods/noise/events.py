@@ -5,18 +5,18 @@ standard deviation per channel and event, which are inferred like those of `Gaus
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from ..signals.events import Events
-from ..simulation.model import Model
-from .noise import HALF_LOG_TWO_PI, GaussianNoise, Noise
+from ..signals.events import Events, events_of
+from .gaussian import HALF_LOG_TWO_PI, GaussianNoise, Noise
 from .sample_counts import SampleCounts
 
-__all__ = ["EventNoise", "EventSums", "find_events", "join_measurements", "named_noise"]
+__all__ = ["EventNoise", "EventSums", "named_noise"]
 
 
 @dataclass(frozen=True)
@@ -192,12 +192,7 @@ class EventNoise:
         return np.where(possible, terms, -np.inf).sum(axis=-1)
 
 
-def join_measurements(model: Model, measurements: Measurements | Mapping[str, Measurements]) -> Measurements:
-    """Measurements over the excitation of a model; those of single events, given by name, are joined."""
-    return _events_of(model).join(measurements) if isinstance(measurements, Mapping) else measurements
-
-
-def named_noise(model: Model, measurements: Measurements, noise: Noise | str | None) -> Noise:
+def named_noise(model: Any, measurements: Measurements, noise: Noise | str | None) -> Noise:
     """The noise that a likelihood was given: an object, None for `GaussianNoise`, or "per event".
 
     Raises
@@ -211,32 +206,4 @@ def named_noise(model: Model, measurements: Measurements, noise: Noise | str | N
         return noise
     if noise != "per event":
         raise ValueError(f'noise must be a noise, such as GaussianNoise(model.channels), or "per event"; got {noise!r}')
-    return EventNoise.of(_events_of(model), measurements)
-
-
-def find_events(model: Model) -> Events | None:
-    """The events that are the excitation of a model, None if it is another one."""
-    for name in ("record", "loading", "supports"):  # of the models of this package; optional in others
-        excitation = getattr(model, name, None)
-        for each in excitation if isinstance(excitation, tuple | list) else (excitation,):
-            if isinstance(each, Events):
-                return each
-    return None
-
-
-def _events_of(model: Model) -> Events:
-    """The events that are the excitation of a model; raise ValueError if it is another one."""
-    events = find_events(model)
-    if events is None:
-        raise ValueError(
-            f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]); that of this "
-            f"{type(model).__name__} is not"
-        )
-    missing = events.duration - (model.n_steps - 1) * model.dt
-    if missing > 1.000001 * model.dt:
-        raise ValueError(
-            f"measurements and noise per event need a response to all {events.duration:g} s of the events, and that of "
-            f"this {type(model).__name__} lacks {missing:g} s; leave out its lead, and put NaN where the measurements "
-            "of the first event are not to be compared"
-        )
-    return events
+    return EventNoise.of(events_of(model), measurements)

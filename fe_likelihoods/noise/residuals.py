@@ -3,7 +3,7 @@
 A residual is the measured minus the simulated response at parameters that fit. White noise treats the n samples of a
 channel as independent. Residuals of real measurements are not, because the error of a model changes slowly and repeats
 from cycle to cycle. `residual_checks` measures how far they are from white noise, `effective_samples` gives the number
-of independent samples for `fe_likelihoods.probability.noise.GaussianNoise`, and `innovations` shows whether
+of independent samples for `fe_likelihoods.noise.gaussian.GaussianNoise`, and `innovations` shows whether
 `fe_likelihoods.AutoregressiveNoise` explains them::
 
     residuals = posterior.likelihood.residuals(best)

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from ..signals.channels import Channel
 from ..signals.interpolation import POINTS
-from .noise import GaussianNoise, Noise, SharedGaussianNoise, as_number
+from .gaussian import GaussianNoise, Noise, SharedGaussianNoise, as_number
 from .sample_counts import SampleCounts
 
 __all__ = ["TimeShiftNoise"]

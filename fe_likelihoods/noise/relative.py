@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from .noise import (
+from .gaussian import (
     PerChannel,
     as_number,
     numbers,

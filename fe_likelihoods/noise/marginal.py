@@ -20,9 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .distributions import Distribution, RandomState, Uniform
-from .noise import GaussianNoise, Noise, SharedGaussianNoise
-from .priors import Prior
+from .gaussian import GaussianNoise, Noise, SharedGaussianNoise
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = ["MarginalNoise", "sampled_noise"]
@@ -60,24 +58,28 @@ class MarginalNoise:
 
     Examples
     --------
-    >>> noise = MarginalNoise(GaussianNoise(model.channels), {"sigma_top": HalfNormal(0.1)})
-    >>> posterior = Posterior(FELikelihood(model, measurements, noise), prior_of_structural_parameters)
+    >>> likelihood = FELikelihood(model, measurements).marginal({"sigma_top": HalfNormal(0.1)})
+    >>> posterior = Posterior(likelihood, prior_of_structural_parameters)
 
-    `fe_likelihoods.probability.posterior.Posterior.marginal` does this for a posterior with all parameters.
+    `fe_likelihoods.Posterior.marginal` does this for a posterior with all parameters.
     """
 
     noise: GaussianNoise | SharedGaussianNoise
-    priors: tuple[Distribution, ...]
+    priors: tuple[Any, ...]
 
-    def __init__(self, noise: GaussianNoise | SharedGaussianNoise, priors: Mapping[str, Distribution]) -> None:
+    def __init__(self, noise: GaussianNoise | SharedGaussianNoise, priors: Mapping[str, Any]) -> None:
         if not isinstance(noise, GaussianNoise | SharedGaussianNoise) or noise.sensor is not None:
             raise ValueError(
                 "MarginalNoise integrates out the standard deviations of white noise, GaussianNoise or "
                 f"SharedGaussianNoise, without sensor noise; got {noise!r}: keep the parameters of this one"
             )
         object.__setattr__(self, "noise", noise)
-        ordered = Prior(priors).reorder(noise.parameter_names)
-        object.__setattr__(self, "priors", tuple(ordered.distributions.values()))
+        if set(priors) != set(noise.parameter_names):
+            raise ValueError(
+                f"expected priors of the noise parameters {', '.join(noise.parameter_names)}; got priors of "
+                f"{', '.join(priors) or 'none'}"
+            )
+        object.__setattr__(self, "priors", tuple(priors[name] for name in noise.parameter_names))
 
     @property
     def channels(self) -> tuple:
@@ -117,7 +119,7 @@ class MarginalNoise:
             total[usable] = constant + np.sum(terms, axis=0)
         return total
 
-    def draw(self, misfit: np.ndarray, n_samples: int | SampleCounts, rng: RandomState = None) -> np.ndarray:
+    def draw(self, misfit: np.ndarray, n_samples: int | SampleCounts, uniform: np.ndarray) -> np.ndarray:
         """Draws of the standard deviations from their conditional posterior, given the misfit, one per row.
 
         Parameters
@@ -126,8 +128,8 @@ class MarginalNoise:
             As for `log_likelihood`; finite and positive.
         n_samples : int or SampleCounts
             Number of samples of every channel, or those of each channel where samples are missing.
-        rng : int, numpy.random.Generator, numpy.random.RandomState or None
-            A seed, a generator, or None for NumPy's global stream.
+        uniform : (n, n_noise) float
+            Independent random numbers in [0, 1).
 
         Returns
         -------
@@ -147,7 +149,6 @@ class MarginalNoise:
                 f"{len(good)} rows it is not, because the simulation failed or fits exactly: leave these rows out"
             )
         squares, counts, _ = self._sums(misfit, n_samples)
-        uniform = Uniform(0.0, 1.0).rvs(squares.shape, rng)
         columns = [_draws(*one) for one in zip(squares.T, counts, self.priors, uniform.T, strict=True)]
         return np.stack(columns, axis=1)
 
@@ -177,14 +178,14 @@ class _Peak(NamedTuple):
     high: np.ndarray
 
 
-def _log_integrand(t: np.ndarray, fit: np.ndarray, count: float, prior: Distribution) -> np.ndarray:
+def _log_integrand(t: np.ndarray, fit: np.ndarray, count: float, prior: Any) -> np.ndarray:
     """Logarithm of the integrand at t = log sigma (n, k); `fit` (n, 1) is the likelihood's maximum, log sqrt(J / n)."""
     with np.errstate(over="ignore", invalid="ignore"):
         likelihood = -count * (_HALF_LOG_TWO_PI + t + 0.5 * np.exp(2.0 * (fit - t)))
     return likelihood + prior.logpdf(np.exp(t)) + t
 
 
-def _find(fit: np.ndarray, count: float, prior: Distribution) -> _Peak:
+def _find(fit: np.ndarray, count: float, prior: Any) -> _Peak:
     """Peak of the integrand for every row of `fit` (n, 1)."""
     least, most = _logarithms(prior)
     middle, far = np.log(prior.ppf(np.array([0.5, 1.0 - 1e-15])))
@@ -217,14 +218,14 @@ def _find(fit: np.ndarray, count: float, prior: Distribution) -> _Peak:
     return _Peak(top, *bounds)
 
 
-def _logarithms(prior: Distribution) -> tuple[float, float]:
+def _logarithms(prior: Any) -> tuple[float, float]:
     """Logarithms of the prior's bounds for positive sigma, moved inwards so that exp(log) is within the bounds."""
     least, most = prior.bounds
     tiny = np.finfo(float).tiny
     return math.log(max(least, tiny)) + 1e-14, math.log(min(most, 1.0 / tiny)) - 1e-14
 
 
-def _integral(squares: np.ndarray, count: float, prior: Distribution) -> np.ndarray:
+def _integral(squares: np.ndarray, count: float, prior: Any) -> np.ndarray:
     """Logarithm of L(J), for sums of squares (n,)."""
     with np.errstate(divide="ignore"):
         fit = 0.5 * np.log(squares / count)[:, None]
@@ -241,7 +242,7 @@ def _integral(squares: np.ndarray, count: float, prior: Distribution) -> np.ndar
     return result
 
 
-def _draws(squares: np.ndarray, count: float, prior: Distribution, uniform: np.ndarray) -> np.ndarray:
+def _draws(squares: np.ndarray, count: float, prior: Any, uniform: np.ndarray) -> np.ndarray:
     """Standard deviations for sums of squares (n,): the inverse of their distribution function at uniform numbers."""
     fit = 0.5 * np.log(squares / count)[:, None]
     peak = _find(fit, count, prior)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .noise import HALF_LOG_TWO_PI
+from .gaussian import HALF_LOG_TWO_PI
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = ["MeasuredLayout", "grouped_log_likelihood", "per_channel", "split_sums", "without_layout"]

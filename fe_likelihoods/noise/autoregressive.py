@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..signals.channels import Channel
-from .noise import HALF_LOG_TWO_PI, PerChannel, Statistic, options_repr, set_channels, total_deviations, weighted
+from .gaussian import HALF_LOG_TWO_PI, PerChannel, Statistic, options_repr, set_channels, total_deviations, weighted
 from .residuals import lag_one_sums
 from .sample_counts import SampleCounts
 
@@ -44,7 +44,7 @@ class AutoregressiveNoise:
         Q     = (1 - rho)^2 J + rho D + rho (1 - rho) E
 
     with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2
-    (`fe_likelihoods.probability.residuals.lag_one_sums`). For rho = 0 this is white noise. Q is written
+    (`fe_likelihoods.noise.residuals.lag_one_sums`). For rho = 0 this is white noise. Q is written
     with differences instead of the products r_t r_{t-1}, because for rho near one their sum would cancel against J. The
     mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
 
@@ -79,7 +79,7 @@ class AutoregressiveNoise:
 
     @property
     def statistic(self) -> Statistic:
-        """Statistic of the residuals: `fe_likelihoods.probability.residuals.lag_one_sums`."""
+        """Statistic of the residuals: `fe_likelihoods.noise.residuals.lag_one_sums`."""
         return lag_one_sums
 
     def log_likelihood(

@@ -23,10 +23,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from .event_noise import find_events
-from .grouped_errors import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
-from .noise import HALF_LOG_TWO_PI, PerChannel, as_number, options_repr, set_channels, weighted
-from .response_levels import Excited, excited_parts, squared_levels
+from ..signals.events import find_events
+from .gaussian import HALF_LOG_TWO_PI, PerChannel, as_number, options_repr, set_channels, weighted
+from .grouped import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
+from .levels import Excited, excited_parts, squared_levels
 from .sample_counts import SampleCounts
 
 __all__ = ["ModulatedNoise", "PartSums"]

@@ -17,8 +17,8 @@ from functools import lru_cache
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
-from .grouped_errors import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
-from .noise import HALF_LOG_TWO_PI, PerChannel, numbers, options_repr, set_channels, weighted
+from .gaussian import HALF_LOG_TWO_PI, PerChannel, numbers, options_repr, set_channels, weighted
+from .grouped import MeasuredLayout, grouped_log_likelihood, per_channel, split_sums, without_layout
 from .sample_counts import SampleCounts
 
 __all__ = ["BandNoise", "BandSums"]

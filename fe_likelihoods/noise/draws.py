@@ -74,7 +74,7 @@ def sample_noise(
     Parameters
     ----------
     noise : Noise
-        With a method ``standard_deviations``, see `fe_likelihoods.probability.noise.Noise`.
+        With a method ``standard_deviations``, see `fe_likelihoods.noise.gaussian.Noise`.
     parameters : (n, n_noise) float
         Parameters of the noise.
     n_channels : int

@@ -1,0 +1,1 @@
+"""Models of the error between measured and simulated response."""
